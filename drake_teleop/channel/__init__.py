@@ -1,0 +1,1 @@
+"""The communication channel between master and slave."""

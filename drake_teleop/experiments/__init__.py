@@ -1,0 +1,1 @@
+"""Experiments: each one file; each is data, a picture and a table."""

@@ -1,0 +1,1 @@
+"""The load's inertia: regressor, parameters, identification, compensation. No Drake in here."""

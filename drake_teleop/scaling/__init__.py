@@ -1,0 +1,1 @@
+"""Scaling of motion (master to slave) and of force (slave to master)."""
