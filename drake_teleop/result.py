@@ -1,0 +1,299 @@
+"""What a simulation gives back: named signals that know their units, plot and save themselves."""
+
+from __future__ import annotations
+
+import difflib
+import html
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.style import house_style, shade_contact
+
+if TYPE_CHECKING:
+    import polars as pl
+    from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike, NDArray
+
+_METADATA_KEY = "drake_teleop.signals"
+# The canonical log (README, "Logs"): which signal fills which columns.
+_CANONICAL = {
+    "measured_wrench_S": ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"),
+    "specific_force_S": ("s_x", "s_y", "s_z"),
+    "angular_velocity_S": ("omega_x", "omega_y", "omega_z"),
+    "angular_acceleration_S": ("alpha_x", "alpha_y", "alpha_z"),
+}
+
+
+@dataclass(frozen=True)
+class Signal:
+    """What a signal is.
+
+    Args:
+        name: the port it comes from, in the paper's words ("measured_wrench_S").
+        components: the name of each of its k components ("f_x", ...).
+        units: the unit of each component; one string if all have the same ("1" for none).
+        description: one line for people.
+
+    Raises:
+        ValueError: if there are not as many units as components.
+    """
+
+    name: str
+    components: tuple[str, ...]
+    units: str | tuple[str, ...]
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "components", tuple(self.components))
+        units = self.units
+        units = (units,) * len(self.components) if isinstance(units, str) else tuple(units)
+        object.__setattr__(self, "units", units)
+        if len(units) != len(self.components):
+            raise ValueError(
+                f"signal {self.name}: {len(self.components)} components, {len(units)} units"
+            )
+
+
+class SimulationResult:
+    """Sampled signals of one simulation, on one time base.
+
+    ``result["measured_wrench_S"]`` is an (N, k) array; ``name in result``, ``len(result)`` and
+    iteration speak of the signals' names. Arrays are read-only.
+
+    Args:
+        t: (N,) sample times [s].
+        signals: the arrays by name, (N, k) or (N,) for one component.
+        specs: what each signal is; the result keeps their order.
+
+    Raises:
+        ValueError: if names, lengths or numbers of components do not fit together.
+    """
+
+    def __init__(
+        self, t: ArrayLike, signals: Mapping[str, ArrayLike], specs: Sequence[Signal]
+    ) -> None:
+        self._t = _read_only(np.asarray(t, dtype=float))
+        self._specs = {spec.name: spec for spec in specs}
+        if self._specs.keys() != signals.keys():
+            odd = sorted(self._specs.keys() ^ signals.keys())
+            raise ValueError(f"signals and specs differ in {', '.join(odd)}")
+        self._values = {name: self._checked(name, signals[name]) for name in self._specs}
+
+    def _checked(self, name: str, values: ArrayLike) -> NDArray[np.float64]:
+        array = np.asarray(values, dtype=float)
+        shape = (len(self._t), len(self._specs[name].components))
+        if array.ndim == 1:
+            array = array[:, np.newaxis]
+        if array.shape != shape:
+            raise ValueError(f"signal {name} has shape {array.shape}, expected {shape}")
+        return _read_only(array)
+
+    @property
+    def t(self) -> NDArray[np.float64]:
+        """(N,) sample times [s]."""
+        return self._t
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The signals' names."""
+        return tuple(self._specs)
+
+    @property
+    def specs(self) -> tuple[Signal, ...]:
+        """What each signal is, in the order of `signals`."""
+        return tuple(self._specs.values())
+
+    @property
+    def units(self) -> dict[str, dict[str, str]]:
+        """Per signal, the unit of each component: ``units["measured_wrench_S"]["f_x"] == "N"``."""
+        return {
+            spec.name: dict(zip(spec.components, spec.units, strict=True)) for spec in self.specs
+        }
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        try:
+            return self._values[name]
+        except KeyError:
+            near = difflib.get_close_matches(str(name), self.signals, n=3) or self.signals
+            raise KeyError(f"no signal {name!r}; there are {', '.join(near)}") from None
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._specs)
+
+    def __len__(self) -> int:
+        return len(self._specs)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self._specs)
+
+    def to_dataframe(self) -> pl.DataFrame:
+        """One row per sample: ``t``, then a column ``signal.component`` for every component."""
+        import polars as pl
+
+        columns = {"t": self._t}
+        for spec in self.specs:
+            for index, component in enumerate(spec.components):
+                columns[f"{spec.name}.{component}"] = self._values[spec.name][:, index]
+        return pl.DataFrame(columns)
+
+    def sensor_log(self) -> pl.DataFrame:
+        """The wrist sensor's samples as a canonical log, for `identify` and `eliminate`.
+
+        Columns ``t``, ``f_x`` ... ``tau_z``, ``s_x`` ..., ``omega_x`` ..., ``alpha_x`` ... in S
+        and SI units, wrench with the sign of Eq. (1).
+
+        Raises:
+            DrakeTeleopError: if the sensor's signals were not recorded.
+        """
+        import polars as pl
+
+        missing = [name for name in _CANONICAL if name not in self]
+        if missing:
+            raise DrakeTeleopError(
+                f"this result holds no {', '.join(missing)}",
+                where="sensor log",
+                remedy="record the wrist sensor's signals",
+            )
+        columns = {"t": self._t}
+        for name, names in _CANONICAL.items():
+            columns |= {column: self[name][:, index] for index, column in enumerate(names)}
+        return pl.DataFrame(columns)
+
+    def write_parquet(self, path: str | Path) -> None:
+        """Writes `to_dataframe` with names, units and descriptions in the file's metadata.
+
+        The same data give the same bytes.
+        """
+        specs = [
+            {
+                "name": spec.name,
+                "components": spec.components,
+                "units": spec.units,
+                "description": spec.description,
+            }
+            for spec in self.specs
+        ]
+        # Fixed row groups: polars' default may follow the number of threads.
+        self.to_dataframe().write_parquet(
+            path, metadata={_METADATA_KEY: json.dumps(specs)}, row_group_size=2**16
+        )
+
+    @classmethod
+    def read_parquet(cls, path: str | Path) -> SimulationResult:
+        """Reads what `write_parquet` wrote.
+
+        Raises:
+            DrakeTeleopError: if the file is absent or was not written by `write_parquet`.
+        """
+        import polars as pl
+
+        try:
+            text = pl.read_parquet_metadata(path)[_METADATA_KEY]
+            table = pl.read_parquet(path)
+        except (OSError, KeyError, pl.exceptions.PolarsError) as error:
+            raise DrakeTeleopError(
+                "is not a simulation result",
+                where=str(path),
+                remedy="give a file written by SimulationResult.write_parquet or drake-teleop run",
+            ) from error
+        specs = [Signal(**entry) for entry in json.loads(text)]
+        signals = {
+            spec.name: table.select(
+                f"{spec.name}.{component}" for component in spec.components
+            ).to_numpy()
+            for spec in specs
+        }
+        return cls(table["t"].to_numpy(), signals, specs)
+
+    def plot(self, *names: str, contact: ArrayLike | None = None) -> Figure:
+        """Draws signals over time, one subplot for each signal and unit.
+
+        Args:
+            names: the signals; all of them if none is named.
+            contact: (N,) booleans; the time in contact is shaded.
+
+        Raises:
+            KeyError: for an unknown name.
+        """
+        # Importing pyplot is what makes a notebook show the returned Figure.
+        import matplotlib.pyplot  # noqa: F401
+        from matplotlib.figure import Figure
+
+        panels = [panel for name in names or self.signals for panel in self._panels(name)]
+        with house_style():
+            figure = Figure(figsize=(8.0, 0.6 + 1.9 * len(panels)))
+            rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+            for axes, (name, unit, indices) in zip(rows, panels, strict=True):
+                components = self._specs[name].components
+                for index in indices:
+                    axes.plot(self._t, self._values[name][:, index], label=components[index])
+                if contact is not None:
+                    shade_contact(axes, self._t, contact)
+                axes.set_title(name)
+                axes.set_ylabel(unit if unit != "1" else "")
+                axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+                axes.margins(x=0)
+            rows[-1].set_xlabel("t [s]")
+        return figure
+
+    def _panels(self, name: str) -> list[tuple[str, str, list[int]]]:
+        """The subplots of a signal: its components, neighbours of the same unit together."""
+        self[name]  # an unknown name is a KeyError with a suggestion
+        units = self._specs[name].units
+        groups = groupby(range(len(units)), key=lambda index: units[index])
+        return [(name, unit, list(indices)) for unit, indices in groups]
+
+    def _span(self) -> str:
+        if not len(self._t):
+            return "no samples"
+        return f"{len(self._t)} samples, {self._t[0]:g} to {self._t[-1]:g} s"
+
+    def __repr__(self) -> str:
+        width = max((len(name) for name in self.signals), default=0)
+        lines = [f"SimulationResult: {self._span()}"]
+        lines += [f"  {spec.name:{width}}  {_describe(spec)}" for spec in self.specs]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td style='text-align:left'><code>{html.escape(spec.name)}</code></td>"
+            f"<td style='text-align:left'>{html.escape(_components(spec))}</td>"
+            f"<td style='text-align:left'>{html.escape(spec.description)}</td></tr>"
+            for spec in self.specs
+        )
+        head = "".join(
+            f"<th style='text-align:left'>{title}</th>"
+            for title in ("signal", "components [unit]", "what it is")
+        )
+        return (
+            f"<b>SimulationResult</b>: {self._span()}"
+            f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+        )
+
+
+def _components(spec: Signal) -> str:
+    """ "f_x, f_y, f_z [N], tau_x [N m]": neighbours of the same unit share it."""
+    pairs = zip(spec.components, spec.units, strict=True)
+    groups = groupby(pairs, key=lambda pair: pair[1])
+    return ", ".join(f"{', '.join(c for c, _ in pairs)} [{unit}]" for unit, pairs in groups)
+
+
+def _describe(spec: Signal) -> str:
+    text = _components(spec)
+    return f"{text}  {spec.description}" if spec.description else text
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    view = array.view()
+    view.flags.writeable = False
+    return view

@@ -1,0 +1,70 @@
+"""The look of every figure, in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Okabe and Ito (2008): told apart with every common colour deficiency, and in grey.
+BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
+PURPLE, SKY, BLACK, GREY = "#CC79A7", "#56B4E9", "#1A1A1A", "#6B7280"
+COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
+
+_STYLE = {
+    "figure.dpi": 110,
+    "savefig.dpi": 160,
+    "figure.constrained_layout.use": True,
+    "font.family": "sans-serif",
+    "font.size": 9.5,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 9.5,
+    "axes.edgecolor": "#9CA3AF",
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E5E7EB",
+    "grid.linewidth": 0.6,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": BLACK,
+    "ytick.labelcolor": BLACK,
+    "lines.linewidth": 1.2,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+}
+
+
+def house_style() -> AbstractContextManager[None]:
+    """A context in which figures get the house's fonts, colours, grid and resolution."""
+    import matplotlib as mpl
+    from cycler import cycler
+
+    return mpl.rc_context({**_STYLE, "axes.prop_cycle": cycler(color=COLOURS)})
+
+
+def shade_contact(axes: Axes, t: Any, contact: Any) -> None:
+    """Shades the spans of time in which there is contact.
+
+    Args:
+        axes: where to draw.
+        t: (N,) times, in the axis' unit.
+        contact: (N,) booleans.
+    """
+    for start, stop in contact_spans(t, contact):
+        axes.axvspan(start, stop, color=ORANGE, alpha=0.18, linewidth=0)
+
+
+def contact_spans(t: Any, contact: Any) -> Sequence[tuple[float, float]]:
+    """The spans (start, stop) of time, in the unit of `t`, in which (N,) `contact` is true."""
+    import numpy as np
+
+    edges = np.diff(np.concatenate([[False], np.asarray(contact, bool), [False]]).astype(int))
+    starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    return [(float(t[a]), float(t[b])) for a, b in zip(starts, stops, strict=True)]

@@ -1,0 +1,154 @@
+"""The result object: names, units, round trip, bit-identical files, the canonical log."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.result import Signal, SimulationResult
+
+XYZ = ("x", "y", "z")
+SPECS = (
+    Signal(
+        "measured_wrench_S",
+        ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"),
+        ("N",) * 3 + ("N m",) * 3,
+        "wrench on the load, sign of Eq. (1)",
+    ),
+    Signal("specific_force_S", XYZ, "m/s^2"),
+    Signal("angular_velocity_S", XYZ, "rad/s"),
+    Signal("angular_acceleration_S", XYZ, "rad/s^2"),
+    Signal("sigma", ("sigma",), "1"),
+)
+
+
+def make_result(samples: int = 50, seed: int = 3) -> SimulationResult:
+    rng = np.random.default_rng(seed)
+    arrays = {s.name: rng.standard_normal((samples, len(s.components))) for s in SPECS}
+    return SimulationResult(np.arange(samples) / 8000.0, arrays, SPECS)
+
+
+def test_signals_are_found_by_name_and_know_their_units():
+    result = make_result()
+    assert result.signals == tuple(spec.name for spec in SPECS)
+    assert "sigma" in result and "force" not in result
+    assert len(result) == 5 and list(result) == list(result.signals)
+    assert result["measured_wrench_S"].shape == (50, 6)
+    assert result["sigma"].shape == (50, 1)
+    assert result.units["measured_wrench_S"] == {
+        "f_x": "N", "f_y": "N", "f_z": "N", "tau_x": "N m", "tau_y": "N m", "tau_z": "N m",
+    }  # fmt: skip
+
+
+def test_one_component_may_be_given_flat():
+    result = SimulationResult([0.0, 1.0], {"sigma": [0.5, 0.7]}, [SPECS[-1]])
+    np.testing.assert_array_equal(result["sigma"], [[0.5], [0.7]])
+
+
+def test_unknown_name_suggests_the_right_one():
+    with pytest.raises(KeyError, match="measured_wrench_S"):
+        make_result()["measured_wrench"]
+    with pytest.raises(KeyError, match="there are"):
+        make_result().plot("nonsense")
+
+
+def test_arrays_are_read_only_but_the_caller_keeps_his():
+    t = np.zeros(2)
+    result = SimulationResult(t, {"sigma": np.zeros(2)}, [SPECS[-1]])
+    with pytest.raises(ValueError, match="read-only"):
+        result["sigma"][0] = 1.0
+    t[0] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({}, "differ in sigma"),
+        ({"sigma": np.zeros(3)}, "shape"),
+        ({"sigma": np.zeros((2, 2))}, "shape"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(arrays, message):
+    with pytest.raises(ValueError, match=message):
+        SimulationResult([0.0, 1.0], arrays, [SPECS[-1]])
+
+
+def test_a_signal_needs_a_unit_for_every_component():
+    with pytest.raises(ValueError, match="3 components, 2 units"):
+        Signal("force", XYZ, ("N", "N"))
+
+
+def test_dataframe_columns():
+    result = make_result()
+    table = result.to_dataframe()
+    assert table.columns[:3] == ["t", "measured_wrench_S.f_x", "measured_wrench_S.f_y"]
+    assert table.columns[-1] == "sigma.sigma"
+    np.testing.assert_array_equal(
+        table["measured_wrench_S.tau_z"].to_numpy(), result["measured_wrench_S"][:, 5]
+    )
+
+
+def test_parquet_round_trip_keeps_values_units_and_descriptions(tmp_path):
+    result = make_result()
+    result.write_parquet(tmp_path / "log.parquet")
+    back = SimulationResult.read_parquet(tmp_path / "log.parquet")
+    assert back.specs == result.specs
+    np.testing.assert_array_equal(back.t, result.t)
+    for name in result:
+        np.testing.assert_array_equal(back[name], result[name])
+
+
+def test_same_data_same_bytes_other_data_other_bytes(tmp_path):
+    # More samples than one row group holds, so that its size matters.
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        make_result(70_000, seed).write_parquet(tmp_path / name)
+    a, b, c = ((tmp_path / name).read_bytes() for name in "abc")
+    assert a == b
+    assert a != c
+
+
+def test_foreign_and_absent_files_are_one_clear_error(tmp_path):
+    pl.DataFrame({"t": [0.0]}).write_parquet(tmp_path / "foreign.parquet")
+    (tmp_path / "text.parquet").write_text("no table at all")
+    for name in ("foreign.parquet", "text.parquet", "absent.parquet"):
+        with pytest.raises(DrakeTeleopError, match=f"{name}: is not a simulation result"):
+            SimulationResult.read_parquet(tmp_path / name)
+
+
+def test_sensor_log_is_the_canonical_table():
+    result = make_result()
+    log = result.sensor_log()
+    assert log.columns == [
+        "t", "f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z", "s_x", "s_y", "s_z",
+        "omega_x", "omega_y", "omega_z", "alpha_x", "alpha_y", "alpha_z",
+    ]  # fmt: skip
+    np.testing.assert_array_equal(log["alpha_y"].to_numpy(), result["angular_acceleration_S"][:, 1])
+
+
+def test_sensor_log_says_what_was_not_recorded():
+    result = SimulationResult([0.0], {"sigma": [0.0]}, [SPECS[-1]])
+    with pytest.raises(DrakeTeleopError, match="measured_wrench_S"):
+        result.sensor_log()
+
+
+def test_plot_has_one_subplot_for_each_signal_and_unit():
+    result = make_result()
+    contact = np.zeros(50, bool)
+    contact[10:20] = contact[30:35] = True
+    figure = result.plot("measured_wrench_S", "sigma", contact=contact)
+    assert [axes.get_ylabel() for axes in figure.axes] == ["N", "N m", ""]
+    assert [len(axes.lines) for axes in figure.axes] == [3, 3, 1]
+    assert figure.axes[-1].get_xlabel() == "t [s]"
+    spans = [(patch.get_x(), patch.get_width()) for patch in figure.axes[0].patches]
+    np.testing.assert_allclose(spans, [(10 / 8e3, 9 / 8e3), (30 / 8e3, 4 / 8e3)])
+
+
+def test_repr_lists_signals_with_units():
+    result = make_result()
+    text = repr(result)
+    assert "50 samples, 0 to 0.006125 s" in text
+    assert "f_x, f_y, f_z [N], tau_x, tau_y, tau_z [N m]" in text
+    assert "<code>angular_velocity_S</code>" in result._repr_html_()
+    assert "no samples" in repr(SimulationResult([], {}, []))
