@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.style import house_style, shade_contact
 
 if TYPE_CHECKING:
     import polars as pl
@@ -225,13 +224,11 @@ class SimulationResult:
         Raises:
             KeyError: for an unknown name.
         """
-        # Importing pyplot is what makes a notebook show the returned Figure.
-        import matplotlib.pyplot  # noqa: F401
-        from matplotlib.figure import Figure
+        from drake_teleop.style import Picture, house_style, shade_contact
 
         panels = [panel for name in names or self.signals for panel in self._panels(name)]
         with house_style():
-            figure = Figure(figsize=(8.0, 0.6 + 1.9 * len(panels)))
+            figure = Picture(figsize=(8.0, 0.6 + 1.9 * len(panels)))
             rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
             for axes, (name, unit, indices) in zip(rows, panels, strict=True):
                 components = self._specs[name].components

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any
+from io import BytesIO
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+import matplotlib as mpl
+import numpy as np
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 # Okabe and Ito (2008): told apart with every common colour deficiency, and in grey.
 BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
@@ -43,13 +46,19 @@ _STYLE = {
 
 def house_style() -> AbstractContextManager[None]:
     """A context in which figures get the house's fonts, colours, grid and resolution."""
-    import matplotlib as mpl
-    from cycler import cycler
-
     return mpl.rc_context({**_STYLE, "axes.prop_cycle": cycler(color=COLOURS)})
 
 
-def shade_contact(axes: Axes, t: Any, contact: Any) -> None:
+class Picture(Figure):
+    """A figure that notebooks show wherever it is the value of a cell, pyplot or not."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = BytesIO()
+        self.savefig(buffer, format="png")
+        return buffer.getvalue()
+
+
+def shade_contact(axes: Axes, t: ArrayLike, contact: ArrayLike) -> None:
     """Shades the spans of time in which there is contact.
 
     Args:
@@ -61,10 +70,9 @@ def shade_contact(axes: Axes, t: Any, contact: Any) -> None:
         axes.axvspan(start, stop, color=ORANGE, alpha=0.18, linewidth=0)
 
 
-def contact_spans(t: Any, contact: Any) -> Sequence[tuple[float, float]]:
+def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]:
     """The spans (start, stop) of time, in the unit of `t`, in which (N,) `contact` is true."""
-    import numpy as np
-
+    times = np.asarray(t, float)
     edges = np.diff(np.concatenate([[False], np.asarray(contact, bool), [False]]).astype(int))
     starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    return [(float(t[a]), float(t[b])) for a, b in zip(starts, stops, strict=True)]
+    return [(float(times[a]), float(times[b])) for a, b in zip(starts, stops, strict=True)]

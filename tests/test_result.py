@@ -152,3 +152,7 @@ def test_repr_lists_signals_with_units():
     assert "f_x, f_y, f_z [N], tau_x, tau_y, tau_z [N m]" in text
     assert "<code>angular_velocity_S</code>" in result._repr_html_()
     assert "no samples" in repr(SimulationResult([], {}, []))
+
+
+def test_a_notebook_can_show_the_plot():
+    assert make_result().plot("sigma")._repr_png_().startswith(b"\x89PNG")
