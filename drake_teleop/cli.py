@@ -1,0 +1,195 @@
+"""The command line. Everything heavy is imported inside the command that needs it."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from drake_teleop._version import __version__
+from drake_teleop.errors import DrakeTeleopError
+
+_PATH = click.Path(path_type=Path)
+
+
+class _Number(click.FloatRange):
+    """A finite number in a range: click's own lets "nan" and "inf" through."""
+
+    name = "number"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number", param, ctx)
+        return number
+
+
+class _Delay(click.ParamType):
+    """Seconds, or "auto"."""
+
+    name = "auto|SECONDS"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | str:
+        return "auto" if value == "auto" else _Number().convert(value, param, ctx)
+
+
+def _out(command: str) -> Callable[[Any], Any]:
+    default = Path("out") / command
+    return click.option("--out", type=_PATH, default=default, show_default=True, metavar="DIR")
+
+
+_seed = click.option("--seed", type=click.IntRange(min=0), help="Instead of the scenario's seed.")
+_quiet = click.option("--quiet", is_flag=True, help="No progress bars, no tables.")
+_cutoff = click.option(
+    "--cutoff",
+    "cutoff_hz",
+    type=_Number(min=0, min_open=True),
+    default=30.0,
+    show_default=True,
+    metavar="HZ",
+    help="Zero-phase low-pass on all signals.",
+)
+_delay = click.option(
+    "--delay",
+    type=_Delay(),
+    default="auto",
+    show_default=True,
+    help="Wrench behind the motion, in seconds, or estimated.",
+)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, prog_name="drake-teleop")
+def cli() -> None:
+    """Bilateral teleoperation with non-contact force scaling: simulate it, and use it on logs.
+
+    Every command writes its figures by name into DIR/summary.json, and exits with status 2 and one
+    error line if its input cannot be used.
+    """
+
+
+@cli.command()
+@_out("reproduce")
+@_seed
+@_quiet
+def reproduce(out: Path, seed: int | None, quiet: bool) -> None:
+    """Repeat the paper's experiments.
+
+    Writes the paper's figures and numbers next to ours, a replay and report.html.
+    """
+    from drake_teleop.experiments.reproduce import reproduce_command
+
+    reproduce_command(out, seed=seed, quiet=quiet)
+
+
+@cli.command()
+@click.argument("scenario")
+@_out("run")
+@_seed
+@_quiet
+def run(scenario: str, out: Path, seed: int | None, quiet: bool) -> None:
+    """Simulate one scenario.
+
+    SCENARIO is the name of a shipped one or a YAML file. Writes its log and its pictures.
+    """
+    from drake_teleop.experiments.run import run_command
+
+    run_command(scenario, out, seed=seed, quiet=quiet)
+
+
+@cli.command()
+@click.argument("log", type=_PATH)
+@_out("identify")
+@_cutoff
+@_delay
+@_quiet
+def identify(log: Path, out: Path, cutoff_hz: float, delay: float | str, quiet: bool) -> None:
+    """Identify the load on the sensor from a log.
+
+    LOG is a canonical log (.csv, .parquet) or a log description (.yaml). Finds the load's mass,
+    centre of mass and inertia, the sensor's offsets and the delay, and says how sure each one is.
+    """
+    from drake_teleop.logs.commands import identify_command
+
+    identify_command(log, out, cutoff_hz=cutoff_hz, delay=delay, quiet=quiet)
+
+
+@cli.command()
+@click.argument("log", type=_PATH)
+@click.option("--load", type=_PATH, required=True, help="The identification.json of the load.")
+@click.option(
+    "--sigma",
+    type=_Number(min=0),
+    default=0.0,
+    show_default=True,
+    help="Scale of the non-contact wrench.",
+)
+@click.option(
+    "--gamma", type=_Number(), default=1.0, show_default=True, help="Scale of the contact wrench."
+)
+@click.option("--eta", type=_Number(0, 1), help="Part of a gripped object that is kept.")
+@_out("eliminate")
+@_cutoff
+@_delay
+@_quiet
+def eliminate(
+    log: Path,
+    load: Path,
+    sigma: float,
+    gamma: float,
+    eta: float | None,
+    out: Path,
+    cutoff_hz: float,
+    delay: float | str,
+    quiet: bool,
+) -> None:
+    """Eliminate or scale non-contact forces in a log.
+
+    LOG is a canonical log (.csv, .parquet) or a log description (.yaml). Writes the log of the
+    contact wrench, or of the scaled one.
+    """
+    from drake_teleop.logs.commands import eliminate_command
+
+    eliminate_command(
+        log,
+        load,
+        out,
+        sigma=sigma,
+        gamma=gamma,
+        eta=eta,
+        cutoff_hz=cutoff_hz,
+        delay=delay,
+        quiet=quiet,
+    )
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command line and exits: 0, 2 for unusable input, 130 for Ctrl-C."""
+    try:
+        status = cli.main(arguments, prog_name="drake-teleop", standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
+        status = 2
+    except click.ClickException as error:
+        status = _fail(error.format_message())
+    except DrakeTeleopError as error:
+        status = _fail(str(error))
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted", err=True)
+        status = 130
+    except OSError as error:
+        status = _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _fail(message: str) -> int:
+    click.echo(f"error: {' '.join(message.split())}", err=True)
+    return 2

@@ -1,0 +1,166 @@
+"""The command line: starts light, hands its options on, and fails in one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+from drake_teleop import cli
+from drake_teleop.errors import DrakeTeleopError
+
+HEAVY = {"numpy", "scipy", "numba", "polars", "matplotlib", "pydrake", "jinja2", "pydantic", "yaml"}
+
+
+def run_main(capsys, *arguments: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(list(arguments))
+    captured = capsys.readouterr()
+    return stop.value.code, captured.out, captured.err
+
+
+@pytest.fixture
+def install(monkeypatch):
+    """Puts a function in the place of a command's module."""
+
+    def put(module: str, name: str, function) -> None:
+        fake = types.ModuleType(module)
+        setattr(fake, name, function)
+        monkeypatch.setitem(sys.modules, module, fake)
+
+    return put
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["identify", "--help"], ["--version"]])
+def test_help_imports_nothing_heavy(arguments):
+    code = (
+        "import sys\n"
+        "from drake_teleop.cli import main\n"
+        f"try: main({arguments!r})\n"
+        "except SystemExit as stop: status = stop.code\n"
+        "print('modules', status, *sorted({name.split('.')[0] for name in sys.modules}))\n"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    word, status, *modules = answer.stdout.splitlines()[-1].split()
+    assert (word, status) == ("modules", "0")
+    assert "click" in modules
+    assert not HEAVY & set(modules)
+
+
+def test_no_command_shows_the_help(capsys):
+    status, _, _ = run_main(capsys)
+    assert status == 2
+    status, out, _ = run_main(capsys, "--help")
+    assert status == 0
+    for command in ("reproduce", "run", "identify", "eliminate"):
+        assert f"  {command} " in out
+    assert "..." not in out.split("Commands:")[1]  # every summary fits its line
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["idntify", "log.csv"],
+        ["identify"],
+        ["identify", "log.csv", "--delay", "soon"],
+        ["identify", "log.csv", "--delay", "nan"],
+        ["identify", "log.csv", "--cutoff", "0"],
+        ["eliminate", "log.csv"],
+        ["eliminate", "log.csv", "--load", "x.json", "--sigma", "-1"],
+        ["eliminate", "log.csv", "--load", "x.json", "--gamma", "inf"],
+        ["eliminate", "log.csv", "--load", "x.json", "--eta", "1.5"],
+        ["run"],
+        ["run", "free_motion_force", "--seed", "-1"],
+        ["reproduce", "--frobnicate"],
+    ],
+)
+def test_wrong_usage_is_one_error_line_and_status_2(capsys, arguments):
+    status, out, err = run_main(capsys, *arguments)
+    assert status == 2
+    assert out == ""
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("exception", "status", "message"),
+    [
+        (DrakeTeleopError("no such\nfield", where="a.yaml:x"), 2, "error: a.yaml:x: no such field"),
+        (PermissionError(13, "Permission denied", "out/x"), 2, "error: out/x: Permission denied"),
+        (OSError("disk on fire"), 2, "error: disk on fire"),
+    ],
+)
+def test_bad_input_is_one_error_line(capsys, install, exception, status, message):
+    def fail(*arguments, **options):
+        raise exception
+
+    install("drake_teleop.experiments.run", "run_command", fail)
+    assert run_main(capsys, "run", "x") == (status, "", message + "\n")
+
+
+def test_ctrl_c_is_status_130_and_no_traceback(capsys, install):
+    def interrupt(*arguments, **options):
+        raise KeyboardInterrupt
+
+    install("drake_teleop.experiments.run", "run_command", interrupt)
+    status, out, err = run_main(capsys, "run", "x")
+    assert (status, out, err.split()) == (130, "", ["interrupted"])
+
+
+def test_programming_mistakes_keep_their_traceback(install):
+    def mistake(*arguments, **options):
+        raise TypeError("a bug")
+
+    install("drake_teleop.experiments.run", "run_command", mistake)
+    with pytest.raises(TypeError, match="a bug"):
+        cli.main(["run", "x"])
+
+
+def test_options_reach_the_commands(capsys, install):
+    calls = []
+
+    def note(*arguments, **options):
+        calls.append((arguments, options))
+
+    install("drake_teleop.experiments.run", "run_command", note)
+    install("drake_teleop.experiments.reproduce", "reproduce_command", note)
+    install("drake_teleop.logs.commands", "identify_command", note)
+    status, out, err = run_main(capsys, "run", "contact_transition", "--seed", "7", "--quiet")
+    assert (status, out, err) == (0, "", "")
+    run_main(capsys, "reproduce", "--out", "out/r")
+    run_main(capsys, "identify", "a.yaml", "--delay", "0.006")
+    assert calls == [
+        (("contact_transition", Path("out/run")), {"seed": 7, "quiet": True}),
+        ((Path("out/r"),), {"seed": None, "quiet": False}),
+        (
+            (Path("a.yaml"), Path("out/identify")),
+            {"cutoff_hz": 30.0, "delay": 0.006, "quiet": False},
+        ),
+    ]
+
+
+def test_eliminate_hands_on_the_scaling_law(capsys, install):
+    calls = []
+    install(
+        "drake_teleop.logs.commands",
+        "eliminate_command",
+        lambda *arguments, **options: calls.append((arguments, options)),
+    )
+    run_main(
+        capsys, "eliminate", "a.csv", "--load", "i.json", "--sigma", "0.5", "--gamma", "2",
+        "--eta", "0.25", "--cutoff", "20",
+    )  # fmt: skip
+    assert calls == [
+        (
+            (Path("a.csv"), Path("i.json"), Path("out/eliminate")),
+            {
+                "sigma": 0.5, "gamma": 2.0, "eta": 0.25, "cutoff_hz": 20.0, "delay": "auto",
+                "quiet": False,
+            },
+        )
+    ]  # fmt: skip
