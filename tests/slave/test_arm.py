@@ -1,0 +1,239 @@
+"""The compiled arm kernels against the Drake plant that they were read from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces, WeldJoint
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.resources import models_dir
+from drake_teleop.slave.arm import (
+    MOTION_SIZE,
+    ArmModelFromPlant,
+    forward_kinematics,
+    inverse_dynamics,
+    jacobian,
+    sensor_motion,
+)
+
+SEVEN_AXES = [
+    (0, 0, 1),
+    (0, 1, 0),
+    (1, 0, 0),
+    (0.6, -0.8, 0),
+    (0, 0, -1),
+    (0, 0.28, 0.96),
+    (1, 0, 0),
+]
+
+
+def other_arm_urdf(last_joint: str = "fixed", root: str = "world") -> str:
+    """Seven joints about odd axes, a tilted base, a camera on link 3, a gripper beyond S."""
+    parts = [f'<robot name="other"><link name="{root}"/>', link("base")]
+    parts.append(joint("to_base", "fixed", root, "base", "0.1 -0.2 0.3", "0.3 0.2 -0.1"))
+    parent = "base"
+    for k, axis in enumerate(SEVEN_AXES, start=1):
+        parts += [link(f"l{k}", mass=8.0 - k)]
+        parts.append(
+            joint(f"j{k}", "revolute", parent, f"l{k}", f"0.0{k} 0.1 0.2", f"0.{k} -0.3 0.5", axis)
+        )
+        parent = f"l{k}"
+    parts += [link("camera", mass=0.4), joint("to_camera", last_joint, "l3", "camera", "0.1 0 0.1")]
+    parts += [link("ft"), joint("to_ft", "fixed", "l7", "ft", "0.01 0.02 0.1", "0.1 0.2 0.3")]
+    parts += [link("hand", mass=0.8), joint("to_hand", "fixed", "ft", "hand", "0 0.01 0.05")]
+    parts += [link("finger", mass=0.1)]
+    parts.append(joint("to_finger", "prismatic", "hand", "finger", "0.01 0 0.04", "0 0 0.2"))
+    parts += [
+        f'<transmission type="SimpleTransmission"><joint name="j{k}"/><actuator name="a{k}">'
+        f"<drake:gear_ratio value='10'/><drake:rotor_inertia value='0.00{k}'/></actuator>"
+        "</transmission>"
+        for k in range(1, 8)
+    ]
+    return "".join(parts) + "</robot>"
+
+
+def link(name: str, mass: float = 2.0) -> str:
+    return (
+        f'<link name="{name}"><inertial><origin xyz="0.02 -0.03 0.08" rpy="0.2 0.1 0.3"/>'
+        f'<mass value="{mass}"/><inertia ixx="{0.02 * mass}" iyy="{0.03 * mass}" '
+        f'izz="{0.025 * mass}" ixy="0.001" ixz="-0.002" iyz="0.0015"/></inertial></link>'
+    )
+
+
+def joint(
+    name: str,
+    kind: str,
+    parent: str,
+    child: str,
+    xyz: str,
+    rpy: str = "0 0 0",
+    axis: tuple[float, ...] = (0, 0, 1),
+) -> str:
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis[0]} {axis[1]} {axis[2]}"/>'
+        '<limit lower="-2" upper="2.5" velocity="3" effort="40"/><dynamics damping="0.3"/></joint>'
+    )
+
+
+def rx90_plant(*, tool: bool = True):
+    plant = MultibodyPlant(0.0)
+    parser = Parser(plant)
+    parser.package_map().AddPackageXml(str(models_dir() / "package.xml"))
+    (arm,) = parser.AddModelsFromUrl("package://drake_teleop/rx90.sdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", arm))
+    if tool:
+        parser.AddModelsFromUrl("package://drake_teleop/tool.sdf")
+        plant.AddJoint(
+            WeldJoint(
+                "sensor_weld",
+                plant.GetFrameByName("sensor", arm),
+                plant.GetFrameByName("tool"),
+                RigidTransform(),
+            )
+        )
+    plant.Finalize()
+    return plant, arm, "sensor"
+
+
+def other_plant(**kwargs):
+    plant = MultibodyPlant(0.0)
+    (arm,) = Parser(plant).AddModelsFromString(other_arm_urdf(**kwargs), "urdf")
+    plant.Finalize()
+    return plant, arm, "ft"
+
+
+@pytest.fixture(scope="module", params=[rx90_plant, other_plant], ids=["rx90", "other"])
+def case(request):
+    plant, instance, frame = request.param()
+    return plant, plant.GetFrameByName(frame), ArmModelFromPlant(plant, instance, frame)
+
+
+def random_states(arm, count=50):
+    rng = np.random.default_rng(1)
+    n = arm.num_joints
+    for _ in range(count):
+        yield rng.uniform(arm.lower, arm.upper), rng.normal(size=n) * 3, rng.normal(size=n) * 20
+
+
+def full(plant, arm, values):
+    """The plant's vector (other joints at zero) that holds the arm's values."""
+    vector = np.zeros(plant.num_velocities())
+    vector[arm.velocity_index] = values
+    return vector
+
+
+def test_pose_and_jacobian_equal_the_plant(case):
+    plant, frame_S, arm = case
+    context = plant.CreateDefaultContext()
+    R, p, J = np.zeros((3, 3)), np.zeros(3), np.zeros((6, arm.num_joints))
+    for q, _, _ in random_states(arm):
+        plant.SetPositions(context, full(plant, arm, q))
+        X_WS = frame_S.CalcPoseInWorld(context)
+        forward_kinematics(arm.table, q, R, p)
+        np.testing.assert_allclose(R, X_WS.rotation().matrix(), atol=1e-12)
+        np.testing.assert_allclose(p, X_WS.translation(), atol=1e-12)
+        J_drake = plant.CalcJacobianSpatialVelocity(
+            context,
+            JacobianWrtVariable.kV,
+            frame_S,
+            np.zeros(3),
+            plant.world_frame(),
+            plant.world_frame(),
+        )[:, arm.velocity_index]
+        jacobian(arm.table, q, J)
+        np.testing.assert_allclose(J[:3], J_drake[3:], atol=1e-12)
+        np.testing.assert_allclose(J[3:], J_drake[:3], atol=1e-12)
+
+
+def test_motion_of_the_sensor_equals_the_plant(case):
+    plant, frame_S, arm = case
+    context = plant.CreateDefaultContext()
+    out = np.full(MOTION_SIZE, np.nan)
+    for q, v, vdot in random_states(arm):
+        plant.SetPositions(context, full(plant, arm, q))
+        plant.SetVelocities(context, full(plant, arm, v))
+        X_WS = frame_S.CalcPoseInWorld(context)
+        R = X_WS.rotation().matrix()
+        V = frame_S.CalcSpatialVelocityInWorld(context)
+        # The plant gives accelerations of bodies only; shift the body's to the origin of S.
+        body = frame_S.body()
+        accelerations = plant.CalcSpatialAccelerationsFromVdot(context, full(plant, arm, vdot))
+        p_BS_W = X_WS.translation() - body.EvalPoseInWorld(context).translation()
+        A = accelerations[body.index()].Shift(p_BS_W, V.rotational())
+        sensor_motion(arm.table, q, v, vdot, out)
+        s_S = R.T @ (A.translational() - plant.gravity_field().gravity_vector())
+        np.testing.assert_allclose(out[0:3], s_S, rtol=1e-12, atol=1e-12 * np.linalg.norm(s_S))
+        np.testing.assert_allclose(out[3:6], R.T @ V.rotational(), rtol=1e-12, atol=1e-12)
+        alpha_S = R.T @ A.rotational()
+        np.testing.assert_allclose(out[6:9], alpha_S, atol=1e-12 * np.linalg.norm(alpha_S))
+        np.testing.assert_allclose(out[9:12], X_WS.translation(), atol=1e-12)
+        np.testing.assert_allclose(out[12:21].reshape(3, 3), R, atol=1e-12)
+
+
+def test_inverse_dynamics_equals_the_plant(case):
+    plant, _, arm = case
+    context = plant.CreateDefaultContext()
+    tau = np.zeros(arm.num_joints)
+    for q, v, vdot in random_states(arm):
+        plant.SetPositions(context, full(plant, arm, q))
+        plant.SetVelocities(context, full(plant, arm, v))
+        forces = MultibodyForces(plant)
+        plant.CalcForceElementsContribution(context, forces)
+        expected = plant.CalcInverseDynamics(context, full(plant, arm, vdot), forces)
+        inverse_dynamics(arm.table, q, v, vdot, tau)
+        np.testing.assert_allclose(
+            tau, expected[arm.velocity_index], atol=1e-10 * np.linalg.norm(expected)
+        )
+
+
+def test_acceleration_from_the_torques_is_the_one_asked_for():
+    plant, instance, frame = rx90_plant()
+    arm = ArmModelFromPlant(plant, instance, frame)
+    context = plant.CreateDefaultContext()
+    tau = np.zeros(arm.num_joints)
+    for q, v, vdot in random_states(arm, 10):
+        plant.SetPositionsAndVelocities(context, np.concatenate([q, v]))
+        inverse_dynamics(arm.table, q, v, vdot, tau)
+        plant.get_applied_generalized_force_input_port().FixValue(context, tau)
+        actual = plant.get_generalized_acceleration_output_port().Eval(context)
+        np.testing.assert_allclose(actual, vdot, rtol=1e-9)
+
+
+def test_the_tool_is_the_load_and_can_be_taken_off():
+    plant, instance, frame = rx90_plant()
+    arm = ArmModelFromPlant(plant, instance, frame)
+    bare = ArmModelFromPlant(*rx90_plant(tool=False))
+    tool = plant.GetBodyByName("tool").default_spatial_inertia()
+    assert arm.phi_load[0] == 3.13
+    np.testing.assert_allclose(arm.phi_load[1:4], tool.CalcComMoment(), atol=1e-15)
+    rotational = tool.CalcRotationalInertia().CopyToFullMatrix3()
+    np.testing.assert_allclose(arm.phi_load[4:], rotational[np.triu_indices(3)], atol=1e-15)
+    np.testing.assert_array_equal(bare.phi_load, np.zeros(10))
+    np.testing.assert_allclose(arm.with_load(np.zeros(10)).table, bare.table, atol=1e-15)
+    np.testing.assert_allclose(bare.with_load(arm.phi_load).table, arm.table, atol=1e-15)
+
+
+def test_limits_are_read_from_the_model():
+    arm = ArmModelFromPlant(*other_plant())
+    assert arm.joint_names == tuple(f"j{k}" for k in range(1, 8))
+    np.testing.assert_array_equal(arm.lower, np.full(7, -2.0))
+    np.testing.assert_array_equal(arm.upper, np.full(7, 2.5))
+    np.testing.assert_array_equal(arm.velocity_limit, np.full(7, 3.0))
+    np.testing.assert_array_equal(arm.acceleration_limit, np.full(7, np.inf))
+    np.testing.assert_array_equal(arm.effort_limit, np.full(7, 40.0))
+
+
+def test_what_is_no_serial_chain_is_refused():
+    with pytest.raises(DrakeTeleopError, match="no frame named 'elsewhere'"):
+        ArmModelFromPlant(*rx90_plant()[:2], "elsewhere")
+    with pytest.raises(DrakeTeleopError, match="to_camera: link l3 carries a moving part"):
+        ArmModelFromPlant(*other_plant(last_joint="revolute"))
+    with pytest.raises(DrakeTeleopError, match="weld the arm's base to the world"):
+        ArmModelFromPlant(*other_plant(root="ground"))
+    with pytest.raises(DrakeTeleopError, match="to_finger: the arm hangs on a prismatic joint"):
+        ArmModelFromPlant(*other_plant()[:2], "finger")
