@@ -1,0 +1,96 @@
+"""What the hand shall feel: the slave's wrench, turned into the master's frame and reversed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_teleop.slave.arm import ArmModel, forward_kinematics
+
+
+@njit(cache=True)
+def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
+    """Compiled `wrench_to_master` of one sample; writes the wrench at E in B (6,) into `out`."""
+    for part in range(2):
+        scale = torque_scale if part == 1 else force_scale
+        base = 3 * part
+        x, y, z = wrench_S[base], wrench_S[base + 1], wrench_S[base + 2]
+        wx = R_WS[0, 0] * x + R_WS[0, 1] * y + R_WS[0, 2] * z
+        wy = R_WS[1, 0] * x + R_WS[1, 1] * y + R_WS[1, 2] * z
+        wz = R_WS[2, 0] * x + R_WS[2, 1] * y + R_WS[2, 2] * z
+        for k in range(3):
+            out[base + k] = -scale * (R_WB[0, k] * wx + R_WB[1, k] * wy + R_WB[2, k] * wz)
+
+
+def wrench_to_master(
+    wrench_S: NDArray[np.float64],
+    R_WS: NDArray[np.float64],
+    R_WB: NDArray[np.float64],
+    force_scale: float,
+    torque_scale: float,
+) -> NDArray[np.float64]:
+    """The wrench that the hand shall feel at the master for a wrench of the slave's sensor.
+
+    Eq. (1)'s wrench is what the sensor exerts on the load, so what the operator feels is its
+    reaction, minus that wrench: holding up a load, the hand is pulled down.
+
+    The moment about the origin of S becomes the moment about E: the stylus stands for the sensor.
+    With the translation scale l, the force scale of equal power at both ends is l; the paper's
+    1/17.5 gives some of it away.
+
+    Args:
+        wrench_S: (..., 6) [f; tau] of Eq. (1), sensor on load, about the origin of S, in S.
+        R_WS: (..., 3, 3) orientation of the sensor.
+        R_WB: (3, 3) alignment of the master's base B with the world.
+        force_scale: force at the master over force at the slave.
+        torque_scale: torque at the master over torque at the slave.
+
+    Returns:
+        (..., 6) F_E_B, [f; tau] on the hand at E, in B [N, N m].
+    """
+    R_BS = np.swapaxes(R_WB, -1, -2) @ R_WS
+    force = np.einsum("...ij,...j->...i", R_BS, wrench_S[..., :3])
+    torque = np.einsum("...ij,...j->...i", R_BS, wrench_S[..., 3:])
+    return -np.concatenate([force_scale * force, torque_scale * torque], axis=-1)
+
+
+class WrenchToMaster(LeafSystem):
+    """Scales the slave's wrench and turns it from S into the base of the master.
+
+    .. pydrake_system::
+
+        name: WrenchToMaster
+        input_ports:
+        - scaled_wrench_S: (6,) F' of Fig. 2 [N, N m]
+        - slave_state: [q; v] of the arm, for the orientation of S
+        output_ports:
+        - wrench_B: (6,) F_E_B, what the hand shall feel at E, in B [N, N m]
+
+    Args:
+        arm: the slave's kinematics.
+        R_WB: (3, 3) alignment of the master's base with the world.
+        scale: force and torque at the master over those at the slave.
+    """
+
+    def __init__(self, arm: ArmModel, R_WB: NDArray[np.float64], scale: float) -> None:
+        super().__init__()
+        self._arm, self._n = arm.table, arm.num_joints
+        self._R_WB, self._scale = np.ascontiguousarray(R_WB), scale
+        self._R_WS, self._p_WS = np.zeros((3, 3)), np.zeros(3)
+        self._wrench = self.DeclareVectorInputPort("scaled_wrench_S", 6)
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
+        self.DeclareVectorOutputPort("wrench_B", 6, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        q = self._state.Eval(context)[: self._n]
+        forward_kinematics(self._arm, q, self._R_WS, self._p_WS)
+        wrench_to_master_into(
+            self._wrench.Eval(context),
+            self._R_WS,
+            self._R_WB,
+            self._scale,
+            self._scale,
+            output.get_mutable_value(),
+        )

@@ -1,0 +1,345 @@
+"""The Phantom's closed forms, its dynamics and its end stops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RotationMatrix
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.master import device
+
+NO_FRICTION = device.JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
+
+
+def random_postures(count: int, seed: int = 0) -> np.ndarray:
+    """Postures inside the joint limits, the five-bar's included."""
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(device.JOINT_LOWER, device.JOINT_UPPER, (40 * count, 6))
+    lower, upper = device.FIVE_BAR_RANGE
+    allowed = (q[:, 1] - q[:, 2] > lower) & (q[:, 1] - q[:, 2] < upper)
+    return q[allowed][:count]
+
+
+def parameters(hand_mass=0.0, hand_inertia=0.0, friction=NO_FRICTION) -> np.ndarray:
+    return np.array([hand_mass, hand_inertia, *friction.coulomb, *friction.viscous])
+
+
+def acceleration(q, v, wrench, torque, parameters) -> np.ndarray:
+    vdot = np.empty(6)
+    device.acceleration_into(q, v, wrench, torque, parameters, np.empty((2, 6, 6)), vdot)
+    return vdot
+
+
+def energy(state, hand_mass=0.0, hand_inertia=0.0) -> float:
+    q, v = state[:6], state[6:]
+    M = device.mass_matrix(q, hand_mass, hand_inertia)
+    return 0.5 * v @ M @ v + device.potential_energy(q)
+
+
+def advance(state, wrench, torque, parameters, period, steps) -> np.ndarray:
+    state, work, stages = state.copy(), np.empty((2, 6, 6)), np.empty((3, 12))
+    for _ in range(steps):
+        device.step(state, wrench, torque, parameters, period, work, stages)
+    return state
+
+
+def rotation(pose) -> np.ndarray:
+    return RotationMatrix(Quaternion(pose[:4])).matrix()
+
+
+def test_main_axes_equal_the_closed_forms_of_the_literature():
+    l1, l2, l3, l5, l6 = 0.215, 0.170, 0.0325, -0.0368, 0.0527
+    ma, mc, mbe, mdf, g = 0.0202, 0.0249, 0.2359, 0.1906, 9.81
+    Ia_xx, Ia_yy, Ia_zz = 0.4864e-4, 0.001843e-4, 0.4864e-4
+    Ic_xx, Ic_yy, Ic_zz = 0.959e-4, 0.959e-4, 0.0051e-4
+    Ibe_xx, Ibe_yy, Ibe_zz = 11.09e-4, 10.06e-4, 0.591e-4
+    Idf_xx, Idf_yy, Idf_zz = 7.11e-4, 0.629e-4, 6.246e-4
+    Ibase_yy = 11.87e-4
+    for q in random_postures(100):
+        _, q2, q3 = q[:3]
+        expected = np.zeros((3, 3))
+        expected[0, 0] = (
+            (4 * Ia_yy + 4 * Ia_zz + 8 * Ibase_yy + 4 * Ibe_yy + 4 * Ibe_zz + 4 * Ic_yy
+             + 4 * Ic_zz + 4 * Idf_yy + 4 * Idf_zz + 4 * l1**2 * ma + l2**2 * ma
+             + l1**2 * mc + 4 * l3**2 * mc) / 8
+            + (4 * Ibe_yy - 4 * Ibe_zz + 4 * Ic_yy - 4 * Ic_zz + l1**2 * (4 * ma + mc)) / 8
+            * np.cos(2 * q2)
+            + (4 * Ia_yy - 4 * Ia_zz + 4 * Idf_yy - 4 * Idf_zz - l2**2 * ma - 4 * l3**2 * mc) / 8
+            * np.cos(2 * q3)
+            + l1 * (l2 * ma + l3 * mc) * np.cos(q2) * np.sin(q3)
+        )  # fmt: skip
+        expected[1, 1] = Ibe_xx + Ic_xx + l1**2 * (ma + mc / 4)
+        expected[2, 2] = Ia_xx + Idf_xx + l2**2 * ma / 4 + l3**2 * mc
+        expected[1, 2] = expected[2, 1] = -l1 * (l2 * ma + l3 * mc) * np.sin(q2 - q3) / 2
+        gravity = [
+            0.0,
+            g / 2 * (2 * l1 * ma + 2 * l5 * mbe + l1 * mc) * np.cos(q2),
+            g / 2 * (l2 * ma + 2 * l3 * mc - 2 * l6 * mdf) * np.sin(q3),
+        ]
+        np.testing.assert_allclose(device.closed_form_mass_matrix(q), expected, atol=1e-15)
+        np.testing.assert_allclose(device.closed_form_gravity(q), gravity, atol=1e-15)
+
+
+def test_home_is_the_stylus_level_and_towards_the_operator():
+    np.testing.assert_allclose(
+        device.forward_kinematics(device.HOME), [1, 0, 0, 0, 0.215, 0, -0.170], atol=1e-15
+    )
+
+
+def test_forward_kinematics_is_the_product_of_its_axes():
+    for q in random_postures(100):
+        pose = device.forward_kinematics(q)
+        Rx, Ry, Rz = (
+            RotationMatrix.MakeXRotation,
+            RotationMatrix.MakeYRotation,
+            RotationMatrix.MakeZRotation,
+        )
+        expected = Rz(q[0]) @ Ry(-q[2]) @ Rz(q[3]) @ Ry(q[4]) @ Rx(q[5])
+        np.testing.assert_allclose(rotation(pose), expected.matrix(), atol=1e-14)
+        in_plane = [0.215 * np.cos(q[1]) + 0.17 * np.sin(q[2]), 0.0,
+                    0.215 * np.sin(q[1]) - 0.17 * np.cos(q[2])]  # fmt: skip
+        np.testing.assert_allclose(pose[4:], Rz(q[0]) @ in_plane, atol=1e-15)
+
+
+def test_jacobian_is_the_derivative_of_the_pose():
+    step = 1e-6
+    for q in random_postures(50):
+        numeric = np.empty((6, 6))
+        R = rotation(device.forward_kinematics(q))
+        for k in range(6):
+            ahead = device.forward_kinematics(q + step * np.eye(6)[k])
+            behind = device.forward_kinematics(q - step * np.eye(6)[k])
+            numeric[:3, k] = (ahead[4:] - behind[4:]) / (2 * step)
+            cross = (rotation(ahead) - rotation(behind)) / (2 * step) @ R.T
+            numeric[3:, k] = cross[2, 1], cross[0, 2], cross[1, 0]
+        np.testing.assert_allclose(device.jacobian(q), numeric, atol=1e-9)
+
+
+def test_inverse_kinematics_returns_the_joint_angles():
+    for q in random_postures(300):
+        reach = 0.215 * np.cos(q[1]) + 0.17 * np.sin(q[2])
+        if reach < 0.01 or abs(q[4]) > 1.56:
+            continue  # the other branch of the yaw or of the wrist
+        np.testing.assert_allclose(
+            device.inverse_kinematics(device.forward_kinematics(q)), q, atol=1e-9
+        )
+
+
+@pytest.mark.parametrize(
+    ("position", "message"),
+    [
+        ([0.5, 0.0, 0.0], "cannot reach"),
+        ([0.384, 0.0, 0.0], "q2 - q3"),
+        ([0.05, 0.0, 0.0], "joint 3"),
+    ],
+)
+def test_a_start_pose_out_of_reach_is_refused(position, message):
+    with pytest.raises(DrakeTeleopError, match=message):
+        device.inverse_kinematics(np.array([1.0, 0, 0, 0, *position]))
+
+
+def test_mass_matrix_is_positive_definite_over_the_workspace():
+    for q in random_postures(2000):
+        M = device.mass_matrix(q)
+        np.testing.assert_array_equal(M, M.T)
+        assert np.linalg.eigvalsh(M)[0] > 1e-5
+
+
+def test_hand_adds_its_kinetic_energy_and_nothing_else():
+    rng = np.random.default_rng(1)
+    for q in random_postures(20):
+        v = rng.normal(size=6)
+        twist = device.jacobian(q) @ v
+        added = device.mass_matrix(q, 0.3, 2e-4) - device.mass_matrix(q)
+        expected = 0.3 * twist[:3] @ twist[:3] + 2e-4 * twist[3:] @ twist[3:]
+        assert v @ added @ v == pytest.approx(expected, rel=1e-12)
+
+
+def test_wrist_is_a_point_mass_and_three_turning_links():
+    rng = np.random.default_rng(2)
+    for q in random_postures(20):
+        v = rng.normal(size=6)
+        J = device.jacobian(q)
+        main = np.zeros((6, 6))
+        main[:3, :3] = device.closed_form_mass_matrix(q)
+        motors = np.array([13.3, 11.2, 11.2]) ** 2 * 1.08e-6
+        expected = v @ main @ v + motors @ v[:3] ** 2 + 0.15 * np.sum((J[:3] @ v) ** 2)
+        for last in (4, 5, 6):
+            expected += 5e-5 * np.sum((J[3:, :last] @ v[:last]) ** 2)
+        assert v @ device.mass_matrix(q) @ v == pytest.approx(expected, rel=1e-12)
+
+
+def test_gravity_is_the_gradient_of_the_potential_energy():
+    step = 1e-5
+    for q in random_postures(20):
+        gradient = [
+            (device.potential_energy(q + step * e) - device.potential_energy(q - step * e))
+            / (2 * step)
+            for e in np.eye(6)
+        ]
+        np.testing.assert_allclose(device.gravity_torque(q), gradient, atol=1e-9)
+        wrist = device.gravity_torque(q)[:3] - device.closed_form_gravity(q)
+        np.testing.assert_allclose(wrist, 0.15 * 9.81 * device.jacobian(q)[2, :3], atol=1e-15)
+
+
+def test_coriolis_follows_from_the_mass_matrix():
+    """Christoffel symbols of the whole M, hand and wrist included, differentiated numerically."""
+    rng = np.random.default_rng(3)
+    hand = (0.25, 2e-4)
+    step = 1e-5
+    for q in 0.9 * random_postures(30, seed=4):
+        v = rng.normal(size=6)
+        dM = np.array(
+            [
+                (device.mass_matrix(q + step * e, *hand) - device.mass_matrix(q - step * e, *hand))
+                / (2 * step)
+                for e in np.eye(6)
+            ]
+        )
+        coriolis = np.einsum("ikj,i,j->k", dM, v, v) - 0.5 * np.einsum("kij,i,j->k", dM, v, v)
+        wrench, torque = rng.normal(size=6), rng.normal(size=6)
+        vdot = acceleration(q, v, wrench, torque, parameters(*hand))
+        balance = (
+            device.mass_matrix(q, *hand) @ vdot
+            + coriolis
+            + device.gravity_torque(q)
+            - torque
+            - device.jacobian(q).T @ wrench
+        )
+        np.testing.assert_allclose(balance, 0, atol=1e-9)
+
+
+def free_state() -> np.ndarray:
+    return np.array([0.1, 0.3, 0.2, -0.4, 0.3, 0.2, 0.6, -0.9, 0.8, 3.0, -2.0, 4.0])
+
+
+def test_energy_is_conserved_in_free_motion_to_fourth_order():
+    drift = []
+    for steps in (50, 100):
+        after = advance(free_state(), np.zeros(6), np.zeros(6), parameters(), 0.1 / steps, steps)
+        drift.append(abs(energy(after) - energy(free_state())))
+    assert drift[0] < 1e-6
+    assert 10 < drift[0] / drift[1] < 60  # 16 or 32: fourth order or better
+    at_hand_rate = advance(free_state(), np.zeros(6), np.zeros(6), parameters(), 5e-4, 200)
+    assert energy(at_hand_rate) == pytest.approx(energy(free_state()), abs=1e-9)
+
+
+def test_friction_only_takes_energy_away():
+    friction = parameters(friction=device.JointFriction())
+    torque = np.zeros(6)
+    state = free_state()
+    for _ in range(200):
+        after = advance(state, np.zeros(6), torque, friction, 5e-4, 1)
+        assert energy(after) < energy(state)
+        state = after
+
+
+def test_work_of_held_inputs_becomes_energy():
+    """A constant torque and a constant force in B have potentials: the balance is exact."""
+    rng = np.random.default_rng(5)
+    hand = (0.25, 2e-4)
+    torque = 0.1 * rng.normal(size=6) * [1, 1, 1, 0.02, 0.02, 0.02]
+    wrench = np.array([*rng.normal(size=3), 0, 0, 0])
+    start = free_state()
+    after = advance(start, wrench, torque, parameters(*hand), 5e-4, 200)
+    path = device.forward_kinematics(after[:6])[4:] - device.forward_kinematics(start[:6])[4:]
+    work = wrench[:3] @ path + torque @ (after[:6] - start[:6])
+    gained = energy(after, *hand) - energy(start, *hand)
+    assert abs(work) > 1e-2
+    assert gained == pytest.approx(work, abs=1e-9)
+
+
+def test_a_hand_wrench_equals_its_joint_torque():
+    """Virtual work: F at E and J^T F at the joints accelerate the device alike."""
+    rng = np.random.default_rng(6)
+    for q in random_postures(20):
+        v, wrench = rng.normal(size=6), rng.normal(size=6)
+        by_hand = acceleration(q, v, wrench, np.zeros(6), parameters())
+        by_motor = acceleration(q, v, np.zeros(6), device.jacobian(q).T @ wrench, parameters())
+        np.testing.assert_allclose(by_hand, by_motor, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("joint", "side"),
+    # q2 = -124 and q3 = 214 degrees are beyond what the five-bar lets the other link reach.
+    [(0, -1), (0, 1), (1, 1), (2, -1), (3, -1), (3, 1), (4, -1), (4, 1), (5, -1), (5, 1)],
+)
+def test_a_joint_stops_at_its_limit(joint, side):
+    limit = (device.JOINT_UPPER if side > 0 else device.JOINT_LOWER)[joint]
+    q = device.HOME.copy()
+    q[joint] = limit - side * 0.02
+    if joint in (1, 2):
+        q[3 - joint] = limit - side * 0.1  # the other link follows inside the five-bar's range
+    push = side * np.array([2.0, 2.0, 2.0, 0.05, 0.05, 0.05]) * np.eye(6)[joint]
+    friction = parameters(friction=device.JointFriction())
+    state, farthest = np.concatenate([q, np.zeros(6)]), 0.0
+    for _ in range(2000):
+        torque = push + device.gravity_torque(state[:6])
+        if joint in (1, 2):
+            torque[3 - joint] += 20 * (q[3 - joint] - state[3 - joint]) - 0.5 * state[9 - joint]
+        state = advance(state, np.zeros(6), torque, friction, 5e-4, 1)
+        farthest = max(farthest, side * (state[joint] - limit))
+    assert 0 < farthest < 0.05
+    assert 0 < side * (state[joint] - limit) < 0.02
+    assert np.all(np.abs(state[6:]) < 0.05)
+
+
+def test_the_five_bar_stops_at_its_limits():
+    friction = parameters(friction=device.JointFriction())
+    for side, limit in ((1, np.radians(65)), (-1, np.radians(-55))):
+        state = np.zeros(12)
+        for _ in range(3000):
+            torque = device.gravity_torque(state[:6])
+            torque[1] += 0.5 * side
+            torque[2] -= 0.5 * side
+            state = advance(state, np.zeros(6), torque, friction, 5e-4, 1)
+        assert state[1] - state[2] == pytest.approx(limit, abs=0.01)
+
+
+def simulate(q_initial, duration, motor_torque):
+    builder = DiagramBuilder()
+    master = builder.AddSystem(
+        device.MasterDevice(5e-4, hand_mass=0.1, hand_inertia=1e-4, q_initial=q_initial)
+    )
+    for port in ("hand_wrench_E", "motor_torque"):
+        builder.ExportInput(master.GetInputPort(port), port)
+    for port in ("state", "pose_master", "twist_master"):
+        builder.ExportOutput(master.GetOutputPort(port), port)
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    diagram.GetInputPort("hand_wrench_E").FixValue(context, np.zeros(6))
+    diagram.GetInputPort("motor_torque").FixValue(context, motor_torque)
+    simulator.AdvanceTo(duration)
+    return {
+        port: diagram.GetOutputPort(port).Eval(context).copy()
+        for port in ("state", "pose_master", "twist_master")
+    }
+
+
+def test_gravity_compensation_holds_the_device_still():
+    q = np.array([0.2, 0.3, 0.1, 0.1, -0.2, 0.3])
+    result = simulate(q, 0.2, device.gravity_torque(q))
+    np.testing.assert_allclose(result["state"], [*q, *np.zeros(6)], atol=1e-12)
+
+
+def test_ports_agree_with_the_state():
+    q = np.array([0.2, 0.3, 0.1, 0.1, -0.2, 0.3])
+    result = simulate(q, 0.05, np.zeros(6))
+    q, v = result["state"][:6], result["state"][6:]
+    assert np.linalg.norm(v) > 0.1
+    np.testing.assert_allclose(result["pose_master"], device.forward_kinematics(q), atol=1e-15)
+    np.testing.assert_allclose(result["twist_master"], device.jacobian(q) @ v, atol=1e-14)
+
+
+def test_a_slow_period_or_a_start_beyond_a_limit_is_refused():
+    with pytest.raises(DrakeTeleopError, match=r"master\.period"):
+        device.MasterDevice(2e-3, hand_mass=0.1, hand_inertia=1e-4)
+    with pytest.raises(DrakeTeleopError, match="joint 1"):
+        device.MasterDevice(
+            5e-4, hand_mass=0.1, hand_inertia=1e-4, q_initial=np.array([2.0, 0, 0, 0, 0, 0])
+        )
