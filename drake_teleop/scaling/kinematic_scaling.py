@@ -1,26 +1,39 @@
 """The paper's 'kinematic scaling' block (Fig. 4): the master's motion becomes the slave's command.
 
-Translations are scaled, orientations by quaternions: the rotation of the master since the clutch
-was closed is a rotation about one axis, and the slave turns about the same axis by the scaled
-angle.
+Translations are scaled, orientations by quaternions: since the clutch was closed the master has
+turned about one axis by one angle, and the slave turns about the same axis by the scaled angle.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from pydrake.math import RotationMatrix
+from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.quantities import quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, normalized, rotate
+
+
+@dataclass
+class KinematicScalingConfig:
+    """How the master's motion is scaled, and how the master's base lies in the world."""
+
+    translation_scale: float = quantity(1.0, "1", 0.0, 100.0, "slave over master translation")
+    rotation_scale: float = quantity(1.0, "1", 0.0, 10.0, "slave over master angle")
+    alignment: list[float] = quantity(
+        [0.0, 0.0, 0.0], "rad", -7.0, 7.0, "R_WB as roll, pitch, yaw (Drake's RollPitchYaw)"
+    )
 
 
 @njit(cache=True)
 def scaled_rotation(rotation, scale):
     """The quaternion of the same axis and `scale` times the angle (the shorter way round).
 
-    With a scale other than 1 the result jumps where the angle passes 180 degrees.
+    With a scale that is not a whole number the result jumps where the angle passes 180 degrees.
     """
     v = logarithm(rotation)
     return exponential((scale * v[0], scale * v[1], scale * v[2]))
@@ -38,14 +51,13 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
         master: (7,) X_BE when the clutch was closed.
         command: (7,) X_WS when the clutch was closed.
         alignment: (4,) quaternion of R_WB.
-        out: (7,) written; the quaternion has norm 1.
+        out: (7,) written; the quaternion has norm 1. It may be `command` itself.
     """
     R_WB = (alignment[0], alignment[1], alignment[2], alignment[3])
     offset = rotate(R_WB, (pose[4] - master[4], pose[5] - master[5], pose[6] - master[6]))
-    reference = conjugate((master[0], master[1], master[2], master[3]))
-    turn_B = scaled_rotation(
-        multiply((pose[0], pose[1], pose[2], pose[3]), reference), rotation_scale
-    )
+    now = (pose[0], pose[1], pose[2], pose[3])
+    reference = (master[0], master[1], master[2], master[3])
+    turn_B = scaled_rotation(multiply(now, conjugate(reference)), rotation_scale)
     turn_W = multiply(multiply(R_WB, turn_B), conjugate(R_WB))
     orientation = normalized(multiply(turn_W, (command[0], command[1], command[2], command[3])))
     for k in range(4):
@@ -59,7 +71,7 @@ class KinematicScaling(LeafSystem):
 
     While the clutch is open the command stays where it is; when it closes, motion goes on from
     there with the master's pose of that instant as its new reference (re-indexing). Neither makes
-    a jump. The clutch starts open and the first sample closes it if it is engaged.
+    a jump. A clutch that is engaged at the start is closed before the first sample.
 
     .. pydrake_system::
 
@@ -71,28 +83,20 @@ class KinematicScaling(LeafSystem):
         - pose_command: (7,) X_WS
 
     Args:
+        config: scales and alignment.
         period: how often the clutch is looked at [s].
         start: (7,) X_WS commanded at the start.
-        translation_scale: slave over master translation.
-        rotation_scale: slave over master rotation angle.
-        R_WB: how the master's base is aligned with the world.
     """
 
     def __init__(
-        self,
-        period: float,
-        start: NDArray[np.float64],
-        *,
-        translation_scale: float = 1.0,
-        rotation_scale: float = 1.0,
-        R_WB: RotationMatrix | None = None,
+        self, config: KinematicScalingConfig, period: float, start: NDArray[np.float64]
     ) -> None:
         super().__init__()
-        alignment = (R_WB or RotationMatrix()).ToQuaternion().wxyz()
-        self._scaling = (alignment, float(translation_scale), float(rotation_scale))
+        R_WB = RollPitchYaw(config.alignment).ToQuaternion().wxyz()
+        self._scaling = (R_WB, float(config.translation_scale), float(config.rotation_scale))
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._clutch = self.DeclareVectorInputPort("clutch", 1)
-        # X_WS and X_BE at the last change of the clutch, and whether it is engaged.
+        # X_WS and X_BE at the last change of the clutch, and whether it is closed.
         identity = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
         self.DeclareDiscreteState(np.concatenate([start, identity, [0.0]]))
         self.DeclareVectorOutputPort("pose_command", 7, self._calc_command)
@@ -100,22 +104,24 @@ class KinematicScaling(LeafSystem):
         # The command follows from the first instant on.
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
-    def _command_into(self, context: Context, out: NDArray[np.float64]) -> None:
-        state = context.get_discrete_state(0).value()
-        command, master, engaged = state[:7], state[7:14], state[14] > 0.5
-        if engaged:
+    def _calc_command(self, context: Context, output: BasicVector) -> None:
+        references = context.get_discrete_state(0).value()
+        self._command_into(context, references, output.get_mutable_value())
+
+    def _command_into(
+        self, context: Context, references: NDArray[np.float64], out: NDArray[np.float64]
+    ) -> None:
+        command, master, closed = references[:7], references[7:14], references[14] > 0.5
+        if closed:
             scale_pose_into(self._pose.Eval(context), master, command, *self._scaling, out)
         else:
             out[:] = command
-
-    def _calc_command(self, context: Context, output: BasicVector) -> None:
-        self._command_into(context, output.get_mutable_value())
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         references = discrete_state.get_mutable_value(0)
         engage = self._clutch.Eval(context)[0] > 0.5
         if engage == (references[14] > 0.5):
             return
-        self._command_into(context, references[:7])
+        self._command_into(context, references, references[:7])
         references[7:14] = self._pose.Eval(context)
         references[14] = float(engage)
