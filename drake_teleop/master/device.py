@@ -19,8 +19,7 @@ How sure each number is: P = read in a public source (Cavusoglu, Feygin, Tendick
 mahilab/Phantom), D = the manufacturer's figure, recalled, E = an engineering estimate.
 """
 
-from __future__ import annotations
-
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,7 @@ The hand is a two-port: it pulls the stylus towards where the operator wants it,
 the force that it feels. Its passive mass moves with the stylus and is part of the device.
 """
 
-from __future__ import annotations
-
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,7 @@ Translations are scaled, orientations by quaternions: since the clutch was close
 turned about one axis by one angle, and the slave turns about the same axis by the scaled angle.
 """
 
-from __future__ import annotations
-
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
 import numpy as np

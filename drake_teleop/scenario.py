@@ -1,0 +1,162 @@
+"""Scenarios: what a station is made of and what happens in it, as dataclasses from YAML.
+
+Every field has a unit and a plausible range; a file that cannot be right is refused with one
+message that names file and field. Times are in s, rates in Hz, lengths in m.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+from pydrake.common.yaml import yaml_load, yaml_load_typed
+
+from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.master.device import JointFriction
+from drake_teleop.master.operator import OperatorConfig
+from drake_teleop.quantities import check_ranges, check_structure, choice, quantity
+from drake_teleop.resources import scenarios_dir
+from drake_teleop.scaling.force_scaling import ForceScalingConfig
+from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
+from drake_teleop.slave.joint_control import JointControlConfig
+from drake_teleop.slave.load_estimator import LoadEstimatorConfig
+from drake_teleop.slave.wrist_sensor import WristSensorConfig
+
+
+@dataclass
+class Rates:
+    """Sampling rates. The paper: sensor 8 kHz, hand above 2 kHz, joint control 10 kHz."""
+
+    sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
+    hand_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "haptic device and channel")
+    joint_control_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "slave's joint control")
+    estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "load estimator")
+    log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "log")
+
+
+@dataclass
+class Simulation:
+    """How long, and with which integrator."""
+
+    duration: float = quantity(1.0, "s", 1e-3, 36000.0, "logged time")
+    settle: float = quantity(0.5, "s", 0.0, 60.0, "time before the log starts, at t < 0")
+    integrator: str = choice(
+        "runge_kutta2",
+        ("runge_kutta2", "runge_kutta3", "semi_explicit_euler"),
+        "Drake's name of the integration scheme",
+    )
+    max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
+    accuracy: float = quantity(1e-4, "1", 1e-12, 0.1, "of error-controlled integrators")
+    seed: int = 0
+
+
+@dataclass
+class Master:
+    """Where the device starts, and its friction."""
+
+    position: list[float] = quantity(
+        [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
+    )
+    friction: JointFriction = field(default_factory=JointFriction)
+
+
+@dataclass
+class Channel:
+    """The line between master and slave."""
+
+    delay: float = quantity(0.0, "s", 0.0, 10.0, "one-way delay, the same in both directions")
+
+
+@dataclass
+class Slave:
+    """Where the tool starts: S points down at this position."""
+
+    position: list[float] = quantity([0.55, 0.0, 0.45], "m", -1.5, 1.5, "p_WS at the start")
+
+
+@dataclass
+class Scenario:
+    """One complete setup of the station of the paper's Fig. 4."""
+
+    description: str = ""
+    simulation: Simulation = field(default_factory=Simulation)
+    rates: Rates = field(default_factory=Rates)
+    operator: OperatorConfig = field(default_factory=OperatorConfig)
+    master: Master = field(default_factory=Master)
+    kinematic_scaling: KinematicScalingConfig = field(default_factory=KinematicScalingConfig)
+    channel: Channel = field(default_factory=Channel)
+    slave: Slave = field(default_factory=Slave)
+    joint_control: JointControlConfig = field(default_factory=JointControlConfig)
+    wrist_sensor: WristSensorConfig = field(default_factory=WristSensorConfig)
+    load_estimator: LoadEstimatorConfig = field(default_factory=LoadEstimatorConfig)
+    force_scaling: ForceScalingConfig = field(default_factory=ForceScalingConfig)
+    sheet_spring: SheetSpring | None = None
+
+    def check(self, where: str = "scenario") -> None:
+        """Checks every value.
+
+        Raises:
+            DrakeTeleopError: naming `where` and the field.
+        """
+        check_ranges(self, where)
+        self.force_scaling.scales()
+        _check_rates(self, where)
+
+
+def ScenarioNames() -> list[str]:
+    """The names of the scenarios that are shipped."""
+    return sorted(path.stem for path in scenarios_dir().glob("*.yaml"))
+
+
+def LoadScenario(name_or_path: str | Path) -> Scenario:
+    """Loads a scenario that is shipped, by its name, or a YAML file.
+
+    Fields that the file leaves out keep their defaults.
+
+    Raises:
+        DrakeTeleopError: if there is no such scenario, or naming file and field of what is wrong.
+    """
+    path = scenarios_dir() / f"{name_or_path}.yaml"
+    if str(name_or_path) not in ScenarioNames():
+        path = Path(name_or_path)
+    if not path.is_file():
+        raise DrakeTeleopError(
+            f"there is no scenario '{name_or_path}'",
+            remedy=f"give a YAML file or one of {', '.join(ScenarioNames())}",
+        )
+    try:
+        text = path.read_text()
+        data = yaml_load(data=text)
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise DrakeTeleopError(f"is not YAML ({error})", where=str(path)) from None
+    check_structure(Scenario, data, str(path))
+    scenario = yaml_load_typed(schema=Scenario, data=text, defaults=Scenario())
+    scenario.check(str(path))
+    return scenario
+
+
+def replace(scenario: Scenario, **changes: object) -> Scenario:
+    """A copy with some fields changed; `a__b` names field b of block a.
+
+    >>> replace(Scenario(), force_scaling__sigma=0.5).force_scaling.sigma
+    0.5
+    """
+    for name, value in changes.items():
+        block, _, inner = name.partition("__")
+        if inner:
+            value = dataclasses.replace(getattr(scenario, block), **{inner: value})
+        scenario = dataclasses.replace(scenario, **{block: value})  # type: ignore[arg-type]
+    return scenario
+
+
+def _check_rates(scenario: Scenario, where: str) -> None:
+    sensor, rates = scenario.wrist_sensor, scenario.rates
+    if not sensor.ideal and sensor.bandwidth_hz >= 0.45 * rates.sensor_hz:
+        raise DrakeTeleopError(
+            f"{sensor.bandwidth_hz:g} Hz is too near to half of rates.sensor_hz "
+            f"({rates.sensor_hz:g} Hz)",
+            where=f"{where}:wrist_sensor.bandwidth_hz",
+            remedy="lower the bandwidth below 0.45 of the sensor's rate",
+        )

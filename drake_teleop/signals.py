@@ -1,0 +1,56 @@
+"""The signals that a station records: name, components, units, meaning."""
+
+from __future__ import annotations
+
+from drake_teleop.result import Signal
+
+#: Log sinks are named after their signal, with this in front.
+LOG_PREFIX = "log_"
+
+
+def _signal(name: str, components: str, units: str, description: str) -> Signal:
+    unit = tuple(units.split(","))
+    return Signal(name, tuple(components.split()), unit[0] if len(unit) == 1 else unit, description)
+
+
+_WRENCH = ("f_x f_y f_z tau_x tau_y tau_z", "N,N,N,N m,N m,N m")
+_POSE = ("q_w q_x q_y q_z p_x p_y p_z", "1,1,1,1,m,m,m")
+_TWIST = ("v_x v_y v_z omega_x omega_y omega_z", "m/s,m/s,m/s,rad/s,rad/s,rad/s")
+_STATE = " ".join([f"q_{i}" for i in range(1, 7)] + [f"v_{i}" for i in range(1, 7)])
+_STATE_UNITS = "rad,rad,rad,rad,rad,rad,rad/s,rad/s,rad/s,rad/s,rad/s,rad/s"
+_JOINTS = "joint_1 joint_2 joint_3 joint_4 joint_5 joint_6"
+
+#: Everything that a station can record.
+SIGNALS = {
+    signal.name: signal
+    for signal in (
+        _signal("measured_wrench_S", *_WRENCH, "what the wrist sensor reads, sign of Eq. (1)"),
+        _signal("specific_force_S", "s_x s_y s_z", "m/s^2", "a - g at So"),
+        _signal("angular_velocity_S", "omega_x omega_y omega_z", "rad/s", "from the encoders"),
+        _signal("angular_acceleration_S", "alpha_x alpha_y alpha_z", "rad/s^2", "of S"),
+        _signal("saturated", "saturated", "1", "1 while a channel of the sensor is saturated"),
+        _signal(
+            "load_estimate",
+            "fo_x fo_y fo_z tauo_x tauo_y tauo_z m mc_x mc_y mc_z I_xx I_xy I_xz I_yy I_yz I_zz",
+            "N,N,N,N m,N m,N m,kg,kg m,kg m,kg m" + ",kg m^2" * 6,
+            "offsets and phi, Eq. (7)",
+        ),
+        _signal("scaled_wrench_S", *_WRENCH, "F' of Fig. 2, before the scale to the master"),
+        _signal("contact_wrench_S", *_WRENCH, "Eq. (13), calculated contact wrench"),
+        _signal("non_contact_wrench_S", *_WRENCH, "Eq. (12), calculated non-contact wrench"),
+        _signal("true_contact_wrench_W", *_WRENCH, "environment on the tool, about the origin"),
+        _signal("sheet_state", "z v_z", "m,m/s", "deflection of the sheet spring's end, upwards"),
+        _signal("intent", *_POSE, "where the operator wants the stylus, X_BE"),
+        _signal("pose_master", *_POSE, "of the stylus, X_BE"),
+        _signal("twist_master", *_TWIST, "of the stylus in the device's base"),
+        _signal("master_state", _STATE, _STATE_UNITS, "joint angles and velocities of the device"),
+        _signal("hand_wrench_E", *_WRENCH, "hand on the stylus at Eo, in B"),
+        _signal("force_to_master", *_WRENCH, "what the device displays, within its limits"),
+        _signal("motor_torque", _JOINTS, "N m", "of the device, with gravity compensation"),
+        _signal("pose_command", *_POSE, "setpoint of the slave, X_WS"),
+        _signal("joint_command", _JOINTS, "rad", "from the inverse kinematics"),
+        _signal("ik_status", "status", "1", "of the inverse kinematics, 0 = fine"),
+        _signal("slave_state", _STATE, _STATE_UNITS, "true joint angles and velocities"),
+        _signal("joint_torque", _JOINTS, "N m", "of the slave's motors"),
+    )
+}

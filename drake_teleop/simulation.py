@@ -1,0 +1,82 @@
+"""Running a station: simulate, and get named signals back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from pydrake.common import RandomGenerator
+from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
+from pydrake.systems.framework import Diagram
+from pydrake.systems.primitives import VectorLogSink
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import Simulation
+from drake_teleop.signals import LOG_PREFIX, SIGNALS
+
+# Long enough to keep progress cheap, short enough to look alive.
+_PROGRESS_STEP = 0.02
+
+
+def simulate(
+    diagram: Diagram,
+    simulation: Simulation,
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> SimulationResult:
+    """Runs a station through its settling time and its duration.
+
+    Args:
+        diagram: a station, as `MakeTeleopStation` makes it.
+        simulation: duration, settling time, integrator and seed.
+        progress: called with the fraction done, 0 to 1.
+
+    Returns:
+        The recorded signals; t = 0 is the end of the settling time.
+
+    Raises:
+        DrakeTeleopError: if a joint of the slave leaves its range.
+    """
+    simulator = MakeSimulator(diagram, simulation)
+    end = simulation.settle + simulation.duration
+    try:
+        simulator.Initialize()
+        for time in np.append(np.arange(_PROGRESS_STEP, end, _PROGRESS_STEP), end):
+            simulator.AdvanceTo(time)
+            if progress is not None:
+                progress(time / end)
+    except RuntimeError as error:
+        if "left its range" not in str(error) and "not finite" not in str(error):
+            raise
+        raise DrakeTeleopError(
+            str(error).splitlines()[0],
+            where="simulation",
+            remedy="ask for a smaller motion, or start elsewhere (slave.position)",
+        ) from None
+    return read_log(simulator, simulation.settle)
+
+
+def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
+    """A simulator with the scenario's integrator, its random sources seeded, at t = 0."""
+    context = diagram.CreateDefaultContext()
+    diagram.SetRandomContext(context, RandomGenerator(simulation.seed))
+    simulator = Simulator(diagram, context)
+    ResetIntegratorFromFlags(simulator, simulation.integrator, simulation.max_step)
+    if simulation.integrator == "runge_kutta3":  # the one with error control
+        simulator.get_mutable_integrator().set_target_accuracy(simulation.accuracy)
+    return simulator
+
+
+def read_log(simulator: Simulator, start: float) -> SimulationResult:
+    """The recorded signals from `start` [s] on, with t = 0 there."""
+    context = simulator.get_context()
+    logs = {
+        system.get_name().removeprefix(LOG_PREFIX): system.FindLog(context)
+        for system in simulator.get_system().GetSystems()
+        if isinstance(system, VectorLogSink)
+    }
+    t = next(iter(logs.values())).sample_times() - start
+    kept = t > -1e-9
+    signals = {name: log.data().T[kept] for name, log in logs.items()}
+    return SimulationResult(t[kept], signals, [SIGNALS[name] for name in logs])

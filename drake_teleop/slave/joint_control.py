@@ -1,0 +1,88 @@
+"""Joint position control of the slave: position loop around a velocity loop, as in the paper.
+
+VI-A: the joint controllers turn joint angle setpoints into joint velocities for the inverters.
+Here the velocity loop acts through the arm's computed torque, so that the joints are decoupled.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from drake_teleop.quantities import quantity
+from drake_teleop.slave.arm import ArmModel, inverse_dynamics
+
+
+@dataclass
+class JointControlConfig:
+    """Bandwidths of the two loops; the closed loop is about as fast as the position loop."""
+
+    position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "of the position loop (E)")
+    velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "of the velocity loop (E)")
+
+
+@njit(cache=True)
+def joint_control_torque(  # type: ignore[no-untyped-def]
+    arm, command, q, v, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
+):  # fmt: skip
+    """tau = ID(q, v, kv (clip(kp (q_command - q)) - v)), within the motors' torque.
+
+    All arrays (n,), rad, rad/s, N m; gains in 1/s. `torque` is written.
+    """
+    for i in range(q.shape[0]):
+        setpoint = position_gain * (command[i] - q[i])
+        setpoint = min(max(setpoint, -velocity_limit[i]), velocity_limit[i])
+        scratch[i] = velocity_gain * (setpoint - v[i])
+    inverse_dynamics(arm, q, v, scratch[: q.shape[0]], torque)
+    for i in range(q.shape[0]):
+        torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
+
+
+class JointControl(LeafSystem):
+    """Sampled joint position controller.
+
+    .. pydrake_system::
+
+        name: JointControl
+        input_ports:
+        - joint_command: (n,) [rad]
+        - slave_state: [q; v] of the arm [rad, rad/s]
+        output_ports:
+        - joint_torque: (n,) [N m], held between samples
+
+    Args:
+        arm: the arm with its tool (the controller knows its own nominal load).
+        config: the bandwidths.
+        period: sampling period [s].
+    """
+
+    def __init__(self, arm: ArmModel, config: JointControlConfig, period: float) -> None:
+        super().__init__()
+        n = arm.num_joints
+        self._n = n
+        self._arm = arm.table
+        self._constants = (
+            2 * np.pi * config.position_bandwidth_hz,
+            2 * np.pi * config.velocity_bandwidth_hz,
+            arm.velocity_limit,
+            arm.effort_limit,
+            np.zeros(n),
+        )
+        self._command = self.DeclareVectorInputPort("joint_command", n)
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
+        self.DeclareStateOutputPort("joint_torque", self.DeclareDiscreteState(n))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclareInitializationDiscreteUpdateEvent(self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        state = self._state.Eval(context)
+        joint_control_torque(
+            self._arm,
+            self._command.Eval(context),
+            state[: self._n],
+            state[self._n :],
+            *self._constants,
+            discrete_state.get_mutable_value(0),
+        )

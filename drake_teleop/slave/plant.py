@@ -1,0 +1,107 @@
+"""The slave's rigid bodies: arm, tool and, if the scenario has one, the sheet spring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, WeldJoint
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.environment.sheet_spring import AddSheetSpring, SheetSpring
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.resources import models_dir
+from drake_teleop.slave.arm import ArmModel, ArmModelFromPlant
+from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
+
+#: S at home: the tool points down, x_S along x_W.
+R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
+#: A bent elbow; the branch nearest to it is home.
+_Q_NEAR_HOME = np.array([0.0, 0.6, 1.2, 0.0, 1.3, 0.0])
+
+
+@dataclass(frozen=True)
+class SlavePlant:
+    """The plant and what the blocks around it need to know.
+
+    Args:
+        plant: continuous MultibodyPlant, finalized.
+        instance: the arm with its tool.
+        tool: the tool's body.
+        arm: kinematics and dynamics up to S, with the tool as its load.
+        sheet: the leaf's model instance, if there is one.
+    """
+
+    plant: MultibodyPlant
+    instance: ModelInstanceIndex
+    tool: BodyIndex
+    arm: ArmModel
+    sheet: ModelInstanceIndex | None
+
+
+def AddSlavePlant(
+    builder: DiagramBuilder, position: list[float], sheet_spring: SheetSpring | None
+) -> SlavePlant:
+    """Adds the slave's plant, at rest at home.
+
+    A scene graph, which costs time at every step, comes only with something to touch.
+
+    Args:
+        builder: the diagram.
+        position: (3,) p_WS at the start [m]; the tool points down.
+        sheet_spring: what there is to touch, or None.
+
+    Raises:
+        DrakeTeleopError: if the arm cannot reach the start.
+    """
+    if sheet_spring is None:
+        plant = builder.AddNamedSystem("slave_plant", MultibodyPlant(time_step=0.0))
+    else:
+        plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
+        plant.set_name("slave_plant")
+        plant.set_contact_model(ContactModel.kPoint)
+    instance, tool = ParseSlave(plant)
+    sheet = None if sheet_spring is None else AddSheetSpring(plant, sheet_spring)
+    plant.Finalize()
+    arm = ArmModelFromPlant(plant, instance, "sensor")
+    plant.SetDefaultPositions(instance, home_position(arm, position))
+    return SlavePlant(plant, instance, tool, arm, sheet)
+
+
+def ParseSlave(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, BodyIndex]:
+    """Parses arm and tool; the tool hangs on the wrist sensor through the joint "sensor_weld".
+
+    Returns:
+        The arm's model instance and the tool's body.
+    """
+    parser = Parser(plant)
+    parser.package_map().AddPackageXml(str(models_dir() / "package.xml"))
+    (arm,) = parser.AddModelsFromUrl("package://drake_teleop/rx90.sdf")
+    parser.AddModelsFromUrl("package://drake_teleop/tool.sdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", arm))
+    tool = plant.GetBodyByName("tool")
+    sensor = plant.GetFrameByName("sensor", arm)
+    plant.AddJoint(WeldJoint("sensor_weld", sensor, tool.body_frame(), RigidTransform.Identity()))
+    return arm, tool.index()
+
+
+def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
+    """Joint angles [rad] with S at `position` [m, in W], tool down, elbow bent upwards.
+
+    Raises:
+        DrakeTeleopError: if the arm cannot reach it.
+    """
+    q, status = nearest_branch(
+        R_WS_HOME.matrix(), np.array(position), _Q_NEAR_HOME, arm.lower, arm.upper
+    )
+    if status != IkStatus.OK:
+        raise DrakeTeleopError(
+            f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})",
+            where="slave.position",
+            remedy="move it nearer to (0.55, 0, 0.45)",
+        )
+    return q

@@ -1,0 +1,345 @@
+"""The wrist sensor: force, torque and acceleration in one housing, and the arm's encoders.
+
+The numbers of the default sensor are those of the JR3 85M35A3-I40-D 200N12 of the paper (sources
+in the README of the models). The truth is rigid-body mechanics: the wrench that the sensor exerts
+on the tool is V phi of the tool minus what the environment exerts on it (Eqs. 1, 2), the
+acceleration is the specific force a - g of the origin of S. Each sample then passes
+
+    offset + noise -> saturation -> quantisation (converter) -> low-pass filter (digital)
+
+The angular velocity is not measured by the JR3: it is the difference of two encoder readings
+through the arm's Jacobian, put through the same filter so that it stays aligned with the rest.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydrake.common import RandomDistribution
+from pydrake.common.value import Value
+from pydrake.multibody.plant import ContactResults
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    DiscreteValues,
+    LeafSystem,
+)
+from pydrake.systems.primitives import Demultiplexer, RandomSource
+
+from drake_teleop.environment.contact import contact_wrench
+from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.quantities import quantity
+from drake_teleop.slave.arm import MOTION_SIZE, ArmModel, sensor_motion
+
+#: The parts of a sample, in the order of the output port `sample`, with their sizes.
+SAMPLE_PARTS = (
+    ("measured_wrench_S", 6),
+    ("specific_force_S", 3),
+    ("angular_velocity_S", 3),
+    ("angular_acceleration_S", 3),
+    ("saturated", 1),
+)
+_CHANNELS = 15
+_SAMPLE = 16
+_SECTIONS = 2  # second-order sections of the fourth-order low-pass
+
+
+@dataclass
+class WristSensorConfig:
+    """A sampled force/torque and acceleration sensor; the defaults are the paper's JR3."""
+
+    ideal: bool = False
+    """The truth at the sampling instant: no noise, offset, quantisation, filter or range."""
+    bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
+    force_noise: float = quantity(0.25, "N", 0.0, 100.0, "1 sigma, full band before the filter")
+    torque_noise: float = quantity(0.012, "N m", 0.0, 10.0, "1 sigma, full band before the filter")
+    acceleration_noise: float = quantity(0.06, "m/s^2", 0.0, 100.0, "1 sigma, full band")
+    angular_acceleration_noise: float = quantity(1.5, "rad/s^2", 0.0, 1e3, "1 sigma, full band")
+    force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "fx, fy, fz")
+    torque_range: list[float] = quantity([12.0, 12.0, 12.0], "N m", 0.01, 1e4, "about So")
+    acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "specific force")
+    angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "each axis")
+    resolution: float = quantity(2.5e-4, "1", 0.0, 0.1, "quantum as a fraction of the range")
+    offset: list[float] = quantity(
+        [6.2, -3.9, 8.1, 0.31, -0.42, 0.12], "N, N m", -100.0, 100.0, "offset, Eq. (7)"
+    )
+    encoder_resolution: float = quantity(1.745e-5, "rad", 0.0, 0.1, "resolver step, 0.001 deg")
+
+    def noise_std(self) -> NDArray[np.float64]:
+        """The 12 standard deviations [N, N m, m/s^2, rad/s^2] before the filter."""
+        return np.repeat(
+            [
+                self.force_noise,
+                self.torque_noise,
+                self.acceleration_noise,
+                self.angular_acceleration_noise,
+            ],
+            3,
+        )
+
+    def ranges(self) -> NDArray[np.float64]:
+        """The 12 ranges in the order of the noise."""
+        return np.concatenate(
+            [
+                self.force_range,
+                self.torque_range,
+                np.full(3, self.acceleration_range),
+                np.full(3, self.angular_acceleration_range),
+            ]
+        )
+
+
+def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
+    """Fourth-order Butterworth low-pass as two second-order sections, bilinear, prewarped.
+
+    Args:
+        cutoff_hz: -3 dB frequency [Hz], below half the rate.
+        rate_hz: sampling rate [Hz].
+
+    Returns:
+        (2, 5) rows [b0, b1, b2, a1, a2], each of unit gain at zero frequency.
+    """
+    warped = np.tan(np.pi * cutoff_hz / rate_hz)
+    sections = np.empty((_SECTIONS, 5))
+    for row, angle in enumerate((np.pi / 8, 3 * np.pi / 8)):
+        damping = 2 * np.cos(angle) * warped
+        a0 = 1 + damping + warped**2
+        sections[row] = (
+            warped**2 / a0,
+            2 * warped**2 / a0,
+            warped**2 / a0,
+            2 * (warped**2 - 1) / a0,
+            (1 - damping + warped**2) / a0,
+        )
+    return sections
+
+
+@njit(cache=True)
+def _true_sample(arm, phi, q, v, vdot, contact_W, motion, out):  # type: ignore[no-untyped-def]
+    """Writes [f, tau, s, omega, alpha] of S into `out` (15,); the wrench is Eqs. (1)-(2)."""
+    sensor_motion(arm, q, v, vdot, motion)
+    out[6:15] = motion[:9]
+    non_contact_wrench_into(out[6:9], out[9:12], out[12:15], phi, out[:6])
+    # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
+    f, tau, p = contact_W[:3], contact_W[3:], motion[9:12]
+    tx = tau[0] - (p[1] * f[2] - p[2] * f[1])
+    ty = tau[1] - (p[2] * f[0] - p[0] * f[2])
+    tz = tau[2] - (p[0] * f[1] - p[1] * f[0])
+    for i in range(3):  # the columns of R_WS are the axes of S
+        x, y, z = motion[12 + i], motion[15 + i], motion[18 + i]
+        out[i] -= x * f[0] + y * f[1] + z * f[2]
+        out[3 + i] -= x * tx + y * ty + z * tz
+
+
+@njit(cache=True)
+def _convert(truth, offset, noise, noise_std, limits, resolution, out):  # type: ignore[no-untyped-def]
+    """The converter's 12 channels; returns 1.0 if one of them is saturated."""
+    saturated = 0.0
+    for i in range(12):
+        value = truth[i if i < 9 else i + 3] + noise_std[i] * noise[i]
+        if i < 6:
+            value += offset[i]
+        if abs(value) >= limits[i]:
+            value = np.copysign(limits[i], value)
+            saturated = 1.0
+        quantum = resolution * limits[i]
+        if quantum > 0.0:
+            value = quantum * np.rint(value / quantum)
+        out[i if i < 9 else i + 3] = value
+    return saturated
+
+
+@njit(cache=True)
+def _low_pass(sections, raw, memory, out):  # type: ignore[no-untyped-def]
+    """Transposed direct form II, channel by channel; `memory` (15, 2, 2) is updated."""
+    for channel in range(raw.shape[0]):
+        value = raw[channel]
+        for k in range(sections.shape[0]):
+            filtered = sections[k, 0] * value + memory[channel, k, 0]
+            memory[channel, k, 0] = (
+                sections[k, 1] * value - sections[k, 3] * filtered + memory[channel, k, 1]
+            )
+            memory[channel, k, 1] = sections[k, 2] * value - sections[k, 4] * filtered
+            value = filtered
+        out[channel] = value
+
+
+@njit(cache=True)
+def _settle(sections, raw, memory):  # type: ignore[no-untyped-def]
+    """Puts the filter's memory where it would be after a long time at `raw`."""
+    for channel in range(raw.shape[0]):
+        for k in range(sections.shape[0]):
+            value = raw[channel]
+            memory[channel, k, 1] = (sections[k, 2] - sections[k, 4]) * value
+            memory[channel, k, 0] = (
+                sections[k, 1] - sections[k, 3] + sections[k, 2] - sections[k, 4]
+            ) * value
+
+
+@njit(cache=True)
+def _angular_velocity_from_encoders(arm, q, resolution, period, last_q, work, out):  # type: ignore[no-untyped-def]
+    """omega_S from two successive encoder readings; `last_q` becomes this reading."""
+    n = q.shape[0]
+    velocity, none, motion = work[:n], work[n : 2 * n], work[2 * n :]
+    for i in range(n):
+        reading = resolution * np.rint(q[i] / resolution) if resolution > 0.0 else q[i]
+        velocity[i] = (reading - last_q[i]) / period
+        last_q[i] = reading
+        none[i] = 0.0
+    sensor_motion(arm, last_q, velocity, none, motion)
+    out[:] = motion[3:6]
+
+
+@njit(cache=True)
+def sample_ideal(arm, phi, q, v, vdot, contact_W, work, sample):  # type: ignore[no-untyped-def]
+    """One sample of the ideal sensor: the truth. `sample` (16,) is written."""
+    _true_sample(arm, phi, q, v, vdot, contact_W, work[:MOTION_SIZE], sample[:15])
+    sample[15] = 0.0
+
+
+@njit(cache=True)
+def sample_realistic(  # type: ignore[no-untyped-def]
+    arm, phi, q, v, vdot, contact_W, noise, offset, noise_std, limits, resolution,
+    encoder_resolution, sections, period, memory, work, sample,
+):  # fmt: skip
+    """One sample of the realistic sensor; `memory` and `sample` (16,) are updated.
+
+    `memory` is [started, last encoder readings (n), filter (15 x 2 x 2)]; `work` is scratch.
+    """
+    n = q.shape[0]
+    last_q = memory[1 : 1 + n]
+    filter_memory = memory[1 + n :].reshape(_CHANNELS, _SECTIONS, 2)
+    truth, raw, rest = work[:15], work[15:30], work[30 : 30 + 2 * n + MOTION_SIZE]
+    _true_sample(arm, phi, q, v, vdot, contact_W, rest[:MOTION_SIZE], truth)
+    saturated = _convert(truth, offset, noise, noise_std, limits, resolution, raw)
+    starts = memory[0] == 0.0
+    if starts:
+        last_q[:] = q - period * v
+    _angular_velocity_from_encoders(arm, q, encoder_resolution, period, last_q, rest, raw[9:12])
+    if starts:
+        memory[0] = 1.0
+        _settle(sections, raw, filter_memory)
+    _low_pass(sections, raw, filter_memory, sample[:15])
+    sample[15] = saturated
+
+
+class WristSensor(LeafSystem):
+    """Samples force, torque, acceleration and angular velocity of S at the sensor's rate.
+
+    .. pydrake_system::
+
+        name: WristSensor
+        input_ports:
+        - slave_state: [q; v] of the arm
+        - slave_acceleration: vdot of the arm
+            - noise: 12 standard normal numbers a sample (a random input, seeded by the scenario)
+        output_ports:
+        - sample: the parts of SAMPLE_PARTS, one after the other
+
+    Args:
+        arm: kinematics up to S, and the tool's true inertial parameters as its load (the plant's,
+            not an estimate: this is the physics).
+        tool: index of the tool's body in the plant.
+        config: the sensor.
+        period: sampling period [s].
+    """
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        tool: BodyIndex,
+        config: WristSensorConfig,
+        period: float,
+    ) -> None:
+        super().__init__()
+        n = arm.num_joints
+        self._arm, self._phi, self._n = arm.table, arm.phi_load, n
+        self._config = config
+        self._constants = (
+            np.array(config.offset),
+            config.noise_std(),
+            config.ranges(),
+            config.resolution,
+            config.encoder_resolution,
+            butterworth_sections(config.bandwidth_hz, 1 / period),
+            period,
+        )
+        self._work = np.zeros(30 + 2 * n + MOTION_SIZE)
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
+        self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
+        self._tool, self._contact_W = tool, np.zeros(6)
+        self._contact = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
+        sample_index = self.DeclareDiscreteState(_SAMPLE)
+        update = self._sample_ideal
+        if not config.ideal:
+            self._noise = self.DeclareVectorInputPort("noise", 12, RandomDistribution.kGaussian)
+            self.DeclareDiscreteState(1 + n + _CHANNELS * _SECTIONS * 2)
+            update = self._sample_realistic
+        self.DeclareStateOutputPort("sample", sample_index)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, update)
+        # The first sample is there before anyone reads it.
+        self.DeclareInitializationDiscreteUpdateEvent(update)
+
+    def _inputs(self, context: Context) -> tuple[NDArray[np.float64], ...]:
+        state = self._state.Eval(context)
+        if self._contact.HasValue(context):
+            contact_wrench(self._contact.Eval(context), self._tool, self._contact_W)
+        return state[: self._n], state[self._n :], self._acceleration.Eval(context), self._contact_W
+
+    def _sample_ideal(self, context: Context, discrete_state: DiscreteValues) -> None:
+        sample = discrete_state.get_mutable_value(0)
+        sample_ideal(self._arm, self._phi, *self._inputs(context), self._work, sample)
+
+    def _sample_realistic(self, context: Context, discrete_state: DiscreteValues) -> None:
+        sample_realistic(
+            self._arm,
+            self._phi,
+            *self._inputs(context),
+            self._noise.Eval(context),
+            *self._constants,
+            discrete_state.get_mutable_value(1),
+            self._work,
+            discrete_state.get_mutable_value(0),
+        )
+
+
+def MakeWristSensor(
+    arm: ArmModel, tool: BodyIndex, config: WristSensorConfig, period: float
+) -> Diagram:
+    """The sampled sensor with its noise, one output port for every part of a sample.
+
+    .. pydrake_system::
+
+        name: wrist_sensor
+        input_ports:
+        - slave_state
+        - slave_acceleration
+        - contact_results (may be left unconnected)
+        output_ports:
+        - sample
+        - measured_wrench_S
+        - specific_force_S
+        - angular_velocity_S
+        - angular_acceleration_S
+        - saturated
+    """
+    builder = DiagramBuilder()
+    sensor = builder.AddNamedSystem("sampler", WristSensor(arm, tool, config, period))
+    names, sizes = zip(*SAMPLE_PARTS, strict=True)
+    parts = builder.AddNamedSystem("parts", Demultiplexer(sizes))
+    builder.Connect(sensor.GetOutputPort("sample"), parts.get_input_port())
+    if not config.ideal:
+        noise = RandomSource(RandomDistribution.kGaussian, 12, period)
+        builder.Connect(
+            builder.AddNamedSystem("noise", noise).get_output_port(), sensor.GetInputPort("noise")
+        )
+    for name in ("slave_state", "slave_acceleration", "contact_results"):
+        builder.ExportInput(sensor.GetInputPort(name), name)
+    builder.ExportOutput(sensor.GetOutputPort("sample"), "sample")
+    for index, name in enumerate(names):
+        builder.ExportOutput(parts.get_output_port(index), name)
+    return builder.Build()

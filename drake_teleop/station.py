@@ -1,0 +1,252 @@
+"""The complete teleoperation system of the paper's Fig. 4 as one Drake Diagram.
+
+Read `MakeTeleopStation` beside the figure: every block of it is one line here, and one file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RollPitchYaw
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+
+from drake_teleop.channel.delay import DelayChannel
+from drake_teleop.environment.contact import ToolContact
+from drake_teleop.load.excitation import FourierTrajectory
+from drake_teleop.master import device
+from drake_teleop.master.device import MasterDevice
+from drake_teleop.master.force_display import ForceDisplay
+from drake_teleop.master.operator import Operator
+from drake_teleop.scaling.force_scaling import ForceScaling
+from drake_teleop.scaling.kinematic_scaling import KinematicScaling
+from drake_teleop.scaling.wrench_mapping import WrenchToMaster
+from drake_teleop.scenario import Scenario
+from drake_teleop.signals import LOG_PREFIX
+from drake_teleop.slave.inverse_kinematics import InverseKinematics
+from drake_teleop.slave.joint_control import JointControl
+from drake_teleop.slave.joint_limits import JointLimitMonitor
+from drake_teleop.slave.joint_trajectory import JointTrajectory
+from drake_teleop.slave.load_estimator import LoadEstimator
+from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, SlavePlant
+from drake_teleop.slave.wrist_sensor import MakeWristSensor
+
+_SLAVE_WIRES = (
+    ("joint_control.joint_torque", "slave_plant.rx90_actuation"),
+    ("slave_plant.rx90_state", "joint_control.slave_state", "joint_limits.slave_state"),
+    ("slave_plant.rx90_state", "wrist_sensor.slave_state"),
+    ("slave_plant.rx90_generalized_acceleration", "wrist_sensor.slave_acceleration"),
+    ("wrist_sensor.sample", "load_estimator.sample"),
+)
+_CONTACT_WIRES = (
+    ("slave_plant.contact_results", "wrist_sensor.contact_results", "tool_contact.contact_results"),
+)
+_TELEOP_WIRES = (
+    # The operator holds the master.
+    ("operator.hand_wrench_E", "master_device.hand_wrench_E"),
+    ("master_device.pose_master", "operator.pose_master"),
+    ("master_device.twist_master", "operator.twist_master"),
+    # Motion, master to slave.
+    ("master_device.pose_master", "kinematic_scaling.pose_master"),
+    ("clutch.y0", "kinematic_scaling.clutch"),
+    ("kinematic_scaling.pose_command", "forward_channel.sent"),
+    ("forward_channel.received", "inverse_kinematics.pose_command"),
+    ("slave_plant.rx90_state", "inverse_kinematics.slave_state"),
+    ("inverse_kinematics.joint_command", "joint_control.joint_command"),
+    # Force, slave to master.
+    ("wrist_sensor.measured_wrench_S", "force_scaling.measured_wrench_S"),
+    ("wrist_sensor.specific_force_S", "force_scaling.specific_force_S"),
+    ("wrist_sensor.angular_velocity_S", "force_scaling.angular_velocity_S"),
+    ("wrist_sensor.angular_acceleration_S", "force_scaling.angular_acceleration_S"),
+    ("load_estimator.load_estimate", "force_scaling.load_estimate"),
+    ("force_scaling.scaled_wrench_S", "wrench_to_master.scaled_wrench_S"),
+    ("slave_plant.rx90_state", "wrench_to_master.slave_state"),
+    ("wrench_to_master.wrench_B", "backward_channel.sent"),
+    ("backward_channel.received", "force_display.wrench_command"),
+    ("master_device.state", "force_display.master_state"),
+    ("force_display.motor_torque", "master_device.motor_torque"),
+)
+
+#: Signal of the log -> port. The names are explained in `drake_teleop.signals`.
+_SLAVE_LOG = {
+    "measured_wrench_S": "wrist_sensor.measured_wrench_S",
+    "specific_force_S": "wrist_sensor.specific_force_S",
+    "angular_velocity_S": "wrist_sensor.angular_velocity_S",
+    "angular_acceleration_S": "wrist_sensor.angular_acceleration_S",
+    "saturated": "wrist_sensor.saturated",
+    "load_estimate": "load_estimator.load_estimate",
+    "slave_state": "slave_plant.rx90_state",
+    "joint_torque": "joint_control.joint_torque",
+}
+_CONTACT_LOG = {
+    "true_contact_wrench_W": "tool_contact.true_contact_wrench_W",
+    "sheet_state": "slave_plant.sheet_spring_state",
+}
+_TELEOP_LOG = {
+    "intent": "operator.intent",
+    "hand_wrench_E": "operator.hand_wrench_E",
+    "master_state": "master_device.state",
+    "pose_master": "master_device.pose_master",
+    "twist_master": "master_device.twist_master",
+    "pose_command": "kinematic_scaling.pose_command",
+    "joint_command": "inverse_kinematics.joint_command",
+    "ik_status": "inverse_kinematics.ik_status",
+    "scaled_wrench_S": "force_scaling.scaled_wrench_S",
+    "contact_wrench_S": "force_scaling.contact_wrench_S",
+    "non_contact_wrench_S": "force_scaling.non_contact_wrench_S",
+    "force_to_master": "force_display.force_to_master",
+    "motor_torque": "force_display.motor_torque",
+}
+
+
+def MakeTeleopStation(
+    scenario: Scenario, *, load_estimate: NDArray[np.float64] | None = None
+) -> Diagram:
+    """Builds the bilateral station: operator, master, channel, slave, sensor, elimination.
+
+    It records the signals of `drake_teleop.signals` and exports the ports that other diagrams
+    may want.
+
+    .. pydrake_system::
+
+        name: TeleopStation
+        output_ports:
+        - pose_master
+        - pose_command
+        - force_to_master
+        - measured_wrench_S
+        - scaled_wrench_S
+        - contact_wrench_S
+        - load_estimate
+
+    Args:
+        scenario: what the station is made of.
+        load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, as an identification
+            found it; zeros (nothing known) if left out.
+
+    Raises:
+        DrakeTeleopError: for a value that cannot be right, or a start out of reach.
+    """
+    scenario.check()
+    period = 1 / scenario.rates.hand_hz
+    hand, delay = scenario.operator.hand, scenario.channel.delay
+    scaling = scenario.kinematic_scaling
+    start_B = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
+    start_W = np.array([*R_WS_HOME.ToQuaternion().wxyz(), *scenario.slave.position])
+    R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix()
+
+    builder = DiagramBuilder()
+    slave = AddSlave(builder, scenario, load_estimate)
+    blocks = {
+        "operator": Operator(scenario.operator, start_B),
+        "master_device": MasterDevice(
+            period,
+            hand_mass=hand.mass,
+            hand_inertia=hand.inertia,
+            q_initial=device.inverse_kinematics(start_B),
+            friction=scenario.master.friction,
+        ),
+        "clutch": ConstantVectorSource([1.0]),
+        "kinematic_scaling": KinematicScaling(scaling, period, start_W),
+        "forward_channel": DelayChannel(delay, period, start_W),
+        "inverse_kinematics": InverseKinematics(slave.arm.lower, slave.arm.upper),
+        "force_scaling": ForceScaling(scenario.force_scaling),
+        "wrench_to_master": WrenchToMaster(
+            slave.arm, R_WB.matrix(), scenario.force_scaling.force_scale
+        ),
+        "backward_channel": DelayChannel(delay, period, np.zeros(6)),
+        "force_display": ForceDisplay(),
+    }
+    for name, block in blocks.items():
+        builder.AddNamedSystem(name, block)
+    _connect(builder, _TELEOP_WIRES)
+    _record(builder, _TELEOP_LOG, scenario.rates.log_hz)
+    for port in (
+        "master_device.pose_master",
+        "kinematic_scaling.pose_command",
+        "force_display.force_to_master",
+        "wrist_sensor.measured_wrench_S",
+        "force_scaling.scaled_wrench_S",
+        "force_scaling.contact_wrench_S",
+        "load_estimator.load_estimate",
+    ):
+        builder.ExportOutput(_output(builder, port), port.partition(".")[2])
+    return _named(builder.Build(), "teleop_station")
+
+
+def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
+    """Builds the slave alone, driven through an excitation trajectory (section IV).
+
+    The slave starts at the trajectory's start; `trajectory` runs once, after the settling time,
+    and the load estimator learns from every sample if the scenario enables it.
+    """
+    scenario.check()
+    builder = DiagramBuilder()
+    slave = AddSlave(builder, scenario, None)
+    start, _, _ = trajectory.evaluate(0.0)
+    slave.plant.SetDefaultPositions(slave.instance, start)
+    builder.AddNamedSystem(
+        "joint_trajectory", JointTrajectory(trajectory, scenario.simulation.settle)
+    )
+    _connect(builder, [("joint_trajectory.joint_command", "joint_control.joint_command")])
+    _record(builder, {"joint_command": "joint_trajectory.joint_command"}, scenario.rates.log_hz)
+    return _named(builder.Build(), "identification_station")
+
+
+def AddSlave(
+    builder: DiagramBuilder, scenario: Scenario, load_estimate: NDArray[np.float64] | None
+) -> SlavePlant:
+    """Adds the slave: plant, joint control, wrist sensor, load estimator, monitor, their log.
+
+    What remains open is the input `joint_control.joint_command`.
+    """
+    rates, sensor = scenario.rates, scenario.wrist_sensor
+    slave = AddSlavePlant(builder, scenario.slave.position, scenario.sheet_spring)
+    blocks = {
+        "joint_control": JointControl(
+            slave.arm, scenario.joint_control, 1 / rates.joint_control_hz
+        ),
+        "joint_limits": JointLimitMonitor(slave.arm, 1 / rates.log_hz),
+        "wrist_sensor": MakeWristSensor(slave.arm, slave.tool, sensor, 1 / rates.sensor_hz),
+        "load_estimator": LoadEstimator(
+            scenario.load_estimator,
+            sensor.noise_std()[:6],
+            1 / rates.estimator_hz,
+            np.zeros(16) if load_estimate is None else load_estimate,
+        ),
+    }
+    for name, block in blocks.items():
+        builder.AddNamedSystem(name, block)
+    _connect(builder, _SLAVE_WIRES)
+    _record(builder, _SLAVE_LOG, rates.log_hz)
+    if slave.sheet is not None:
+        builder.AddNamedSystem("tool_contact", ToolContact(slave.tool))
+        _connect(builder, _CONTACT_WIRES)
+        _record(builder, _CONTACT_LOG, rates.log_hz)
+    return slave
+
+
+def _connect(builder: DiagramBuilder, wires: Iterable[tuple[str, ...]]) -> None:
+    for source, *targets in wires:
+        for target in targets:
+            system, _, port = target.partition(".")
+            builder.Connect(
+                _output(builder, source), builder.GetSubsystemByName(system).GetInputPort(port)
+            )
+
+
+def _output(builder: DiagramBuilder, name: str):  # type: ignore[no-untyped-def]
+    system, _, port = name.partition(".")
+    return builder.GetSubsystemByName(system).GetOutputPort(port)
+
+
+def _record(builder: DiagramBuilder, signals: Mapping[str, str], rate: float) -> None:
+    for signal, port in signals.items():
+        LogVectorOutput(_output(builder, port), builder, 1 / rate).set_name(LOG_PREFIX + signal)
+
+
+def _named(diagram: Diagram, name: str) -> Diagram:
+    diagram.set_name(name)
+    return diagram
