@@ -230,8 +230,8 @@ def _embedded(figure: Figure) -> str:
 
 
 def _between(what: str, paper: str, value: float, unit: str, low: float, high: float) -> Comparison:
-    bounds = f"at most {_text(high, unit)}" if low == 0 else f"{low:.3g} to {_text(high, unit)}"
-    return Comparison(what, paper, _text(value, unit), bounds, bool(low <= value <= high))
+    bounds = f"at most {high:.3g} {unit}" if low == 0 else f"{low:.3g} to {high:.3g} {unit}"
+    return Comparison(what, paper, _text(value, unit), bounds.strip(), bool(low <= value <= high))
 
 
 def _answer(what: str, paper: str, value: bool, expected: bool) -> Comparison:
