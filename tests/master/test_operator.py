@@ -66,7 +66,7 @@ def test_twist_is_the_derivative_of_the_intended_pose():
         spin = (difference - difference.T) / (4 * step)
         angular = [spin[2, 1], spin[0, 2], spin[1, 0]]
         np.testing.assert_allclose(twist[3:], angular, atol=1e-7)
-    assert np.max(np.abs(twists), axis=0).min() > 0.05
+    assert np.max(np.abs(twists), axis=0).min() > 0.03
 
 
 def test_intent_is_smooth_to_the_second_derivative():
