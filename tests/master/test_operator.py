@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
+from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -187,3 +188,18 @@ def test_operator_shows_its_intent():
         context.SetTime(time)
         expected, _ = intent_at(SEGMENTS, START, time)
         np.testing.assert_array_equal(operator.GetOutputPort("intent").Eval(context), expected[0])
+
+
+def test_intent_loads_from_yaml():
+    text = """
+        grip: firm
+        intent:
+        - !MinimumJerk {duration: 2.0, translation: [0.0, 0.0, 0.1]}
+        - !Sine {frequency: 3.0, rotation: [0.0, 0.2, 0.0]}
+    """
+    config = yaml_load_typed(schema=OperatorConfig, data=text)
+    assert config.hand is GRIPS["firm"]
+    assert config.intent == [
+        MinimumJerk(duration=2.0, translation=[0.0, 0.0, 0.1]),
+        Sine(frequency=3.0, rotation=[0.0, 0.2, 0.0]),
+    ]
