@@ -1,0 +1,70 @@
+"""Checks of the arrays that come into the load core from outside."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+
+Array: TypeAlias = NDArray[np.float64]
+
+
+def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> Array:
+    """`value` as a finite float64 array of the given shape.
+
+    Args:
+        name: what the array is called in the error message.
+        shape: the shape demanded.
+        leading: allow any further dimensions in front of `shape`.
+
+    Raises:
+        DrakeTeleopError: if it holds no numbers, has another shape, or is not finite.
+    """
+    wanted = ", ".join(["..."] * leading + [str(n) for n in shape])
+    wanted = f"({wanted},)" if len(shape) == 1 and not leading else f"({wanted})"
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DrakeTeleopError(
+            f"holds no numbers ({error})", where=name, remedy=f"give an array of shape {wanted}"
+        ) from error
+    own = array.shape[array.ndim - len(shape) :] if leading else array.shape
+    if own != shape:
+        raise DrakeTeleopError(f"has shape {array.shape} instead of {wanted}", where=name)
+    finite = np.isfinite(array)
+    if not finite.all():
+        first = tuple(int(i) for i in np.argwhere(~finite)[0])
+        raise DrakeTeleopError(f"is not finite at index {first}", where=name)
+    return array
+
+
+def checked_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list[Array]]:
+    """Arrays of vectors, each (..., n), as contiguous tables of N rows.
+
+    Args:
+        arrays: name -> (value, n); the leading dimensions are broadcast against each other.
+
+    Returns:
+        The common leading shape, and for each array an (N, n) table.
+
+    Raises:
+        DrakeTeleopError: as `checked`, or if the leading dimensions do not fit together.
+    """
+    tables = {name: checked(name, value, n, leading=True) for name, (value, n) in arrays.items()}
+    try:
+        leading = np.broadcast_shapes(*(table.shape[:-1] for table in tables.values()))
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {table.shape}" for name, table in tables.items())
+        raise DrakeTeleopError(
+            f"the numbers of samples differ: {shapes}", remedy="give one row of each per sample"
+        ) from error
+    rows = [
+        np.ascontiguousarray(np.broadcast_to(table, (*leading, table.shape[-1]))).reshape(
+            -1, table.shape[-1]
+        )
+        for table in tables.values()
+    ]
+    return leading, rows

@@ -1,0 +1,123 @@
+"""The non-contact wrench of a load: the matrix V of Eq. (5) and the Newton-Euler Eqs. (1)-(2).
+
+Everything is expressed in the sensor frame S, about its origin So. The wrench is what the sensor
+exerts on the load: at rest f = -m g. The motion enters as
+
+- s: specific force a - g of So [m/s^2] (a real accelerometer's reading, moved to So),
+- omega: angular velocity [rad/s],
+- alpha: angular acceleration [rad/s^2],
+
+and the load as phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz] [kg, kg m, kg m^2] with the
+inertia about So and the products as entries of the tensor of Eq. (3).
+
+The ``..._into`` kernels are compiled, allocate nothing and check nothing; the functions without
+that suffix check their input and run the same kernels over any number of samples.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
+
+from drake_teleop.load.arrays import Array, checked, checked_rows
+
+
+@njit(cache=True)
+def regressor_into(s, omega, alpha, V):
+    """Writes V of Eq. (5) into V (6, 10); rows [f; tau], columns as phi."""
+    sx, sy, sz = s[0], s[1], s[2]
+    wx, wy, wz = omega[0], omega[1], omega[2]
+    ax, ay, az = alpha[0], alpha[1], alpha[2]
+    xx, yy, zz = wx * wx, wy * wy, wz * wz
+    xy, xz, yz = wx * wy, wx * wz, wy * wz
+
+    V[:] = 0.0
+    V[0, 0], V[1, 0], V[2, 0] = sx, sy, sz
+    V[0, 1], V[0, 2], V[0, 3] = -yy - zz, xy - az, xz + ay
+    V[1, 1], V[1, 2], V[1, 3] = xy + az, -xx - zz, yz - ax
+    V[2, 1], V[2, 2], V[2, 3] = xz - ay, yz + ax, -yy - xx
+
+    V[3, 2], V[3, 3] = sz, -sy
+    V[4, 1], V[4, 3] = -sz, sx
+    V[5, 1], V[5, 2] = sy, -sx
+    V[3, 4], V[3, 5], V[3, 6], V[3, 7], V[3, 8], V[3, 9] = ax, ay - xz, az + xy, -yz, yy - zz, yz
+    V[4, 4], V[4, 5], V[4, 6], V[4, 7], V[4, 8], V[4, 9] = xz, ax + yz, zz - xx, ay, az - xy, -xz
+    V[5, 4], V[5, 5], V[5, 6], V[5, 7], V[5, 8], V[5, 9] = -xy, xx - yy, ax - yz, xy, ay + xz, az
+
+
+@njit(cache=True)
+def non_contact_wrench_into(s, omega, alpha, phi, out):
+    """Writes V phi, Eqs. (1)-(2), into out (6,) without building V. phi may be a tuple."""
+    sx, sy, sz = s[0], s[1], s[2]
+    wx, wy, wz = omega[0], omega[1], omega[2]
+    ax, ay, az = alpha[0], alpha[1], alpha[2]
+    m, hx, hy, hz = phi[0], phi[1], phi[2], phi[3]
+    ixx, ixy, ixz, iyy, iyz, izz = phi[4], phi[5], phi[6], phi[7], phi[8], phi[9]
+
+    # f = m s + alpha x h + omega x (omega x h), h = m c
+    ux, uy, uz = wy * hz - wz * hy, wz * hx - wx * hz, wx * hy - wy * hx
+    out[0] = m * sx + (ay * hz - az * hy) + (wy * uz - wz * uy)
+    out[1] = m * sy + (az * hx - ax * hz) + (wz * ux - wx * uz)
+    out[2] = m * sz + (ax * hy - ay * hx) + (wx * uy - wy * ux)
+
+    # tau = I alpha + omega x (I omega) + h x s
+    lx = ixx * wx + ixy * wy + ixz * wz
+    ly = ixy * wx + iyy * wy + iyz * wz
+    lz = ixz * wx + iyz * wy + izz * wz
+    out[3] = ixx * ax + ixy * ay + ixz * az + (wy * lz - wz * ly) + (hy * sz - hz * sy)
+    out[4] = ixy * ax + iyy * ay + iyz * az + (wz * lx - wx * lz) + (hz * sx - hx * sz)
+    out[5] = ixz * ax + iyz * ay + izz * az + (wx * ly - wy * lx) + (hx * sy - hy * sx)
+
+
+@njit(cache=True)
+def _regressors(s, omega, alpha, V):
+    for i in range(s.shape[0]):
+        regressor_into(s[i], omega[i], alpha[i], V[i])
+
+
+@njit(cache=True)
+def _non_contact_wrenches(s, omega, alpha, phi, out):
+    for i in range(s.shape[0]):
+        non_contact_wrench_into(s[i], omega[i], alpha[i], phi, out[i])
+
+
+def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
+    """V of Eq. (5), with [f; tau] = V phi.
+
+    Args:
+        s: (..., 3) specific force a - g of So in S [m/s^2].
+        omega: (..., 3) angular velocity of S in S [rad/s].
+        alpha: (..., 3) angular acceleration of S in S [rad/s^2].
+
+    Returns:
+        (..., 6, 10). For many samples this is large: `non_contact_wrench` and
+        `identification.NormalEquations` do without it.
+
+    Raises:
+        DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
+    """
+    leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+    V = np.empty((motion[0].shape[0], 6, 10))
+    _regressors(*motion, V)
+    return V.reshape(*leading, 6, 10)
+
+
+def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: ArrayLike) -> Array:
+    """The wrench [f; tau] that moves the load, Eqs. (1)-(2) and (12).
+
+    Args:
+        s, omega, alpha: (..., 3) as for `regressor`.
+        phi: (10,) the load about So in S.
+
+    Returns:
+        (..., 6) wrench of the sensor on the load about So in S [N, N m].
+
+    Raises:
+        DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
+    """
+    phi = checked("phi", phi, 10)
+    leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+    out = np.empty((motion[0].shape[0], 6))
+    _non_contact_wrenches(*motion, phi, out)
+    return out.reshape(*leading, 6)
