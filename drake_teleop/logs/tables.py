@@ -1,0 +1,173 @@
+"""Tables of numbers from CSV, Parquet and NPZ files, with messages that name file, column, row."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+
+if TYPE_CHECKING:
+    import polars as pl
+
+FORMATS = (".csv", ".parquet", ".npz")
+
+
+@dataclass(frozen=True)
+class Table:
+    """The columns of one file.
+
+    Args:
+        path: the file, for messages.
+        columns: name to array (N,) or, from an NPZ file, (N, ...); of any type as yet.
+        first_row: number of the first data row in the file as a reader counts, for messages.
+    """
+
+    path: Path
+    columns: dict[str, NDArray]
+    first_row: int = 1
+
+    def numbers(self, names: Sequence[str | int], width: int, where: str) -> NDArray[np.float64]:
+        """(N, width) finite numbers from the named columns side by side.
+
+        An array with several columns (NPZ) counts as that many, row-major.
+
+        Raises:
+            DrakeTeleopError: naming `where`, if a column is absent, a cell is no finite number, or
+                the columns are not `width` in all.
+        """
+        columns = [self._column(str(name), where) for name in names]
+        if len({len(column) for column in columns}) > 1:
+            sizes = ", ".join(f"{n}: {len(c)}" for n, c in zip(names, columns, strict=True))
+            raise DrakeTeleopError(
+                f"the columns differ in length ({sizes})",
+                where=where,
+                remedy=f"repair {self.path.name}",
+            )
+        found = np.column_stack(columns)
+        if found.shape[1] != width:
+            raise DrakeTeleopError(
+                f"{found.shape[1]} columns where {width} are needed",
+                where=where,
+                remedy=f"list {width} columns of {self.path.name}",
+            )
+        return found
+
+    def _column(self, name: str, where: str) -> NDArray[np.float64]:
+        if name not in self.columns:
+            near = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
+            hint = "did you mean" if near else "its columns are"
+            raise DrakeTeleopError(
+                f"{self.path.name} has no column {name!r}",
+                where=where,
+                remedy=f"{hint} {_listed(near or list(self.columns))}",
+            )
+        numbers = _as_numbers(self.columns[name], lambda row, cell: self._bad(name, row, cell))
+        bad = ~np.isfinite(numbers).reshape(len(numbers), -1).all(axis=1)
+        if bad.any():
+            first = int(np.argmax(bad))
+            raise DrakeTeleopError(
+                f"no finite number in {int(bad.sum())} rows, the first is row"
+                f" {first + self.first_row}",
+                where=f"{self.path}:{name}",
+                remedy="cut the log before it or repair the rows",
+            )
+        return numbers.reshape(len(numbers), -1)
+
+    def _bad(self, name: str, row: int, cell: object) -> DrakeTeleopError:
+        return DrakeTeleopError(
+            f"{cell!r} in row {row + self.first_row} is not a number",
+            where=f"{self.path}:{name}",
+            remedy="correct the cell or delete the row",
+        )
+
+
+def read_table(path: Path, *, header: bool = True) -> Table:
+    """Reads a CSV, Parquet or NPZ file, told apart by its suffix.
+
+    Args:
+        path: the file.
+        header: whether the first line of a CSV file holds names; if not, the columns are named by
+            their numbers, from "0".
+
+    Raises:
+        DrakeTeleopError: if the file is absent, of another kind, or cannot be parsed.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise DrakeTeleopError(
+            f"format {path.suffix!r} is not known",
+            where=str(path),
+            remedy=f"convert it to one of {', '.join(FORMATS)}",
+        )
+    if not path.is_file():
+        raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
+    try:
+        table = _read_npz(path) if path.suffix.lower() == ".npz" else _read_frame(path, header)
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, error) from error
+    if not table.columns or not all(len(c) for c in table.columns.values()):
+        raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
+    return table
+
+
+def _read_frame(path: Path, header: bool) -> Table:
+    import polars as pl
+
+    is_csv = path.suffix.lower() == ".csv"
+    try:
+        if is_csv:
+            frame = pl.read_csv(path, has_header=header, infer_schema_length=None)
+        else:
+            frame = pl.read_parquet(path)
+    except pl.exceptions.PolarsError as error:
+        raise _unreadable(path, error) from error
+    named = [name.strip() if header else str(i) for i, name in enumerate(frame.columns)]
+    columns = {
+        name: _frame_column(series) for name, series in zip(named, frame.get_columns(), strict=True)
+    }
+    return Table(path, columns, first_row=2 if is_csv and header else 1)
+
+
+def _frame_column(series: pl.Series) -> NDArray:
+    import polars as pl
+
+    # Floats keep their empty cells as NaN, which is reported with its row later on.
+    return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
+
+
+def _read_npz(path: Path) -> Table:
+    with np.load(path, allow_pickle=False) as archive:
+        return Table(path, {key: archive[key] for key in archive.files if archive[key].ndim})
+
+
+def _as_numbers(
+    column: NDArray, bad: Callable[[int, object], DrakeTeleopError]
+) -> NDArray[np.float64]:
+    if column.dtype.kind in "fiu":
+        return column.astype(float)
+    numbers = np.empty(len(column))
+    for row, cell in enumerate(column):
+        try:
+            numbers[row] = np.nan if cell is None else float(cell)
+        except (TypeError, ValueError) as error:
+            raise bad(row, cell) from error
+    return numbers
+
+
+def _unreadable(path: Path, error: Exception) -> DrakeTeleopError:
+    return DrakeTeleopError(
+        f"cannot be read: {str(error).splitlines()[0]}",
+        where=str(path),
+        remedy=f"check that it is a valid {path.suffix} file",
+    )
+
+
+def _listed(names: Sequence[str], most: int = 12) -> str:
+    shown = ", ".join(names[:most])
+    return f"{shown}, ..." if len(names) > most else shown

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import motion_at
+
+from drake_teleop.logs.alignment import (
+    angular_motion,
+    decimated,
+    low_pass,
+    low_passed,
+    noise_gain,
+    resample,
+    smooth_derivatives,
+    undelayed,
+    uniform_times,
+)
+from drake_teleop.logs.canonical import Log
+
+
+def a_log(t: np.ndarray) -> Log:
+    motion = motion_at(t)
+    wrench = np.hstack([motion.specific_force, motion.omega])
+    return Log(t, wrench, motion.specific_force, motion.omega, motion.alpha)
+
+
+def test_low_pass_halves_the_cutoff_and_shifts_nothing() -> None:
+    t = np.arange(4000) * 1e-3
+    for f, gain in ((3.0, 1 / (1 + 1e-4)), (30.0, 0.5), (90.0, 1 / 82)):
+        x = np.sin(2 * np.pi * f * t)[:, None]
+        middle = slice(1000, 3000)
+        np.testing.assert_allclose(low_pass(x, 1e-3, 30.0)[middle], gain * x[middle], atol=2e-6)
+
+
+def test_low_pass_keeps_straight_lines_to_the_ends() -> None:
+    t = np.arange(500) * 1e-3
+    x = np.stack([np.ones_like(t), 3 - 2 * t], axis=1)
+    np.testing.assert_allclose(low_pass(x, 1e-3, 20.0), x, atol=2e-3)
+    np.testing.assert_allclose(low_pass(x, 1e-3, 20.0)[:, 0], 1, atol=1e-12)
+
+
+def test_low_pass_above_nyquist_or_none_changes_nothing() -> None:
+    x = np.random.default_rng(1).normal(size=(50, 2))
+    assert low_pass(x, 0.1, 30.0) is x
+    assert low_pass(x, 0.1, None) is x
+
+
+@pytest.mark.parametrize("bandwidth", [None, 10.0, 1e-3])
+def test_smoother_is_exact_on_quintics_even_at_the_ends(bandwidth: float | None) -> None:
+    t = np.linspace(-1, 1, 101)
+    x = np.stack([1 + t - 2 * t**2 + 3 * t**3 - t**5, np.ones_like(t)], axis=1)
+    smooth, first, second = smooth_derivatives(x, t[1] - t[0], bandwidth)
+    np.testing.assert_allclose(smooth, x, atol=1e-11)
+    np.testing.assert_allclose(first[:, 0], 1 - 4 * t + 9 * t**2 - 5 * t**4, atol=1e-8)
+    np.testing.assert_allclose(second[:, 0], -4 + 18 * t - 20 * t**3, atol=1e-5)
+
+
+def test_noise_gain_is_what_noise_does() -> None:
+    noise = np.random.default_rng(2).normal(size=(200_000, 1))
+    measured = [part[500:-500].std() for part in smooth_derivatives(noise, 1e-3, 30.0)]
+    np.testing.assert_allclose(measured, noise_gain(1e-3, 30.0), rtol=0.02)
+
+
+def test_angular_motion_from_orientations() -> None:
+    t = np.arange(0, 4, 0.002)
+    motion = motion_at(t)
+    omega, alpha = angular_motion(motion.R_WS, 0.002, None)
+    np.testing.assert_allclose(omega, motion.omega, atol=1e-4)
+    np.testing.assert_allclose(alpha, motion.alpha, atol=2e-2)
+    np.testing.assert_allclose(alpha[4:-4], motion.alpha[4:-4], atol=1e-3)
+
+
+def test_undelayed_moves_the_motion_and_not_the_wrench() -> None:
+    t = np.arange(0, 2, 0.001)
+    late = motion_at(t - 0.0123)
+    log = Log(t, a_log(t).wrench, late.specific_force, late.omega, late.alpha)
+    back = undelayed(log, 0.0123)
+    now = motion_at(back.t)
+    assert len(back) == len(t) - 13
+    np.testing.assert_array_equal(back.wrench, log.wrench[: len(back)])
+    np.testing.assert_allclose(back.specific_force, now.specific_force, atol=1e-3)
+    np.testing.assert_allclose(back.angular_velocity, now.omega, atol=1e-3)
+    np.testing.assert_allclose(back.angular_acceleration, now.alpha, atol=1e-2)
+
+
+def test_decimated_to_twice_the_cutoff() -> None:
+    log = a_log(np.arange(0, 2, 0.001))
+    thin = decimated(low_passed(log, 30.0), 30.0)
+    assert 1 / thin.dt == pytest.approx(62.5)
+    assert decimated(log, None) is log
+
+
+def test_uniform_times_removes_jitter_only() -> None:
+    even = 5.0 + np.arange(100) * 0.01
+    assert uniform_times(even) is even
+    jitter = even + np.random.default_rng(3).uniform(-2e-3, 2e-3, 100)
+    found = uniform_times(jitter)
+    np.testing.assert_allclose(np.diff(found), np.median(np.diff(jitter)))
+    assert found[0] == jitter[0]
+    assert jitter[-1] - 0.02 < found[-1] <= jitter[-1]
+
+
+def test_resample_interpolates_matrices() -> None:
+    x = np.arange(12.0).reshape(3, 2, 2)
+    found = resample(np.array([0.5, 1.0]), np.arange(3.0), x)
+    np.testing.assert_allclose(found, [x[:2].mean(axis=0), x[1]])

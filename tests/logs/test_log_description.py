@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.description import Description, load_description
+
+PAGE = Path(__file__).parents[2] / "docs" / "logs.md"
+EXAMPLES = re.findall(r"```yaml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize("example", EXAMPLES)
+def test_the_examples_of_the_page_are_valid(tmp_path: Path, example: str) -> None:
+    path = tmp_path / "log.yaml"
+    path.write_text(example, encoding="utf-8")
+    description = load_description(path)
+    streams = [s for s in (description.wrench, description.imu, description.static) if s]
+    assert streams
+    assert all(stream.file.parent == tmp_path for stream in streams)
+
+
+def test_the_page_documents_every_field() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    assert len(EXAMPLES) == 2
+    schema = Description.model_json_schema()
+    fields = {name for entry in schema["$defs"].values() for name in entry["properties"]}
+    units = {
+        unit
+        for entry in schema["$defs"].values()
+        for unit in entry["properties"].get("unit", {}).get("enum", [])
+    }
+    for word in sorted(fields | units):
+        assert re.search(rf"`([a-z_]+\.)?{re.escape(word)}`", page), word
+
+
+BASE = yaml.safe_load(EXAMPLES[0])
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "words"),
+    [
+        (("wrench", "forse"), {}, ["wrench.forse", "unknown field", "did you mean 'force'"]),
+        (("zzz",), {}, ["zzz: unknown field", "the fields are gravity, wrench"]),
+        (("wrench", "force", "unit"), "kgf", ["wrench.force.unit", "'N' or 'lbf'", "'kgf'"]),
+        (("wrench", "time", "unit"), "hours", ["wrench.time.unit", "'hours'"]),
+        (("wrench", "time", "rate"), 100.0, ["wrench.time", "either column or rate"]),
+        (("wrench", "sign"), 2, ["wrench.sign", "1 or -1"]),
+        (("wrench", "frame"), "tool", ["wrench.frame", "3x3 rotation matrix"]),
+        (("imu", "frame"), [[0, 1, 0], [1, 0, 0], [0, 0, 1]], ["imu.frame", "not a rotation"]),
+        (("imu", "frame"), [[2, 0, 0], [0, 1, 0], [0, 0, 1]], ["imu.frame", "not a rotation"]),
+        (("imu", "position"), [0.1, 0.2], ["imu.position"]),
+        (("imu", "position"), [0.1, 0.2, float("nan")], ["imu.position", "finite"]),
+        (("imu", "specific_force"), None, ["imu", "give specific_force"]),
+        (("pose", "frame"), "base", ["pose", "must be sensor"]),
+        (("pose", "orientation", "form"), "euler", ["pose.orientation.form", "'matrix'"]),
+        (("gravity",), "down", ["gravity"]),
+        (("wrench",), None, ["no wrench"]),
+        (("pose",), None, ["nothing gives the angular velocity", "imu.angular_velocity"]),
+        (("wrench", "file"), None, ["wrench.file"]),
+    ],
+)
+def test_errors_name_file_and_field(
+    tmp_path: Path, where: tuple[str, ...], value: object, words: list[str]
+) -> None:
+    data = yaml.safe_load(EXAMPLES[0])
+    place = data
+    for key in where[:-1]:
+        place = place[key]
+    place[where[-1]] = value
+    _expect(tmp_path, yaml.safe_dump(data), words)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("wrench: [", ["is not YAML"]),
+        ("- 1", ["holds no fields"]),
+        ("", ["holds no fields"]),
+        ("static: {}", ["static.file: is missing", "add file"]),
+        (yaml.safe_dump({"wrench": BASE["wrench"]}), ["without kinematics", "add imu or pose"]),
+        (EXAMPLES[1] + EXAMPLES[0].replace("gravity: 9.82 ", "#"), ["stand alone"]),
+    ],
+)
+def test_files_that_are_no_descriptions(tmp_path: Path, text: str, words: list[str]) -> None:
+    _expect(tmp_path, text, words)
+
+
+def test_missing_description(tmp_path: Path) -> None:
+    with pytest.raises(DrakeTeleopError, match="no such file"):
+        load_description(tmp_path / "log.yaml")
+
+
+def _expect(folder: Path, text: str, words: list[str]) -> None:
+    path = folder / "log.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(DrakeTeleopError) as error:
+        load_description(path)
+    message = str(error.value)
+    assert message.startswith(str(path))
+    assert "\n" not in message
+    for word in words:
+        assert word in message

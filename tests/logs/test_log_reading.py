@@ -1,0 +1,399 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+from conftest import GRAVITY_W, Motion, motion_at, quaternions
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.alignment import low_pass
+from drake_teleop.logs.canonical import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    ORIENTATION,
+    POSITION,
+    SPECIFIC_FORCE,
+    WRENCH,
+    Log,
+    write_log,
+)
+from drake_teleop.logs.reading import read_log
+
+T = np.arange(0, 3, 0.002)
+TURNED = np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])
+
+
+def a_wrench(motion: Motion) -> np.ndarray:
+    """Anything smooth that the motion determines, so that a wrong clock shows."""
+    return np.hstack([2 * motion.specific_force, 0.1 * motion.omega])
+
+
+def a_log(t: np.ndarray = T) -> Log:
+    motion = motion_at(t)
+    return Log(t, a_wrench(motion), motion.specific_force, motion.omega, motion.alpha)
+
+
+def canonical(*groups: str) -> pl.DataFrame:
+    motion = motion_at(T)
+    columns: dict[str, Any] = {"t": T} | dict(zip(WRENCH, a_wrench(motion).T, strict=True))
+    for name, names, values in (
+        ("s", SPECIFIC_FORCE, motion.specific_force),
+        ("omega", ANGULAR_VELOCITY, motion.omega),
+        ("alpha", ANGULAR_ACCELERATION, motion.alpha),
+        ("q", ORIENTATION, quaternions(motion.R_WS)),
+        ("p", POSITION, motion.p_WS),
+    ):
+        if name in groups:
+            columns |= dict(zip(names, values.T, strict=True))
+    return pl.DataFrame(columns)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_canonical_log_survives_writing_and_reading(tmp_path: Path, suffix: str) -> None:
+    log = a_log(2.0 + T)
+    path = tmp_path / f"log.{suffix}"
+    write_log(log, path)
+    found = read_log(path)
+    np.testing.assert_array_equal(found.t, log.t)
+    np.testing.assert_array_equal(found.wrench, log.wrench)
+    for ours, theirs in zip(found.motion, log.motion, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert found.notes == ()
+    with pytest.raises(DrakeTeleopError, match=r"name it \.csv or \.parquet"):
+        write_log(log, tmp_path / "log.txt")
+
+
+@pytest.mark.parametrize(
+    "groups", [("q", "p"), ("s", "omega"), ("s", "q"), ("omega", "q", "p"), ("s", "omega", "alpha")]
+)
+def test_a_pose_stands_in_for_missing_kinematics(tmp_path: Path, groups: tuple[str, ...]) -> None:
+    canonical(*groups).write_parquet(tmp_path / "log.parquet")
+    found = read_log(tmp_path / "log.parquet", bandwidth_hz=None)
+    motion = motion_at(found.t)
+    inner = slice(5, -5)
+    np.testing.assert_allclose(found.specific_force[inner], motion.specific_force[inner], atol=1e-4)
+    np.testing.assert_allclose(found.angular_velocity[inner], motion.omega[inner], atol=1e-5)
+    np.testing.assert_allclose(found.angular_acceleration[inner], motion.alpha[inner], atol=1e-3)
+    if "q" in groups:
+        expected = np.einsum("nji,j->ni", motion.R_WS, GRAVITY_W)
+        assert found.gravity is not None
+        np.testing.assert_allclose(found.gravity, expected, atol=1e-9)
+
+
+def test_orientation_alone_is_taken_for_slow_motion_and_says_so(tmp_path: Path) -> None:
+    canonical("q").write_csv(tmp_path / "log.csv")
+    found = read_log(tmp_path / "log.csv")
+    assert "acceleration of S is taken as zero" in found.notes[0]
+    assert found.gravity is not None
+    np.testing.assert_allclose(found.specific_force, -found.gravity, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: f.drop("f_x"), "no column 'f_x'; did you mean "),
+        (lambda f: f.drop("s_z"), "no column 's_z'"),
+        (lambda f: f.drop(*SPECIFIC_FORCE), "without kinematics: no columns s_x s_y s_z"),
+        (lambda f: f.drop(*ANGULAR_VELOCITY), "no columns omega_x omega_y omega_z"),
+        (lambda f: f.head(15), "15 samples in log.csv are too few"),
+        (lambda f: f.with_columns(t=pl.col("t").reverse()), "do not increase, the first is row 3"),
+        (lambda f: pl.concat([f[:4], f[3:]]), "1 time stamps do not increase, the first is row 6"),
+        (lambda f: f.with_columns(s_x=pl.lit("?")), "log.csv:s_x: '?' in row 2 is not a number"),
+        (lambda f: f.with_columns(f_x=pl.lit(float("nan"))), "no finite number in 1500 rows"),
+    ],
+)
+def test_bad_canonical_logs(
+    tmp_path: Path, change: Callable[[pl.DataFrame], pl.DataFrame], words: str
+) -> None:
+    path = tmp_path / "log.csv"
+    change(canonical("s", "omega")).write_csv(path)
+    with pytest.raises(DrakeTeleopError) as error:
+        read_log(path)
+    assert str(error.value).startswith(str(path))
+    assert words in str(error.value)
+    assert ";" in str(error.value)
+
+
+def test_unknown_kind_of_log(tmp_path: Path) -> None:
+    with pytest.raises(DrakeTeleopError, match=r"'\.bag' is not known; give a canonical log"):
+        read_log(tmp_path / "log.bag")
+
+
+def foreign(folder: Path, **changes: Any) -> Path:
+    """Three files with their own clocks, rates, units, axes and signs; and their description."""
+    rng = np.random.default_rng(5)
+    epoch = 1_700_000_000
+
+    def stamps(rate: float, start: float) -> np.ndarray:
+        t = np.arange(start, 3 + start, 1 / rate)
+        return t + rng.uniform(-0.02, 0.02, len(t)) / rate
+
+    t_wrench, t_imu, t_pose = stamps(700, 0.013), stamps(1500, 0.0), stamps(200, 0.031)
+    wrench = a_wrench(motion_at(t_wrench))
+    frame = pl.DataFrame({"time": np.rint((epoch + t_wrench) * 1e6).astype(np.int64)})
+    frame = frame.with_columns(
+        **{f"F{i}": -wrench[:, i] / 4.4482216152605 for i in range(3)},
+        **{f"T{i}": -1e3 * wrench[:, 3 + i] for i in range(3)},
+    )
+    frame.write_csv(folder / "wrench.csv")
+
+    motion = motion_at(t_imu)
+    lever = np.array([0.05, -0.02, 0.03])
+    s = motion.specific_force + np.cross(motion.alpha, lever)
+    s += np.cross(motion.omega, np.cross(motion.omega, lever))
+    s_imu, gyro = s @ TURNED, np.rad2deg(motion.omega @ TURNED) + np.array([1.0, -2.0, 3.0])
+    np.savez(folder / "imu.npz", clock=(epoch + t_imu) * 1e3, a=-s_imu / 9.80665 + 0.1, w=gyro)
+
+    motion = motion_at(t_pose)
+    q = quaternions(motion.R_WS @ TURNED)
+    columns = {"sec": t_pose} | {f"q{i}": q[:, i] for i in range(4)}
+    pl.DataFrame(columns).write_parquet(folder / "pose.parquet")
+
+    description: dict[str, Any] = {
+        "wrench": {
+            "file": "wrench.csv",
+            "time": {"column": "time", "unit": "us"},
+            "force": {"columns": ["F0", "F1", "F2"], "unit": "lbf"},
+            "torque": {"columns": ["T0", "T1", "T2"], "unit": "N mm"},
+            "sign": -1,
+        },
+        "imu": {
+            "file": "imu.npz",
+            "time": {"column": "clock", "unit": "ms"},
+            "specific_force": {"columns": ["a"], "unit": "g", "bias": [0.1, 0.1, 0.1]},
+            "angular_velocity": {"columns": ["w"], "unit": "deg/s", "bias": [1, -2, 3]},
+            "sign": -1,
+            "frame": TURNED.tolist(),
+            "position": lever.tolist(),
+        },
+        "pose": {
+            "file": "pose.parquet",
+            "time": {"column": "sec", "offset": float(epoch)},
+            "orientation": {"columns": ["q1", "q2", "q3", "q0"], "form": "quaternion_xyzw"},
+            "frame": TURNED.tolist(),
+        },
+    }
+    for place, value in changes.items():
+        *parents, last = place.split("__")
+        target = description
+        for key in parents:
+            target = target[key]
+        target[last] = value
+    path = folder / "log.yaml"
+    path.write_text(yaml.safe_dump(description), encoding="utf-8")
+    return path
+
+
+def test_streams_with_own_clocks_units_axes_and_signs(tmp_path: Path) -> None:
+    log = read_log(foreign(tmp_path), bandwidth_hz=60.0)
+    motion = motion_at(log.t + 0.013)
+    inner = slice(40, -40)
+    assert 1 / log.dt == pytest.approx(700, rel=0.01)
+    assert log.t[0] == pytest.approx(0.018, abs=1 / 700)
+    # Interpolation between jittered stamps is what limits these, not the conversions.
+    for found, expected, tolerance in (
+        (log.wrench, a_wrench(motion), 0.01),
+        (log.specific_force, motion.specific_force, 0.02),
+        (log.angular_velocity, motion.omega, 2e-3),
+        (log.angular_acceleration, motion.alpha, 0.15),
+        (log.gravity, np.einsum("nji,j->ni", motion.R_WS, GRAVITY_W), 5e-3),
+    ):
+        assert found is not None
+        np.testing.assert_allclose(found[inner], expected[inner], atol=tolerance)
+    assert log.notes == ()
+
+
+def test_base_axes_are_turned_by_the_orientation(tmp_path: Path) -> None:
+    motion = motion_at(T)
+    wrench_W = np.einsum("nij,nkj->nki", motion.R_WS, a_wrench(motion).reshape(-1, 2, 3))
+    s_W = np.einsum("nij,nj->ni", motion.R_WS, motion.specific_force)
+    np.savez(
+        tmp_path / "all.npz", t=T, w=wrench_W.reshape(-1, 6), s=s_W, R=motion.R_WS, n=T[:, None]
+    )
+    np.savez(tmp_path / "parts.npz", t=T, f=wrench_W[:, 0], tau=wrench_W[:, 1])
+    time = {"column": "t"}
+    description = {
+        "wrench": {
+            "file": "parts.npz",
+            "time": time,
+            "force": {"columns": ["f"]},
+            "torque": {"columns": ["tau"]},
+            "frame": "base",
+        },
+        "imu": {
+            "file": "all.npz",
+            "time": time,
+            "specific_force": {"columns": ["s"]},
+            "frame": "base",
+        },
+        "pose": {
+            "file": "all.npz",
+            "time": time,
+            "orientation": {"columns": ["R"], "form": "matrix"},
+        },
+    }
+    path = tmp_path / "log.yaml"
+    path.write_text(yaml.safe_dump(description), encoding="utf-8")
+    log = read_log(path)
+    np.testing.assert_allclose(log.wrench, a_wrench(motion), atol=1e-9)
+    np.testing.assert_allclose(log.specific_force, motion.specific_force, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"wrench__file": "none.csv"}, ["none.csv: no such file"]),
+        (
+            {"wrench__force__columns": ["F0", "F1", "FF2"]},
+            ["wrench.force.columns", "did you mean F2"],
+        ),
+        ({"wrench__force__columns": ["F0", "F1"]}, ["wrench.force.columns", "2 columns where 3"]),
+        ({"imu__specific_force__columns": ["clock"]}, ["imu.specific_force.columns", "1 columns"]),
+        (
+            {"wrench__time": {"column": "time", "unit": "ms"}},
+            ["do not overlap in time", "wrench 1.7e+12", "time.offset"],
+        ),
+        ({"pose__time": {"column": "sec"}}, ["do not overlap in time", "pose 0.03"]),
+        ({"pose__time": {"column": "q0"}}, ["pose.time", "do not increase", "going back"]),
+        (
+            {"pose__orientation": {"columns": ["q0", "q1", "q2"], "form": "quaternion_wxyz"}},
+            ["pose.orientation.columns", "3 columns where 4"],
+        ),
+        (
+            {"pose__orientation": {"columns": ["q0", "q1", "q2", "q2"], "form": "quaternion_wxyz"}},
+            ["pose.orientation", "is not a rotation", "form is quaternion_wxyz"],
+        ),
+        ({"wrench__frame": "base", "pose": None}, ["wrench.frame", "add a pose stream"]),
+        ({"imu__frame": "base", "pose": None}, ["imu.frame", "add a pose stream"]),
+    ],
+)
+def test_bad_streams(tmp_path: Path, changes: dict[str, Any], words: list[str]) -> None:
+    path = foreign(tmp_path, **changes)
+    with pytest.raises(DrakeTeleopError) as error:
+        read_log(path)
+    message = str(error.value)
+    assert str(tmp_path) in message
+    for word in [*words, ";"]:
+        assert word in message
+
+
+def test_nominal_rate_in_place_of_time_stamps(tmp_path: Path) -> None:
+    canonical("s", "omega").write_csv(tmp_path / "all.csv")
+    stream = {"file": "all.csv", "time": {"rate": 500.0}}
+    description = {
+        "wrench": stream
+        | {"force": {"columns": list(WRENCH[:3])}, "torque": {"columns": list(WRENCH[3:])}},
+        "imu": stream
+        | {
+            "specific_force": {"columns": list(SPECIFIC_FORCE)},
+            "angular_velocity": {"columns": list(ANGULAR_VELOCITY)},
+        },
+    }
+    path = tmp_path / "log.yaml"
+    path.write_text(yaml.safe_dump(description), encoding="utf-8")
+    log = read_log(path)
+    np.testing.assert_allclose(log.t, T, atol=1e-12)
+    np.testing.assert_allclose(log.specific_force, motion_at(T).specific_force, atol=1e-12)
+
+
+def test_a_gap_is_bridged_and_noted(tmp_path: Path) -> None:
+    frame = canonical("s", "omega")
+    pl.concat([frame[:500], frame[600:]]).write_csv(tmp_path / "log.csv")
+    log = read_log(tmp_path / "log.csv")
+    assert any("a gap of 0.202 s at 0.998 s" in note for note in log.notes)
+    assert log.t[-1] == pytest.approx(T[-1])
+
+
+def test_static_poses_from_gravity_or_orientation(tmp_path: Path) -> None:
+    motion = motion_at(np.linspace(0, 5, 12))
+    gravity = np.einsum("nji,j->ni", motion.R_WS, GRAVITY_W)
+    wrench_W = np.einsum("nij,nj->ni", motion.R_WS, -2 * gravity)
+    np.savez(
+        tmp_path / "x.npz", f=-2 * gravity, f_W=wrench_W, tau=0 * gravity, g=gravity, R=motion.R_WS
+    )
+    orientation = {"columns": ["R"], "form": "matrix"}
+    for force, extra in (
+        ("f", {"gravity": {"columns": ["g"]}}),
+        ("f", {"orientation": orientation}),
+        ("f_W", {"orientation": orientation, "frame": "base"}),
+    ):
+        stream = {"file": "x.npz", "force": {"columns": [force]}, "torque": {"columns": ["tau"]}}
+        path = tmp_path / "log.yaml"
+        path.write_text(yaml.safe_dump({"static": stream | extra}), encoding="utf-8")
+        log = read_log(path)
+        assert log.static
+        np.testing.assert_allclose(log.specific_force, -gravity, atol=1e-9)
+        np.testing.assert_allclose(log.wrench[:, :3], -2 * gravity, atol=1e-9)
+        assert not log.angular_velocity.any() and not log.angular_acceleration.any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"wrench": np.zeros((4, 5))}, r"wrench: has shape \(4, 5\), needs \(4, 6\)"),
+        ({"t": np.array([0.0, 1, 1, 2])}, "t: does not increase"),
+        ({"angular_velocity": np.full((4, 3), np.nan)}, "angular_velocity: holds NaN"),
+    ],
+)
+def test_a_log_that_cannot_be(changes: dict[str, Any], words: str) -> None:
+    good = {
+        "t": np.arange(4.0),
+        "wrench": np.zeros((4, 6)),
+        "specific_force": np.zeros((4, 3)),
+        "angular_velocity": np.zeros((4, 3)),
+        "angular_acceleration": np.zeros((4, 3)),
+    }
+    with pytest.raises(DrakeTeleopError, match=words):
+        Log(**good | changes)
+
+
+def test_ur5_gyroscope_agrees_with_the_pose(ur5: Path, tmp_path: Path) -> None:
+    """Files without header, a clock in ms and one in s, a rotation vector; IMU axes are the tool's.
+
+    The IMU's clock lags by 0.11 s, and its map to the tool's axes is the identity within 2.5 %.
+    """
+    time_ms, time_s = {"column": 0, "unit": "ms"}, {"column": 0}
+    record = f"{ur5}/No9_Singularity_Free_ForceSensor__"
+    description: dict[str, Any] = {
+        "wrench": {
+            "file": record + "log_force_sensor.csv",
+            "header": False,
+            "time": time_s,
+            "force": {"columns": [1, 2, 3]},
+            "torque": {"columns": [4, 5, 6]},
+        },
+        "imu": {
+            "file": record + "acc_data.csv",
+            "header": False,
+            "time": time_ms | {"offset": -0.11},
+            "specific_force": {"columns": [1, 2, 3]},
+            "angular_velocity": {"columns": [7, 8, 9]},
+        },
+        "pose": {
+            "file": record + "log_tool_vector.csv",
+            "header": False,
+            "time": time_s,
+            "orientation": {"columns": [4, 5, 6], "form": "rotation_vector"},
+            "position": {"columns": [1, 2, 3]},
+        },
+    }
+    path = tmp_path / "log.yaml"
+    path.write_text(yaml.safe_dump(description), encoding="utf-8")
+    both = read_log(path, bandwidth_hz=10.0)
+    del description["imu"]
+    path.write_text(yaml.safe_dump(description), encoding="utf-8")
+    posed = read_log(path, bandwidth_hz=10.0)
+    at = np.searchsorted(posed.t, both.t + 1e-9) - 1
+    omega = posed.angular_velocity[at]
+    moving = np.linalg.norm(omega, axis=1) > 0.2
+    scale = np.sum(both.angular_velocity[moving] * omega[moving]) / np.sum(omega[moving] ** 2)
+    assert scale == pytest.approx(1.0, abs=0.025)
+    error = (both.angular_velocity - omega)[moving]
+    assert np.sqrt(np.mean(error**2)) < 0.1 * np.sqrt(np.mean(omega[moving] ** 2))
+    tilt = low_pass(both.specific_force - posed.specific_force[at], both.dt, 1.0)
+    assert np.median(np.linalg.norm(tilt, axis=1)) < 0.6

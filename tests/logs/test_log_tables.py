@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.tables import read_table
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_csv_and_parquet_hold_the_same(tmp_path: Path) -> None:
+    frame = pl.DataFrame({"a": [1.0, 2.5], "b": [3, 4]})
+    frame.write_csv(tmp_path / "x.csv")
+    frame.write_parquet(tmp_path / "x.parquet")
+    for name in ("x.csv", "x.parquet"):
+        found = read_table(tmp_path / name).numbers(["b", "a"], 2, "here")
+        assert found.tolist() == [[3.0, 1.0], [4.0, 2.5]]
+
+
+def test_npz_array_counts_as_several_columns(tmp_path: Path) -> None:
+    matrices = np.arange(18.0).reshape(2, 3, 3)
+    np.savez(tmp_path / "x.npz", R=matrices, t=np.arange(2.0))
+    found = read_table(tmp_path / "x.npz").numbers(["R"], 9, "here")
+    assert found.tolist() == matrices.reshape(2, 9).tolist()
+
+
+def test_csv_without_header_is_addressed_by_number(tmp_path: Path) -> None:
+    table = read_table(write(tmp_path / "x.csv", "1,2,3\n4,5,6\n"), header=False)
+    assert table.numbers([2, 0], 2, "here").tolist() == [[3.0, 1.0], [6.0, 4.0]]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "columns", "words"),
+    [
+        ("x.csv", "force_x,t\n1,2\n", ["forcex"], ["no column 'forcex'", "did you mean force_x"]),
+        ("x.csv", "a,b\n1,2\n3,x7\n", ["b"], ["'x7' in row 3 is not a number", "x.csv:b"]),
+        ("x.csv", "a,b\n1,2\n3,\n", ["b"], ["no finite number in 1 rows, the first is row 3"]),
+        ("x.csv", "a,b\n1,2\n3,nan\n4,nan\n", ["b"], ["in 2 rows, the first is row 3"]),
+        ("x.csv", "a,b\n1,2\n3,inf\n", ["b"], ["no finite number"]),
+        ("x.csv", "a,b\n1,2\n3,4,5\n", ["b"], ["cannot be read"]),
+        ("x.csv", "a,b\n1,2\n", ["a", "b"], ["2 columns where 1 are needed", "here:"]),
+        ("x.csv", "a,b\n", ["a"], ["holds no rows"]),
+        ("x.csv", "", ["a"], ["cannot be read"]),
+        ("x.parquet", "no parquet", ["a"], ["cannot be read", "valid .parquet"]),
+        ("x.npz", "no npz", ["a"], ["cannot be read"]),
+        ("x.xls", "", ["a"], ["'.xls' is not known", ".parquet"]),
+    ],
+)
+def test_errors_name_file_and_remedy(
+    tmp_path: Path, name: str, text: str, columns: list[str], words: list[str]
+) -> None:
+    path = write(tmp_path / name, text)
+    with pytest.raises(DrakeTeleopError) as error:
+        read_table(path).numbers(columns, 1, "here")
+    for word in [*words, ";"]:
+        assert word in str(error.value)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(DrakeTeleopError, match=r"none\.csv: no such file"):
+        read_table(tmp_path / "none.csv")
+
+
+def test_columns_of_different_length(tmp_path: Path) -> None:
+    np.savez(tmp_path / "x.npz", a=np.zeros(3), b=np.zeros(4))
+    with pytest.raises(DrakeTeleopError, match=r"differ in length \(a: 3, b: 4\)"):
+        read_table(tmp_path / "x.npz").numbers(["a", "b"], 2, "here")
