@@ -64,7 +64,9 @@ _FRICTION_SPEED = 0.01  # rad/s, E
 # End stops, a spring and a damper that never pulls back, E: 7 kN/m at the tip.
 _STOP_STIFFNESS, _STOP_DAMPING = 300.0, 1.5  # N m/rad, N m s/rad, main axes
 _WRIST_STOP_STIFFNESS, _WRIST_STOP_DAMPING = 5.0, 0.01
-_LARGEST_PERIOD = 1e-3  # s; the stiffest part, friction at the bare wrist, is stable up to 1.3 ms
+_LARGEST_PERIOD = 1e-3  # s, slower than any haptic device
+# The Runge-Kutta step is stable up to 2.8 for (friction's slope / inertia) * period.
+_LARGEST_FRICTION_STEP = 2.0
 
 # M11 = _YAW_CONSTANT + _YAW_2 cos 2 q2 + _YAW_3 cos 2 q3 + 2 _COUPLING cos q2 sin q3.
 _YAW_CONSTANT = INERTIA_BASE_YY + 0.5 * (
@@ -427,6 +429,16 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return q
 
 
+def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The joint angles of the serial tree in `phantom.sdf` for the device's q (..., 6).
+
+    The tree's third joint turns relative to the inner link, the device's q3 is absolute.
+    """
+    serial = np.array(q, dtype=float)
+    serial[..., 2] -= serial[..., 1]
+    return serial
+
+
 def _check_limits(q: NDArray[np.float64]) -> None:
     margin = 1e-9
     for i in range(6):
@@ -442,6 +454,18 @@ def _check_limits(q: NDArray[np.float64]) -> None:
             f"q2 - q3 would be {np.degrees(q[1] - q[2]):.1f} degrees, its range is -55 to 65",
             where="pose_master",
             remedy="choose a start pose inside the device's workspace",
+        )
+
+
+def _check_friction(friction: JointFriction, M: NDArray[np.float64], period: float) -> None:
+    slope = np.array(friction.coulomb) / _FRICTION_SPEED + np.array(friction.viscous)
+    rate = float(np.max(np.linalg.eigvals(np.linalg.solve(M, np.diag(slope))).real))
+    if rate * period > _LARGEST_FRICTION_STEP:
+        raise DrakeTeleopError(
+            f"the joints' friction stops the device within {1e3 / rate:.2g} ms, too fast for a "
+            f"period of {1e3 * period:g} ms",
+            where="master.friction",
+            remedy="choose less friction (N m, N m s/rad) or a higher hand rate",
         )
 
 
@@ -472,7 +496,8 @@ class MasterDevice(LeafSystem):
         friction: joint friction.
 
     Raises:
-        DrakeTeleopError: if the period is too long or the start is beyond a joint's limit.
+        DrakeTeleopError: if the period is too long, for the device or for its friction, or the
+            start is beyond a joint's limit.
     """
 
     def __init__(
@@ -493,6 +518,7 @@ class MasterDevice(LeafSystem):
             )
         _check_limits(q_initial)
         friction = friction or JointFriction()
+        _check_friction(friction, mass_matrix(q_initial, hand_mass, hand_inertia), period)
         self._period = period
         self._parameters = np.array(
             [hand_mass, hand_inertia, *friction.coulomb, *friction.viscous], dtype=float

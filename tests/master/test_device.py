@@ -343,3 +343,15 @@ def test_a_slow_period_or_a_start_beyond_a_limit_is_refused():
         device.MasterDevice(
             5e-4, hand_mass=0.1, hand_inertia=1e-4, q_initial=np.array([2.0, 0, 0, 0, 0, 0])
         )
+
+
+def test_friction_that_the_step_cannot_follow_is_refused():
+    friction = device.JointFriction(viscous=[5e-4, 5e-4, 5e-4, 5e-5, 5e-5, 2.0])
+    with pytest.raises(DrakeTeleopError, match=r"master\.friction"):
+        device.MasterDevice(5e-4, hand_mass=0.1, hand_inertia=1e-4, friction=friction)
+
+
+def test_serial_joint_angles_turn_the_outer_link_relative_to_the_inner():
+    q = np.array([[0.1, 0.2, 0.5, 0.4, 0.5, 0.6], [0.0, -0.3, 0.1, 0.0, 0.0, 0.0]])
+    expected = [[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.0, -0.3, 0.4, 0.0, 0.0, 0.0]]
+    np.testing.assert_allclose(device.serial_joint_angles(q), expected, atol=1e-15)
