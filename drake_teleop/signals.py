@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from drake_teleop.result import Signal
 
-#: Log sinks are named after their signal, with this in front.
-LOG_PREFIX = "log_"
+#: Name of the one log sink in a station; it holds the station's output ports side by side.
+LOG = "log"
 
 
 def _signal(name: str, components: str, units: str, description: str) -> Signal:

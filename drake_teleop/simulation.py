@@ -8,12 +8,11 @@ import numpy as np
 from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Diagram
-from pydrake.systems.primitives import VectorLogSink
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Simulation
-from drake_teleop.signals import LOG_PREFIX, SIGNALS
+from drake_teleop.signals import LOG, SIGNALS
 
 # Long enough to keep progress cheap, short enough to look alive.
 _PROGRESS_STEP = 0.02
@@ -70,13 +69,12 @@ def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
 
 def read_log(simulator: Simulator, start: float) -> SimulationResult:
     """The recorded signals from `start` [s] on, with t = 0 there."""
-    context = simulator.get_context()
-    logs = {
-        system.get_name().removeprefix(LOG_PREFIX): system.FindLog(context)
-        for system in simulator.get_system().GetSystems()
-        if isinstance(system, VectorLogSink)
-    }
-    t = next(iter(logs.values())).sample_times() - start
+    diagram = simulator.get_system()
+    log = diagram.GetSubsystemByName(LOG).FindLog(simulator.get_context())
+    t = log.sample_times() - start
     kept = t > -1e-9
-    signals = {name: log.data().T[kept] for name, log in logs.items()}
-    return SimulationResult(t[kept], signals, [SIGNALS[name] for name in logs])
+    ports = [diagram.get_output_port(index) for index in range(diagram.num_output_ports())]
+    ends = np.cumsum([port.size() for port in ports])
+    columns = np.split(log.data().T[kept], ends[:-1], axis=1)
+    signals = dict(zip((port.get_name() for port in ports), columns, strict=True))
+    return SimulationResult(t[kept], signals, [SIGNALS[name] for name in signals])

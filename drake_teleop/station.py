@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, Multiplexer
 
 from drake_teleop.channel.delay import DelayChannel
 from drake_teleop.environment.contact import ToolContact
@@ -24,7 +24,7 @@ from drake_teleop.scaling.force_scaling import ForceScaling
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.scaling.wrench_mapping import WrenchToMaster
 from drake_teleop.scenario import Scenario
-from drake_teleop.signals import LOG_PREFIX
+from drake_teleop.signals import LOG
 from drake_teleop.slave.inverse_kinematics import InverseKinematics
 from drake_teleop.slave.joint_control import JointControl
 from drake_teleop.slave.joint_limits import JointLimitMonitor
@@ -69,8 +69,8 @@ _TELEOP_WIRES = (
     ("force_display.motor_torque", "master_device.motor_torque"),
 )
 
-#: Signal of the log -> port. The names are explained in `drake_teleop.signals`.
-_SLAVE_LOG = {
+#: Signal -> port; `drake_teleop.signals` says what each one is.
+_SLAVE_SIGNALS = {
     "measured_wrench_S": "wrist_sensor.measured_wrench_S",
     "specific_force_S": "wrist_sensor.specific_force_S",
     "angular_velocity_S": "wrist_sensor.angular_velocity_S",
@@ -80,11 +80,11 @@ _SLAVE_LOG = {
     "slave_state": "slave_plant.rx90_state",
     "joint_torque": "joint_control.joint_torque",
 }
-_CONTACT_LOG = {
+_CONTACT_SIGNALS = {
     "true_contact_wrench_W": "tool_contact.true_contact_wrench_W",
     "sheet_state": "slave_plant.sheet_spring_state",
 }
-_TELEOP_LOG = {
+_TELEOP_SIGNALS = {
     "intent": "operator.intent",
     "hand_wrench_E": "operator.hand_wrench_E",
     "master_state": "master_device.state",
@@ -101,25 +101,43 @@ _TELEOP_LOG = {
 }
 
 
+_LIMIT_CHECK_PERIOD = 0.01
+
+
 def MakeTeleopStation(
     scenario: Scenario, *, load_estimate: NDArray[np.float64] | None = None
 ) -> Diagram:
     """Builds the bilateral station: operator, master, channel, slave, sensor, elimination.
 
-    It records the signals of `drake_teleop.signals` and exports the ports that other diagrams
-    may want.
+    Every output port is a signal of `drake_teleop.signals`, exported and recorded.
 
     .. pydrake_system::
 
-        name: TeleopStation
+        name: teleop_station
         output_ports:
-        - pose_master
-        - pose_command
-        - force_to_master
         - measured_wrench_S
+        - specific_force_S
+        - angular_velocity_S
+        - angular_acceleration_S
+        - saturated
+        - load_estimate
+        - slave_state
+        - joint_torque
+        - true_contact_wrench_W (with a sheet spring)
+        - sheet_state (with a sheet spring)
+        - intent
+        - hand_wrench_E
+        - master_state
+        - pose_master
+        - twist_master
+        - pose_command
+        - joint_command
+        - ik_status
         - scaled_wrench_S
         - contact_wrench_S
-        - load_estimate
+        - non_contact_wrench_S
+        - force_to_master
+        - motor_torque
 
     Args:
         scenario: what the station is made of.
@@ -138,7 +156,7 @@ def MakeTeleopStation(
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix()
 
     builder = DiagramBuilder()
-    slave = AddSlave(builder, scenario, load_estimate)
+    slave, slave_signals = AddSlave(builder, scenario, load_estimate)
     blocks = {
         "operator": Operator(scenario.operator, start_B),
         "master_device": MasterDevice(
@@ -162,18 +180,7 @@ def MakeTeleopStation(
     for name, block in blocks.items():
         builder.AddNamedSystem(name, block)
     _connect(builder, _TELEOP_WIRES)
-    _record(builder, _TELEOP_LOG, scenario.rates.log_hz)
-    for port in (
-        "master_device.pose_master",
-        "kinematic_scaling.pose_command",
-        "force_display.force_to_master",
-        "wrist_sensor.measured_wrench_S",
-        "force_scaling.scaled_wrench_S",
-        "force_scaling.contact_wrench_S",
-        "load_estimator.load_estimate",
-    ):
-        builder.ExportOutput(_output(builder, port), port.partition(".")[2])
-    return _named(builder.Build(), "teleop_station")
+    return _finish(builder, "teleop_station", slave_signals | _TELEOP_SIGNALS, scenario)
 
 
 def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
@@ -184,23 +191,26 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
     """
     scenario.check()
     builder = DiagramBuilder()
-    slave = AddSlave(builder, scenario, None)
+    slave, signals = AddSlave(builder, scenario, None)
     start, _, _ = trajectory.evaluate(0.0)
     slave.plant.SetDefaultPositions(slave.instance, start)
     builder.AddNamedSystem(
         "joint_trajectory", JointTrajectory(trajectory, scenario.simulation.settle)
     )
     _connect(builder, [("joint_trajectory.joint_command", "joint_control.joint_command")])
-    _record(builder, {"joint_command": "joint_trajectory.joint_command"}, scenario.rates.log_hz)
-    return _named(builder.Build(), "identification_station")
+    signals |= {"joint_command": "joint_trajectory.joint_command"}
+    return _finish(builder, "identification_station", signals, scenario)
 
 
 def AddSlave(
     builder: DiagramBuilder, scenario: Scenario, load_estimate: NDArray[np.float64] | None
-) -> SlavePlant:
-    """Adds the slave: plant, joint control, wrist sensor, load estimator, monitor, their log.
+) -> tuple[SlavePlant, dict[str, str]]:
+    """Adds the slave: plant, joint control, wrist sensor, load estimator, monitor.
 
     What remains open is the input `joint_control.joint_command`.
+
+    Returns:
+        The plant, and the signals that can be recorded: name -> "system.port".
     """
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave.position, scenario.sheet_spring)
@@ -208,7 +218,7 @@ def AddSlave(
         "joint_control": JointControl(
             slave.arm, scenario.joint_control, 1 / rates.joint_control_hz
         ),
-        "joint_limits": JointLimitMonitor(slave.arm, 1 / rates.log_hz),
+        "joint_limits": JointLimitMonitor(slave.arm, _LIMIT_CHECK_PERIOD),
         "wrist_sensor": MakeWristSensor(slave.arm, slave.tool, sensor, 1 / rates.sensor_hz),
         "load_estimator": LoadEstimator(
             scenario.load_estimator,
@@ -220,12 +230,11 @@ def AddSlave(
     for name, block in blocks.items():
         builder.AddNamedSystem(name, block)
     _connect(builder, _SLAVE_WIRES)
-    _record(builder, _SLAVE_LOG, rates.log_hz)
-    if slave.sheet is not None:
-        builder.AddNamedSystem("tool_contact", ToolContact(slave.tool))
-        _connect(builder, _CONTACT_WIRES)
-        _record(builder, _CONTACT_LOG, rates.log_hz)
-    return slave
+    if slave.sheet is None:
+        return slave, _SLAVE_SIGNALS
+    builder.AddNamedSystem("tool_contact", ToolContact(slave.tool))
+    _connect(builder, _CONTACT_WIRES)
+    return slave, _SLAVE_SIGNALS | _CONTACT_SIGNALS
 
 
 def _connect(builder: DiagramBuilder, wires: Iterable[tuple[str, ...]]) -> None:
@@ -242,11 +251,18 @@ def _output(builder: DiagramBuilder, name: str):  # type: ignore[no-untyped-def]
     return builder.GetSubsystemByName(system).GetOutputPort(port)
 
 
-def _record(builder: DiagramBuilder, signals: Mapping[str, str], rate: float) -> None:
-    for signal, port in signals.items():
-        LogVectorOutput(_output(builder, port), builder, 1 / rate).set_name(LOG_PREFIX + signal)
-
-
-def _named(diagram: Diagram, name: str) -> Diagram:
+def _finish(
+    builder: DiagramBuilder, name: str, signals: Mapping[str, str], scenario: Scenario
+) -> Diagram:
+    """Exports the signals, records them in that order, and builds."""
+    ports = [_output(builder, port) for port in signals.values()]
+    # One wide log: at 8 kHz each further system with events of its own costs time at every step.
+    wide = builder.AddNamedSystem("log_input", Multiplexer([port.size() for port in ports]))
+    for index, (signal, port) in enumerate(zip(signals, ports, strict=True)):
+        builder.ExportOutput(port, signal)
+        builder.Connect(port, wide.get_input_port(index))
+    log = LogVectorOutput(wide.get_output_port(), builder, 1 / scenario.rates.log_hz)
+    log.set_name(LOG)
+    diagram = builder.Build()
     diagram.set_name(name)
     return diagram

@@ -1,6 +1,7 @@
 """The paper's 'Force scaling/elimination' block (Figs. 2 and 4)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +9,12 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.compensation import contact_wrench, scaled_wrench_into, scales_from_eta
+from drake_teleop.load.compensation import scaled_wrench_into, scales_from_eta
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.quantities import quantity
+
+#: sigma_gripper, sigma_object, gamma that leave the contact wrench alone, Eq. (13).
+_ELIMINATION = (0.0, 0.0, 1.0)
 
 
 @dataclass
@@ -88,33 +92,31 @@ class ForceScaling(LeafSystem):
         parameter = context.get_mutable_numeric_parameter(self._scales)
         parameter.SetFromVector([sigma_gripper, sigma_object, gamma])
 
-    def _split(self, phi: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        if self._gripper_phi is None:
-            return phi, np.zeros(10)
-        return self._gripper_phi, phi - self._gripper_phi
-
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
+        self._scale(context, context.get_numeric_parameter(self._scales).value(), output)
+
+    def _calc_contact(self, context: Context, output: BasicVector) -> None:
+        self._scale(context, _ELIMINATION, output)
+
+    def _scale(self, context: Context, scales: Sequence[float], output: BasicVector) -> None:
         estimate = self._estimate.Eval(context)
-        sigma_gripper, sigma_object, gamma = context.get_numeric_parameter(self._scales).value()
+        phi_gripper = estimate[6:] if self._gripper_phi is None else self._gripper_phi
+        s, omega, alpha = self._motion
         scaled_wrench_into(
             self._measured.Eval(context),
             estimate[:6],
-            *(port.Eval(context) for port in self._motion),
-            *self._split(estimate[6:]),
-            sigma_gripper,
-            sigma_object,
-            gamma,
+            s.Eval(context),
+            omega.Eval(context),
+            alpha.Eval(context),
+            phi_gripper,
+            estimate[6:] - phi_gripper,
+            scales[0],
+            scales[1],
+            scales[2],
             output.get_mutable_value(),
         )
 
-    def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        estimate = self._estimate.Eval(context)
-        motion = (port.Eval(context) for port in self._motion)
-        output.SetFromVector(
-            contact_wrench(self._measured.Eval(context), estimate[:6], *motion, estimate[6:])
-        )
-
     def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
-        motion = (port.Eval(context) for port in self._motion)
+        s, omega, alpha = (port.Eval(context) for port in self._motion)
         phi = self._estimate.Eval(context)[6:]
-        non_contact_wrench_into(*motion, phi, output.get_mutable_value())
+        non_contact_wrench_into(s, omega, alpha, phi, output.get_mutable_value())

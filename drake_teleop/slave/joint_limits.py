@@ -25,13 +25,11 @@ class JointLimitMonitor(LeafSystem):
 
     def _watch(self, context: Context) -> EventStatus:
         q = self._state.Eval(context)[: self._arm.num_joints]
-        outside = (q < self._arm.lower) | (q > self._arm.upper)
-        # A comparison with NaN is false: ask for it separately.
-        if not outside.any() and (q == q).all():
+        # A comparison with NaN is false, so a lost joint is outside too.
+        inside = (q >= self._arm.lower) & (q <= self._arm.upper)
+        if inside.all():
             return EventStatus.DidNothing()
-        if not (q == q).all():
-            return EventStatus.Failed(self, "the slave's joint angles are not finite")
-        joint = int(outside.argmax())
+        joint = int(inside.argmin())
         return EventStatus.Failed(
             self,
             f"joint {joint + 1} of the slave left its range at {context.get_time():.3f} s: "

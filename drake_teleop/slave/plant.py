@@ -20,8 +20,8 @@ from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
 
 #: S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-#: A bent elbow; the branch nearest to it is home.
-_Q_NEAR_HOME = np.array([0.0, 0.6, 1.2, 0.0, 1.3, 0.0])
+#: Elbow up, reaching forward (negative q2 and q3 lean towards +x); the branch nearest to it is home.
+_Q_NEAR_HOME = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
 
 @dataclass(frozen=True)
