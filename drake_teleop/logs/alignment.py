@@ -171,17 +171,6 @@ def low_passed(log: Log, cutoff_hz: float | None) -> Log:
     )
 
 
-def decimated(log: Log, cutoff_hz: float | None) -> Log:
-    """Every k-th sample of a low-passed log, k as large as twice the cut-off rate allows.
-
-    More samples than that are no more information, and a covariance that counts them is too small.
-    """
-    if log.static or cutoff_hz is None:
-        return log
-    step = max(1, math.floor(1 / (2 * cutoff_hz * log.dt)))
-    return _rows(log, slice(None, None, step))
-
-
 def undelayed(log: Log, delay_s: float) -> Log:
     """The log with its motion moved forward in time by `delay_s`, at the instants of the wrench.
 

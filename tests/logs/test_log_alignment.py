@@ -2,13 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import motion_at
+from known_motion import motion_at
 
 from drake_teleop.logs.alignment import (
     angular_motion,
-    decimated,
     low_pass,
-    low_passed,
     noise_gain,
     resample,
     smooth_derivatives,
@@ -81,13 +79,6 @@ def test_undelayed_moves_the_motion_and_not_the_wrench() -> None:
     np.testing.assert_allclose(back.specific_force, now.specific_force, atol=1e-3)
     np.testing.assert_allclose(back.angular_velocity, now.omega, atol=1e-3)
     np.testing.assert_allclose(back.angular_acceleration, now.alpha, atol=1e-2)
-
-
-def test_decimated_to_twice_the_cutoff() -> None:
-    log = a_log(np.arange(0, 2, 0.001))
-    thin = decimated(low_passed(log, 30.0), 30.0)
-    assert 1 / thin.dt == pytest.approx(62.5)
-    assert decimated(log, None) is log
 
 
 def test_uniform_times_removes_jitter_only() -> None:

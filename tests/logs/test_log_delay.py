@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import motion_at
+from known_motion import motion_at
 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
@@ -46,7 +46,7 @@ def test_delay_of_a_sensor_at_rest_is_not_made_up(duration: float, phi: np.ndarr
     for seed in range(10):
         rng = np.random.default_rng(seed)
         t = np.arange(0, duration, 1e-3)
-        s = [0, 0, 9.8] + 0.05 * rng.normal(size=(len(t), 3))
+        s = np.array([0, 0, 9.8]) + 0.05 * rng.normal(size=(len(t), 3))
         rest = np.zeros((len(t), 3))
         log = Log(t, rng.normal(size=(len(t), 6)), s, rest, rest)
         assert estimate_delay(log, 30.0, phi) is None

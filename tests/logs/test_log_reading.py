@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from conftest import GRAVITY_W, Motion, motion_at, quaternions
+from known_motion import GRAVITY_W, Motion, motion_at, quaternions
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.alignment import low_pass

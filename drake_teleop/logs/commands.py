@@ -1,0 +1,308 @@
+"""What `drake-teleop identify` and `drake-teleop eliminate` do, as functions.
+
+Names in the summaries (and in summary.json); forces in N, torques in N m, frame S:
+
+====================== ==========================================================================
+both
+====================== ==========================================================================
+log                    the file that was read
+samples, duration_s    samples used, and the time that they span
+rate_hz                of the log on its common clock; 0 for static poses
+cutoff_hz              zero-phase low-pass on everything; null if there was none
+delay_s                how far the motion lags behind the wrench; it was moved forward by this
+delay_source           "given", "estimated" (from this record), "load" (of the load file, because
+                       this record does not determine it), "undetermined" (0 was used), or
+                       "static" (poses at rest have none)
+notes                  what had to be assumed, in words
+====================== ==========================================================================
+
+====================== ==========================================================================
+identify
+====================== ==========================================================================
+mass, mass_std         kg; standard deviations are null for what is not determined at all
+com, com_std           m; the standard deviation is of com with the mass held
+inertia_com            kg m^2, about the centre of mass, axes of S
+offsets, offsets_std   [f; tau]
+phi, phi_std           Eq. (6), in the order of this project
+identifiable           the names of what the record determines
+not_identifiable       the names of what it does not: do not use their values
+physically_consistent  whether phi belongs to a possible body
+condition_number       of the regression
+residual_rms           [f; tau], after the fit
+residual_rms_force     of |F|
+====================== ==========================================================================
+
+========================= =======================================================================
+eliminate
+========================= =======================================================================
+load                      the identification file
+sigma, gamma, eta         as given
+tare                      [f; tau], offsets of this record minus those of the load file
+tare_fraction             share of the samples that the offsets were taken from (those that agree)
+raw_rms                   rms of |F| with the offsets removed and nothing else
+gravity_only_rms          rms of |F| with offsets and m g removed; null if no orientation is known
+residual_rms              rms of |F_c|, the contact force: in free motion, what is left
+residual_peak             largest |F_c|
+raw_torque_rms ...        the same four of the torque
+raw_rms_per_channel ...   the same four of each channel [f; tau]
+========================= =======================================================================
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.logs.canonical import WRENCH, Log
+from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
+
+
+def identify_command(
+    log: Path,
+    out: Path,
+    *,
+    cutoff_hz: float | None = 30.0,
+    delay: str | float = "auto",
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """`identify_log`, writing identification.json, fit.png and summary.json into `out`.
+
+    Returns:
+        the summary; its names are explained at the top of this module.
+    """
+    found = identify_log(log, cutoff_hz=cutoff_hz, delay=delay)
+    result = found.identification
+    deviations = np.asarray(result.standard_deviations)
+    summary = _common(log, found.log, cutoff_hz, result.delay_s, found.delay_source) | {
+        "samples": result.samples,
+        "mass": result.mass,
+        "mass_std": deviations[6],
+        "com": result.com,
+        "com_std": deviations[7:10] / result.mass,
+        "inertia_com": result.inertia_com,
+        "offsets": result.offsets,
+        "offsets_std": deviations[:6],
+        "phi": result.phi,
+        "phi_std": deviations[6:],
+        "identifiable": _named(result, True),
+        "not_identifiable": _named(result, False),
+        "physically_consistent": result.physically_consistent,
+        "condition_number": result.condition_number,
+        "residual_rms": result.residual_rms,
+        "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
+    }
+    summary = _plain(summary)
+    from drake_teleop.logs.pictures import draw_fit
+
+    out.mkdir(parents=True, exist_ok=True)
+    result.save(out / "identification.json")
+    draw_fit(found).savefig(out / "fit.png")
+    _write_summary(out, summary)
+    if not quiet:
+        _print_identification(summary, out)
+    return summary
+
+
+def eliminate_command(
+    log: Path,
+    load: Path,
+    out: Path,
+    *,
+    sigma: float = 0.0,
+    gamma: float = 1.0,
+    eta: float | None = None,
+    cutoff_hz: float | None = 30.0,
+    delay: str | float = "auto",
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """`eliminate_log`, writing contact_wrench.parquet, contact_wrench.png and summary.json.
+
+    The Parquet table has `t` and, for each channel such as f_x, `contact_f_x`, `scaled_f_x`,
+    `non_contact_f_x` and `measured_f_x` (offsets removed).
+
+    Returns:
+        the summary; its names are explained at the top of this module.
+    """
+    load_file = Identification.load(load)
+    found = eliminate_log(
+        log,
+        load_file,
+        sigma=sigma,
+        gamma=gamma,
+        eta=eta,
+        cutoff_hz=cutoff_hz,
+        delay=delay,
+    )
+    summary = _common(log, found.log, cutoff_hz, found.delay_s, found.delay_source) | {
+        "load": str(load),
+        "sigma": sigma,
+        "gamma": gamma,
+        "eta": eta,
+        "tare": found.offsets - load_file.offsets,
+        "tare_fraction": found.tare_fraction,
+    }
+    if found.point_mass:
+        summary["notes"].append(
+            f"{', '.join(found.point_mass)} of the load file are not identifiable: those of a point"
+            " mass are used"
+        )
+    if found.tare_fraction < 0.5:
+        summary["notes"].append(
+            "less than half of the record agrees on the sensor's offsets: if it is in contact most"
+            " of the time, the contact wrench may be off by a constant"
+        )
+    summary = _plain(summary | _rms_figures(found))
+    from drake_teleop.logs.pictures import draw_elimination
+
+    out.mkdir(parents=True, exist_ok=True)
+    _write_wrenches(found, out / "contact_wrench.parquet")
+    draw_elimination(found).savefig(out / "contact_wrench.png")
+    _write_summary(out, summary)
+    if not quiet:
+        _print_elimination(summary, out)
+    return summary
+
+
+def _common(
+    path: Path, log: Log, cutoff_hz: float | None, delay_s: float, source: str
+) -> dict[str, Any]:
+    return {
+        "log": str(path),
+        "samples": len(log),
+        "duration_s": 0.0 if log.static else float(log.t[-1] - log.t[0]),
+        "rate_hz": 0.0 if log.static else 1 / log.dt,
+        "cutoff_hz": None if log.static else cutoff_hz,
+        "delay_s": delay_s,
+        "delay_source": source,
+        "notes": list(log.notes),
+    }
+
+
+def _named(result: Identification, identifiable: bool) -> list[str]:
+    pairs = zip(PARAMETERS, result.identifiable, strict=True)
+    return [name for name, flag in pairs if bool(flag) == identifiable]
+
+
+def _rms_figures(found: EliminatedLog) -> dict[str, Any]:
+    def rms(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.sqrt(np.mean(x**2, axis=0))
+
+    def peak(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.abs(x).max(axis=0)
+
+    return (
+        _reduced("raw", "rms", found.measured, rms)
+        | _reduced("gravity_only", "rms", found.gravity_only, rms)
+        | _reduced("residual", "rms", found.contact, rms)
+        | _reduced("residual", "peak", found.contact, peak)
+    )
+
+
+def _reduced(
+    name: str,
+    suffix: str,
+    wrench: NDArray[np.float64] | None,
+    reduce: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+) -> dict[str, Any]:
+    keys = (f"{name}_{suffix}", f"{name}_torque_{suffix}", f"{name}_{suffix}_per_channel")
+    if wrench is None:
+        return dict.fromkeys(keys)
+    norms = [reduce(np.linalg.norm(part, axis=1)) for part in (wrench[:, :3], wrench[:, 3:])]
+    return dict(zip(keys, [*norms, reduce(wrench)], strict=True))
+
+
+def _plain(value: Any) -> Any:
+    """The same with lists and numbers of Python instead of numpy's, and null for infinity."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    return None if value == float("inf") else value
+
+
+def _write_summary(out: Path, summary: dict[str, Any]) -> None:
+    (out / "summary.json").write_text(
+        json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8"
+    )
+
+
+def _write_wrenches(found: EliminatedLog, path: Path) -> None:
+    import polars as pl
+
+    columns = {"t": found.log.t}
+    for name in ("contact", "scaled", "non_contact", "measured"):
+        values = getattr(found, name)
+        columns |= {f"{name}_{c}": values[:, i] for i, c in enumerate(WRENCH)}
+    pl.DataFrame(columns).write_parquet(path)
+
+
+def _print_identification(summary: dict[str, Any], out: Path) -> None:
+    from rich.table import Table
+
+    table = Table(title=f"Load identified from {Path(summary['log']).name}", title_justify="left")
+    for heading in ("", "value", "std", "unit"):
+        table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
+    rows = [("mass", summary["mass"], summary["mass_std"], 1.0, "kg", "m")]
+    rows += [
+        (f"com {axis}", summary["com"][i], summary["com_std"][i], 1e3, "mm", f"m c_{axis}")
+        for i, axis in enumerate("xyz")
+    ]
+    rows += [
+        (name, summary["phi"][4 + i], summary["phi_std"][4 + i], 1e3, "g m^2", name)
+        for i, name in enumerate(PARAMETERS[10:])
+    ]
+    rows += [
+        (name, value, std, 1.0, "N" if i < 3 else "N m", name)
+        for i, (name, value, std) in enumerate(
+            zip(PARAMETERS[:6], summary["offsets"], summary["offsets_std"], strict=True)
+        )
+    ]
+    for label, value, std, scale, unit, name in rows:
+        if name in summary["identifiable"]:
+            table.add_row(label, f"{value * scale:.4f}", f"{std * scale:.4f}", unit)
+        else:
+            table.add_row(f"[dim]{label}", "[dim]not identifiable", "", "")
+    figures = (
+        f"residual {summary['residual_rms_force']:.4g} N rms of |F|,"
+        f" condition number {summary['condition_number']:.3g}, {summary['samples']} samples"
+    )
+    _print(table, figures, summary, out)
+
+
+def _print_elimination(summary: dict[str, Any], out: Path) -> None:
+    from rich.table import Table
+
+    table = Table(title=f"Contact wrench in {Path(summary['log']).name}", title_justify="left")
+    for heading in ("rms of", "|F| [N]", "|tau| [N m]"):
+        table.add_column(heading, justify="left" if heading == "rms of" else "right")
+    for label, name in (
+        ("measured, without offsets", "raw"),
+        ("less static weight only", "gravity_only"),
+        ("less the non-contact wrench", "residual"),
+    ):
+        force, torque = summary[f"{name}_rms"], summary[f"{name}_torque_rms"]
+        if force is not None:
+            table.add_row(label, f"{force:.4g}", f"{torque:.4g}")
+    _print(table, f"largest contact force {summary['residual_peak']:.4g} N", summary, out)
+
+
+def _print(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+
+    lines = [figures]
+    if summary["delay_source"] != "static":
+        delay = f"{summary['delay_s'] * 1e3:.2f} ms behind the wrench ({summary['delay_source']})"
+        lines.append(f"motion {delay}")
+    lines += [f"note: {note}" for note in summary["notes"]]
+    console = Console()
+    console.print(table)
+    for line in [*lines, f"written to {out}"]:
+        console.print(line, highlight=False, markup=False)

@@ -1,0 +1,247 @@
+"""Identification and elimination on recorded logs, as functions from files to arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta
+from drake_teleop.load.identification import PARAMETERS, Identification, identify
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.alignment import low_pass, low_passed, undelayed
+from drake_teleop.logs.canonical import Log
+from drake_teleop.logs.delay import estimate_delay
+from drake_teleop.logs.reading import read_log
+
+
+@dataclass(frozen=True)
+class IdentifiedLog:
+    """A log and what was identified from it.
+
+    Args:
+        log: the samples that were used: delay taken out, low-passed.
+        identification: the result.
+        predicted: (N, 6) offsets + V phi at the same instants.
+        delay_source: as in the summary: "estimated", "given" ...
+    """
+
+    log: Log
+    identification: Identification
+    predicted: NDArray[np.float64]
+    delay_source: str
+
+
+@dataclass(frozen=True)
+class EliminatedLog:
+    """A log without its non-contact wrench. All arrays are low-passed and in S, sign of Eq. (1).
+
+    Args:
+        log: the log with its delay taken out; not low-passed.
+        phi: (10,) the load that was used, see `usable_phi`.
+        point_mass: names of the inertias that are not of the load file but of a point mass.
+        offsets: (6,) of this record.
+        tare_fraction: share of the samples that `offsets` were taken from; 1 if not tared.
+        delay_s: how far the motion lagged behind the wrench [s].
+        delay_source: as in the summary: "estimated", "given" ...
+        measured: (N, 6) wrench without offsets.
+        non_contact: (N, 6) V phi.
+        contact: (N, 6) Eq. (13).
+        scaled: (N, 6) gamma F_c + sigma V phi.
+        gravity_only: (N, 6) wrench without offsets and static weight, or None if the orientation
+            is not known.
+    """
+
+    log: Log
+    phi: NDArray[np.float64]
+    point_mass: tuple[str, ...]
+    offsets: NDArray[np.float64]
+    tare_fraction: float
+    delay_s: float
+    delay_source: str
+    measured: NDArray[np.float64]
+    non_contact: NDArray[np.float64]
+    contact: NDArray[np.float64]
+    scaled: NDArray[np.float64]
+    gravity_only: NDArray[np.float64] | None
+
+
+def identify_log(
+    path: str | Path, *, cutoff_hz: float | None = 30.0, delay: str | float = "auto"
+) -> IdentifiedLog:
+    """Identifies the load and the sensor's offsets from a log.
+
+    Wrench and motion pass the same zero-phase low-pass. Static poses are used as they are.
+
+    Args:
+        path: canonical table or log description.
+        cutoff_hz: of the low-pass; None for none.
+        delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
+
+    Raises:
+        DrakeTeleopError: if the log cannot be used, or the fitted mass is negative.
+    """
+    log = read_log(path, bandwidth_hz=cutoff_hz)
+    delay_s, source = _delay(log, cutoff_hz, delay)
+    log = low_passed(undelayed(log, delay_s), cutoff_hz)
+    result = identify(log.wrench, *log.motion, delay_s=delay_s)
+    if result.mass < 0 and result.identifiable[6]:
+        raise DrakeTeleopError(
+            f"the fitted mass is {result.mass:.4g} kg: the sign of the wrench is probably inverted",
+            where=f"{log.source}:wrench.sign",
+            remedy="set `sign: -1` in the log description (or remove it if it is there)",
+        )
+    predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
+    return IdentifiedLog(log, result, predicted, source)
+
+
+def eliminate_log(
+    path: str | Path,
+    load: str | Path | Identification,
+    *,
+    sigma: float = 0.0,
+    gamma: float = 1.0,
+    eta: float | None = None,
+    cutoff_hz: float | None = 30.0,
+    delay: str | float = "auto",
+    tare: bool = True,
+) -> EliminatedLog:
+    """Removes (or scales) the non-contact wrench of a known load in a log.
+
+    Args:
+        path: canonical table or log description.
+        load: identification.json, or what is in it.
+        sigma: share of the non-contact wrench that is kept.
+        gamma: scale of the contact wrench.
+        eta: Eq. (14), the share that is kept of an object; the load counts as the object. Goes
+            with sigma = 0 and gamma = 1 only.
+        cutoff_hz: zero-phase low-pass on everything that comes out; None for none.
+        delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
+        tare: take the sensor's offsets from this record (they drift between records), not from
+            `load`: the constant that most of the record agrees on, see `robust_offsets`.
+
+    Raises:
+        DrakeTeleopError: if the log or the load file cannot be used, or eta is given together with
+            sigma or gamma.
+    """
+    identification = load if isinstance(load, Identification) else Identification.load(load)
+    sigma, gamma = _scales(sigma, gamma, eta)
+    log = read_log(path, bandwidth_hz=cutoff_hz)
+    phi, point_mass = usable_phi(identification)
+    delay_s, source = _delay(log, cutoff_hz, delay, phi)
+    if source == "undetermined":
+        delay_s, source = identification.delay_s, "load"
+    log = undelayed(log, delay_s)
+
+    def smooth(wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+        return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)
+
+    offsets, fraction = identification.offsets, 1.0
+    if tare:
+        residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
+        offsets, fraction = robust_offsets(smooth(residual))
+    motion = log.motion
+    # With one load, all of it is the gripper's share: sigma_object has nothing to scale.
+    scales = {"sigma_gripper": sigma, "sigma_object": 0.0, "gamma": gamma}
+    gravity_only = None
+    if log.gravity is not None:
+        rest = np.zeros_like(log.gravity)
+        weightless = contact_wrench(log.wrench, np.zeros(6), -log.gravity, rest, rest, phi)
+        weightless = smooth(weightless)
+        gravity_only = weightless - (robust_offsets(weightless)[0] if tare else offsets)
+    return EliminatedLog(
+        log=log,
+        phi=phi,
+        point_mass=point_mass,
+        offsets=offsets,
+        tare_fraction=fraction,
+        delay_s=delay_s,
+        delay_source=source,
+        measured=smooth(log.wrench - offsets),
+        non_contact=smooth(non_contact_wrench(*motion, phi)),
+        contact=smooth(contact_wrench(log.wrench, offsets, *motion, phi)),
+        scaled=smooth(scaled_wrench(log.wrench, offsets, *motion, phi, np.zeros(10), **scales)),
+        gravity_only=gravity_only,
+    )
+
+
+def usable_phi(identification: Identification) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """phi with the inertias that were not identifiable replaced by those of a point mass.
+
+    Their fitted values are arbitrary, and may be huge. What mass and centre of mass imply,
+    m (c'c E - c c'), is the smallest inertia that such a load can have about the origin of S.
+
+    Returns:
+        phi (10,), and the names of the inertias that were replaced.
+    """
+    phi = identification.phi.copy()
+    replaced = np.flatnonzero(~identification.identifiable[10:])
+    point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
+    phi[4 + replaced] = point[4 + replaced]
+    return phi, tuple(PARAMETERS[10 + i] for i in replaced)
+
+
+def robust_offsets(residual: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The constant that most samples agree on, untouched by contact in the rest of them.
+
+    Starts from the middle of the shortest interval that holds half of the samples in each channel
+    (Rousseeuw's shorth), then takes the mean of all samples within 4 robust standard deviations of
+    it in every channel, until that no longer changes.
+
+    Args:
+        residual: (N, 6) wrench minus non-contact wrench.
+
+    Returns:
+        offsets (6,), and the share of the samples that they are the mean of.
+    """
+    ordered = np.sort(residual, axis=0)
+    half = len(ordered) // 2
+    widths = ordered[half:] - ordered[: len(ordered) - half]
+    start, channels = np.argmin(widths, axis=0), np.arange(6)
+    offsets = (ordered[start, channels] + ordered[start + half, channels]) / 2
+    agrees = np.zeros(len(residual), bool)
+    for _ in range(50):
+        distance = np.abs(residual - offsets)
+        # 1.4826 * median |x| is the standard deviation of a normal x.
+        spread = 1.4826 * np.median(distance, axis=0) + 1e-12
+        before, agrees = agrees, (distance <= 4 * spread).all(axis=1)
+        if np.array_equal(before, agrees) or not agrees.any():
+            break
+        offsets = residual[agrees].mean(axis=0)
+    return offsets, float(agrees.mean())
+
+
+def _delay(
+    log: Log, cutoff_hz: float | None, delay: str | float, phi: NDArray[np.float64] | None = None
+) -> tuple[float, str]:
+    if log.static:
+        return 0.0, "static"
+    if not isinstance(delay, str):
+        return float(delay), "given"
+    if delay != "auto":
+        raise DrakeTeleopError(
+            f"{delay!r} is neither seconds nor auto", where="delay", remedy="give a number or auto"
+        )
+    found = estimate_delay(log, cutoff_hz, phi)
+    return (0.0, "undetermined") if found is None else (found, "estimated")
+
+
+def _scales(sigma: float, gamma: float, eta: float | None) -> tuple[float, float]:
+    if sigma < 0:
+        raise DrakeTeleopError(
+            f"sigma is {sigma:g}", where="sigma", remedy="give a number of at least 0"
+        )
+    if eta is None:
+        return sigma, gamma
+    if sigma != 0 or gamma != 1:
+        raise DrakeTeleopError(
+            "eta goes with sigma = 0 and gamma = 1 only (Eq. 14)",
+            where="eta",
+            remedy="leave sigma and gamma out",
+        )
+    _, sigma_object, gamma = scales_from_eta(eta)
+    return sigma_object, gamma
