@@ -62,7 +62,7 @@ _delay = click.option(
     type=_Delay(),
     default="auto",
     show_default=True,
-    help="Wrench behind the motion, in seconds, or estimated.",
+    help="Motion behind the wrench, in seconds, or estimated.",
 )
 
 

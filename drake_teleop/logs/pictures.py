@@ -28,7 +28,7 @@ def draw_fit(found: IdentifiedLog) -> Figure:
     """
     log, result = found.log, found.identification
     curves = [
-        ("measured", log.wrench - result.offsets, _MEASURED),
+        ("measured, offsets removed", log.wrench - result.offsets, _MEASURED),
         (r"$V\,\varphi$", found.predicted - result.offsets, BLUE),
         ("residual", log.wrench - found.predicted, VERMILION),
     ]

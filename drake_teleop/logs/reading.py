@@ -123,11 +123,14 @@ class _Reader:
 
     def _wrench(self, stream: Wrench) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         table = self._table(stream)
-        return self._time("wrench", stream.time, table), self._forces("wrench", stream, table)
+        t = self._time("wrench", stream.time, table)
+        return t, self._forces("wrench", stream, table, len(t))
 
-    def _forces(self, name: str, stream: Wrench | Static, table: Table) -> NDArray[np.float64]:
+    def _forces(
+        self, name: str, stream: Wrench | Static, table: Table, rows: int
+    ) -> NDArray[np.float64]:
         both = [
-            table.numbers(quantity.columns, 3, f"{self._source}:{name}.{field}.columns")
+            table.numbers(quantity.columns, 3, f"{self._source}:{name}.{field}.columns", rows)
             * (stream.sign * self._description.scale(quantity.unit))
             for field, quantity in (("force", stream.force), ("torque", stream.torque))
         ]
@@ -139,7 +142,7 @@ class _Reader:
     def _pose(self, stream: Pose, bandwidth_hz: float | None) -> _Stream:
         table = self._table(stream)
         raw_t = self._time("pose", stream.time, table)
-        raw_R = self._rotations("pose", stream.orientation, table)
+        raw_R = self._rotations("pose", stream.orientation, table, len(raw_t))
         if isinstance(stream.frame, tuple):
             raw_R = raw_R @ np.array(stream.frame).T
         t = uniform_times(raw_t)
@@ -148,7 +151,7 @@ class _Reader:
         acceleration = np.zeros(3)
         if stream.position is not None:
             where = f"{self._source}:pose.position.columns"
-            position = table.numbers(stream.position.columns, 3, where)
+            position = table.numbers(stream.position.columns, 3, where, len(raw_t))
             position = resample(t, raw_t, position) * self._description.scale(stream.position.unit)
             acceleration = smooth_derivatives(position, dt, bandwidth_hz)[2]
         return _Stream(
@@ -170,7 +173,7 @@ class _Reader:
             if quantity is None:
                 return None
             where = f"{self._source}:imu.{field}.columns"
-            unbiased = table.numbers(quantity.columns, 3, where) - quantity.bias
+            unbiased = table.numbers(quantity.columns, 3, where, len(raw_t)) - quantity.bias
             scaled = resample(t, raw_t, unbiased) * (sign * self._description.scale(quantity.unit))
             return self._to_S("imu", stream.frame, scaled, t, pose)
 
@@ -221,15 +224,16 @@ class _Reader:
 
     def _static(self, stream: Static) -> Log:
         table = self._table(stream)
-        wrench = self._forces("static", stream, table)
+        wrench = self._forces("static", stream, table, table.rows)
         if stream.gravity is not None:
             where = f"{self._source}:static.gravity.columns"
-            gravity = table.numbers(stream.gravity.columns, 3, where) - stream.gravity.bias
-            gravity = gravity * self._description.scale(stream.gravity.unit)
+            gravity = table.numbers(stream.gravity.columns, 3, where, table.rows)
+            scale = self._description.scale(stream.gravity.unit)
+            gravity = (gravity - stream.gravity.bias) * scale
             R_SW = None
         else:
             assert stream.orientation is not None
-            R_WS = self._rotations("static", stream.orientation, table)
+            R_WS = self._rotations("static", stream.orientation, table, table.rows)
             R_SW = np.swapaxes(R_WS, 1, 2)
             gravity = R_SW @ self._description.gravity_W
         if stream.frame == "base":
@@ -260,7 +264,7 @@ class _Reader:
         where = f"{self._source}:{name}.time"
         if time.column is None:
             assert time.rate is not None
-            t = np.arange(len(next(iter(table.columns.values())))) / time.rate
+            t = np.arange(table.rows) / time.rate
         else:
             t = table.numbers([time.column], 1, f"{where}.column")[:, 0]
             t = t * self._description.scale(time.unit)
@@ -288,10 +292,12 @@ class _Reader:
             )
         return t + time.offset
 
-    def _rotations(self, name: str, orientation: Orientation, table: Table) -> NDArray[np.float64]:
+    def _rotations(
+        self, name: str, orientation: Orientation, table: Table, rows: int
+    ) -> NDArray[np.float64]:
         where = f"{self._source}:{name}.orientation"
         width = WIDTHS[orientation.form]
-        columns = table.numbers(orientation.columns, width, f"{where}.columns")
+        columns = table.numbers(orientation.columns, width, f"{where}.columns", rows)
         if orientation.form == "rotation_vector":
             columns = columns * self._description.scale(orientation.unit)
         R = rotation_matrices(columns, orientation.form)

@@ -33,31 +33,45 @@ class Table:
     columns: dict[str, NDArray]
     first_row: int = 1
 
-    def numbers(self, names: Sequence[str | int], width: int, where: str) -> NDArray[np.float64]:
+    @property
+    def rows(self) -> int:
+        """Rows of the longest column."""
+        return max(len(column) for column in self.columns.values())
+
+    def numbers(
+        self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
+    ) -> NDArray[np.float64]:
         """(N, width) finite numbers from the named columns side by side.
 
         An array with several columns (NPZ) counts as that many, row-major.
 
+        Args:
+            names: of the columns.
+            width: how many they have to be.
+            where: the field that names them, for messages.
+            rows: how many rows they have to have; None for the same number in all of them.
+
         Raises:
-            DrakeTeleopError: naming `where`, if a column is absent, a cell is no finite number, or
-                the columns are not `width` in all.
+            DrakeTeleopError: if a column is absent, a cell is no finite number, or the numbers of
+                columns and rows are not these.
         """
         columns = [self._column(str(name), where) for name in names]
-        if len({len(column) for column in columns}) > 1:
-            sizes = ", ".join(f"{n}: {len(c)}" for n, c in zip(names, columns, strict=True))
+        rows = len(columns[0]) if columns and rows is None else rows
+        for name, column in zip(names, columns, strict=True):
+            if len(column) != rows:
+                raise DrakeTeleopError(
+                    f"{name!r} of {self.path.name} has {len(column)} rows where {rows} are needed",
+                    where=where,
+                    remedy="name columns that belong together",
+                )
+        found = sum(column.shape[1] for column in columns)
+        if found != width:
             raise DrakeTeleopError(
-                f"the columns differ in length ({sizes})",
-                where=where,
-                remedy=f"repair {self.path.name}",
-            )
-        found = np.column_stack(columns)
-        if found.shape[1] != width:
-            raise DrakeTeleopError(
-                f"{found.shape[1]} columns where {width} are needed",
+                f"{found} columns where {width} are needed",
                 where=where,
                 remedy=f"list {width} columns of {self.path.name}",
             )
-        return found
+        return np.hstack(columns)
 
     def _column(self, name: str, where: str) -> NDArray[np.float64]:
         if name not in self.columns:

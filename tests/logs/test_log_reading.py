@@ -282,6 +282,14 @@ def test_bad_streams(tmp_path: Path, changes: dict[str, Any], words: list[str]) 
         assert word in message
 
 
+def test_arrays_that_do_not_belong_together(tmp_path: Path) -> None:
+    path = foreign(tmp_path, imu__time={"column": "t"})
+    with np.load(tmp_path / "imu.npz") as archive:
+        np.savez(tmp_path / "imu.npz", t=archive["clock"][:-1] * 1e-3, **archive)
+    with pytest.raises(DrakeTeleopError, match="has 4500 rows where 4499 are needed"):
+        read_log(path)
+
+
 def test_nominal_rate_in_place_of_time_stamps(tmp_path: Path) -> None:
     canonical("s", "omega").write_csv(tmp_path / "all.csv")
     stream = {"file": "all.csv", "time": {"rate": 500.0}}
