@@ -1,6 +1,71 @@
-"""Bilateral teleoperation with non-contact force scaling, on Drake."""
+"""Bilateral teleoperation with non-contact force scaling, on Drake.
+
+Everything that most users need is here; `drake_teleop.load`, `drake_teleop.station` and their
+neighbours hold the rest. A name is imported when it is first used, so that `import drake_teleop`
+costs nothing and a user with a log never waits for the simulator.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from drake_teleop._version import __version__
 from drake_teleop.errors import DrakeTeleopError
 
-__all__ = ["DrakeTeleopError", "__version__"]
+if TYPE_CHECKING:
+    from drake_teleop.load.compensation import contact_wrench, scaled_wrench
+    from drake_teleop.load.identification import Identification, identify
+    from drake_teleop.load.regressor import non_contact_wrench, regressor
+    from drake_teleop.logs.processing import eliminate_log, identify_log
+    from drake_teleop.logs.reading import read_log
+    from drake_teleop.result import SimulationResult
+    from drake_teleop.scenario import LoadScenario, Scenario, ScenarioNames
+    from drake_teleop.simulation import simulate
+    from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
+
+__all__ = [
+    "DrakeTeleopError",
+    "Identification",
+    "LoadScenario",
+    "MakeIdentificationStation",
+    "MakeTeleopStation",
+    "Scenario",
+    "ScenarioNames",
+    "SimulationResult",
+    "__version__",
+    "contact_wrench",
+    "eliminate_log",
+    "identify",
+    "identify_log",
+    "non_contact_wrench",
+    "read_log",
+    "regressor",
+    "scaled_wrench",
+    "simulate",
+]
+
+_HOMES = {
+    "load.compensation": ("contact_wrench", "scaled_wrench"),
+    "load.identification": ("Identification", "identify"),
+    "load.regressor": ("non_contact_wrench", "regressor"),
+    "logs.processing": ("eliminate_log", "identify_log"),
+    "logs.reading": ("read_log",),
+    "result": ("SimulationResult",),
+    "scenario": ("LoadScenario", "Scenario", "ScenarioNames"),
+    "simulation": ("simulate",),
+    "station": ("MakeIdentificationStation", "MakeTeleopStation"),
+}
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value  # the next access is an ordinary one
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

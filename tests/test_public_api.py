@@ -1,0 +1,54 @@
+"""`drake_teleop` itself: light to import, complete, and honest about what it holds."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import drake_teleop
+
+
+@pytest.mark.parametrize("name", drake_teleop.__all__)
+def test_every_name_is_there(name):
+    assert getattr(drake_teleop, name) is not None
+
+
+def test_dir_is_the_curated_list():
+    assert dir(drake_teleop) == sorted(drake_teleop.__all__)
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="'drake_teleop' has no attribute 'Frobnicate'"):
+        drake_teleop.Frobnicate  # noqa: B018
+
+
+def test_type_checkers_see_the_names_where_they_are_at_run_time():
+    tree = ast.parse(Path(drake_teleop.__file__).read_text())
+    (guarded,) = (node for node in tree.body if isinstance(node, ast.If))
+    seen = {
+        alias.name: statement.module.removeprefix("drake_teleop.")
+        for statement in guarded.body
+        for alias in statement.names
+    }
+    assert seen == drake_teleop._HOME
+    eager = {"DrakeTeleopError", "__version__"}
+    assert sorted(seen.keys() | eager) == sorted(drake_teleop.__all__)
+
+
+@pytest.mark.parametrize(
+    ("statement", "foreign"),
+    [
+        ("import drake_teleop", {"numpy", "numba", "polars", "matplotlib", "pydrake"}),
+        ("from drake_teleop import identify, scaled_wrench, read_log", {"pydrake"}),
+    ],
+)
+def test_nobody_pays_for_what_they_do_not_use(statement, foreign):
+    code = f"import sys\n{statement}\nprint(*{{name.split('.')[0] for name in sys.modules}})"
+    answer = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert not foreign & set(answer.stdout.split())
