@@ -1,0 +1,109 @@
+"""The scaling law and what must follow from it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from load_cases import OFFSETS, TOOL, loads, motions, rich_motion, vectors
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.compensation import (
+    contact_wrench,
+    modified_phi,
+    scaled_wrench,
+    scaled_wrench_into,
+    scales_from_eta,
+)
+from drake_teleop.load.regressor import non_contact_wrench, regressor
+
+scales = st.floats(0.0, 10.0)
+NAMES = ("sigma_gripper", "sigma_object", "gamma")
+
+
+def named(*values):
+    return dict(zip(NAMES, values, strict=True))
+
+
+@given(vectors(6, 100.0), motions(), loads(), loads(), scales, scales, scales)
+def test_the_law_as_the_paper_draws_it(F, motion, gripper, thing, sigma_gr, sigma_obj, gamma):
+    V = regressor(*motion)
+    F_c = F - OFFSETS - V @ (gripper + thing)
+    expected = gamma * F_c + V @ (sigma_gr * gripper + sigma_obj * thing)
+    actual = scaled_wrench(F, OFFSETS, *motion, gripper, thing, **named(sigma_gr, sigma_obj, gamma))
+    np.testing.assert_allclose(actual, expected, rtol=1e-10, atol=1e-7)
+
+
+@given(vectors(6, 100.0), motions(), loads())
+def test_elimination_leaves_the_contact(contact, motion, phi):
+    F = contact + OFFSETS + non_contact_wrench(*motion, phi)
+    np.testing.assert_allclose(contact_wrench(F, OFFSETS, *motion, phi), contact, atol=1e-8)
+
+
+@given(vectors(6, 100.0), motions(), vectors(10), vectors(10), scales)
+def test_equal_scales_make_the_load_irrelevant(F, motion, wrong_phi, other_phi, scale):
+    actual = scaled_wrench(F, OFFSETS, *motion, wrong_phi, other_phi, **named(scale, scale, scale))
+    np.testing.assert_array_equal(actual, scale * (F - OFFSETS))
+
+
+@given(vectors(6, 100.0), motions(), loads(), loads(), st.floats(0.0, 1.0))
+def test_eta_is_equation_14(F, motion, gripper, thing, eta):
+    by_eq_14 = contact_wrench(F, OFFSETS, *motion, modified_phi(gripper, thing, eta))
+    by_scales = scaled_wrench(F, OFFSETS, *motion, gripper, thing, **named(*scales_from_eta(eta)))
+    np.testing.assert_allclose(by_scales, by_eq_14, rtol=1e-10, atol=1e-8)
+    F_c = contact_wrench(F, OFFSETS, *motion, gripper + thing)
+    kept = eta * non_contact_wrench(*motion, thing)
+    np.testing.assert_allclose(by_scales, F_c + kept, rtol=1e-10, atol=1e-7)
+
+
+@given(motions(), loads(), scales)
+def test_apparent_load_is_sigma_times_the_load(motion, phi, sigma):
+    free = OFFSETS + non_contact_wrench(*motion, phi)
+    felt = scaled_wrench(free, OFFSETS, *motion, phi, np.zeros(10), **named(sigma, 0.0, 1.0))
+    np.testing.assert_allclose(felt, non_contact_wrench(*motion, sigma * phi), atol=1e-7)
+
+
+def test_offsets_are_subtracted_and_never_scaled():
+    motion = rich_motion(5)
+    F = non_contact_wrench(*motion, TOOL)
+    for values in [(0.0, 0.0, 1.0), (0.5, 0.5, 2.0), (1.5, 0.0, 0.3)]:
+        with_offsets = scaled_wrench(
+            F + OFFSETS, OFFSETS, *motion, TOOL, 0 * TOOL, **named(*values)
+        )
+        without = scaled_wrench(F, np.zeros(6), *motion, TOOL, 0 * TOOL, **named(*values))
+        np.testing.assert_allclose(with_offsets, without, atol=1e-12)
+
+
+def test_one_sample_and_many_are_the_same_to_the_last_bit():
+    motion, thing = rich_motion(20), 0.1 * TOOL
+    F = non_contact_wrench(*motion, TOOL) + np.arange(6)
+    drifting = OFFSETS + np.linspace(0.0, 1.0, 20)[:, None]
+    many = scaled_wrench(F, drifting, *motion, TOOL, thing, **named(0.3, 0.7, 1.2))
+    for i, sample in enumerate(zip(*motion, strict=True)):
+        out = np.full(6, np.nan)
+        scaled_wrench_into(F[i], drifting[i], *sample, TOOL, thing, 0.3, 0.7, 1.2, out)
+        np.testing.assert_array_equal(many[i], out)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])
+def test_scales_are_not_negative(name, value):
+    values = {**named(1.0, 1.0, 1.0), name: value}
+    with pytest.raises(DrakeTeleopError, match=f"^{name}: .* is not a finite number >= 0"):
+        scaled_wrench(np.zeros(6), OFFSETS, *np.zeros((3, 3)), TOOL, TOOL, **values)
+
+
+@pytest.mark.parametrize("eta", [-0.01, 1.01, np.nan])
+def test_eta_is_a_share(eta):
+    with pytest.raises(DrakeTeleopError, match=r"^eta: .* is not within 0 to 1"):
+        scales_from_eta(eta)
+    with pytest.raises(DrakeTeleopError, match=r"^eta: "):
+        modified_phi(TOOL, TOOL, eta)
+
+
+def test_bad_input_is_named():
+    with pytest.raises(DrakeTeleopError, match=r"^wrench: has shape \(5,\)"):
+        contact_wrench(np.zeros(5), OFFSETS, *np.zeros((3, 3)), TOOL)
+    with pytest.raises(DrakeTeleopError, match=r"^offsets: is not finite"):
+        contact_wrench(np.zeros(6), np.full(6, np.nan), *np.zeros((3, 3)), TOOL)
