@@ -287,7 +287,7 @@ class NormalEquations:
         return np.sqrt(squares) < _NO_EXCITATION
 
     def _residual_squares(self, theta: Array) -> Array:
-        """(6,) sum of squared residuals; rounding leaves about 1e-8 of the wrench's rms in it."""
+        """(6,) sums of squared residuals; rounding leaves 1e-7 of the wrench in their roots."""
         squares = np.empty(6)
         for c in range(6):
             x = np.concatenate([[-theta[c], 1.0], -theta[6:]])

@@ -1,0 +1,303 @@
+"""Batch least squares: exact without noise, honest with it, and on real static poses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from load_cases import OFFSETS, TOOL, rich_motion
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.identification import PARAMETERS, Identification, NormalEquations, identify
+from drake_teleop.load.regressor import non_contact_wrench, regressor
+
+DATA = Path(__file__).parents[2] / ".." / "shared" / "data"
+TRUTH = np.concatenate([OFFSETS, TOOL])
+NOISE = np.array([0.3, 0.3, 0.5, 0.01, 0.01, 0.005])
+REST = np.zeros(3)
+
+
+def estimate(result):
+    return np.concatenate([result.offsets, result.phi])
+
+
+def record(samples, seed=0):
+    motion = rich_motion(samples, seed)
+    return OFFSETS + non_contact_wrench(*motion, TOOL), motion
+
+
+def static_poses(samples=24, seed=0):
+    """Specific force in random orientations."""
+    up = np.random.default_rng(seed).normal(size=(samples, 3))
+    return 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
+
+
+def about_one_axis(samples=500):
+    """Swinging about the horizontal axis y of S, which passes through So."""
+    t = np.linspace(0.0, 10.0, samples)
+    angle = np.cos(t)
+    s = 9.81 * np.stack([np.sin(angle), 0 * t, np.cos(angle)], axis=1)
+    turning = np.array([0.0, 1.0, 0.0])
+    return s, np.outer(-np.sin(t), turning), np.outer(-np.cos(t), turning)
+
+
+@pytest.mark.parametrize("noise", [None, NOISE])
+def test_exact_without_noise(noise):
+    F, motion = record(2000)
+    result = identify(F, *motion, noise=noise, delay_s=0.006)
+    np.testing.assert_allclose(estimate(result), TRUTH, rtol=0, atol=1e-9)
+    assert result.identifiable.all() and result.physically_consistent
+    assert result.residual_rms.max() < 1e-5
+    assert (result.method, result.samples) == ("batch least squares", 2000)
+    assert result.delay_s == 0.006
+
+
+def test_same_as_the_stacked_matrix():
+    F, motion = record(300)
+    F = F + np.random.default_rng(1).normal(size=F.shape) * NOISE
+    stacked = np.concatenate([np.tile(np.eye(6), (300, 1, 1)), regressor(*motion)], axis=2)
+    rows = (stacked / NOISE[:, None]).reshape(-1, 16)
+    expected = np.linalg.lstsq(rows, (F / NOISE).ravel(), rcond=None)[0]
+    result = identify(F, *motion, noise=NOISE)
+    np.testing.assert_allclose(estimate(result), expected, rtol=0, atol=1e-10)
+    residual = F - stacked @ expected
+    np.testing.assert_allclose(result.residual_rms, np.sqrt((residual**2).mean(axis=0)), rtol=1e-6)
+    singular = np.linalg.svd(rows / np.linalg.norm(rows, axis=0), compute_uv=False)
+    assert result.condition_number == pytest.approx(singular[0] / singular[-1], rel=1e-9)
+
+
+def test_chunks_and_order_do_not_matter():
+    F, motion = record(3000)
+    F = F + np.random.default_rng(2).normal(size=F.shape) * NOISE
+    whole = identify(F, *motion, noise=NOISE)
+    in_chunks = NormalEquations(NOISE)
+    for part in np.split(np.arange(3000), [1, 2, 700, 701, 2222]):
+        in_chunks.add(F[part], *(x[part] for x in motion))
+    in_chunks.add(F[:0], *(x[:0] for x in motion))
+    chunked = in_chunks.solve()
+    np.testing.assert_allclose(estimate(chunked), estimate(whole), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(chunked.covariance, whole.covariance, rtol=1e-9, atol=1e-15)
+    shuffled = np.random.default_rng(3).permutation(3000)
+    other = identify(F[shuffled], *(x[shuffled] for x in motion), noise=NOISE)
+    np.testing.assert_allclose(estimate(other), estimate(whole), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(other.residual_rms, whole.residual_rms, rtol=1e-9)
+
+
+def normalised_errors(noise_of, repetitions=60, samples=4000):
+    """Mean square of error / stated standard deviation, for each parameter."""
+    F, motion = record(samples)
+    squares = np.zeros(16)
+    for seed in range(repetitions):
+        noise = NOISE * noise_of(np.random.default_rng(seed), samples)
+        result = identify(F + noise, *motion, noise=NOISE)
+        squares += ((estimate(result) - TRUTH) / result.standard_deviations) ** 2
+    return squares / repetitions
+
+
+def test_stated_deviations_hold_for_white_noise():
+    errors = normalised_errors(lambda rng, n: rng.normal(size=(n, 6)))
+    # 1 would be perfect; the block means err on the cautious side.
+    assert errors.max() < 1.3
+    assert 0.5 < errors.mean() < 1.0
+
+
+def test_stated_deviations_hold_for_coloured_noise():
+    def coloured(rng, n):
+        white, noise = rng.normal(size=(n, 6)), np.zeros((n, 6))
+        for i in range(1, n):
+            noise[i] = 0.95 * noise[i - 1] + white[i]
+        return noise * np.sqrt(1.0 - 0.95**2)
+
+    errors = normalised_errors(coloured)
+    # Taken for white, this noise would give about (1 + 0.95) / (1 - 0.95) = 39.
+    assert errors.max() < 2.0
+    assert 0.5 < errors.mean() < 1.5
+
+
+def test_unweighted_deviations_know_newtons_from_newton_metres():
+    F, motion = record(4000)
+    squares = np.zeros(16)
+    for seed in range(40):
+        noise = NOISE * np.random.default_rng(seed).normal(size=F.shape)
+        result = identify(F + noise, *motion)
+        squares += ((estimate(result) - TRUTH) / result.standard_deviations) ** 2
+    assert (squares / 40).max() < 1.5
+    assert 0.5 < squares.mean() / 40 < 1.1
+
+
+def test_static_poses_determine_all_but_the_inertia():
+    s = static_poses()
+    rng = np.random.default_rng(4)
+    F = OFFSETS + non_contact_wrench(s, REST, REST, TOOL) + 0.1 * NOISE * rng.normal(size=(24, 6))
+    result = identify(F, s, REST, REST)
+    assert result.identifiable.tolist() == 10 * [True] + 6 * [False]
+    np.testing.assert_array_equal(result.phi[4:], np.zeros(6))
+    assert np.isinf(result.standard_deviations[10:]).all()
+    assert np.isfinite(result.standard_deviations[:10]).all()
+    assert np.abs(estimate(result) - TRUTH)[:10].max() < 0.1
+    assert result.condition_number < 5.0
+
+
+def test_angles_from_rounding_do_not_count_as_excitation():
+    s = static_poses()
+    rounding = 1e-13 * np.random.default_rng(5).normal(size=(24, 3))
+    F = OFFSETS + non_contact_wrench(s, REST, REST, TOOL)
+    result = identify(F, s, rounding, rounding)
+    assert result.identifiable.tolist() == 10 * [True] + 6 * [False]
+
+
+def test_one_axis_determines_what_it_moves():
+    motion = about_one_axis()
+    result = identify(OFFSETS + non_contact_wrench(*motion, TOOL), *motion)
+    unknown = {n for n, known in zip(PARAMETERS, result.identifiable, strict=True) if not known}
+    assert unknown == {"I_xx", "I_xz", "I_zz"}
+    known = result.identifiable
+    np.testing.assert_allclose(estimate(result)[known], TRUTH[known], rtol=0, atol=1e-9)
+
+
+def test_one_pose_determines_no_mass():
+    s = np.tile([0.0, 0.0, 9.81], (50, 1))
+    F = OFFSETS + non_contact_wrench(s, REST, REST, TOOL)
+    result = identify(F, s, REST, REST)
+    # The minimum norm solution reproduces the wrench; only what one pose tells is called known.
+    predicted = result.offsets + non_contact_wrench(s, REST, REST, result.phi)
+    np.testing.assert_allclose(predicted, F, atol=1e-9)
+    known = {n for n, known in zip(PARAMETERS, result.identifiable, strict=True) if known}
+    assert known <= {"f_ox", "f_oy", "tau_oz"}
+    assert not result.identifiable[6:].any()
+
+
+def test_slow_motion_in_noise_does_not_determine_the_inertia():
+    s, omega, alpha = about_one_axis()
+    F = OFFSETS + non_contact_wrench(s, omega, alpha, TOOL)
+    rng = np.random.default_rng(6)
+    wobble = np.cumsum(rng.normal(size=F.shape), axis=0)
+    F = F + NOISE * (wobble - wobble.mean(axis=0)) / wobble.std(axis=0)
+    result = identify(F, s, omega, alpha)
+    assert result.identifiable[[0, 1, 2, 6]].all()
+    assert not result.identifiable[10:].any()
+
+
+def test_the_wrong_sign_gives_a_negative_mass():
+    F, motion = record(500)
+    result = identify(-F, *motion)
+    assert result.mass == pytest.approx(-TOOL[0])
+    assert not result.physically_consistent
+    np.testing.assert_allclose(result.com, TOOL[1:4] / TOOL[0])
+
+
+def test_real_static_poses():
+    path = DATA / "ntnu_fts_imu_contact" / "0-calibration_fts-accel.csv"
+    if not path.is_file():
+        pytest.skip("needs the NTNU static poses, which the project does not ship")
+    table = np.genfromtxt(path, delimiter=",", skip_header=1)
+    wrench, g = -table[:, :6], table[:, 9:12]  # the sensor reports the load's wrench on it
+    result = identify(wrench, -g, REST, REST)
+    assert result.samples == 24
+    assert result.mass == pytest.approx(0.9323, abs=0.0005)
+    assert result.com[2] == pytest.approx(0.04390, abs=0.0001)
+    expected = -np.array([9.0765, -1.0181, 9.9848, 0.4325, -0.6916, -0.1570])
+    np.testing.assert_allclose(result.offsets, expected, rtol=0, atol=0.01)
+    assert result.identifiable.tolist() == 10 * [True] + 6 * [False]
+
+
+# ---- the file
+
+
+def same(a: Identification, b: Identification) -> bool:
+    return all(np.array_equal(getattr(a, n), getattr(b, n)) for n in Identification.__annotations__)
+
+
+@pytest.mark.parametrize("poses_only", [False, True])
+def test_file_round_trip(tmp_path, poses_only):
+    s = static_poses()
+    F = OFFSETS + non_contact_wrench(s, REST, REST, TOOL)
+    result = identify(F, s, REST, REST) if poses_only else identify(record(99)[0], *record(99)[1])
+    path = tmp_path / "identification.json"
+    result.save(path)
+    assert same(Identification.load(path), result)
+    document = json.loads(path.read_text())
+    assert set(document) == {
+        *("phi", "offsets", "covariance", "identifiable", "mass", "com", "inertia_com"),
+        *("physically_consistent", "condition_number", "delay_s", "residual_rms", "method"),
+        "samples",
+    }
+    assert document["mass"] == result.mass
+    nulls = [i for i in range(16) if document["covariance"][i][i] is None]
+    assert nulls == (list(range(10, 16)) if poses_only else [])
+
+
+def drop(name):
+    return lambda document: document.pop(name)
+
+
+def put(name, value):
+    return lambda document: document.update({name: value})
+
+
+def hole(document):
+    document["covariance"][0][1] = None
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (drop("phi"), "json:phi: is missing"),
+        (drop("delay_s"), "json:delay_s: is missing"),
+        (put("weight", 3.0), "json:weight: is not a field"),
+        (put("phi", [1.0] * 9), r"json:phi: has shape \(9,\) instead of \(10,\)"),
+        (put("phi", [float("nan")] * 10), "json:phi: is not finite"),
+        (put("phi", None), "json:phi: "),
+        (put("offsets", ["a"] * 6), "json:offsets: holds no numbers"),
+        (put("covariance", [[1.0] * 16] * 15), "json:covariance: is not a"),
+        (put("covariance", [[1.0] * 16] * 15 + [[1.0]]), "json:covariance: is not a"),
+        (hole, "json:covariance: is not finite"),
+        (put("identifiable", [True] * 15), "json:identifiable: is not a list"),
+        (put("identifiable", ["yes"] * 16), "json:identifiable: is not a list"),
+        (put("mass", 99.0), "json:mass: does not follow from phi"),
+        (put("com", [0.0, 0.0]), "json:com: has shape"),
+        (put("physically_consistent", False), "json:physically_consistent: does not follow"),
+        (put("samples", "many"), "json:samples: holds no numbers"),
+    ],
+)
+def test_spoilt_file(tmp_path, spoil, message):
+    path = tmp_path / "identification.json"
+    identify(record(99)[0], *record(99)[1]).save(path)
+    document = json.loads(path.read_text())
+    spoil(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(DrakeTeleopError, match=message):
+        Identification.load(path)
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(DrakeTeleopError, match=r"absent\.json: cannot be read"):
+        Identification.load(tmp_path / "absent.json")
+    for text, message in [("{", "is not JSON"), ("[1]", "holds no JSON object")]:
+        (tmp_path / "bad.json").write_text(text)
+        with pytest.raises(DrakeTeleopError, match=rf"bad\.json: {message}"):
+            Identification.load(tmp_path / "bad.json")
+    (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(DrakeTeleopError, match=r"binary\.json: is not JSON"):
+        Identification.load(tmp_path / "binary.json")
+
+
+# ---- bad input
+
+
+def test_bad_input_is_named():
+    F, motion = record(10)
+    with pytest.raises(DrakeTeleopError, match=r"^wrench: has shape \(10, 5\)"):
+        identify(F[:, :5], *motion)
+    with pytest.raises(DrakeTeleopError, match="numbers of samples differ"):
+        identify(F[:9], *motion)
+    with pytest.raises(DrakeTeleopError, match=r"^wrench: is not finite at index \(3, 0\)"):
+        identify(np.where(np.arange(10)[:, None] == 3, np.nan, F), *motion)
+    with pytest.raises(DrakeTeleopError, match=r"^noise: is not positive"):
+        identify(F, *motion, noise=[1, 1, 1, 0, 1, 1])
+    with pytest.raises(DrakeTeleopError, match=r"^2 samples cannot determine a load"):
+        identify(F[:2], *(x[:2] for x in motion))
+    with pytest.raises(DrakeTeleopError, match="no mass can be told"):
+        identify(np.zeros((10, 6)), *motion)
