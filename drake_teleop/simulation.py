@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 
 import numpy as np
@@ -42,7 +43,7 @@ def simulate(
     try:
         simulator.Initialize()
         for time in np.append(np.arange(_PROGRESS_STEP, end, _PROGRESS_STEP), end):
-            simulator.AdvanceTo(time)
+            advance(simulator, time)
             if progress is not None:
                 progress(time / end)
     except RuntimeError as error:
@@ -65,6 +66,21 @@ def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
     if simulation.integrator == "runge_kutta3":  # the one with error control
         simulator.get_mutable_integrator().set_target_accuracy(simulation.accuracy)
     return simulator
+
+
+def advance(simulator: Simulator, time: float) -> None:
+    """`simulator.AdvanceTo(time)` without Python's cyclic garbage collector.
+
+    The blocks make no cycles, but thousands of short-lived arrays, each of which brings the
+    collector's next round nearer: 7 % of the time.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        simulator.AdvanceTo(time)
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def read_log(simulator: Simulator, start: float) -> SimulationResult:

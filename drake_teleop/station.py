@@ -13,7 +13,7 @@ from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, Multiplexer
 
-from drake_teleop.channel.delay import DelayChannel
+from drake_teleop.channel.delay import MakeChannel
 from drake_teleop.environment.contact import ToolContact
 from drake_teleop.load.excitation import FourierTrajectory
 from drake_teleop.master import device
@@ -31,7 +31,7 @@ from drake_teleop.slave.joint_limits import JointLimitMonitor
 from drake_teleop.slave.joint_trajectory import JointTrajectory
 from drake_teleop.slave.load_estimator import LoadEstimator
 from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, SlavePlant
-from drake_teleop.slave.wrist_sensor import MakeWristSensor
+from drake_teleop.slave.wrist_sensor import MakeWristSensor, sample_parts
 
 _SLAVE_WIRES = (
     ("joint_control.joint_torque", "slave_plant.rx90_actuation"),
@@ -53,7 +53,7 @@ _TELEOP_WIRES = (
     ("clutch.y0", "kinematic_scaling.clutch"),
     ("kinematic_scaling.pose_command", "forward_channel.sent"),
     ("forward_channel.received", "inverse_kinematics.pose_command"),
-    ("slave_plant.rx90_state", "inverse_kinematics.slave_state"),
+    ("wrist_sensor.joint_position", "inverse_kinematics.joint_position"),
     ("inverse_kinematics.joint_command", "joint_control.joint_command"),
     # Force, slave to master.
     ("wrist_sensor.measured_wrench_S", "force_scaling.measured_wrench_S"),
@@ -62,7 +62,7 @@ _TELEOP_WIRES = (
     ("wrist_sensor.angular_acceleration_S", "force_scaling.angular_acceleration_S"),
     ("load_estimator.load_estimate", "force_scaling.load_estimate"),
     ("force_scaling.scaled_wrench_S", "wrench_to_master.scaled_wrench_S"),
-    ("slave_plant.rx90_state", "wrench_to_master.slave_state"),
+    ("wrist_sensor.joint_position", "wrench_to_master.joint_position"),
     ("wrench_to_master.wrench_B", "backward_channel.sent"),
     ("backward_channel.received", "force_display.wrench_command"),
     ("master_device.state", "force_display.master_state"),
@@ -95,9 +95,7 @@ _TELEOP_SIGNALS = {
     "ik_status": "inverse_kinematics.ik_status",
     "scaled_wrench_S": "force_scaling.scaled_wrench_S",
     "contact_wrench_S": "force_scaling.contact_wrench_S",
-    "non_contact_wrench_S": "force_scaling.non_contact_wrench_S",
     "force_to_master": "force_display.force_to_master",
-    "motor_torque": "force_display.motor_torque",
 }
 
 
@@ -135,9 +133,7 @@ def MakeTeleopStation(
         - ik_status
         - scaled_wrench_S
         - contact_wrench_S
-        - non_contact_wrench_S
         - force_to_master
-        - motor_torque
 
     Args:
         scenario: what the station is made of.
@@ -168,13 +164,13 @@ def MakeTeleopStation(
         ),
         "clutch": ConstantVectorSource([1.0]),
         "kinematic_scaling": KinematicScaling(scaling, period, start_W),
-        "forward_channel": DelayChannel(delay, period, start_W),
+        "forward_channel": MakeChannel(delay, period, start_W),
         "inverse_kinematics": InverseKinematics(slave.arm.lower, slave.arm.upper),
         "force_scaling": ForceScaling(scenario.force_scaling),
         "wrench_to_master": WrenchToMaster(
             slave.arm, R_WB.matrix(), scenario.force_scaling.force_scale
         ),
-        "backward_channel": DelayChannel(delay, period, np.zeros(6)),
+        "backward_channel": MakeChannel(delay, period, np.zeros(6)),
         "force_display": ForceDisplay(),
     }
     for name, block in blocks.items():
@@ -224,6 +220,7 @@ def AddSlave(
             scenario.load_estimator,
             sensor.noise_std()[:6],
             1 / rates.estimator_hz,
+            sum(sample_parts(slave.arm.num_joints).values()),
             np.zeros(16) if load_estimate is None else load_estimate,
         ),
     }

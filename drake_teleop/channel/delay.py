@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    DiscreteValues,
+    LeafSystem,
+)
+from pydrake.systems.primitives import PassThrough
 
 
-class DelayChannel(LeafSystem):
-    """A line of packets, one a period; with no delay it passes its input straight through.
+def MakeChannel(delay: float, period: float, neutral: NDArray[np.float64]) -> Diagram:
+    """A channel with a constant delay; without delay the receiver sees at once what is sent.
 
     .. pydrake_system::
 
-        name: DelayChannel
+        name: channel
         input_ports:
         - sent
         output_ports:
@@ -23,31 +30,45 @@ class DelayChannel(LeafSystem):
         period: time between packets [s].
         neutral: (k,) what the receiver gets before the first packet arrives.
     """
+    builder = DiagramBuilder()
+    packets = round(delay / period)
+    line = builder.AddNamedSystem(
+        "line", DelayLine(packets, period, neutral) if packets else PassThrough(len(neutral))
+    )
+    builder.ExportInput(line.get_input_port(), "sent")
+    builder.ExportOutput(line.get_output_port(), "received")
+    return builder.Build()
 
-    def __init__(self, delay: float, period: float, neutral: NDArray[np.float64]) -> None:
+
+class DelayLine(LeafSystem):
+    """A line on which each packet, one a period, travels for a whole number of periods.
+
+    .. pydrake_system::
+
+        name: DelayLine
+        input_ports:
+        - sent
+        output_ports:
+        - received
+    """
+
+    def __init__(self, packets: int, period: float, neutral: NDArray[np.float64]) -> None:
         super().__init__()
-        size = len(neutral)
-        self._packets = round(delay / period)
-        self._sent = self.DeclareVectorInputPort("sent", size)
-        if self._packets == 0:
-            self.DeclareVectorOutputPort("received", size, self._pass_through)
-            return
-        self._size = size
+        self._packets, self._size = packets, len(neutral)
+        self._sent = self.DeclareVectorInputPort("sent", self._size)
         # A packet that leaves at step k lies in slot k modulo the number of packets on the line.
-        line = self.DeclareDiscreteState(np.tile(neutral, self._packets))
+        # What is received at step k left at step k - packets: one period goes by in the state.
+        line = self.DeclareDiscreteState(np.tile(neutral, packets))
         head = self.DeclareDiscreteState(1)
         received = self.DeclareDiscreteState(neutral)
         self._groups = (int(line), int(head), int(received))
         self.DeclareStateOutputPort("received", received)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def _pass_through(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._sent.Eval(context))
-
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         line, head, received = (discrete_state.get_mutable_value(i) for i in self._groups)
         slot = int(head[0])
-        packet = slice(slot * self._size, (slot + 1) * self._size)
-        received[:] = line[packet]
-        line[packet] = self._sent.Eval(context)
-        head[0] = (slot + 1) % self._packets
+        following = (slot + 1) % self._packets
+        line[slot * self._size : (slot + 1) * self._size] = self._sent.Eval(context)
+        received[:] = line[following * self._size : (following + 1) * self._size]
+        head[0] = following

@@ -28,7 +28,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.quantities import quantity
@@ -527,16 +527,20 @@ class MasterDevice(LeafSystem):
         self._stages = np.zeros((3, 12))
         self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
         self._motor_torque = self.DeclareVectorInputPort("motor_torque", 6)
-        state = self.DeclareDiscreteState(np.concatenate([q_initial, np.zeros(6)]))
-        self.DeclareStateOutputPort("state", state)
-        from_state = {self.discrete_state_ticket(state)}
-        self.DeclareVectorOutputPort("pose_master", 7, self._calc_pose, from_state)
-        self.DeclareVectorOutputPort("twist_master", 6, self._calc_twist, from_state)
+        # Pose and twist are kept beside the state: they are read more often than they change.
+        state = np.concatenate([q_initial, np.zeros(6)])
+        for name, start in (
+            ("state", state),
+            ("pose_master", forward_kinematics(q_initial)),
+            ("twist_master", np.zeros(6)),
+        ):
+            self.DeclareStateOutputPort(name, self.DeclareDiscreteState(start))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        state, pose, twist = (discrete_state.get_mutable_value(i) for i in range(3))
         step(
-            discrete_state.get_mutable_value(0),
+            state,
             self._hand_wrench.Eval(context),
             self._motor_torque.Eval(context),
             self._parameters,
@@ -544,10 +548,5 @@ class MasterDevice(LeafSystem):
             self._work,
             self._stages,
         )
-
-    def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        pose_into(context.get_discrete_state(0).value()[:6], output.get_mutable_value())
-
-    def _calc_twist(self, context: Context, output: BasicVector) -> None:
-        state = context.get_discrete_state(0).value()
-        twist_into(state[:6], state[6:], self._work[0], output.get_mutable_value())
+        pose_into(state[:6], pose)
+        twist_into(state[:6], state[6:], self._work[0], twist)

@@ -83,8 +83,9 @@ class ForceDisplay(LeafSystem):
         self._unused = np.zeros(6)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._state = self.DeclareVectorInputPort("master_state", 12)
-        self.DeclareVectorOutputPort("motor_torque", 6, self._calc_torque)
-        self.DeclareVectorOutputPort("force_to_master", 6, self._calc_force)
+        inputs = {self.all_input_ports_ticket()}
+        self.DeclareVectorOutputPort("motor_torque", 6, self._calc_torque, inputs)
+        self.DeclareVectorOutputPort("force_to_master", 6, self._calc_force, inputs)
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
         self._calc(context, self._unused, output.get_mutable_value())

@@ -81,9 +81,14 @@ class ForceScaling(LeafSystem):
             for name in ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
         ]
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
-        self.DeclareVectorOutputPort("scaled_wrench_S", 6, self._calc_scaled)
-        self.DeclareVectorOutputPort("contact_wrench_S", 6, self._calc_contact)
-        self.DeclareVectorOutputPort("non_contact_wrench_S", 6, self._calc_non_contact)
+        # Not time: what does not depend on it need not be looked at in every step.
+        inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
+        for name, calc in (
+            ("scaled_wrench_S", self._calc_scaled),
+            ("contact_wrench_S", self._calc_contact),
+            ("non_contact_wrench_S", self._calc_non_contact),
+        ):
+            self.DeclareVectorOutputPort(name, 6, calc, inputs)
 
     def SetScales(
         self, context: Context, *, sigma_gripper: float, sigma_object: float, gamma: float

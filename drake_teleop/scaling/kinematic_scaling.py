@@ -98,7 +98,8 @@ class KinematicScaling(LeafSystem):
         # X_WS and X_BE at the last change of the clutch, and whether it is closed.
         identity = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
         self.DeclareDiscreteState(np.concatenate([start, identity, [0.0]]))
-        self.DeclareVectorOutputPort("pose_command", 7, self._calc_command)
+        sources = {self._pose.ticket(), self.xd_ticket()}
+        self.DeclareVectorOutputPort("pose_command", 7, self._calc_command, sources)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         # The command follows from the first instant on.
         self.DeclareInitializationDiscreteUpdateEvent(self._update)

@@ -64,7 +64,7 @@ class WrenchToMaster(LeafSystem):
         name: WrenchToMaster
         input_ports:
         - scaled_wrench_S: (6,) F' of Fig. 2 [N, N m]
-        - slave_state: [q; v] of the arm, for the orientation of S
+        - joint_position: (n,) of the arm, for the orientation of S [rad]
         output_ports:
         - wrench_B: (6,) F_E_B, what the hand shall feel at E, in B [N, N m]
 
@@ -76,15 +76,17 @@ class WrenchToMaster(LeafSystem):
 
     def __init__(self, arm: ArmModel, R_WB: NDArray[np.float64], scale: float) -> None:
         super().__init__()
-        self._arm, self._n = arm.table, arm.num_joints
+        self._arm = arm.table
         self._R_WB, self._scale = np.ascontiguousarray(R_WB), scale
         self._R_WS, self._p_WS = np.zeros((3, 3)), np.zeros(3)
         self._wrench = self.DeclareVectorInputPort("scaled_wrench_S", 6)
-        self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
-        self.DeclareVectorOutputPort("wrench_B", 6, self._calc)
+        self._position = self.DeclareVectorInputPort("joint_position", arm.num_joints)
+        self.DeclareVectorOutputPort(
+            "wrench_B", 6, self._calc, {self.all_input_ports_ticket()}
+        )
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        q = self._state.Eval(context)[: self._n]
+        q = self._position.Eval(context)
         forward_kinematics(self._arm, q, self._R_WS, self._p_WS)
         wrench_to_master_into(
             self._wrench.Eval(context),

@@ -260,7 +260,7 @@ class InverseKinematics(LeafSystem):
         name: InverseKinematics
         input_ports:
         - pose_command: X_WS as [qw, qx, qy, qz, px, py, pz] [-, m]
-        - slave_state: (12,) [q; v], where the arm is [rad, rad/s]
+        - joint_position: (6,) where the arm is [rad]
         output_ports:
         - joint_command: (6,) the nearest branch [rad]
         - ik_status: an `IkStatus`
@@ -278,14 +278,15 @@ class InverseKinematics(LeafSystem):
         self._lower = np.array(lower, dtype=np.float64)
         self._upper = np.array(upper, dtype=np.float64)
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
-        self._state = self.DeclareVectorInputPort("slave_state", 12)
-        self.DeclareVectorOutputPort("joint_command", 6, self._calc_command)
-        self.DeclareVectorOutputPort("ik_status", 1, self._calc_status)
+        self._position = self.DeclareVectorInputPort("joint_position", 6)
+        inputs = {self.all_input_ports_ticket()}
+        self.DeclareVectorOutputPort("joint_command", 6, self._calc_command, inputs)
+        self.DeclareVectorOutputPort("ik_status", 1, self._calc_status, inputs)
 
     def _solve(self, context: Context, q: np.ndarray) -> int:
         return solve_pose_command(
             self._pose.Eval(context),
-            self._state.Eval(context)[:6],
+            self._position.Eval(context),
             self._lower,
             self._upper,
             self.MAX_STEP,

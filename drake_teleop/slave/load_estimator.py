@@ -38,6 +38,7 @@ class LoadEstimator(LeafSystem):
         config: whether to learn, and how fast to forget.
         noise_std: (6,) weights, 1 sigma of the wrench channels [N, N m].
         period: sampling period [s].
+        sample_size: length of the sample.
         initial: (16,) the estimate to start from.
     """
 
@@ -46,11 +47,12 @@ class LoadEstimator(LeafSystem):
         config: LoadEstimatorConfig,
         noise_std: NDArray[np.float64],
         period: float,
+        sample_size: int,
         initial: NDArray[np.float64],
     ) -> None:
         super().__init__()
         self._estimator = RecursiveLeastSquares(noise_std, config.forgetting)
-        self._sample = self.DeclareVectorInputPort("sample", 16)
+        self._sample = self.DeclareVectorInputPort("sample", sample_size)
         estimate = self.DeclareDiscreteState(np.asarray(initial, dtype=float))
         self.DeclareDiscreteState(self._estimator.covariance.ravel())
         self.DeclareStateOutputPort("load_estimate", estimate)

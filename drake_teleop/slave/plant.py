@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
@@ -61,12 +62,14 @@ def AddSlavePlant(
     if sheet_spring is None:
         plant = builder.AddNamedSystem("slave_plant", MultibodyPlant(time_step=0.0))
     else:
-        plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
+        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
         plant.set_name("slave_plant")
         plant.set_contact_model(ContactModel.kPoint)
     instance, tool = ParseSlave(plant)
     sheet = None if sheet_spring is None else AddSheetSpring(plant, sheet_spring)
     plant.Finalize()
+    if sheet is not None:
+        _remove_visuals(plant, scene_graph)
     arm = ArmModelFromPlant(plant, instance, "sensor")
     plant.SetDefaultPositions(instance, home_position(arm, position))
     return SlavePlant(plant, instance, tool, arm, sheet)
@@ -87,6 +90,13 @@ def ParseSlave(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, BodyIndex]:
     sensor = plant.GetFrameByName("sensor", arm)
     plant.AddJoint(WeldJoint("sensor_weld", sensor, tool.body_frame(), RigidTransform.Identity()))
     return arm, tool.index()
+
+
+def _remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Every shape costs time at every step, and nobody looks at these: a replay has its own."""
+    for index in range(plant.num_bodies()):
+        for shape in plant.GetVisualGeometriesForBody(plant.get_body(BodyIndex(index))):
+            scene_graph.RemoveGeometry(plant.get_source_id(), shape)
 
 
 def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:

@@ -35,19 +35,23 @@ from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.quantities import quantity
 from drake_teleop.slave.arm import MOTION_SIZE, ArmModel, sensor_motion
 
-#: The parts of a sample, in the order of the output port `sample`, with their sizes.
-SAMPLE_PARTS = (
-    ("measured_wrench_S", 6),
-    ("specific_force_S", 3),
-    ("angular_velocity_S", 3),
-    ("angular_acceleration_S", 3),
-    ("saturated", 1),
-)
-#: Samples that share one event of the noise source: an event at 8 kHz costs 5 us, mostly its own.
-NOISE_BLOCK = 8
 _CHANNELS = 15
 _SAMPLE = 16
+#: Samples that share one event of the noise source: an event at 8 kHz costs 5 us, mostly its own.
+NOISE_BLOCK = 8
 _SECTIONS = 2  # second-order sections of the fourth-order low-pass
+
+
+def sample_parts(num_joints: int) -> dict[str, int]:
+    """The parts of a sample, in the order of the output port `sample`, with their sizes."""
+    return {
+        "measured_wrench_S": 6,
+        "specific_force_S": 3,
+        "angular_velocity_S": 3,
+        "angular_acceleration_S": 3,
+        "saturated": 1,
+        "joint_position": num_joints,
+    }
 
 
 @dataclass
@@ -198,9 +202,10 @@ def _angular_velocity_from_encoders(arm, q, resolution, period, last_q, work, ou
 
 @njit(cache=True)
 def sample_ideal(arm, phi, q, v, vdot, contact_W, work, sample):  # type: ignore[no-untyped-def]
-    """One sample of the ideal sensor: the truth. `sample` (16,) is written."""
+    """One sample of the ideal sensor: the truth. `sample` (16 + n,) is written."""
     _true_sample(arm, phi, q, v, vdot, contact_W, work[:MOTION_SIZE], sample[:15])
     sample[15] = 0.0
+    sample[16:] = q
 
 
 @njit(cache=True)
@@ -208,7 +213,7 @@ def sample_realistic(  # type: ignore[no-untyped-def]
     arm, phi, q, v, vdot, contact_W, noise, offset, noise_std, limits, resolution,
     encoder_resolution, sections, period, memory, work, sample,
 ):  # fmt: skip
-    """One sample of the realistic sensor; `memory` and `sample` (16,) are updated.
+    """One sample of the realistic sensor; `memory` and `sample` (16 + n,) are updated.
 
     `memory` is [samples taken, last encoder readings (n), filter (15 x 2 x 2)]; `work` is scratch.
     """
@@ -228,6 +233,7 @@ def sample_realistic(  # type: ignore[no-untyped-def]
     memory[0] += 1.0
     _low_pass(sections, raw, filter_memory, sample[:15])
     sample[15] = saturated
+    sample[16:] = last_q
 
 
 class WristSensor(LeafSystem):
@@ -241,7 +247,7 @@ class WristSensor(LeafSystem):
         - slave_acceleration: vdot of the arm
             - noise: 12 standard normal numbers for each of NOISE_BLOCK samples
         output_ports:
-        - sample: the parts of SAMPLE_PARTS, one after the other
+        - sample: the parts of `sample_parts`, one after the other
 
     Args:
         arm: kinematics up to S, and the tool's true inertial parameters as its load (the plant's,
@@ -276,7 +282,7 @@ class WristSensor(LeafSystem):
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
         self._tool, self._contact_W = tool, np.zeros(6)
         self._contact = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
-        sample_index = self.DeclareDiscreteState(_SAMPLE)
+        sample_index = self.DeclareDiscreteState(_SAMPLE + n)
         update = self._sample_ideal
         if not config.ideal:
             self._noise = self.DeclareVectorInputPort("noise", 12 * NOISE_BLOCK)
@@ -341,11 +347,12 @@ def MakeWristSensor(
         - angular_velocity_S
         - angular_acceleration_S
         - saturated
+        - joint_position: the encoders' reading [rad]
     """
     builder = DiagramBuilder()
     sensor = builder.AddNamedSystem("sampler", WristSensor(arm, tool, config, period))
-    names, sizes = zip(*SAMPLE_PARTS, strict=True)
-    parts = builder.AddNamedSystem("parts", Demultiplexer(sizes))
+    sizes = sample_parts(arm.num_joints)
+    parts = builder.AddNamedSystem("parts", Demultiplexer(list(sizes.values())))
     builder.Connect(sensor.GetOutputPort("sample"), parts.get_input_port())
     if not config.ideal:
         noise = RandomSource(
@@ -357,6 +364,6 @@ def MakeWristSensor(
     for name in ("slave_state", "slave_acceleration", "contact_results"):
         builder.ExportInput(sensor.GetInputPort(name), name)
     builder.ExportOutput(sensor.GetOutputPort("sample"), "sample")
-    for index, name in enumerate(names):
+    for index, name in enumerate(sizes):
         builder.ExportOutput(parts.get_output_port(index), name)
     return builder.Build()

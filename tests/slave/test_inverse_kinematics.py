@@ -227,7 +227,7 @@ def unit(vector):
 def test_the_system_solves_its_pose_command(arm, quaternion, expected_status, expected):
     system = InverseKinematics(arm.lower, arm.upper)
     context = system.CreateDefaultContext()
-    system.GetInputPort("slave_state").FixValue(context, [*(Q_HOME + 0.05), *np.ones(6)])
+    system.GetInputPort("joint_position").FixValue(context, Q_HOME + 0.05)
     system.GetInputPort("pose_command").FixValue(context, [*quaternion, *P_HOME])
     assert system.GetOutputPort("ik_status").Eval(context) == [expected_status]
     command = system.GetOutputPort("joint_command").Eval(context)
@@ -242,7 +242,7 @@ def test_the_system_agrees_with_drakes_quaternions(arm):
         q = rng.uniform(arm.lower, arm.upper)
         R, p = forward(arm, q)
         wxyz = RotationMatrix(R).ToQuaternion().wxyz()
-        system.GetInputPort("slave_state").FixValue(context, [*q, *np.ones(6)])
+        system.GetInputPort("joint_position").FixValue(context, q)
         system.GetInputPort("pose_command").FixValue(context, [*wxyz, *p])
         np.testing.assert_allclose(
             system.GetOutputPort("joint_command").Eval(context), q, atol=1e-7
