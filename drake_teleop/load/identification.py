@@ -45,6 +45,8 @@ PARAMETERS = (
 )
 """Names of the 16 parameters in the order of Eq. (7): [offsets; phi]."""
 
+METHODS = ("batch least squares", "recursive least squares")
+
 # Rank: smallest eigenvalue of the scaled Gram over the largest, component of a parameter in the
 # null space, and excitation of a column [m/s^2, rad/s^2] below which it counts as none.
 _RANK, _NULL_COMPONENT, _NO_EXCITATION = 1e-12, 1e-6, 1e-9
@@ -71,7 +73,7 @@ class Identification:
             (and rows by the noise), over the directions that the record determines.
         delay_s: how much later the motion was recorded than the wrench [s].
         residual_rms: (6,) of the wrench channels [N, N m].
-        method: "batch least squares" or "recursive least squares".
+        method: one of `METHODS`.
         samples: number of samples.
     """
 
@@ -146,6 +148,8 @@ class Identification:
         def numbers(name: str, *shape: int) -> Array:
             return checked(f"{path}:{name}", document[name], *shape)
 
+        if document["method"] not in METHODS:
+            raise DrakeTeleopError(f"is not one of {METHODS}", where=f"{path}:method")
         result = cls(
             phi=numbers("phi", 10),
             offsets=numbers("offsets", 6),
@@ -154,7 +158,7 @@ class Identification:
             condition_number=float(numbers("condition_number")),
             delay_s=float(numbers("delay_s")),
             residual_rms=numbers("residual_rms", 6),
-            method=str(document["method"]),
+            method=document["method"],
             samples=int(numbers("samples")),
         )
         for name, value in result._derived().items():
@@ -269,7 +273,7 @@ class NormalEquations:
             condition_number=condition_number,
             delay_s=float(delay_s),
             residual_rms=np.sqrt(squares / self.samples),
-            method="batch least squares",
+            method=METHODS[0],
             samples=self.samples,
         )
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array
-from drake_teleop.load.identification import Identification, positive, worth_stating
+from drake_teleop.load.identification import METHODS, Identification, positive, worth_stating
 from drake_teleop.load.regressor import regressor_into
 
 PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
@@ -24,6 +24,10 @@ PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
 
 # A parameter whose standard deviation is still above this share of the prior's was not learnt.
 _STILL_PRIOR = 0.5
+# The least variance of a row relative to the sum of the variances that it is made of: below it,
+# rounding would make P indefinite. It only slows the first samples of a sensor that is nearly ideal
+# by the measure of the prior (with the default prior, one better than about 1 mN).
+_RESOLUTION = 1e-10
 
 
 @njit(cache=True)
@@ -61,11 +65,14 @@ def rls_update(theta, P, wrench, s, omega, alpha, noise_std, forgetting, largest
             for i in range(16):
                 gain[i] += v * P[6 + j, i]
         innovation = wrench[c] - theta[c]
-        variance = noise_std[c] * noise_std[c]
-        total = variance + gain[c]
+        predicted, uncorrelated = gain[c], P[c, c]
         for j in range(first, last):
-            innovation -= V[c, j] * theta[6 + j]
-            total += V[c, j] * gain[6 + j]
+            v = V[c, j]
+            innovation -= v * theta[6 + j]
+            predicted += v * gain[6 + j]
+            uncorrelated += v * v * P[6 + j, 6 + j]
+        variance = max(noise_std[c] * noise_std[c], _RESOLUTION * uncorrelated)
+        total = variance + predicted
         share = innovation / total
         squares[c] += variance * innovation * share
         inverse = 1.0 / total
@@ -185,7 +192,7 @@ class RecursiveLeastSquares:
             condition_number=self._condition_number(),
             delay_s=0.0,
             residual_rms=np.sqrt(self._squares / self._memory()),
-            method="recursive least squares",
+            method=METHODS[1],
             samples=self._samples,
         )
 

@@ -112,6 +112,21 @@ def test_standing_still_does_not_wind_up():
     assert estimator.phi[0] == pytest.approx(TOOL[0], abs=0.1)
 
 
+@pytest.mark.parametrize("forgetting", [1.0, 0.999])
+def test_a_nearly_ideal_sensor_keeps_the_covariance_positive(forgetting):
+    # Samples so close that one says almost the same as the last.
+    motion = [x[:1000] for x in rich_motion(8000)]
+    F = OFFSETS + non_contact_wrench(*motion, TOOL)
+    estimator = RecursiveLeastSquares(1e-9 * NOISE, forgetting)
+    for sample in zip(F, *motion, strict=True):
+        estimator.update(*sample)
+        # Scaled to unit variances: whether a direction is negative beyond rounding.
+        P = estimator.covariance
+        scale = 1.0 / np.sqrt(np.diag(P))
+        assert np.linalg.eigvalsh(P * np.outer(scale, scale)).min() > -1e-6
+    np.testing.assert_allclose(estimator.phi, TOOL, rtol=0, atol=1e-9)
+
+
 def test_updates_an_estimate_that_is_kept_elsewhere():
     F, motion = noisy_record(50)
     own = learnt(F, motion)
