@@ -1,0 +1,86 @@
+"""The wheel carries everything, and works in an environment and a folder of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+USE = """
+from importlib.resources import files
+from pathlib import Path
+
+import drake_teleop
+from drake_teleop.resources import models_dir, scenarios_dir
+
+home = Path(drake_teleop.__file__).parent
+assert home.parent.name == "site-packages", home
+assert models_dir() == home / "models" and scenarios_dir() == home / "scenarios"
+assert files("drake_teleop.experiments").joinpath("report.html.j2").is_file()
+for name in drake_teleop.ScenarioNames():
+    print(drake_teleop.MakeTeleopStation(drake_teleop.LoadScenario(name)).get_name(), name)
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder), cwd=ROOT)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def run(*command: str, cwd: Path) -> str:
+    # Only what is installed may be found, not what a shell or a test run points to.
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    answer = subprocess.run(
+        command, cwd=cwd, env=environment, capture_output=True, text=True, check=False
+    )
+    assert answer.returncode == 0, answer.stdout + answer.stderr
+    return answer.stdout
+
+
+def test_the_wheel_holds_what_the_repository_holds_and_nothing_else(wheel):
+    held = set(zipfile.ZipFile(wheel).namelist())
+    python = {f"drake_teleop/{path}" for path in relative(ROOT / "drake_teleop")}
+    models = {f"drake_teleop/models/{path}" for path in relative(ROOT / "models")}
+    assert "drake_teleop/models/rx90.sdf" in models
+    assert "drake_teleop/scenarios/free_motion_force.yaml" in python
+    assert "drake_teleop/py.typed" in python
+    assert {name for name in held if ".dist-info/" not in name} == python | models
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in held)
+
+
+def relative(folder: Path) -> set[str]:
+    return {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+def test_the_wheel_works_from_an_empty_folder(wheel, tmp_path):
+    home = tmp_path / "environment"
+    venv.create(home, with_pip=True)
+    scheme = {"base": str(home), "platbase": str(home)}
+    scripts, library = (
+        Path(sysconfig.get_path(kind, "posix_prefix", scheme)) for kind in ("scripts", "purelib")
+    )
+    python = str(scripts / Path(sys.executable).name)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    run(python, "-m", "pip", "install", "--no-deps", "--no-index", str(wheel), cwd=empty)
+    # The dependencies are those of this run; its own drake_teleop comes later in the path, or not.
+    (library / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    listing = run(python, "-c", USE, cwd=empty).splitlines()
+    assert "teleop_station free_motion_force" in listing
+    assert "reproduce" in run(str(scripts / "drake-teleop"), "--help", cwd=empty)
+    assert not list(empty.iterdir())
