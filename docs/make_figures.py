@@ -1,0 +1,162 @@
+"""Draws the README's pictures into docs/figures.
+
+python docs/make_figures.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.patches import FancyBboxPatch
+
+from drake_teleop.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, house_style
+
+FIGURES = Path(__file__).parent / "figures"
+
+# Inches: columns from the operator to the slave, rows for motion, force and what serves them.
+COLUMNS = (0.72, 2.2, 3.68, 5.16, 6.64, 8.12, 9.82)
+MOTION, FORCE, BELOW = 3.3, 1.9, 0.55
+WIDTH, HEIGHT = 1.04, 0.68
+_CORNER = "angle,angleA=-90,angleB=0,rad=5"
+MASTER, LINE, SLAVE = "#EEF4FA", "#F3F4F6", "#FBF1EA"
+
+
+def station_figure() -> Picture:
+    """The paper's Fig. 4 with the blocks of this library."""
+    operator, master, scaling, channel, ik, control, slave = COLUMNS
+    with house_style(), mpl.rc_context({"mathtext.fontset": "dejavuserif"}):
+        figure = Picture(figsize=(10.7, 4.32), facecolor="white", layout="none")
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set(xlim=(0, 10.7), ylim=(-0.05, 4.27), aspect="equal")
+        axes.axis("off")
+        _side(axes, 0.08, 4.32, "master", MASTER)
+        _side(axes, 4.44, 5.88, "channel", LINE)
+        _side(axes, 6.0, 10.62, "slave", SLAVE)
+
+        _block(axes, operator, MOTION, "operator")
+        _block(axes, master, MOTION, "master\ndevice")
+        _block(axes, scaling, MOTION, "kinematic\nscaling")
+        _block(axes, channel, MOTION, "delay")
+        _block(axes, ik, MOTION, "inverse\nkinematics")
+        _block(axes, control, MOTION, "joint\ncontrol")
+        _block(axes, slave, MOTION, "slave arm")
+        _block(axes, master, FORCE, "force display\n" r"$J_M^{\,T}$, limits")
+        _block(axes, channel, FORCE, "delay")
+        _block(axes, ik, FORCE, "to the master\n" r"$\times\ 1/17.5$")
+        _block(axes, control, FORCE, "elimination,\nscaling " r"$\sigma,\gamma,\eta$", heavy=True)
+        _block(axes, slave, FORCE, "wrist sensor")
+        _block(axes, control, BELOW, "load\nestimator", colour=GREEN)
+        _block(axes, slave, BELOW, "tool on the\nsheet spring", colour=GREY)
+
+        _arrow(axes, (operator, MOTION + 0.14), (master, MOTION + 0.14), "hand", BLUE)
+        _arrow(axes, (master, MOTION - 0.14), (operator, MOTION - 0.14), "force", VERMILION, -1)
+        _arrow(axes, (master, MOTION), (scaling, MOTION), r"${}^B T_E$", BLUE)
+        _arrow(axes, (scaling, MOTION), (channel, MOTION), r"${}^R T_E$", BLUE)
+        _arrow(axes, (channel, MOTION), (ik, MOTION), "", BLUE)
+        _arrow(axes, (ik, MOTION), (control, MOTION), r"$\bar q_S$", BLUE)
+        _arrow(axes, (control, MOTION), (slave, MOTION), r"$\tau$", BLUE)
+        _arrow(axes, (slave, MOTION), (slave, FORCE), r"$q_S,\ \dot q_S$", BLUE)
+        _arrow(axes, (slave, FORCE + 0.14), (control, FORCE + 0.14), r"$f_S,\tau_S$", VERMILION)
+        _arrow(axes, (slave, FORCE - 0.14), (control, FORCE - 0.14), r"$s,\omega,\alpha$", BLUE, -1)
+        _arrow(axes, (control, FORCE), (ik, FORCE), r"$F'$", VERMILION)
+        _arrow(axes, (ik, FORCE), (channel, FORCE), "", VERMILION)
+        _arrow(axes, (channel, FORCE), (master, FORCE), r"$\bar f_M,\ \bar\tau_M$", VERMILION)
+        _arrow(axes, (master, FORCE), (master, MOTION), r"$\bar m_M$", VERMILION)
+        _arrow(axes, (control, BELOW), (control, FORCE), r"$\hat\varphi,\ F_o$", GREEN)
+        _arrow(axes, (slave, BELOW), (slave, FORCE), "contact", VERMILION)
+        tap = slave - WIDTH / 2 - 0.1
+        for height in (FORCE + 0.14, FORCE - 0.14):
+            axes.plot(tap, height, "o", color=GREEN, markersize=4, zorder=4)
+        _line(axes, (tap, FORCE + 0.14), (control + WIDTH / 2, BELOW), GREEN, _CORNER)
+        axes.text(
+            (operator + scaling) / 2, BELOW + 0.2, r"$F' \;=\; \gamma\,(F - F_o - V\varphi)"
+            r" \;+\; \sigma\,V\varphi$", ha="center", va="center", fontsize=13, color=BLACK,
+        )  # fmt: skip
+        for x, word, colour in (
+            (1.3, "motion", BLUE),
+            (2.2, "force", VERMILION),
+            (3.1, "load", GREEN),
+        ):
+            axes.text(x, BELOW - 0.2, f"\u2192 {word}", ha="center", va="center", color=colour)
+    return figure
+
+
+def _side(axes: Axes, left: float, right: float, name: str, colour: str) -> None:
+    style = "round,pad=0,rounding_size=0.12"
+    axes.add_patch(
+        FancyBboxPatch(
+            (left, 0.05), right - left, 4.12, boxstyle=style, facecolor=colour, edgecolor="none"
+        )
+    )
+    axes.text(left + 0.14, 4.0, name, va="center", color=GREY, fontsize=10)
+
+
+def _block(
+    axes: Axes, x: float, y: float, text: str, *, heavy: bool = False, colour: str = BLACK
+) -> None:
+    axes.add_patch(
+        FancyBboxPatch(
+            (x - WIDTH / 2, y - HEIGHT / 2), WIDTH, HEIGHT,
+            boxstyle="round,pad=0,rounding_size=0.07",
+            facecolor="white",
+            edgecolor=VERMILION if heavy else colour,
+            linewidth=2.0 if heavy else 0.9,
+            zorder=3,
+        )
+    )  # fmt: skip
+    axes.text(
+        x, y, text, ha="center", va="center", fontsize=9.5, color=BLACK, linespacing=1.35, zorder=4
+    )
+
+
+def _arrow(
+    axes: Axes,
+    start: tuple[float, float],
+    stop: tuple[float, float],
+    label: str,
+    colour: str,
+    side: int = 1,
+) -> None:
+    """An arrow between two blocks' edges, its label above it or to its right (side = 1)."""
+    (x0, y0), (x1, y1) = start, stop
+    if y0 == y1:
+        shift = (WIDTH / 2) * (1 if x1 > x0 else -1)
+        x0, x1 = x0 + shift, x1 - shift
+        place, alignment = ((x0 + x1) / 2, y0 + 0.06 * side), ("center", _above(side))
+    else:
+        shift = (HEIGHT / 2) * (1 if y1 > y0 else -1)
+        y0, y1 = y0 + shift, y1 - shift
+        place, alignment = (x0 + 0.07, (y0 + y1) / 2), ("left", "center")
+    _line(axes, (x0, y0), (x1, y1), colour, "arc3")
+    axes.text(*place, label, ha=alignment[0], va=alignment[1], fontsize=9, color=colour, zorder=4)
+
+
+def _above(side: int) -> str:
+    return "bottom" if side > 0 else "top"
+
+
+def _line(
+    axes: Axes, start: tuple[float, float], stop: tuple[float, float], colour: str, style: str
+) -> None:
+    arrow = {
+        "arrowstyle": "-|>,head_width=0.22,head_length=0.42",
+        "connectionstyle": style,
+        "color": colour,
+        "linewidth": 1.3,
+        "shrinkA": 0,
+        "shrinkB": 0.5,
+    }
+    axes.annotate("", xy=stop, xytext=start, arrowprops=arrow, zorder=2)
+
+
+def main() -> None:
+    FIGURES.mkdir(exist_ok=True)
+    # Without date and random ids, so that the same script draws the same file.
+    with mpl.rc_context({"svg.hashsalt": "drake_teleop"}):
+        station_figure().savefig(FIGURES / "station.svg", metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    main()
