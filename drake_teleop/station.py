@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
-from pydrake.systems.framework import Diagram, DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, Multiplexer
+from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
-from drake_teleop.channel.delay import MakeChannel
+from drake_teleop.channel.delay import AddChannel
 from drake_teleop.environment.contact import ToolContact
 from drake_teleop.load.excitation import FourierTrajectory
 from drake_teleop.master import device
@@ -22,26 +22,27 @@ from drake_teleop.master.force_display import ForceDisplay
 from drake_teleop.master.operator import Operator
 from drake_teleop.scaling.force_scaling import ForceScaling
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
-from drake_teleop.scaling.wrench_mapping import WrenchToMaster
 from drake_teleop.scenario import Scenario
 from drake_teleop.signals import LOG
 from drake_teleop.slave.inverse_kinematics import InverseKinematics
 from drake_teleop.slave.joint_control import JointControl
-from drake_teleop.slave.joint_limits import JointLimitMonitor
 from drake_teleop.slave.joint_trajectory import JointTrajectory
 from drake_teleop.slave.load_estimator import LoadEstimator
+from drake_teleop.slave.monitor import SlaveMonitor
 from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, SlavePlant
-from drake_teleop.slave.wrist_sensor import MakeWristSensor, sample_parts
+from drake_teleop.slave.wrist_sensor import AddWristSensor, sample_parts
 
 _SLAVE_WIRES = (
     ("joint_control.joint_torque", "slave_plant.rx90_actuation"),
-    ("slave_plant.rx90_state", "joint_control.slave_state", "joint_limits.slave_state"),
+    ("slave_plant.rx90_state", "joint_control.slave_state"),
+    ("slave_plant.rx90_state", "monitor.slave_state"),
     ("slave_plant.rx90_state", "wrist_sensor.slave_state"),
     ("slave_plant.rx90_generalized_acceleration", "wrist_sensor.slave_acceleration"),
     ("wrist_sensor.sample", "load_estimator.sample"),
 )
 _CONTACT_WIRES = (
-    ("slave_plant.contact_results", "wrist_sensor.contact_results", "tool_contact.contact_results"),
+    ("slave_plant.contact_results", "wrist_sensor.contact_results"),
+    ("slave_plant.contact_results", "tool_contact.contact_results"),
 )
 _TELEOP_WIRES = (
     # The operator holds the master.
@@ -50,32 +51,26 @@ _TELEOP_WIRES = (
     ("master_device.twist_master", "operator.twist_master"),
     # Motion, master to slave.
     ("master_device.pose_master", "kinematic_scaling.pose_master"),
-    ("clutch.y0", "kinematic_scaling.clutch"),
-    ("kinematic_scaling.pose_command", "forward_channel.sent"),
-    ("forward_channel.received", "inverse_kinematics.pose_command"),
-    ("wrist_sensor.joint_position", "inverse_kinematics.joint_position"),
+    ("sample_parts.joint_position", "inverse_kinematics.joint_position"),
     ("inverse_kinematics.joint_command", "joint_control.joint_command"),
+    ("inverse_kinematics.ik_status", "monitor.ik_status"),
     # Force, slave to master.
-    ("wrist_sensor.measured_wrench_S", "force_scaling.measured_wrench_S"),
-    ("wrist_sensor.specific_force_S", "force_scaling.specific_force_S"),
-    ("wrist_sensor.angular_velocity_S", "force_scaling.angular_velocity_S"),
-    ("wrist_sensor.angular_acceleration_S", "force_scaling.angular_acceleration_S"),
+    ("wrist_sensor.sample", "force_scaling.sample"),
     ("load_estimator.load_estimate", "force_scaling.load_estimate"),
-    ("force_scaling.scaled_wrench_S", "wrench_to_master.scaled_wrench_S"),
-    ("wrist_sensor.joint_position", "wrench_to_master.joint_position"),
-    ("wrench_to_master.wrench_B", "backward_channel.sent"),
-    ("backward_channel.received", "force_display.wrench_command"),
     ("master_device.state", "force_display.master_state"),
     ("force_display.motor_torque", "master_device.motor_torque"),
 )
+# Through the channel.
+_FORWARD = ("forward_channel", "kinematic_scaling.pose_command", "inverse_kinematics.pose_command")
+_BACKWARD = ("backward_channel", "force_scaling.wrench_B", "force_display.wrench_command")
 
 #: Signal -> port; `drake_teleop.signals` says what each one is.
 _SLAVE_SIGNALS = {
-    "measured_wrench_S": "wrist_sensor.measured_wrench_S",
-    "specific_force_S": "wrist_sensor.specific_force_S",
-    "angular_velocity_S": "wrist_sensor.angular_velocity_S",
-    "angular_acceleration_S": "wrist_sensor.angular_acceleration_S",
-    "saturated": "wrist_sensor.saturated",
+    "measured_wrench_S": "sample_parts.measured_wrench_S",
+    "specific_force_S": "sample_parts.specific_force_S",
+    "angular_velocity_S": "sample_parts.angular_velocity_S",
+    "angular_acceleration_S": "sample_parts.angular_acceleration_S",
+    "saturated": "sample_parts.saturated",
     "load_estimate": "load_estimator.load_estimate",
     "slave_state": "slave_plant.rx90_state",
     "joint_torque": "joint_control.joint_torque",
@@ -92,14 +87,17 @@ _TELEOP_SIGNALS = {
     "twist_master": "master_device.twist_master",
     "pose_command": "kinematic_scaling.pose_command",
     "joint_command": "inverse_kinematics.joint_command",
-    "ik_status": "inverse_kinematics.ik_status",
+    "ik_status": "monitor.ik_status",
     "scaled_wrench_S": "force_scaling.scaled_wrench_S",
     "contact_wrench_S": "force_scaling.contact_wrench_S",
     "force_to_master": "force_display.force_to_master",
 }
 
 
-_LIMIT_CHECK_PERIOD = 0.01
+#: How often the clutch and the monitor are looked at [s]; an event at 2 kHz would cost time.
+_HUMAN_PERIOD = 0.01
+_SAMPLE_PARTS = list(sample_parts(6))
+_SAMPLE_SIZE = sum(sample_parts(6).values())
 
 
 def MakeTeleopStation(
@@ -112,6 +110,8 @@ def MakeTeleopStation(
     .. pydrake_system::
 
         name: teleop_station
+        input_ports:
+        - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
         output_ports:
         - measured_wrench_S
         - specific_force_S
@@ -162,20 +162,19 @@ def MakeTeleopStation(
             q_initial=device.inverse_kinematics(start_B),
             friction=scenario.master.friction,
         ),
-        "clutch": ConstantVectorSource([1.0]),
-        "kinematic_scaling": KinematicScaling(scaling, period, start_W),
-        "forward_channel": MakeChannel(delay, period, start_W),
+        "kinematic_scaling": KinematicScaling(scaling, _HUMAN_PERIOD, start_W),
         "inverse_kinematics": InverseKinematics(slave.arm.lower, slave.arm.upper),
-        "force_scaling": ForceScaling(scenario.force_scaling),
-        "wrench_to_master": WrenchToMaster(
-            slave.arm, R_WB.matrix(), scenario.force_scaling.force_scale
-        ),
-        "backward_channel": MakeChannel(delay, period, np.zeros(6)),
+        "force_scaling": ForceScaling(scenario.force_scaling, slave.arm, R_WB.matrix()),
         "force_display": ForceDisplay(),
     }
     for name, block in blocks.items():
         builder.AddNamedSystem(name, block)
     _connect(builder, _TELEOP_WIRES)
+    for wire, neutral in (_FORWARD, start_W), (_BACKWARD, np.zeros(6)):
+        name, sender, receiver = wire
+        received = AddChannel(builder, name, _output(builder, sender), delay, period, neutral)
+        builder.Connect(received, _input(builder, receiver))
+    builder.ExportInput(_input(builder, "kinematic_scaling.clutch"), "clutch")
     return _finish(builder, "teleop_station", slave_signals | _TELEOP_SIGNALS, scenario)
 
 
@@ -214,20 +213,21 @@ def AddSlave(
         "joint_control": JointControl(
             slave.arm, scenario.joint_control, 1 / rates.joint_control_hz
         ),
-        "joint_limits": JointLimitMonitor(slave.arm, _LIMIT_CHECK_PERIOD),
-        "wrist_sensor": MakeWristSensor(slave.arm, slave.tool, sensor, 1 / rates.sensor_hz),
+        "monitor": SlaveMonitor(slave.arm, _HUMAN_PERIOD),
         "load_estimator": LoadEstimator(
             scenario.load_estimator,
             sensor.noise_std()[:6],
             1 / rates.estimator_hz,
-            sum(sample_parts(slave.arm.num_joints).values()),
+            _SAMPLE_SIZE,
             np.zeros(16) if load_estimate is None else load_estimate,
         ),
     }
     for name, block in blocks.items():
         builder.AddNamedSystem(name, block)
+    contact = slave.sheet is not None
+    AddWristSensor(builder, slave.arm, slave.tool, sensor, 1 / rates.sensor_hz, contact=contact)
     _connect(builder, _SLAVE_WIRES)
-    if slave.sheet is None:
+    if not contact:
         return slave, _SLAVE_SIGNALS
     builder.AddNamedSystem("tool_contact", ToolContact(slave.tool))
     _connect(builder, _CONTACT_WIRES)
@@ -237,15 +237,19 @@ def AddSlave(
 def _connect(builder: DiagramBuilder, wires: Iterable[tuple[str, ...]]) -> None:
     for source, *targets in wires:
         for target in targets:
-            system, _, port = target.partition(".")
-            builder.Connect(
-                _output(builder, source), builder.GetSubsystemByName(system).GetInputPort(port)
-            )
+            builder.Connect(_output(builder, source), _input(builder, target))
 
 
-def _output(builder: DiagramBuilder, name: str):  # type: ignore[no-untyped-def]
+def _output(builder: DiagramBuilder, name: str) -> OutputPort:
     system, _, port = name.partition(".")
+    if system == "sample_parts":
+        return builder.GetSubsystemByName(system).get_output_port(_SAMPLE_PARTS.index(port))
     return builder.GetSubsystemByName(system).GetOutputPort(port)
+
+
+def _input(builder: DiagramBuilder, name: str) -> InputPort:
+    system, _, port = name.partition(".")
+    return builder.GetSubsystemByName(system).GetInputPort(port)
 
 
 def _finish(

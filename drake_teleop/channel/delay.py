@@ -6,50 +6,53 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import (
     Context,
-    Diagram,
     DiagramBuilder,
     DiscreteValues,
     LeafSystem,
+    OutputPort,
 )
-from pydrake.systems.primitives import PassThrough
 
 
-def MakeChannel(delay: float, period: float, neutral: NDArray[np.float64]) -> Diagram:
-    """A channel with a constant delay; without delay the receiver sees at once what is sent.
+def AddChannel(
+    builder: DiagramBuilder,
+    name: str,
+    sent: OutputPort,
+    delay: float,
+    period: float,
+    neutral: NDArray[np.float64],
+) -> OutputPort:
+    """Adds a channel behind the port `sent` and returns the port of what is received.
 
-    .. pydrake_system::
-
-        name: channel
-        input_ports:
-        - sent
-        output_ports:
-        - received
+    Without delay nothing stands between sender and receiver: the port itself is returned.
 
     Args:
         delay: one-way delay [s], rounded to whole periods.
         period: time between packets [s].
         neutral: (k,) what the receiver gets before the first packet arrives.
     """
-    builder = DiagramBuilder()
     packets = round(delay / period)
-    line = builder.AddNamedSystem(
-        "line", DelayLine(packets, period, neutral) if packets else PassThrough(len(neutral))
-    )
-    builder.ExportInput(line.get_input_port(), "sent")
-    builder.ExportOutput(line.get_output_port(), "received")
-    return builder.Build()
+    if packets == 0:
+        return sent
+    line = builder.AddNamedSystem(name, Delay(packets, period, neutral))
+    builder.Connect(sent, line.get_input_port())
+    return line.get_output_port()
 
 
-class DelayLine(LeafSystem):
+class Delay(LeafSystem):
     """A line on which each packet, one a period, travels for a whole number of periods.
 
     .. pydrake_system::
 
-        name: DelayLine
+        name: Delay
         input_ports:
         - sent
         output_ports:
         - received
+
+    Args:
+        packets: how many periods a packet travels, at least 1.
+        period: time between packets [s].
+        neutral: (k,) what the receiver gets before the first packet arrives.
     """
 
     def __init__(self, packets: int, period: float, neutral: NDArray[np.float64]) -> None:

@@ -12,9 +12,13 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.compensation import scaled_wrench_into, scales_from_eta
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.quantities import quantity
+from drake_teleop.scaling.wrench_mapping import wrench_to_master_into
+from drake_teleop.slave.arm import ArmModel, forward_kinematics
+from drake_teleop.slave.wrist_sensor import sample_parts
 
 #: sigma_gripper, sigma_object, gamma that leave the contact wrench alone, Eq. (13).
 _ELIMINATION = (0.0, 0.0, 1.0)
+_NO_OBJECT = np.zeros(10)
 
 
 @dataclass
@@ -51,35 +55,42 @@ class ForceScalingConfig:
 
 
 class ForceScaling(LeafSystem):
-    """Removes or scales the non-contact wrench: F' = gamma F_c + V (sigma_gr phi_gr + ...).
+    """Removes or scales the non-contact wrench, then scales the rest down and turns it to the hand.
 
-    The scales are a numeric parameter of the context, [sigma_gripper, sigma_object, gamma], so
-    that they may be changed while a simulation runs.
+    F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj). The scales are a numeric parameter of
+    the context, so that they may be changed while a simulation runs (`SetScales`).
 
     .. pydrake_system::
 
         name: ForceScaling
         input_ports:
-        - measured_wrench_S
-        - specific_force_S
-        - angular_velocity_S
-        - angular_acceleration_S
+        - sample: the wrist sensor's, see `drake_teleop.slave.wrist_sensor.sample_parts`
         - load_estimate: (16,) Eq. (7), [offsets; phi]
         output_ports:
         - scaled_wrench_S: F' of Fig. 2
         - contact_wrench_S: Eq. (13)
         - non_contact_wrench_S: Eq. (12)
+        - wrench_B: F_E_B, what the hand shall feel: -force_scale F', in the master's base B
+
+    Args:
+        config: the scales.
+        arm: the slave's kinematics.
+        R_WB: (3, 3) alignment of the master's base with the world.
     """
 
-    def __init__(self, config: ForceScalingConfig) -> None:
+    def __init__(
+        self, config: ForceScalingConfig, arm: ArmModel, R_WB: NDArray[np.float64]
+    ) -> None:
         super().__init__()
         self._gripper_phi = None if config.gripper_phi is None else np.array(config.gripper_phi)
-        self._scales = self.DeclareNumericParameter(BasicVector(list(config.scales())))
-        self._measured = self.DeclareVectorInputPort("measured_wrench_S", 6)
-        self._motion = [
-            self.DeclareVectorInputPort(name, 3)
-            for name in ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
-        ]
+        self._arm, self._R_WB = arm.table, np.ascontiguousarray(R_WB)
+        self._R_WS, self._p_WS, self._scaled_S = np.zeros((3, 3)), np.zeros(3), np.zeros(6)
+        # sigma_gripper, sigma_object, gamma, force scale.
+        self._scales = self.DeclareNumericParameter(
+            BasicVector([*config.scales(), config.force_scale])
+        )
+        size = sum(sample_parts(arm.num_joints).values())
+        self._sample = self.DeclareVectorInputPort("sample", size)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         # Not time: what does not depend on it need not be looked at in every step.
         inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
@@ -87,41 +98,65 @@ class ForceScaling(LeafSystem):
             ("scaled_wrench_S", self._calc_scaled),
             ("contact_wrench_S", self._calc_contact),
             ("non_contact_wrench_S", self._calc_non_contact),
+            ("wrench_B", self._calc_wrench_B),
         ):
             self.DeclareVectorOutputPort(name, 6, calc, inputs)
 
     def SetScales(
-        self, context: Context, *, sigma_gripper: float, sigma_object: float, gamma: float
+        self,
+        context: Context,
+        *,
+        sigma_gripper: float,
+        sigma_object: float,
+        gamma: float,
+        force_scale: float,
     ) -> None:
         """Changes the scales in a running simulation."""
         parameter = context.get_mutable_numeric_parameter(self._scales)
-        parameter.SetFromVector([sigma_gripper, sigma_object, gamma])
+        parameter.SetFromVector([sigma_gripper, sigma_object, gamma, force_scale])
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
-        self._scale(context, context.get_numeric_parameter(self._scales).value(), output)
+        scales = context.get_numeric_parameter(self._scales).value()
+        self._scale(context, self._sample.Eval(context), scales, output.get_mutable_value())
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        self._scale(context, _ELIMINATION, output)
+        self._scale(context, self._sample.Eval(context), _ELIMINATION, output.get_mutable_value())
 
-    def _scale(self, context: Context, scales: Sequence[float], output: BasicVector) -> None:
+    def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
+        sample, phi = self._sample.Eval(context), self._estimate.Eval(context)[6:]
+        non_contact_wrench_into(
+            sample[6:9], sample[9:12], sample[12:15], phi, output.get_mutable_value()
+        )
+
+    def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
+        sample = self._sample.Eval(context)
+        scales = context.get_numeric_parameter(self._scales).value()
+        self._scale(context, sample, scales, self._scaled_S)
+        forward_kinematics(self._arm, sample[16:], self._R_WS, self._p_WS)
+        wrench_to_master_into(
+            self._scaled_S, self._R_WS, self._R_WB, scales[3], scales[3], output.get_mutable_value()
+        )
+
+    def _scale(
+        self,
+        context: Context,
+        sample: NDArray[np.float64],
+        scales: Sequence[float],
+        out: NDArray[np.float64],
+    ) -> None:
         estimate = self._estimate.Eval(context)
-        phi_gripper = estimate[6:] if self._gripper_phi is None else self._gripper_phi
-        s, omega, alpha = self._motion
+        phi = estimate[6:]
+        gripper = phi if self._gripper_phi is None else self._gripper_phi
         scaled_wrench_into(
-            self._measured.Eval(context),
+            sample[:6],
             estimate[:6],
-            s.Eval(context),
-            omega.Eval(context),
-            alpha.Eval(context),
-            phi_gripper,
-            estimate[6:] - phi_gripper,
+            sample[6:9],
+            sample[9:12],
+            sample[12:15],
+            gripper,
+            _NO_OBJECT if gripper is phi else phi - gripper,
             scales[0],
             scales[1],
             scales[2],
-            output.get_mutable_value(),
+            out,
         )
-
-    def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
-        s, omega, alpha = (port.Eval(context) for port in self._motion)
-        phi = self._estimate.Eval(context)[6:]
-        non_contact_wrench_into(s, omega, alpha, phi, output.get_mutable_value())

@@ -77,7 +77,7 @@ class KinematicScaling(LeafSystem):
         name: KinematicScaling
         input_ports:
         - pose_master: (7,) X_BE
-        - clutch: (1,) engaged if above 0.5
+        - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
         output_ports:
         - pose_command: (7,) X_WS
 
@@ -119,7 +119,7 @@ class KinematicScaling(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         references = discrete_state.get_mutable_value(0)
-        engage = self._clutch.Eval(context)[0] > 0.5
+        engage = not self._clutch.HasValue(context) or self._clutch.Eval(context)[0] > 0.5
         if engage == (references[14] > 0.5):
             return
         self._command_into(context, references, references[:7])

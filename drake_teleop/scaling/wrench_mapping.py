@@ -5,9 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
-
-from drake_teleop.slave.arm import ArmModel, forward_kinematics
 
 
 @njit(cache=True)
@@ -54,45 +51,3 @@ def wrench_to_master(
     force = np.einsum("...ij,...j->...i", R_BS, wrench_S[..., :3])
     torque = np.einsum("...ij,...j->...i", R_BS, wrench_S[..., 3:])
     return -np.concatenate([force_scale * force, torque_scale * torque], axis=-1)
-
-
-class WrenchToMaster(LeafSystem):
-    """Scales the slave's wrench and turns it from S into the base of the master.
-
-    .. pydrake_system::
-
-        name: WrenchToMaster
-        input_ports:
-        - scaled_wrench_S: (6,) F' of Fig. 2 [N, N m]
-        - joint_position: (n,) of the arm, for the orientation of S [rad]
-        output_ports:
-        - wrench_B: (6,) F_E_B, what the hand shall feel at E, in B [N, N m]
-
-    Args:
-        arm: the slave's kinematics.
-        R_WB: (3, 3) alignment of the master's base with the world.
-        scale: force and torque at the master over those at the slave.
-    """
-
-    def __init__(self, arm: ArmModel, R_WB: NDArray[np.float64], scale: float) -> None:
-        super().__init__()
-        self._arm = arm.table
-        self._R_WB, self._scale = np.ascontiguousarray(R_WB), scale
-        self._R_WS, self._p_WS = np.zeros((3, 3)), np.zeros(3)
-        self._wrench = self.DeclareVectorInputPort("scaled_wrench_S", 6)
-        self._position = self.DeclareVectorInputPort("joint_position", arm.num_joints)
-        self.DeclareVectorOutputPort(
-            "wrench_B", 6, self._calc, {self.all_input_ports_ticket()}
-        )
-
-    def _calc(self, context: Context, output: BasicVector) -> None:
-        q = self._position.Eval(context)
-        forward_kinematics(self._arm, q, self._R_WS, self._p_WS)
-        wrench_to_master_into(
-            self._wrench.Eval(context),
-            self._R_WS,
-            self._R_WB,
-            self._scale,
-            self._scale,
-            output.get_mutable_value(),
-        )

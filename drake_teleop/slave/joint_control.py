@@ -24,7 +24,7 @@ class JointControlConfig:
 
 
 @njit(cache=True)
-def joint_control_torque(  # type: ignore[no-untyped-def]
+def joint_control_torque(
     arm, command, q, v, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
 ):  # fmt: skip
     """tau = ID(q, v, kv (clip(kp (q_command - q)) - v)), within the motors' torque.

@@ -23,7 +23,6 @@ from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import (
     Context,
-    Diagram,
     DiagramBuilder,
     DiscreteValues,
     LeafSystem,
@@ -38,8 +37,9 @@ from drake_teleop.slave.arm import MOTION_SIZE, ArmModel, sensor_motion
 _CHANNELS = 15
 _SAMPLE = 16
 #: Samples that share one event of the noise source: an event at 8 kHz costs 5 us, mostly its own.
-NOISE_BLOCK = 8
+NOISE_BLOCK = 32
 _SECTIONS = 2  # second-order sections of the fourth-order low-pass
+_FILTER = _CHANNELS * _SECTIONS * 2
 
 
 def sample_parts(num_joints: int) -> dict[str, int]:
@@ -125,7 +125,7 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
 
 
 @njit(cache=True)
-def _true_sample(arm, phi, q, v, vdot, contact_W, motion, out):  # type: ignore[no-untyped-def]
+def _true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
     """Writes [f, tau, s, omega, alpha] of S into `out` (15,); the wrench is Eqs. (1)-(2)."""
     sensor_motion(arm, q, v, vdot, motion)
     out[6:15] = motion[:9]
@@ -142,7 +142,7 @@ def _true_sample(arm, phi, q, v, vdot, contact_W, motion, out):  # type: ignore[
 
 
 @njit(cache=True)
-def _convert(truth, offset, noise, noise_std, limits, resolution, out):  # type: ignore[no-untyped-def]
+def _convert(truth, offset, noise, noise_std, limits, resolution, out):
     """The converter's 12 channels; returns 1.0 if one of them is saturated."""
     saturated = 0.0
     for i in range(12):
@@ -160,7 +160,7 @@ def _convert(truth, offset, noise, noise_std, limits, resolution, out):  # type:
 
 
 @njit(cache=True)
-def _low_pass(sections, raw, memory, out):  # type: ignore[no-untyped-def]
+def _low_pass(sections, raw, memory, out):
     """Transposed direct form II, channel by channel; `memory` (15, 2, 2) is updated."""
     for channel in range(raw.shape[0]):
         value = raw[channel]
@@ -175,7 +175,7 @@ def _low_pass(sections, raw, memory, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _settle(sections, raw, memory):  # type: ignore[no-untyped-def]
+def _settle(sections, raw, memory):
     """Puts the filter's memory where it would be after a long time at `raw`."""
     for channel in range(raw.shape[0]):
         for k in range(sections.shape[0]):
@@ -187,7 +187,7 @@ def _settle(sections, raw, memory):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _angular_velocity_from_encoders(arm, q, resolution, period, last_q, work, out):  # type: ignore[no-untyped-def]
+def _angular_velocity_from_encoders(arm, q, resolution, period, last_q, work, out):
     """omega_S from two successive encoder readings; `last_q` becomes this reading."""
     n = q.shape[0]
     velocity, none, motion = work[:n], work[n : 2 * n], work[2 * n :]
@@ -201,29 +201,35 @@ def _angular_velocity_from_encoders(arm, q, resolution, period, last_q, work, ou
 
 
 @njit(cache=True)
-def sample_ideal(arm, phi, q, v, vdot, contact_W, work, sample):  # type: ignore[no-untyped-def]
+def sample_ideal(arm, phi, state, vdot, contact_W, work, sample):
     """One sample of the ideal sensor: the truth. `sample` (16 + n,) is written."""
-    _true_sample(arm, phi, q, v, vdot, contact_W, work[:MOTION_SIZE], sample[:15])
+    n = vdot.shape[0]
+    motion = work[:MOTION_SIZE]
+    _true_sample(arm, phi, state[:n], state[n:], vdot, contact_W, motion, sample[:15])
     sample[15] = 0.0
-    sample[16:] = q
+    sample[16:] = state[:n]
 
 
 @njit(cache=True)
-def sample_realistic(  # type: ignore[no-untyped-def]
-    arm, phi, q, v, vdot, contact_W, noise, offset, noise_std, limits, resolution,
-    encoder_resolution, sections, period, memory, work, sample,
-):  # fmt: skip
+def sample_realistic(arm, phi, state, vdot, contact_W, constants, memory, work, sample):
     """One sample of the realistic sensor; `memory` and `sample` (16 + n,) are updated.
 
-    `memory` is [samples taken, last encoder readings (n), filter (15 x 2 x 2)]; `work` is scratch.
+    `state` is [q; v]; `constants` comes from `pack_constants`; `memory` is [samples taken, last
+    encoder readings (n), filter (15 x 2 x 2), the noise of this block of samples (32 x 12)];
+    `work` is scratch.
     """
-    n = q.shape[0]
-    first = 12 * (int(memory[0]) % NOISE_BLOCK)
+    n = vdot.shape[0]
+    q, v = state[:n], state[n:]
+    offset, noise_std, limits = constants[:6], constants[6:18], constants[18:30]
+    sections = constants[30:40].reshape(_SECTIONS, 5)
+    resolution, encoder_resolution, period = constants[40], constants[41], constants[42]
     last_q = memory[1 : 1 + n]
-    filter_memory = memory[1 + n :].reshape(_CHANNELS, _SECTIONS, 2)
+    filter_memory = memory[1 + n : 1 + n + _FILTER].reshape(_CHANNELS, _SECTIONS, 2)
+    first = 1 + n + _FILTER + 12 * (int(memory[0]) % NOISE_BLOCK)
+    noise = memory[first : first + 12]
     truth, raw, rest = work[:15], work[15:30], work[30 : 30 + 2 * n + MOTION_SIZE]
     _true_sample(arm, phi, q, v, vdot, contact_W, rest[:MOTION_SIZE], truth)
-    saturated = _convert(truth, offset, noise[first : first + 12], noise_std, limits, resolution, raw)
+    saturated = _convert(truth, offset, noise, noise_std, limits, resolution, raw)
     starts = memory[0] == 0.0
     if starts:
         last_q[:] = q - period * v
@@ -236,6 +242,19 @@ def sample_realistic(  # type: ignore[no-untyped-def]
     sample[16:] = last_q
 
 
+def pack_constants(config: WristSensorConfig, period: float) -> NDArray[np.float64]:
+    """What `sample_realistic` needs to know, in one array: passing ten costs a microsecond."""
+    return np.concatenate(
+        [
+            config.offset,
+            config.noise_std(),
+            config.ranges(),
+            butterworth_sections(config.bandwidth_hz, 1 / period).ravel(),
+            [config.resolution, config.encoder_resolution, period],
+        ]
+    )
+
+
 class WristSensor(LeafSystem):
     """Samples force, torque, acceleration and angular velocity of S at the sensor's rate.
 
@@ -245,7 +264,8 @@ class WristSensor(LeafSystem):
         input_ports:
         - slave_state: [q; v] of the arm
         - slave_acceleration: vdot of the arm
-            - noise: 12 standard normal numbers for each of NOISE_BLOCK samples
+        - contact_results: the plant's contact results (only with `contact`)
+        - noise: 12 standard normal numbers for each of NOISE_BLOCK samples
         output_ports:
         - sample: the parts of `sample_parts`, one after the other
 
@@ -255,6 +275,7 @@ class WristSensor(LeafSystem):
         tool: index of the tool's body in the plant.
         config: the sensor.
         period: sampling period [s].
+        contact: whether there is anything to touch.
     """
 
     def __init__(
@@ -263,30 +284,26 @@ class WristSensor(LeafSystem):
         tool: BodyIndex,
         config: WristSensorConfig,
         period: float,
+        *,
+        contact: bool,
     ) -> None:
         super().__init__()
         n = arm.num_joints
-        self._arm, self._phi, self._n = arm.table, arm.phi_load, n
-        self._config = config
-        self._constants = (
-            np.array(config.offset),
-            config.noise_std(),
-            config.ranges(),
-            config.resolution,
-            config.encoder_resolution,
-            butterworth_sections(config.bandwidth_hz, 1 / period),
-            period,
-        )
+        self._arm, self._phi = arm.table, arm.phi_load
         self._work = np.zeros(30 + 2 * n + MOTION_SIZE)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
         self._tool, self._contact_W = tool, np.zeros(6)
-        self._contact = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
+        self._contact = None
+        if contact:
+            results = Value(ContactResults())
+            self._contact = self.DeclareAbstractInputPort("contact_results", results)
         sample_index = self.DeclareDiscreteState(_SAMPLE + n)
         update = self._sample_ideal
         if not config.ideal:
+            self._constants = pack_constants(config, period)
             self._noise = self.DeclareVectorInputPort("noise", 12 * NOISE_BLOCK)
-            self.DeclareDiscreteState(1 + n + _CHANNELS * _SECTIONS * 2)
+            self.DeclareDiscreteState(1 + n + _FILTER + 12 * NOISE_BLOCK)
             update = self._sample_realistic
         self.DeclareStateOutputPort("sample", sample_index)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, update)
@@ -294,17 +311,15 @@ class WristSensor(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(update)
 
     def _true_contact(self, context: Context) -> NDArray[np.float64]:
-        if self._contact.HasValue(context):
+        if self._contact is not None:
             contact_wrench(self._contact.Eval(context), self._tool, self._contact_W)
         return self._contact_W
 
     def _sample_ideal(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = self._state.Eval(context)
         sample_ideal(
             self._arm,
             self._phi,
-            state[: self._n],
-            state[self._n :],
+            self._state.Eval(context),
             self._acceleration.Eval(context),
             self._true_contact(context),
             self._work,
@@ -312,58 +327,44 @@ class WristSensor(LeafSystem):
         )
 
     def _sample_realistic(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = self._state.Eval(context)
+        memory = discrete_state.get_mutable_value(1)
+        if memory[0] % NOISE_BLOCK == 0:
+            memory[-12 * NOISE_BLOCK :] = self._noise.Eval(context)
         sample_realistic(
             self._arm,
             self._phi,
-            state[: self._n],
-            state[self._n :],
+            self._state.Eval(context),
             self._acceleration.Eval(context),
             self._true_contact(context),
-            self._noise.Eval(context),
-            *self._constants,
-            discrete_state.get_mutable_value(1),
+            self._constants,
+            memory,
             self._work,
             discrete_state.get_mutable_value(0),
         )
 
 
-def MakeWristSensor(
-    arm: ArmModel, tool: BodyIndex, config: WristSensorConfig, period: float
-) -> Diagram:
-    """The sampled sensor with its noise, one output port for every part of a sample.
+def AddWristSensor(
+    builder: DiagramBuilder,
+    arm: ArmModel,
+    tool: BodyIndex,
+    config: WristSensorConfig,
+    period: float,
+    *,
+    contact: bool,
+) -> WristSensor:
+    """Adds the sensor, its noise, and "sample_parts", which has a port for every part of a sample.
 
-    .. pydrake_system::
-
-        name: wrist_sensor
-        input_ports:
-        - slave_state
-        - slave_acceleration
-        - contact_results (may be left unconnected)
-        output_ports:
-        - sample
-        - measured_wrench_S
-        - specific_force_S
-        - angular_velocity_S
-        - angular_acceleration_S
-        - saturated
-        - joint_position: the encoders' reading [rad]
+    Arguments as for `WristSensor`.
     """
-    builder = DiagramBuilder()
-    sensor = builder.AddNamedSystem("sampler", WristSensor(arm, tool, config, period))
-    sizes = sample_parts(arm.num_joints)
-    parts = builder.AddNamedSystem("parts", Demultiplexer(list(sizes.values())))
-    builder.Connect(sensor.GetOutputPort("sample"), parts.get_input_port())
+    sensor = WristSensor(arm, tool, config, period, contact=contact)
+    builder.AddNamedSystem("wrist_sensor", sensor)
     if not config.ideal:
-        noise = RandomSource(
-            RandomDistribution.kGaussian, 12 * NOISE_BLOCK, NOISE_BLOCK * period
+        noise = builder.AddNamedSystem(
+            "wrist_sensor_noise",
+            RandomSource(RandomDistribution.kGaussian, 12 * NOISE_BLOCK, NOISE_BLOCK * period),
         )
-        builder.Connect(
-            builder.AddNamedSystem("noise", noise).get_output_port(), sensor.GetInputPort("noise")
-        )
-    for name in ("slave_state", "slave_acceleration", "contact_results"):
-        builder.ExportInput(sensor.GetInputPort(name), name)
-    builder.ExportOutput(sensor.GetOutputPort("sample"), "sample")
-    for index, name in enumerate(sizes):
-        builder.ExportOutput(parts.get_output_port(index), name)
-    return builder.Build()
+        builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
+    sizes = sample_parts(arm.num_joints)
+    parts = builder.AddNamedSystem("sample_parts", Demultiplexer(list(sizes.values())))
+    builder.Connect(sensor.GetOutputPort("sample"), parts.get_input_port())
+    return sensor

@@ -1,34 +1,45 @@
-"""The monitor of joint limits: continuous plants do not enforce them, so somebody must watch."""
+"""The monitor of the slave: joint limits, which continuous plants do not enforce, and the IK."""
 
 from __future__ import annotations
 
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
 from drake_teleop.slave.arm import ArmModel
 
 
-class JointLimitMonitor(LeafSystem):
+class SlaveMonitor(LeafSystem):
     """Ends the simulation with a clear message when a joint of the slave leaves its range.
 
     .. pydrake_system::
 
-        name: JointLimitMonitor
+        name: SlaveMonitor
         input_ports:
         - slave_state: [q; v] of the arm [rad, rad/s]
+        - ik_status: of the inverse kinematics (may be left unconnected)
+        output_ports:
+        - ik_status: the last one seen, for the log
+
+    Args:
+        arm: the limits.
+        period: how often it looks [s].
     """
 
     def __init__(self, arm: ArmModel, period: float) -> None:
         super().__init__()
         self._arm = arm
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
-        self.DeclarePeriodicPublishEvent(period, 0.0, self._watch)
+        self._status = self.DeclareVectorInputPort("ik_status", 1)
+        self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._watch)
 
-    def _watch(self, context: Context) -> EventStatus:
+    def _watch(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        if self._status.HasValue(context):
+            discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]
         # A comparison with NaN is false, so a lost joint is outside too.
         inside = (q >= self._arm.lower) & (q <= self._arm.upper)
         if inside.all():
-            return EventStatus.DidNothing()
+            return EventStatus.Succeeded()
         joint = int(inside.argmin())
         return EventStatus.Failed(
             self,
