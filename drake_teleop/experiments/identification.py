@@ -6,17 +6,18 @@ Nothing of the plant's truth is used: what is known comes from the wrist sensor'
 from __future__ import annotations
 
 import dataclasses
+import time
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from drake_teleop.experiments.progress import Stage
+from drake_teleop.experiments.progress import Progress, Stage
 from drake_teleop.load.excitation import FourierTrajectory, condition_numbers, design_excitation
 from drake_teleop.load.identification import Identification, identify
 from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import ArmModel
 from drake_teleop.slave.excitation import excitation_limits, sensor_motion_of
@@ -39,6 +40,7 @@ class LoadIdentification:
         estimate: (16,) Eq. (7), [offsets; phi] of the recursive estimator in the loop at the end.
         batch: the same record by batch least squares.
         kappa_w10: condition number of the motion, see `condition_numbers`.
+        real_time_factor: of the simulation.
     """
 
     trajectory: FourierTrajectory
@@ -46,6 +48,7 @@ class LoadIdentification:
     estimate: Array
     batch: Identification
     kappa_w10: float
+    real_time_factor: float
 
     @property
     def identification(self) -> Identification:
@@ -106,18 +109,26 @@ def identify_load(scenario: Scenario, stage: Stage) -> LoadIdentification:
     )
     samples = motion(*trajectory.evaluate(np.arange(0.0, trajectory.period, 1e-3)))
     designed(1.0)
-    result = simulate(
-        MakeIdentificationStation(scenario, trajectory),
-        scenario.simulation,
-        progress=stage("Identify the load"),
-    )
+    station = MakeIdentificationStation(scenario, trajectory)
+    result, factor = timed(station, scenario.simulation, stage("Identify the load"))
     usable = result["saturated"][:, 0] == 0
     batch = identify(
         *(signal[usable] for signal in sensor_samples(result)),
         noise=scenario.wrist_sensor.noise_std()[:6],
     )
     kappa = condition_numbers(*samples[:3]).kappa_w10
-    return LoadIdentification(trajectory, result, result["load_estimate"][-1], batch, kappa)
+    estimate = result["load_estimate"][-1]
+    return LoadIdentification(trajectory, result, estimate, batch, kappa, factor)
+
+
+def timed(
+    station: Diagram, simulation: Simulation, progress: Progress
+) -> tuple[SimulationResult, float]:
+    """`simulate`, and its real-time factor: simulated over elapsed time, compilation included."""
+    start = time.perf_counter()
+    result = simulate(station, simulation, progress=progress)
+    elapsed = time.perf_counter() - start
+    return result, (simulation.settle + simulation.duration) / elapsed
 
 
 def sensor_samples(result: SimulationResult) -> tuple[Array, Array, Array, Array]:
