@@ -12,11 +12,16 @@ Stage: TypeAlias = Callable[[str], Progress]
 """Opens a stage by its name."""
 
 
+def silent(name: str) -> Progress:
+    """A stage that shows nothing."""
+    return lambda fraction: None
+
+
 @contextmanager
 def progress_bars(quiet: bool) -> Iterator[Stage]:
     """Bars on the terminal for as long as the context lasts; nothing at all if `quiet`."""
     if quiet:
-        yield lambda name: lambda fraction: None
+        yield silent
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 

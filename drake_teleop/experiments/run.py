@@ -156,8 +156,8 @@ def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
 def calculated_contact_wrench(result: SimulationResult) -> Array:
     """(N, 6) Eq. (13) from the recorded samples and the load estimate of the end."""
     estimate = result["load_estimate"][-1]
-    wrench, *motion = sensor_samples(result)
-    return contact_wrench(wrench, estimate[:6], *motion, estimate[6:])
+    wrench, s, omega, alpha = sensor_samples(result)
+    return contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
 
 
 def summarise(run: ScenarioRun) -> dict[str, Any]:
