@@ -14,6 +14,8 @@ from drake_teleop._version import __version__
 from drake_teleop.errors import DrakeTeleopError
 
 if TYPE_CHECKING:
+    from drake_teleop.experiments.identification import identify_load
+    from drake_teleop.experiments.run import run_scenario
     from drake_teleop.load.compensation import contact_wrench, scaled_wrench
     from drake_teleop.load.identification import Identification, identify
     from drake_teleop.load.regressor import non_contact_wrench, regressor
@@ -37,15 +39,19 @@ __all__ = [
     "contact_wrench",
     "eliminate_log",
     "identify",
+    "identify_load",
     "identify_log",
     "non_contact_wrench",
     "read_log",
     "regressor",
+    "run_scenario",
     "scaled_wrench",
     "simulate",
 ]
 
 _HOMES = {
+    "experiments.identification": ("identify_load",),
+    "experiments.run": ("run_scenario",),
     "load.compensation": ("contact_wrench", "scaled_wrench"),
     "load.identification": ("Identification", "identify"),
     "load.regressor": ("non_contact_wrench", "regressor"),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from drake_teleop.experiments.progress import Progress, Stage
+from drake_teleop.experiments.progress import Progress, Stage, silent
 from drake_teleop.load.excitation import FourierTrajectory, condition_numbers, design_excitation
 from drake_teleop.load.identification import Identification, identify
 from drake_teleop.result import SimulationResult
@@ -87,7 +87,7 @@ def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
     )
 
 
-def identify_load(scenario: Scenario, stage: Stage) -> LoadIdentification:
+def identify_load(scenario: Scenario, stage: Stage = silent) -> LoadIdentification:
     """Designs an excitation trajectory of the scenario's duration, runs it, and identifies.
 
     Args:

@@ -45,7 +45,7 @@ from drake_teleop.experiments.identification import (
     slave_arm,
     timed,
 )
-from drake_teleop.experiments.progress import Stage, progress_bars
+from drake_teleop.experiments.progress import Stage, progress_bars, silent
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.result import SimulationResult
@@ -116,7 +116,7 @@ def run_command(
     return summary
 
 
-def run_scenario(scenario: Scenario, stage: Stage) -> ScenarioRun:
+def run_scenario(scenario: Scenario, stage: Stage = silent) -> ScenarioRun:
     """Runs a scenario by the rule at the top of this module.
 
     Args:
