@@ -193,8 +193,8 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
         "joint_trajectory", JointTrajectory(trajectory, scenario.simulation.settle)
     )
     _connect(builder, [("joint_trajectory.joint_command", "joint_control.joint_command")])
-    signals |= {"joint_command": "joint_trajectory.joint_command"}
-    return _finish(builder, "identification_station", signals, scenario)
+    command = {"joint_command": "joint_trajectory.joint_command"}
+    return _finish(builder, "identification_station", signals | command, scenario)
 
 
 def AddSlave(

@@ -21,7 +21,7 @@ from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
 
 #: S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-#: Elbow up, reaching forward (negative q2 and q3 lean towards +x); home is the branch nearest to it.
+#: Elbow up, reaching forward (negative q2 and q3 lean to +x); home is the branch nearest to it.
 _Q_NEAR_HOME = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
 

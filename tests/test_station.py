@@ -1,0 +1,321 @@
+"""The whole station of Fig. 4 against rigid-body mechanics and the paper's statements."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.environment.contact import contact_wrench
+from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.compensation import scaled_wrench
+from drake_teleop.load.excitation import FourierTrajectory
+from drake_teleop.master import device
+from drake_teleop.master.device import JointFriction
+from drake_teleop.master.operator import OperatorConfig, Sine
+from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
+from drake_teleop.signals import SIGNALS
+from drake_teleop.simulation import MakeSimulator, simulate
+from drake_teleop.slave.arm import MOTION_SIZE, sensor_motion
+from drake_teleop.slave.inverse_kinematics import IkStatus
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.wrist_sensor import sample_ideal
+from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
+
+FORCE_SCALE = 1 / 17.5
+MASS = 3.13
+
+
+@pytest.fixture(scope="module")
+def slave():
+    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None)
+
+
+def true_estimate(slave, offset=(0.0,) * 6) -> np.ndarray:
+    return np.concatenate([offset, slave.arm.phi_load])
+
+
+def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
+    """An ideal loop in a steady vertical oscillation: no friction, no sensor errors."""
+    sine = Sine(
+        t_start=0.0, duration=100.0, ramp=0.5, frequency=frequency, translation=[0, 0, amplitude]
+    )
+    scenario = replace(
+        Scenario(),
+        operator=OperatorConfig(grip="firm", intent=[sine]),
+        master__friction=JointFriction([0.0] * 6, [0.0] * 6),
+        wrist_sensor__ideal=True,
+        simulation__settle=1.0,
+        simulation__duration=1.0,
+    )
+    return replace(scenario, **changes)
+
+
+@pytest.mark.parametrize("sheet", [None, SheetSpring(position=[0.55, 0.0, 0.246])])
+def test_the_wrist_wrench_is_the_reaction_force_of_the_sensors_joint(slave, sheet):
+    """V phi minus the contact wrench is what the plant says the weld transmits, to 1e-9 N."""
+    scenario = vertical(0.07, 2.5, sheet_spring=sheet, simulation__settle=0.0)
+    simulator = MakeSimulator(MakeTeleopStation(scenario), scenario.simulation)
+    station = simulator.get_system()
+    plant = station.GetSubsystemByName("slave_plant")
+    rx90 = plant.GetModelInstanceByName("rx90")
+    weld = plant.GetJointByName("sensor_weld")
+    place = list(plant.GetJointIndices()).index(weld.index())
+    tool = plant.GetBodyByName("tool").index()
+    seen = {"peak": 0.0, "contacts": 0, "error": 0.0}
+
+    def compare(root):
+        context = plant.GetMyContextFromRoot(root)
+        reaction = plant.get_reaction_forces_output_port().Eval(context)[place]
+        expected = np.concatenate([reaction.translational(), reaction.rotational()])
+        contact_W = np.zeros(6)
+        if sheet is not None:
+            results = plant.get_contact_results_output_port().Eval(context)
+            contact_wrench(results, tool, contact_W)
+            seen["contacts"] += results.num_point_pair_contacts()
+        wrench = np.zeros(22)
+        sample_ideal(
+            slave.arm.table,
+            slave.arm.phi_load,
+            plant.get_state_output_port(rx90).Eval(context),
+            plant.get_generalized_acceleration_output_port(rx90).Eval(context),
+            contact_W,
+            np.zeros(64),
+            wrench,
+        )
+        seen["peak"] = max(seen["peak"], np.linalg.norm(expected[:3]))
+        seen["error"] = max(seen["error"], np.abs(wrench[:6] - expected).max())
+
+    simulator.set_monitor(compare)
+    simulator.AdvanceTo(1.0)
+    assert seen["peak"] > 60.0
+    assert (seen["contacts"] > 100) == (sheet is not None)
+    assert seen["error"] < 1e-9
+
+
+def first_harmonic(signal: np.ndarray, t: np.ndarray, frequency: float) -> complex:
+    """Over a whole number of periods."""
+    return 2 * np.mean(signal * np.exp(-2j * np.pi * frequency * t))
+
+
+@pytest.fixture(scope="module")
+def felt(slave):
+    """Per sigma: hand force, acceleration of the master and of the slave at 1 Hz, vertical."""
+    responses = {}
+    for sigma in (0.0, 0.5, 1.0, 1.5):
+        scenario = vertical(0.03, 1.0, force_scaling__sigma=sigma)
+        result = simulate(
+            MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
+        )
+        t = result.t[:-1]  # one period, its end left out
+        height = result["pose_master"][:-1, 6]
+        acceleration = -((2 * np.pi) ** 2) * first_harmonic(height, t, 1.0)
+        slave_acceleration = -first_harmonic(result["specific_force_S"][:-1, 2], t, 1.0)
+        hand = first_harmonic(result["hand_wrench_E"][:-1, 2], t, 1.0)
+        responses[sigma] = hand, acceleration, slave_acceleration
+    return responses
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.0, 1.5])
+def test_the_operator_feels_sigma_times_the_loads_mass_on_top_of_the_device(felt, sigma):
+    """Apparent mass m_a = sigma m (section V), here / 17.5 and times the slave's tracking."""
+    hand_0, acceleration_0, _ = felt[0.0]
+    hand, acceleration, slave_acceleration = felt[sigma]
+    tracking = slave_acceleration / acceleration
+    added_mass = (hand / acceleration - hand_0 / acceleration_0) / tracking
+    assert added_mass.real == pytest.approx(sigma * MASS * FORCE_SCALE, rel=0.02)
+
+
+def test_with_sigma_0_the_operator_feels_the_device_alone(felt):
+    """The device's own mass, from its closed forms, and the hand's."""
+    hand, acceleration, _ = felt[0.0]
+    q = device.inverse_kinematics(np.array([1.0, 0, 0, 0, 0.27, 0, 0.03]))
+    grip = OperatorConfig(grip="firm").hand
+    M, J = device.mass_matrix(q, grip.mass, grip.inertia), device.jacobian(q)
+    # A vertical force meets this mass when the stylus is held upright by the wrist.
+    inverse_inertia = J @ np.linalg.inv(M) @ J.T
+    mass = np.linalg.inv(inverse_inertia)[2, 2]
+    assert (hand / acceleration).real == pytest.approx(mass, rel=0.02)
+
+
+def test_energy_of_the_ideal_loop_is_accounted_for(slave):
+    """What hand and motors put in is what the bodies hold, on both sides.
+
+    Wrenches and torques are held over a period, so that their work over it is known exactly.
+    """
+    scenario = vertical(
+        0.04, 1.5, rates__log_hz=2000.0, rates__sensor_hz=2000.0, simulation__settle=0.0
+    )
+    result = simulate(
+        MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
+    )
+    # The log shows each instant before its events: the wrenches at an entry are those that are
+    # then held, the torque at an entry is the one that was held until then.
+    # Master: gravity is compensated, so the rest of the torque works on kinetic energy alone.
+    hand, twist = scenario.operator.hand, result["twist_master"]
+    held = result["hand_wrench_E"] + result["force_to_master"]
+    steps = np.sum(held[:-1] * (twist[1:] + twist[:-1]), axis=1) / 2 / 2000
+    q, v = np.split(result["master_state"], 2, axis=1)
+    kinetic = [
+        0.5 * w @ device.mass_matrix(p, hand.mass, hand.inertia) @ w
+        for p, w in zip(q, v, strict=True)
+    ]
+    work = np.concatenate([[0], np.cumsum(steps)])
+    assert np.abs(work).max() > 0.02
+    np.testing.assert_allclose(work, kinetic, atol=1e-3 * np.abs(work).max())
+
+    # Slave: motor work = kinetic + potential energy; there is neither contact nor friction.
+    plant, context = slave.plant, slave.plant.CreateDefaultContext()
+    q, v = np.split(result["slave_state"], 2, axis=1)
+    stored = []
+    for p, w in zip(q, v, strict=True):
+        plant.SetPositions(context, p)
+        mass_matrix = plant.CalcMassMatrix(context)
+        stored.append(0.5 * w @ mass_matrix @ w + plant.CalcPotentialEnergy(context))
+    work = np.concatenate(
+        [[0], np.cumsum(np.sum(result["joint_torque"][1:] * np.diff(q, axis=0), 1))]
+    )
+    np.testing.assert_allclose(work, np.array(stored) - stored[0], atol=1e-3 * np.ptp(stored))
+    assert np.ptp(stored) > 1.0
+
+
+def test_what_the_station_puts_out_is_what_the_plain_functions_say(slave):
+    """The blocks are thin shells: the same kernel on the log gives the same wrench."""
+    scenario = vertical(0.05, 2.0, force_scaling__sigma=0.5, wrist_sensor__ideal=False)
+    estimate = true_estimate(slave, scenario.wrist_sensor.offset)
+    result = simulate(MakeTeleopStation(scenario, load_estimate=estimate), scenario.simulation)
+    motion = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
+    wrench = scaled_wrench(
+        result["measured_wrench_S"],
+        estimate[:6],
+        *(result[name] for name in motion),
+        estimate[6:],
+        np.zeros(10),
+        sigma_gripper=0.5,
+        sigma_object=0.0,
+        gamma=1.0,
+    )
+    np.testing.assert_array_equal(result["scaled_wrench_S"], wrench)
+
+
+def test_ideal_sensor_and_true_load_leave_nothing(slave):
+    scenario = vertical(0.06, 2.5, force_scaling__sigma=0.0)
+    result = simulate(
+        MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
+    )
+    assert np.abs(result["measured_wrench_S"][:, 2]).max() > 60.0
+    assert np.abs(result["contact_wrench_S"]).max() < 1e-9
+
+
+def test_the_slave_follows_the_scaled_master(slave):
+    scenario = vertical(
+        0.02, 0.5, kinematic_scaling__translation_scale=2.0, simulation__duration=2.0
+    )
+    result = simulate(
+        MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
+    )
+    out = np.zeros(MOTION_SIZE)
+    heights = []
+    for state in result["slave_state"]:
+        sensor_motion(slave.arm.table, state[:6], state[6:], np.zeros(6), out)
+        heights.append(out[11])
+    master = result["pose_master"][:, 6] - 0.03
+    slave_offset = np.array(heights) - 0.45
+    # 12 Hz position control lags a 0.5 Hz motion by about 13 ms.
+    late = np.interp(result.t - 1 / (2 * np.pi * 12), result.t, master)
+    assert np.ptp(slave_offset) == pytest.approx(2 * np.ptp(master), rel=0.01)
+    np.testing.assert_allclose(slave_offset[50:], 2 * late[50:], atol=0.03 * np.ptp(slave_offset))
+
+
+def test_a_delay_delays_both_directions(slave):
+    # A light load: with sigma = 1 the felt rotational inertia is larger than the hand's and the
+    # device's, and any delay makes the loop unstable.
+    scenario = vertical(0.03, 1.0, channel__delay=0.1, force_scaling__sigma=0.1)
+    result = simulate(
+        MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
+    )
+    lag = round(0.1 / 1e-3)
+    # What is displayed now is minus 1/17.5 of what the sensor felt 0.1 s ago; S points down.
+    displayed, scaled = result["force_to_master"][:, 2], result["scaled_wrench_S"][:, 2]
+    np.testing.assert_allclose(displayed[lag:], FORCE_SCALE * scaled[:-lag], atol=2e-4)
+    assert np.ptp(FORCE_SCALE * scaled) > 0.01
+
+
+def test_an_open_clutch_stops_the_slave(slave):
+    scenario = vertical(0.03, 1.0, simulation__settle=0.0)
+    station = MakeTeleopStation(scenario, load_estimate=true_estimate(slave))
+    simulator = MakeSimulator(station, scenario.simulation)
+    station.GetInputPort("clutch").FixValue(simulator.get_mutable_context(), [0.0])
+    simulator.AdvanceTo(0.75)
+    command = station.GetOutputPort("pose_command").Eval(simulator.get_context())
+    master = station.GetOutputPort("pose_master").Eval(simulator.get_context())
+    np.testing.assert_allclose(command[4:], scenario.slave.position, atol=1e-12)
+    assert abs(master[6] - 0.03) > 0.005
+
+
+def test_scales_change_while_running(slave):
+    scenario = vertical(0.03, 1.0)
+    station = MakeTeleopStation(scenario, load_estimate=true_estimate(slave))
+    simulator = MakeSimulator(station, scenario.simulation)
+    simulator.AdvanceTo(0.2)
+    block = station.GetSubsystemByName("force_scaling")
+    context = block.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    block.SetScales(context, sigma_gripper=0.0, sigma_object=0.0, gamma=1.0, force_scale=0.1)
+    simulator.AdvanceTo(0.21)
+    scaled = station.GetOutputPort("scaled_wrench_S").Eval(simulator.get_context())
+    assert np.abs(scaled).max() < 1e-9
+
+
+def test_every_output_port_is_a_documented_signal():
+    scenario = replace(LoadScenario("contact_transition"), simulation=Simulation(duration=0.01))
+    station = MakeTeleopStation(scenario)
+    names = {station.get_output_port(i).get_name() for i in range(station.num_output_ports())}
+    assert names == set(SIGNALS)
+    for name in names:
+        assert station.GetOutputPort(name).size() == len(SIGNALS[name].components)
+        assert name in MakeTeleopStation.__doc__
+
+
+def test_a_start_out_of_reach_is_one_clear_error():
+    with pytest.raises(DrakeTeleopError, match=r"slave\.position.*cannot reach"):
+        MakeTeleopStation(replace(Scenario(), slave__position=[1.4, 0.0, 0.45]))
+
+
+def test_a_command_far_out_of_reach_is_survived_and_reported(slave):
+    """The inverse kinematics clamps the command: no joint leaves its range, nothing is lost."""
+    sine = Sine(duration=100.0, ramp=0.5, frequency=0.4, translation=[0.0, 0.06, 0.0])
+    scenario = replace(
+        Scenario(),
+        operator=OperatorConfig(grip="firm", intent=[sine]),
+        kinematic_scaling__translation_scale=20.0,
+    )
+    result = simulate(
+        MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
+    )
+    assert IkStatus.OUT_OF_REACH in result["ik_status"]
+    for name in result:
+        assert np.isfinite(result[name]).all(), name
+
+
+def trajectory_of_joint_5(slave, amplitude: float) -> FourierTrajectory:
+    cosine = np.zeros((6, 4))
+    cosine[4, 0] = amplitude
+    home = slave.plant.GetDefaultPositions(slave.instance)
+    return FourierTrajectory.at_rest(home, np.zeros((6, 4)), cosine, 0.5)
+
+
+def test_leaving_the_joints_range_ends_the_simulation_with_a_clear_message(slave):
+    scenario = replace(LoadScenario("identification"), simulation=Simulation(duration=2.0))
+    station = MakeIdentificationStation(scenario, trajectory_of_joint_5(slave, 6.0))
+    with pytest.raises(DrakeTeleopError, match=r"joint 5 of the slave left its range at \d\.\d+ s"):
+        simulate(station, scenario.simulation)
+
+
+def test_identification_leaves_the_teleoperation_station_alone(slave):
+    """Stations do not share state: building one does not change the next."""
+    short = Simulation(duration=0.02)
+    scenario = replace(LoadScenario("identification"), simulation=short)
+    station = MakeIdentificationStation(scenario, trajectory_of_joint_5(slave, 0.1))
+    assert "joint_command" in simulate(station, short)
+    assert "pose_master" in simulate(MakeTeleopStation(Scenario()), short)
