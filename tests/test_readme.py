@@ -1,0 +1,60 @@
+"""What the README tells people to type works as it stands."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import polars as pl
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_python_example_runs(tmp_path, monkeypatch):
+    (example,) = re.findall("```python\n(.*?)```", README, re.S)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(compile(example, "README.md", "exec"), names)
+    contact = names["result"]["contact_wrench_S"]
+    assert contact.shape == (len(names["result"].t), 6)
+    assert len(pl.read_csv("log.csv")) == len(contact)
+    assert Path("forces.png").stat().st_size > 10_000
+
+
+def test_every_link_into_the_repository_leads_somewhere():
+    targets = re.findall(r"\]\((?!https?:)([^)]+)\)", README)
+    assert targets
+    assert [target for target in targets if not (ROOT / target).exists()] == []
+
+
+def test_ci_runs_the_readmes_test_command(tmp_path):
+    # A copy of the two files in a folder where the command's programs only say their names.
+    (tmp_path / ".ci").mkdir()
+    (tmp_path / ".ci" / "run").write_text((ROOT / ".ci" / "run").read_text())
+    (tmp_path / "README.md").write_text(README)
+    programs = tmp_path / ".venv-test" / "bin"
+    fake = tmp_path / "fake"
+    fake.mkdir()
+    (fake / "python3").write_text(
+        f"#!/bin/sh\necho python3 $*\nmkdir -p {programs}\n"
+        f"for name in pip pytest; do printf '#!/bin/sh\\necho '$name' $*\\n' > {programs}/$name\n"
+        f"chmod +x {programs}/$name; done\n"
+    )
+    (fake / "python3").chmod(0o755)
+    answer = subprocess.run(
+        ["bash", ".ci/run"],
+        cwd=tmp_path,
+        env={"PATH": f"{fake}:/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    (command,) = re.findall("<!-- the test command -->\n```sh\n(.*)\n```", README)
+    assert answer.stdout.splitlines() == [
+        f"+ {command}",
+        "python3 -m venv .venv-test",
+        "pip install -q -e .[test]",
+        "pytest -n 2",
+    ]
