@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.slave.arm import ArmModel
 
 
@@ -22,6 +23,9 @@ class SlaveMonitor(LeafSystem):
     Args:
         arm: the limits.
         period: how often it looks [s].
+
+    Raises:
+        DrakeTeleopError: from the simulation, when a joint is outside or not finite.
     """
 
     def __init__(self, arm: ArmModel, period: float) -> None:
@@ -32,18 +36,20 @@ class SlaveMonitor(LeafSystem):
         self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._watch)
 
-    def _watch(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _watch(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._status.HasValue(context):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]
         # A comparison with NaN is false, so a lost joint is outside too.
         inside = (q >= self._arm.lower) & (q <= self._arm.upper)
         if inside.all():
-            return EventStatus.Succeeded()
+            return
         joint = int(inside.argmin())
-        return EventStatus.Failed(
-            self,
+        # Raised, not returned as EventStatus.Failed: that crashes for systems written in Python.
+        raise DrakeTeleopError(
             f"joint {joint + 1} of the slave left its range at {context.get_time():.3f} s: "
             f"{q[joint]:.3f} rad is outside {self._arm.lower[joint]:.3f} to "
             f"{self._arm.upper[joint]:.3f} rad",
+            where="simulation",
+            remedy="ask for a smaller motion, or start elsewhere (slave.position)",
         )
