@@ -216,7 +216,7 @@ def AddSlave(
         "monitor": SlaveMonitor(slave.arm, _HUMAN_PERIOD),
         "load_estimator": LoadEstimator(
             scenario.load_estimator,
-            sensor.noise_std()[:6],
+            sensor.wrench_std(),
             1 / rates.estimator_hz,
             _SAMPLE_SIZE,
             np.zeros(16) if load_estimate is None else load_estimate,

@@ -87,6 +87,11 @@ class WristSensorConfig:
             3,
         )
 
+    def wrench_std(self) -> NDArray[np.float64]:
+        """(6,) weights for an estimator: noise and quantisation, never quite zero [N, N m]."""
+        quantum = self.resolution * self.ranges()[:6]
+        return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
+
     def ranges(self) -> NDArray[np.float64]:
         """The 12 ranges in the order of the noise."""
         return np.concatenate(

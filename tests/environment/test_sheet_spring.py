@@ -1,0 +1,68 @@
+"""The sheet spring against beam theory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.environment.sheet_spring import AddSheetSpring, SheetSpring
+from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.simulation import simulate
+from drake_teleop.station import MakeTeleopStation
+
+
+def leaf(sheet: SheetSpring):
+    builder = DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
+    AddSheetSpring(plant, sheet)
+    plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
+    plant.Finalize()
+    return plant, Simulator(builder.Build())
+
+
+def test_the_default_leaf_is_that_of_the_hardware_notes():
+    """210 GPa, 60 x 2 mm, 170 mm long: 5.1 kN/m, 0.16 kg, of which 0.038 kg move."""
+    sheet = SheetSpring()
+    assert sheet.stiffness == pytest.approx(5129.0, rel=1e-3)
+    assert sheet.effective_mass == pytest.approx(0.0377, rel=2e-3)
+    assert sheet.largest_small_deflection == pytest.approx(0.017)
+
+
+def test_it_rings_at_the_frequency_of_its_stiffness_and_mass_and_decays():
+    sheet = SheetSpring(thickness=0.001, damping_ratio=0.02)
+    plant, simulator = leaf(sheet)
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    plant.SetPositions(context, [0.005])
+    omega = np.sqrt(sheet.stiffness / sheet.effective_mass)
+    damped = omega * np.sqrt(1 - 0.02**2)
+    period = 2 * np.pi / damped
+    simulator.get_mutable_integrator().set_target_accuracy(1e-9)
+    simulator.AdvanceTo(3 * period)
+    # After three whole periods: the envelope of the free decay.
+    expected = 0.005 * np.exp(-0.02 * omega * 3 * period)
+    assert plant.GetPositions(context)[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_contact_at_the_scenarios_step_agrees_with_a_tight_run():
+    """RK2 at the sensor's 125 us against error-controlled RK3 at an eighth of that."""
+    scenario = replace(
+        LoadScenario("contact_transition"),
+        wrist_sensor__ideal=True,
+        simulation__duration=0.3,
+        rates__log_hz=8000.0,
+    )
+    tight = replace(
+        scenario,
+        simulation__integrator="runge_kutta3",
+        simulation__accuracy=1e-8,
+        simulation__max_step=1.25e-4 / 8,
+    )
+    coarse_run, tight_run = (
+        simulate(MakeTeleopStation(run), run.simulation) for run in (scenario, tight)
+    )
+    deflection, expected = coarse_run["sheet_state"][:, 0], tight_run["sheet_state"][:, 0]
+    assert expected.min() < -2e-3  # there was a contact
+    assert np.abs(deflection - expected).max() < 5e-5

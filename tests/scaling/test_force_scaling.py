@@ -1,0 +1,79 @@
+"""The block of Fig. 2 and the rules of its scales."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.scaling.force_scaling import ForceScaling, ForceScalingConfig
+from drake_teleop.slave.plant import AddSlavePlant
+
+GRIPPER = [2.0, 0.01, -0.02, 0.15, 0.02, 0.0, 0.0, 0.02, 0.0, 0.01]
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm
+
+
+def outputs(config: ForceScalingConfig, arm, contact=(0.0,) * 6) -> dict[str, np.ndarray]:
+    """The block's outputs for one sample of a load that moves and touches something."""
+    rng = np.random.default_rng(3)
+    motion, offsets = rng.normal(size=(3, 3)) * 5, rng.normal(size=6)
+    measured = non_contact_wrench(*motion, arm.phi_load) + offsets + contact
+    block = ForceScaling(config, arm, np.eye(3))
+    context = block.CreateDefaultContext()
+    q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
+    sample = np.concatenate([measured, *motion, [0.0], q])
+    block.GetInputPort("sample").FixValue(context, sample)
+    block.GetInputPort("load_estimate").FixValue(context, np.concatenate([offsets, arm.phi_load]))
+    names = ("scaled_wrench_S", "contact_wrench_S", "non_contact_wrench_S", "wrench_B")
+    return {name: block.GetOutputPort(name).Eval(context) for name in names}
+
+
+def test_the_four_cases_of_section_v(arm):
+    contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
+    for sigma in (0.0, 0.5, 1.0, 2.0):
+        out = outputs(ForceScalingConfig(sigma=sigma), arm, contact)
+        np.testing.assert_allclose(out["contact_wrench_S"], contact, atol=1e-12)
+        expected = contact + sigma * out["non_contact_wrench_S"]
+        np.testing.assert_allclose(out["scaled_wrench_S"], expected, atol=1e-12)
+
+
+def test_gamma_scales_the_contact_alone(arm):
+    contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
+    out = outputs(ForceScalingConfig(sigma=0.0, gamma=3.0), arm, contact)
+    np.testing.assert_allclose(out["scaled_wrench_S"], 3 * contact, atol=1e-12)
+
+
+def test_eta_keeps_that_share_of_the_object(arm):
+    config = ForceScalingConfig(sigma=0.0, eta=0.25, gripper_phi=GRIPPER)
+    out = outputs(config, arm)
+    total = out["non_contact_wrench_S"]
+    none = outputs(ForceScalingConfig(sigma=0.0, eta=0.0, gripper_phi=GRIPPER), arm)
+    whole = outputs(ForceScalingConfig(sigma=0.0, eta=1.0, gripper_phi=GRIPPER), arm)
+    np.testing.assert_allclose(none["scaled_wrench_S"], 0.0, atol=1e-12)
+    np.testing.assert_allclose(out["scaled_wrench_S"], 0.25 * whole["scaled_wrench_S"], atol=1e-12)
+    assert np.abs(whole["scaled_wrench_S"] - total).max() > 1.0
+
+
+def test_what_the_hand_feels_is_the_scaled_reaction(arm):
+    out = outputs(ForceScalingConfig(sigma=1.0), arm)
+    force_S, force_B = out["scaled_wrench_S"][:3], out["wrench_B"][:3]
+    assert np.linalg.norm(force_B) == pytest.approx(np.linalg.norm(force_S) / 17.5)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        ForceScalingConfig(sigma=0.5, eta=0.5, gripper_phi=GRIPPER),
+        ForceScalingConfig(sigma=0.0, gamma=2.0, eta=0.5, gripper_phi=GRIPPER),
+        ForceScalingConfig(sigma=0.0, eta=0.5),
+    ],
+)
+def test_eta_asks_for_sigma_0_gamma_1_and_a_gripper(config, arm):
+    with pytest.raises(DrakeTeleopError, match=r"force_scaling\.eta"):
+        ForceScaling(config, arm, np.eye(3))
