@@ -8,6 +8,9 @@ slave, 4 mm a newton.
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -40,9 +43,8 @@ Array = NDArray[np.float64]
 FRAMES_PER_SECOND = 50
 
 # Where the haptic device stands: origin of its base frame B in W [m], on a table.
-_P_WB = np.array([1.15, -0.10, 0.88])
 _TABLE_TOP = 0.60
-_FOOT_B = -0.28  # underside of the device's plate
+_P_WB = np.array([1.15, -0.10, _TABLE_TOP + 0.28])  # the device's foot is 0.28 m below B
 _CAMERA, _TARGET = (0.80, -1.25, 0.95), (0.72, 0.0, 0.56)
 
 _FLOOR, _WOOD, _STEEL = Rgba(0.93, 0.94, 0.95), Rgba(0.78, 0.66, 0.50), Rgba(0.40, 0.43, 0.47)
@@ -65,7 +67,8 @@ def write_replay(
         scenario: that was run.
         slow_motion: seconds of the film for one second of the run.
     """
-    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    with _quiet_drake():  # nobody is to connect to its server
+        meshcat = Meshcat(MeshcatParams(host="localhost"))
     stage = _Stage(meshcat, scenario)
     meshcat.StartRecording(FRAMES_PER_SECOND, set_visualizations_while_recording=False)
     span = result.t[-1] - result.t[0]
@@ -77,6 +80,17 @@ def write_replay(
     meshcat.get_mutable_recording().set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     meshcat.PublishRecording()
     path.write_text(meshcat.StaticHtml(), encoding="utf-8")
+
+
+@contextmanager
+def _quiet_drake() -> Iterator[None]:
+    logger = logging.getLogger("drake")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 class _Stage:
@@ -169,12 +183,9 @@ def _furnish(meshcat: Meshcat, scenario: Scenario) -> None:
     box("floor", (8.0, 8.0, 0.02), (0.6, 0.5, -0.011), _FLOOR)
     x, y, _ = _P_WB
     box("table", (0.50, 0.60, 0.03), (x - 0.09, y, _TABLE_TOP - 0.015), _WOOD)
+    height = _TABLE_TOP - 0.03
     for i, (dx, dy) in enumerate(((-0.31, -0.27), (-0.31, 0.27), (0.13, -0.27), (0.13, 0.27))):
-        height = _TABLE_TOP - 0.03
         box(f"leg_{i}", (0.04, 0.04, height), (x + dx, y + dy, height / 2), _STEEL)
-    foot = _P_WB[2] + _FOOT_B - _TABLE_TOP
-    if foot > 1e-6:
-        box("foot", (0.25, 0.20, foot), (x - 0.06, y, _TABLE_TOP + foot / 2), _STEEL)
     if scenario.sheet_spring is not None:
         sx, sy, sz = scenario.sheet_spring.position
         height = sz - 0.15  # the model's bench ends there

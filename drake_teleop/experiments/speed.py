@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.experiments.progress import Progress
 from drake_teleop.scenario import Scenario, Simulation
 from drake_teleop.simulation import MakeSimulator, advance
 from drake_teleop.slave.plant import AddSlavePlant
@@ -44,12 +45,15 @@ def MakeMovingStation(scenario: Scenario) -> Simulator:
     return simulator
 
 
-def cpu_seconds(simulators: Mapping[str, Simulator], turns: int = 7) -> dict[str, float]:
+def cpu_seconds(
+    simulators: Mapping[str, Simulator], *, turns: int = 11, progress: Progress = lambda done: None
+) -> dict[str, float]:
     """CPU seconds a simulated second of each, median over interleaved turns of 0.1 s."""
     spent: dict[str, list[float]] = {name: [] for name in simulators}
-    for _ in range(turns):
+    for turn in range(turns):
         for name, simulator in simulators.items():
             start = time.thread_time()
             advance(simulator, simulator.get_context().get_time() + _SPAN)
             spent[name].append((time.thread_time() - start) / _SPAN)
+        progress((turn + 1) / turns)
     return {name: statistics.median(times) for name, times in spent.items()}
