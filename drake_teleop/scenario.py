@@ -101,7 +101,7 @@ class Scenario:
             DrakeTeleopError: naming `where` and the field.
         """
         check_ranges(self, where)
-        self.force_scaling.scales()
+        self.force_scaling.scales(f"{where}:force_scaling")
         _check_rates(self, where)
 
 

@@ -269,7 +269,8 @@ def _resolved(description: Description, folder: Path) -> Description:
 
 
 def _explained(error: ValidationError, path: Path) -> DrakeTeleopError:
-    first = error.errors()[0]
+    # A misspelt field is also a missing one: name what stands there first.
+    first = min(error.errors(), key=lambda entry: entry["type"] == "missing")
     location = [part for part in first["loc"] if _is_field(part)]
     where = f"{path}:{'.'.join(map(str, location))}" if location else str(path)
     remedy = "see docs/logs.md for the fields and their units"

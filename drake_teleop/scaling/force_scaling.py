@@ -37,8 +37,8 @@ class ForceScalingConfig:
         1 / 17.5, "1", 0.0, 100.0, "force and torque, slave to master (VI-B)"
     )
 
-    def scales(self) -> tuple[float, float, float]:
-        """(sigma_gripper, sigma_object, gamma).
+    def scales(self, where: str = "force_scaling") -> tuple[float, float, float]:
+        """(sigma_gripper, sigma_object, gamma); `where` is the place for the message.
 
         Raises:
             DrakeTeleopError: if eta is given and sigma is not 0 or gamma is not 1 (section V).
@@ -48,7 +48,7 @@ class ForceScalingConfig:
         if self.sigma != 0 or self.gamma != 1 or self.gripper_phi is None:
             raise DrakeTeleopError(
                 "eta works on the object alone",
-                where="force_scaling.eta",
+                where=f"{where}.eta",
                 remedy="set sigma: 0, gamma: 1 and gripper_phi (section V of the paper)",
             )
         return scales_from_eta(self.eta)

@@ -1,0 +1,136 @@
+"""Bad scenarios and logs: one error line that names file and field, exit status 2."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from drake_teleop.cli import main
+
+SCENARIOS = {
+    "unknown block": ("wrist_senser: {ideal: true}", "wrist_sensor"),
+    "unknown field": ("wrist_sensor: {force_nois: 1.0}", "force_noise"),
+    "unit in the value": ("channel: {delay: 200 ms}", "channel.delay"),
+    "milliseconds for seconds": ("channel: {delay: 200}", "channel.delay"),
+    "millimetres for metres": ("slave: {position: [550, 0, 450]}", "slave.position"),
+    "not a number": ("simulation: {duration: .nan}", "simulation.duration"),
+    "negative": ("force_scaling: {sigma: -0.5}", "force_scaling.sigma"),
+    "wrong length": ("wrist_sensor: {offset: [1, 2, 3]}", "wrist_sensor.offset"),
+    "word for a number": ("rates: {sensor_hz: fast}", "rates.sensor_hz"),
+    "number for a block": ("operator: 3", "operator"),
+    "unknown word": ("operator: {grip: iron}", "operator.grip"),
+    "unknown variant": ("operator: {intent: [!Circle {radius: 1}]}", "operator.intent[0]"),
+    "bandwidth beyond the rate": ("rates: {sensor_hz: 1000}", "wrist_sensor.bandwidth_hz"),
+    "eta without a gripper": ("force_scaling: {sigma: 0, eta: 0.5}", "force_scaling.eta"),
+    "out of reach": ("slave: {position: [1.4, 0, 0.4]}", "slave.position"),
+    "master out of reach": ("master: {position: [0.0, 0.0, 0.45]}", "master"),
+    "not a mapping": ("- 1\n- 2", "mapping"),
+    "not YAML": ("simulation: {duration: [", "YAML"),
+    "true for a number": ("simulation: {duration: true}", "simulation.duration"),
+    "fraction for the seed": ("simulation: {seed: 0.5}", "simulation.seed"),
+}
+
+HEADER = (
+    "t,f_x,f_y,f_z,tau_x,tau_y,tau_z,s_x,s_y,s_z,omega_x,omega_y,omega_z,alpha_x,alpha_y,alpha_z"
+)
+
+
+def rows(count: int = 50) -> np.ndarray:
+    table = np.random.default_rng(0).normal(size=(count, 16))
+    table[:, 0] = np.arange(count) * 1e-3
+    return table
+
+
+def write(path, table, header=HEADER):
+    np.savetxt(path, table, delimiter=",", header=header, comments="")
+
+
+def with_entry(row: int, column: int, value: float) -> np.ndarray:
+    table = rows()
+    table[row, column] = value
+    return table
+
+
+LOGS = {
+    "a missing column": (lambda p: write(p, rows()[:, :3], "t,f_x,f_y"), "f_z"),
+    "time that stands still": (lambda p: write(p, with_entry(20, 0, 0.019)), "t"),
+    "time that runs backwards": (lambda p: write(p, with_entry(20, 0, -1.0)), "t"),
+    "NaN": (lambda p: write(p, with_entry(20, 5, np.nan)), "tau_y"),
+    "words among the numbers": (
+        lambda p: p.write_text(HEADER + "\n" + ",".join(["1", "fast"] + ["0"] * 14) + "\n"),
+        "f_x",
+    ),
+    "too few samples": (lambda p: write(p, rows(2)), "sample"),
+    "an empty file": (lambda p: p.write_text(""), "empty"),
+    "not a table": (lambda p: p.write_bytes(bytes(range(256)) * 8), "log.csv"),
+}
+
+
+def error_line(arguments, capsys) -> str:
+    with pytest.raises(SystemExit) as exit_info:
+        main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    assert exit_info.value.code == 2
+    lines = captured.err.strip().splitlines()
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_malformed_scenario(name, tmp_path, capsys):
+    text, expected = SCENARIOS[name]
+    path = tmp_path / "scenario.yaml"
+    path.write_text(text)
+    line = error_line(["run", path, "--out", tmp_path / "out", "--quiet"], capsys)
+    assert expected in line
+    if name not in ("out of reach", "master out of reach"):
+        assert "scenario.yaml" in line
+
+
+def test_an_unknown_scenario_lists_the_known_ones(tmp_path, capsys):
+    line = error_line(["run", "free_moton", "--out", tmp_path], capsys)
+    assert "free_motion_force" in line
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_a_malformed_log(name, tmp_path, capsys):
+    make, expected = LOGS[name]
+    path = tmp_path / "log.csv"
+    make(path)
+    line = error_line(["identify", path, "--out", tmp_path / "out", "--quiet"], capsys)
+    assert "log.csv" in line
+    assert expected in line
+
+
+def test_a_log_that_is_not_there(tmp_path, capsys):
+    assert "absent.csv" in error_line(["identify", tmp_path / "absent.csv"], capsys)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("wrench: {file: w.csv}\nunits: {}", "units"),
+        ("wrench: {file: w.csv, colums: {}}", "colums"),
+        ("wrench: [1, 2]", "wrench"),
+        ("{", "log.yaml"),
+    ],
+)
+def test_a_malformed_description(text, expected, tmp_path, capsys):
+    path = tmp_path / "log.yaml"
+    path.write_text(text)
+    line = error_line(["identify", path, "--out", tmp_path / "out"], capsys)
+    assert expected in line
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", json.dumps({"phi": [1.0] * 9}), json.dumps({"phi": "heavy"})]
+)
+def test_a_malformed_load(content, tmp_path, capsys):
+    log, load = tmp_path / "log.csv", tmp_path / "load.json"
+    write(log, rows())
+    load.write_text(content)
+    line = error_line(["eliminate", log, "--load", load, "--out", tmp_path / "out"], capsys)
+    assert "load.json" in line
