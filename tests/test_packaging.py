@@ -40,7 +40,8 @@ def wheel(tmp_path_factory) -> Path:
 
 def run(*command: str, cwd: Path) -> str:
     # Only what is installed may be found, not what a shell or a test run points to.
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    foreign = {"PYTHONPATH", "NUMBA_CACHE_DIR"}
+    environment = {name: value for name, value in os.environ.items() if name not in foreign}
     answer = subprocess.run(
         command, cwd=cwd, env=environment, capture_output=True, text=True, check=False
     )
