@@ -128,9 +128,8 @@ def _check_kind(hint: Any, value: Any, place: str) -> None:
     if value is None and type(None) in options:
         return
     options = tuple(option for option in options if option is not type(None))
-    variants: dict[str, type] = {
-        option.__name__: option for option in options if dataclasses.is_dataclass(option)
-    }
+    classes = (option for option in options if isinstance(option, type))
+    variants = {option.__name__: option for option in classes if dataclasses.is_dataclass(option)}
     if variants:
         tag = value.get("_tag", "").lstrip("!") if isinstance(value, dict) else ""
         if tag and tag not in variants:
