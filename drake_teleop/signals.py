@@ -29,6 +29,7 @@ SIGNALS = {
         _signal("angular_velocity_S", "omega_x omega_y omega_z", "rad/s", "from the encoders"),
         _signal("angular_acceleration_S", "alpha_x alpha_y alpha_z", "rad/s^2", "of S"),
         _signal("saturated", "saturated", "1", "1 while a channel of the sensor is saturated"),
+        _signal("joint_position", _JOINTS, "rad", "of the slave, the encoders' reading"),
         _signal(
             "load_estimate",
             "fo_x fo_y fo_z tauo_x tauo_y tauo_z m mc_x mc_y mc_z I_xx I_xy I_xz I_yy I_yz I_zz",

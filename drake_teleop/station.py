@@ -71,6 +71,7 @@ _SLAVE_SIGNALS = {
     "angular_velocity_S": "sample_parts.angular_velocity_S",
     "angular_acceleration_S": "sample_parts.angular_acceleration_S",
     "saturated": "sample_parts.saturated",
+    "joint_position": "sample_parts.joint_position",
     "load_estimate": "load_estimator.load_estimate",
     "slave_state": "slave_plant.rx90_state",
     "joint_torque": "joint_control.joint_torque",
@@ -118,6 +119,7 @@ def MakeTeleopStation(
         - angular_velocity_S
         - angular_acceleration_S
         - saturated
+        - joint_position
         - load_estimate
         - slave_state
         - joint_torque
@@ -256,11 +258,17 @@ def _finish(
     builder: DiagramBuilder, name: str, signals: Mapping[str, str], scenario: Scenario
 ) -> Diagram:
     """Exports the signals, records them in that order, and builds."""
-    ports = [_output(builder, port) for port in signals.values()]
+    for signal, port in signals.items():
+        builder.ExportOutput(_output(builder, port), signal)
+    # The parts of a sample lie side by side in it: one port instead of six.
+    recorded = dict.fromkeys(
+        "wrist_sensor.sample" if port.startswith("sample_parts.") else port
+        for port in signals.values()
+    )
+    ports = [_output(builder, port) for port in recorded]
     # One wide log: at 8 kHz each further system with events of its own costs time at every step.
     wide = builder.AddNamedSystem("log_input", Multiplexer([port.size() for port in ports]))
-    for index, (signal, port) in enumerate(zip(signals, ports, strict=True)):
-        builder.ExportOutput(port, signal)
+    for index, port in enumerate(ports):
         builder.Connect(port, wide.get_input_port(index))
     log = LogVectorOutput(wide.get_output_port(), builder, 1 / scenario.rates.log_hz)
     log.set_name(LOG)

@@ -1,10 +1,10 @@
 """The paper's 'Force scaling/elimination' block (Figs. 2 and 4)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
@@ -17,8 +17,7 @@ from drake_teleop.slave.arm import ArmModel, forward_kinematics
 from drake_teleop.slave.wrist_sensor import sample_parts
 
 #: sigma_gripper, sigma_object, gamma that leave the contact wrench alone, Eq. (13).
-_ELIMINATION = (0.0, 0.0, 1.0)
-_NO_OBJECT = np.zeros(10)
+_ELIMINATION = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass
@@ -54,6 +53,27 @@ class ForceScalingConfig:
         return scales_from_eta(self.eta)
 
 
+@njit(cache=True)
+def _scaled_into(sample, estimate, phi_gripper, scales, out):
+    """F' of one sample; what of the load is not gripper is object."""
+    phi_object = np.empty(10)
+    for i in range(10):
+        phi_object[i] = estimate[6 + i] - phi_gripper[i]
+    scaled_wrench_into(
+        sample[:6], estimate[:6], sample[6:9], sample[9:12], sample[12:15],
+        phi_gripper, phi_object, scales[0], scales[1], scales[2], out,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _felt_into(sample, estimate, phi_gripper, scales, arm, R_WB, out):
+    """What the hand shall feel of F'; the orientation of S comes from the same sample."""
+    scaled_S, R_WS, p_WS = np.empty(6), np.empty((3, 3)), np.empty(3)
+    _scaled_into(sample, estimate, phi_gripper, scales, scaled_S)
+    forward_kinematics(arm, sample[16:], R_WS, p_WS)
+    wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
+
+
 class ForceScaling(LeafSystem):
     """Removes or scales the non-contact wrench, then scales the rest down and turns it to the hand.
 
@@ -84,7 +104,6 @@ class ForceScaling(LeafSystem):
         super().__init__()
         self._gripper_phi = None if config.gripper_phi is None else np.array(config.gripper_phi)
         self._arm, self._R_WB = arm.table, np.ascontiguousarray(R_WB)
-        self._R_WS, self._p_WS, self._scaled_S = np.zeros((3, 3)), np.zeros(3), np.zeros(6)
         # sigma_gripper, sigma_object, gamma, force scale.
         self._scales = self.DeclareNumericParameter(
             BasicVector([*config.scales(), config.force_scale])
@@ -117,10 +136,10 @@ class ForceScaling(LeafSystem):
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
         scales = context.get_numeric_parameter(self._scales).value()
-        self._scale(context, self._sample.Eval(context), scales, output.get_mutable_value())
+        _scaled_into(*self._inputs(context), scales, output.get_mutable_value())
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        self._scale(context, self._sample.Eval(context), _ELIMINATION, output.get_mutable_value())
+        _scaled_into(*self._inputs(context), _ELIMINATION, output.get_mutable_value())
 
     def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
         sample, phi = self._sample.Eval(context), self._estimate.Eval(context)[6:]
@@ -129,34 +148,12 @@ class ForceScaling(LeafSystem):
         )
 
     def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
-        sample = self._sample.Eval(context)
         scales = context.get_numeric_parameter(self._scales).value()
-        self._scale(context, sample, scales, self._scaled_S)
-        forward_kinematics(self._arm, sample[16:], self._R_WS, self._p_WS)
-        wrench_to_master_into(
-            self._scaled_S, self._R_WS, self._R_WB, scales[3], scales[3], output.get_mutable_value()
-        )
+        inputs = self._inputs(context)
+        _felt_into(*inputs, scales, self._arm, self._R_WB, output.get_mutable_value())
 
-    def _scale(
-        self,
-        context: Context,
-        sample: NDArray[np.float64],
-        scales: Sequence[float],
-        out: NDArray[np.float64],
-    ) -> None:
+    def _inputs(self, context: Context) -> tuple[NDArray[np.float64], ...]:
+        """The sample, the estimate, and the gripper's part of it."""
         estimate = self._estimate.Eval(context)
-        phi = estimate[6:]
-        gripper = phi if self._gripper_phi is None else self._gripper_phi
-        scaled_wrench_into(
-            sample[:6],
-            estimate[:6],
-            sample[6:9],
-            sample[9:12],
-            sample[12:15],
-            gripper,
-            _NO_OBJECT if gripper is phi else phi - gripper,
-            scales[0],
-            scales[1],
-            scales[2],
-            out,
-        )
+        gripper = estimate[6:] if self._gripper_phi is None else self._gripper_phi
+        return self._sample.Eval(context), estimate, gripper
