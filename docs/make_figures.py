@@ -1,16 +1,19 @@
-"""Draws the README's pictures into docs/figures.
+"""Draws the README's pictures into docs/figures: the station, and Fig. 8 as `reproduce` makes it.
 
-python docs/make_figures.py
+Run it as `python docs/make_figures.py`.
 """
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from pathlib import Path
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyBboxPatch
 
+from drake_teleop.experiments.reproduce import reproduce_command
 from drake_teleop.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, house_style
 
 FIGURES = Path(__file__).parent / "figures"
@@ -156,6 +159,9 @@ def main() -> None:
     # Without date and random ids, so that the same script draws the same file.
     with mpl.rc_context({"svg.hashsalt": "drake_teleop"}):
         station_figure().savefig(FIGURES / "station.svg", metadata={"Date": None})
+    with tempfile.TemporaryDirectory() as folder:
+        reproduce_command(Path(folder))
+        shutil.copy(Path(folder) / "fig8.png", FIGURES / "result.png")
 
 
 if __name__ == "__main__":
