@@ -42,8 +42,8 @@ Array = NDArray[np.float64]
 
 FRAMES_PER_SECOND = 50
 
-# Where the haptic device stands: origin of its base frame B in W [m], on a table.
 _TABLE_TOP = 0.60
+# Where the haptic device stands: origin of its base frame B in W [m].
 _P_WB = np.array([1.15, -0.10, _TABLE_TOP + 0.28])  # the device's foot is 0.28 m below B
 _CAMERA, _TARGET = (0.80, -1.25, 0.95), (0.72, 0.0, 0.56)
 
@@ -69,13 +69,13 @@ def write_replay(
     """
     with _quiet_drake():  # nobody is to connect to its server
         meshcat = Meshcat(MeshcatParams(host="localhost"))
-    stage = _Stage(meshcat, scenario)
+    scene = ReplayScene(meshcat, scenario)
     meshcat.StartRecording(FRAMES_PER_SECOND, set_visualizations_while_recording=False)
     span = result.t[-1] - result.t[0]
     for frame in range(int(span * slow_motion * FRAMES_PER_SECOND) + 1):
         film_time = frame / FRAMES_PER_SECOND
         instant = result.t[0] + film_time / slow_motion
-        stage.show(film_time, result, int(np.argmin(np.abs(result.t - instant))))
+        scene.show(film_time, result, int(np.argmin(np.abs(result.t - instant))))
     meshcat.StopRecording()
     meshcat.get_mutable_recording().set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     meshcat.PublishRecording()
@@ -93,20 +93,26 @@ def _quiet_drake() -> Iterator[None]:
         logger.setLevel(level)
 
 
-class _Stage:
-    """Everything that is seen, and the recording of one frame."""
+class ReplayScene:
+    """Everything that is seen in a replay; shows one sample after the other.
+
+    Attributes:
+        plant: slave, sheet spring and haptic device, for their shapes and kinematics only.
+        context: of the plant, in the posture that was shown last.
+    """
 
     def __init__(self, meshcat: Meshcat, scenario: Scenario) -> None:
-        self._meshcat = meshcat
         builder = DiagramBuilder()
-        self._plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
-        self._slave, _ = ParseSlave(self._plant)
-        self._sheet = self._add_sheet(scenario)
-        self._master = _add_master(self._plant)
-        self._plant.Finalize()
+        self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
+        self._slave, _ = ParseSlave(self.plant)
+        sheet = scenario.sheet_spring
+        self._sheet = None if sheet is None else AddSheetSpring(self.plant, sheet)
+        self._master = _add_master(self.plant)
+        self.plant.Finalize()
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
         self._diagram: Diagram = builder.Build()
-        self._context = self._diagram.CreateDefaultContext()
+        self._root = self._diagram.CreateDefaultContext()
+        self.context = self.plant.GetMyMutableContextFromRoot(self._root)
         _furnish(meshcat, scenario)
         # The device's base stands along the world's axes here, whatever its alignment in the run.
         alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
@@ -115,20 +121,16 @@ class _Stage:
         self._contact = _Arrow(meshcat, "contact_at_stylus", _CONTACT)
         self._touch = _Arrow(meshcat, "contact_at_tip", _CONTACT)
 
-    def _add_sheet(self, scenario: Scenario) -> ModelInstanceIndex | None:
-        if scenario.sheet_spring is None:
-            return None
-        return AddSheetSpring(self._plant, scenario.sheet_spring)
-
     def show(self, film_time: float, result: SimulationResult, sample: int) -> None:
-        self._context.SetTime(film_time)
-        plant, context = self._plant, self._plant.GetMyMutableContextFromRoot(self._context)
+        """Shows a sample (its index) of a run, at a time of the film [s]."""
+        self._root.SetTime(film_time)
+        plant, context = self.plant, self.context
         master = serial_joint_angles(result["master_state"][sample, :6])
         plant.SetPositions(context, self._slave, result["slave_state"][sample, :6])
         plant.SetPositions(context, self._master, master)
         if self._sheet is not None:
             plant.SetPositions(context, self._sheet, result["sheet_state"][sample, :1])
-        self._diagram.ForcedPublish(self._context)
+        self._diagram.ForcedPublish(self._root)
         # Eq. (1) is what the sensor exerts on the load: the arrows show what the load exerts.
         R_WS = plant.GetFrameByName("sensor").CalcPoseInWorld(context).rotation().matrix()
         measured = result["measured_wrench_S"][sample, :3] - result["load_estimate"][sample, :3]

@@ -1,0 +1,85 @@
+"""The shipped scenarios: they load, and what happens in them is possible."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.experiments.identification import slave_arm
+from drake_teleop.master import device
+from drake_teleop.scenario import LoadScenario, ScenarioNames, replace
+from drake_teleop.simulation import simulate
+from drake_teleop.station import MakeTeleopStation
+
+MOVEMENTS = ("free_motion_force", "free_motion_torque", "contact_transition")
+
+
+def run(name: str, **changes):
+    """The scenario with a perfectly known load."""
+    scenario = replace(LoadScenario(name), **changes)
+    estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
+    station = MakeTeleopStation(scenario, load_estimate=estimate)
+    return scenario, simulate(station, scenario.simulation)
+
+
+def margin(values, lower, upper):
+    return np.minimum(values - lower, upper - values).min(axis=0)
+
+
+def test_these_are_shipped_and_say_what_they_are():
+    assert ScenarioNames() == sorted([*MOVEMENTS, "ideal_sensor", "identification"])
+    for name in ScenarioNames():
+        scenario = LoadScenario(name)
+        scenario.check()
+        assert scenario.description
+
+
+def test_the_ideal_sensor_sees_the_vertical_movement():
+    ideal, realistic = LoadScenario("ideal_sensor"), LoadScenario("free_motion_force")
+    assert ideal == replace(realistic, description=ideal.description, wrist_sensor__ideal=True)
+
+
+@pytest.fixture(scope="module", params=MOVEMENTS)
+def movement(request):
+    return run(request.param)
+
+
+def test_arm_and_sensor_stay_within_their_limits(movement):
+    scenario, result = movement
+    arm, state = slave_arm(scenario), result["slave_state"]
+    assert np.all(margin(state[:, :6], arm.lower, arm.upper) > 0.3)
+    assert np.all(np.abs(state[:, 6:]) < 0.8 * arm.velocity_limit)
+    assert np.all(np.abs(result["joint_torque"]) < 0.8 * arm.effort_limit)
+    assert not result["saturated"].any()
+    assert not result["ik_status"].any()
+
+
+def test_the_master_stays_well_inside_its_workspace_and_its_force(movement):
+    _, result = movement
+    q = result["master_state"][:, :6]
+    assert np.all(margin(q, device.JOINT_LOWER, device.JOINT_UPPER) > np.radians(30))
+    assert np.all(margin(q[:, 1] - q[:, 2], *device.FIVE_BAR_RANGE) > np.radians(20))
+    force = np.linalg.norm(result["force_to_master"][:, :3], axis=1)
+    assert np.all(force < 0.2 * device.FORCE_LIMIT)
+    assert np.all(np.linalg.norm(result["hand_wrench_E"][:, :3], axis=1) < 30)
+
+
+@pytest.mark.parametrize("name", MOVEMENTS)
+def test_everything_starts_where_it_stays(name):
+    """The hand's intent begins at 0.1 s; until then nothing has a reason to move."""
+    _, result = run(name, simulation__settle=0.0, simulation__duration=0.1)
+    q = result["slave_state"][:, :6]
+    assert np.abs(q - q[0]).max() < 1e-3  # rad
+    assert np.linalg.norm(np.ptp(result["pose_master"][:, 4:], axis=0)) < 1e-4  # m
+
+
+def test_the_contact_is_one_touch_of_a_leaf_that_bends_little():
+    scenario, result = run("contact_transition", simulation__duration=0.7)
+    bend = np.abs(result["sheet_state"][:, 0]).max()
+    assert 0.002 < bend < 0.5 * scenario.sheet_spring.largest_small_deflection
+    touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
+    assert 0.205 < result.t[touching].min() < 0.235
+    assert result.t[touching].max() < 0.3
+    upwards = result["true_contact_wrench_W"][touching, 2]
+    assert np.all(upwards > 0)
+    assert 10 < upwards.max() < 25
