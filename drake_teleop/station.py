@@ -40,10 +40,7 @@ _SLAVE_WIRES = (
     ("slave_plant.rx90_generalized_acceleration", "wrist_sensor.slave_acceleration"),
     ("wrist_sensor.sample", "load_estimator.sample"),
 )
-_CONTACT_WIRES = (
-    ("slave_plant.contact_results", "wrist_sensor.contact_results"),
-    ("slave_plant.contact_results", "tool_contact.contact_results"),
-)
+_CONTACT_WIRES = (("slave_plant.contact_results", "tool_contact.contact_results"),)
 _TELEOP_WIRES = (
     # The operator holds the master.
     ("operator.hand_wrench_E", "master_device.hand_wrench_E"),
@@ -227,7 +224,7 @@ def AddSlave(
     for name, block in blocks.items():
         builder.AddNamedSystem(name, block)
     contact = slave.sheet is not None
-    AddWristSensor(builder, slave.arm, slave.tool, sensor, 1 / rates.sensor_hz, contact=contact)
+    AddWristSensor(builder, slave.plant, slave.arm, sensor, 1 / rates.sensor_hz, contact=contact)
     _connect(builder, _SLAVE_WIRES)
     if not contact:
         return slave, _SLAVE_SIGNALS

@@ -20,7 +20,7 @@ from drake_teleop.simulation import MakeSimulator, simulate
 from drake_teleop.slave.arm import MOTION_SIZE, sensor_motion
 from drake_teleop.slave.inverse_kinematics import IkStatus
 from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.wrist_sensor import sample_ideal
+from drake_teleop.slave.wrist_sensor import true_sample
 from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
 
 FORCE_SCALE = 1 / 17.5
@@ -74,18 +74,20 @@ def test_the_wrist_wrench_is_the_reaction_force_of_the_sensors_joint(slave, shee
             results = plant.get_contact_results_output_port().Eval(context)
             contact_wrench(results, tool, contact_W)
             seen["contacts"] += results.num_point_pair_contacts()
-        wrench = np.zeros(22)
-        sample_ideal(
+        state = plant.get_state_output_port(rx90).Eval(context)
+        sample = np.zeros(15)
+        true_sample(
             slave.arm.table,
             slave.arm.phi_load,
-            plant.get_state_output_port(rx90).Eval(context),
+            state[:6],
+            state[6:],
             plant.get_generalized_acceleration_output_port(rx90).Eval(context),
             contact_W,
-            np.zeros(64),
-            wrench,
+            np.zeros(MOTION_SIZE),
+            sample,
         )
         seen["peak"] = max(seen["peak"], np.linalg.norm(expected[:3]))
-        seen["error"] = max(seen["error"], np.abs(wrench[:6] - expected).max())
+        seen["error"] = max(seen["error"], np.abs(sample[:6] - expected).max())
 
     simulator.set_monitor(compare)
     simulator.AdvanceTo(1.0)

@@ -19,7 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydrake.common import RandomDistribution
 from pydrake.common.value import Value
-from pydrake.multibody.plant import ContactResults
+from pydrake.multibody.plant import ContactResults, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import (
     Context,
@@ -130,8 +130,12 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
 
 
 @njit(cache=True)
-def _true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
-    """Writes [f, tau, s, omega, alpha] of S into `out` (15,); the wrench is Eqs. (1)-(2)."""
+def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
+    """Writes [f, tau, s, omega, alpha] of S into `out` (15,); `motion` (21,) is scratch.
+
+    The wrench is Eqs. (1)-(2) minus `contact_W` (6,), the wrench of the environment on the tool
+    about the world's origin, in W.
+    """
     sensor_motion(arm, q, v, vdot, motion)
     out[6:15] = motion[:9]
     non_contact_wrench_into(out[6:9], out[9:12], out[12:15], phi, out[:6])
@@ -206,18 +210,8 @@ def _angular_velocity_from_encoders(arm, q, resolution, period, last_q, work, ou
 
 
 @njit(cache=True)
-def sample_ideal(arm, phi, state, vdot, contact_W, work, sample):
-    """One sample of the ideal sensor: the truth. `sample` (16 + n,) is written."""
-    n = vdot.shape[0]
-    motion = work[:MOTION_SIZE]
-    _true_sample(arm, phi, state[:n], state[n:], vdot, contact_W, motion, sample[:15])
-    sample[15] = 0.0
-    sample[16:] = state[:n]
-
-
-@njit(cache=True)
-def sample_realistic(arm, phi, state, vdot, contact_W, constants, memory, work, sample):
-    """One sample of the realistic sensor; `memory` and `sample` (16 + n,) are updated.
+def sample_into(arm, phi, state, vdot, contact_W, constants, memory, work, sample):
+    """One sample of the sensor; `memory` and `sample` (16 + n,) are updated.
 
     `state` is [q; v]; `constants` comes from `pack_constants`; `memory` is [samples taken, last
     encoder readings (n), filter (15 x 2 x 2), the noise of this block of samples (32 x 12)];
@@ -233,7 +227,7 @@ def sample_realistic(arm, phi, state, vdot, contact_W, constants, memory, work, 
     first = 1 + n + _FILTER + 12 * (int(memory[0]) % NOISE_BLOCK)
     noise = memory[first : first + 12]
     truth, raw, rest = work[:15], work[15:30], work[30 : 30 + 2 * n + MOTION_SIZE]
-    _true_sample(arm, phi, q, v, vdot, contact_W, rest[:MOTION_SIZE], truth)
+    true_sample(arm, phi, q, v, vdot, contact_W, rest[:MOTION_SIZE], truth)
     saturated = _convert(truth, offset, noise, noise_std, limits, resolution, raw)
     starts = memory[0] == 0.0
     if starts:
@@ -248,7 +242,7 @@ def sample_realistic(arm, phi, state, vdot, contact_W, constants, memory, work, 
 
 
 def pack_constants(config: WristSensorConfig, period: float) -> NDArray[np.float64]:
-    """What `sample_realistic` needs to know, in one array: passing ten costs a microsecond."""
+    """What `sample_into` needs to know, in one array: passing ten costs a microsecond."""
     return np.concatenate(
         [
             config.offset,
@@ -269,8 +263,8 @@ class WristSensor(LeafSystem):
         input_ports:
         - slave_state: [q; v] of the arm
         - slave_acceleration: vdot of the arm
-        - contact_results: the plant's contact results (only with `contact`)
         - noise: 12 standard normal numbers for each of NOISE_BLOCK samples
+        - contact_results: the plant's (only with `contact`)
         output_ports:
         - sample: the parts of `sample_parts`, one after the other
 
@@ -294,53 +288,34 @@ class WristSensor(LeafSystem):
     ) -> None:
         super().__init__()
         n = arm.num_joints
-        self._arm, self._phi = arm.table, arm.phi_load
-        self._work = np.zeros(30 + 2 * n + MOTION_SIZE)
+        self._arm, self._phi, self._tool = arm.table, arm.phi_load, tool
+        self._constants = pack_constants(config, period)
+        self._work, self._contact_W = np.zeros(30 + 2 * n + MOTION_SIZE), np.zeros(6)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
-        self._tool, self._contact_W = tool, np.zeros(6)
+        self._noise = self.DeclareVectorInputPort("noise", 12 * NOISE_BLOCK)
         self._contact = None
         if contact:
             results = Value(ContactResults())
             self._contact = self.DeclareAbstractInputPort("contact_results", results)
-        sample_index = self.DeclareDiscreteState(_SAMPLE + n)
-        update = self._sample_ideal
-        if not config.ideal:
-            self._constants = pack_constants(config, period)
-            self._noise = self.DeclareVectorInputPort("noise", 12 * NOISE_BLOCK)
-            self.DeclareDiscreteState(1 + n + _FILTER + 12 * NOISE_BLOCK)
-            update = self._sample_realistic
-        self.DeclareStateOutputPort("sample", sample_index)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, update)
+        self.DeclareStateOutputPort("sample", self.DeclareDiscreteState(_SAMPLE + n))
+        self.DeclareDiscreteState(1 + n + _FILTER + 12 * NOISE_BLOCK)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         # The first sample is there before anyone reads it.
-        self.DeclareInitializationDiscreteUpdateEvent(update)
+        self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
-    def _true_contact(self, context: Context) -> NDArray[np.float64]:
-        if self._contact is not None:
-            contact_wrench(self._contact.Eval(context), self._tool, self._contact_W)
-        return self._contact_W
-
-    def _sample_ideal(self, context: Context, discrete_state: DiscreteValues) -> None:
-        sample_ideal(
-            self._arm,
-            self._phi,
-            self._state.Eval(context),
-            self._acceleration.Eval(context),
-            self._true_contact(context),
-            self._work,
-            discrete_state.get_mutable_value(0),
-        )
-
-    def _sample_realistic(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         memory = discrete_state.get_mutable_value(1)
         if memory[0] % NOISE_BLOCK == 0:
             memory[-12 * NOISE_BLOCK :] = self._noise.Eval(context)
-        sample_realistic(
+        if self._contact is not None:
+            contact_wrench(self._contact.Eval(context), self._tool, self._contact_W)
+        sample_into(
             self._arm,
             self._phi,
             self._state.Eval(context),
             self._acceleration.Eval(context),
-            self._true_contact(context),
+            self._contact_W,
             self._constants,
             memory,
             self._work,
@@ -348,28 +323,88 @@ class WristSensor(LeafSystem):
         )
 
 
+class IdealWristSensor(LeafSystem):
+    """The truth, sampled: the wrench is the plant's own reaction force in the sensor's joint.
+
+    .. pydrake_system::
+
+        name: IdealWristSensor
+        input_ports:
+        - slave_state: [q; v] of the arm
+        - slave_acceleration: vdot of the arm
+        - reaction_forces: the plant's
+        output_ports:
+        - sample: the parts of `sample_parts`, one after the other
+
+    Args:
+        arm: kinematics up to S.
+        plant: the plant, with the joint "sensor_weld" between S and the tool.
+        period: sampling period [s].
+    """
+
+    def __init__(self, arm: ArmModel, plant: MultibodyPlant, period: float) -> None:
+        super().__init__()
+        n = arm.num_joints
+        self._arm, self._n, self._motion = arm.table, n, np.zeros(MOTION_SIZE)
+        weld = plant.GetJointByName("sensor_weld")
+        self._joint = list(plant.GetJointIndices()).index(weld.index())
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
+        self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
+        forces = plant.get_reaction_forces_output_port().Allocate()
+        self._reaction = self.DeclareAbstractInputPort("reaction_forces", forces)
+        self.DeclareStateOutputPort("sample", self.DeclareDiscreteState(_SAMPLE + n))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclareInitializationDiscreteUpdateEvent(self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        sample, state = discrete_state.get_mutable_value(0), self._state.Eval(context)
+        q, v = state[: self._n], state[self._n :]
+        # On the child, the tool, in its frame, which is S: the sign of Eq. (1).
+        F_Tool_S = self._reaction.Eval(context)[self._joint]
+        sensor_motion(self._arm, q, v, self._acceleration.Eval(context), self._motion)
+        sample[:3], sample[3:6] = F_Tool_S.translational(), F_Tool_S.rotational()
+        sample[6:15], sample[16:] = self._motion[:9], q
+
+
 def AddWristSensor(
     builder: DiagramBuilder,
+    plant: MultibodyPlant,
     arm: ArmModel,
-    tool: BodyIndex,
     config: WristSensorConfig,
     period: float,
     *,
     contact: bool,
-) -> WristSensor:
-    """Adds the sensor, its noise, and "sample_parts", which has a port for every part of a sample.
+) -> None:
+    """Adds "wrist_sensor", its noise, and "sample_parts" with a port for every part of a sample.
 
-    Arguments as for `WristSensor`.
+    Args:
+        builder: the diagram that holds the plant.
+        plant: the plant, with the body "tool" on the joint "sensor_weld".
+        arm: kinematics up to S, and the tool as its load.
+        config: the sensor.
+        period: sampling period [s].
+        contact: whether there is anything to touch.
     """
-    sensor = WristSensor(arm, tool, config, period, contact=contact)
-    builder.AddNamedSystem("wrist_sensor", sensor)
-    if not config.ideal:
+    sensor: LeafSystem
+    if config.ideal:
+        sensor = IdealWristSensor(arm, plant, period)
+        builder.AddNamedSystem("wrist_sensor", sensor)
+        builder.Connect(
+            plant.get_reaction_forces_output_port(), sensor.GetInputPort("reaction_forces")
+        )
+    else:
+        tool = plant.GetBodyByName("tool").index()
+        sensor = WristSensor(arm, tool, config, period, contact=contact)
+        builder.AddNamedSystem("wrist_sensor", sensor)
         noise = builder.AddNamedSystem(
             "wrist_sensor_noise",
             RandomSource(RandomDistribution.kGaussian, 12 * NOISE_BLOCK, NOISE_BLOCK * period),
         )
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
+        if contact:
+            builder.Connect(
+                plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")
+            )
     sizes = sample_parts(arm.num_joints)
     parts = builder.AddNamedSystem("sample_parts", Demultiplexer(list(sizes.values())))
     builder.Connect(sensor.GetOutputPort("sample"), parts.get_input_port())
-    return sensor
