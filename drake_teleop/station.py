@@ -185,9 +185,8 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
     """
     scenario.check()
     builder = DiagramBuilder()
-    slave, signals = AddSlave(builder, scenario, None)
     start, _, _ = trajectory.evaluate(0.0)
-    slave.plant.SetDefaultPositions(slave.instance, start)
+    _, signals = AddSlave(builder, scenario, None, start)
     builder.AddNamedSystem(
         "joint_trajectory", JointTrajectory(trajectory, scenario.simulation.settle)
     )
@@ -197,7 +196,10 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
 
 
 def AddSlave(
-    builder: DiagramBuilder, scenario: Scenario, load_estimate: NDArray[np.float64] | None
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    load_estimate: NDArray[np.float64] | None,
+    q_start: NDArray[np.float64] | None = None,
 ) -> tuple[SlavePlant, dict[str, str]]:
     """Adds the slave: plant, joint control, wrist sensor, load estimator, monitor.
 
@@ -207,10 +209,11 @@ def AddSlave(
         The plant, and the signals that can be recorded: name -> "system.port".
     """
     rates, sensor = scenario.rates, scenario.wrist_sensor
-    slave = AddSlavePlant(builder, scenario.slave.position, scenario.sheet_spring)
+    slave = AddSlavePlant(builder, scenario.slave.position, scenario.sheet_spring, q_start)
+    start = slave.plant.GetDefaultPositions(slave.instance)
     blocks = {
         "joint_control": JointControl(
-            slave.arm, scenario.joint_control, 1 / rates.joint_control_hz
+            slave.arm, scenario.joint_control, 1 / rates.joint_control_hz, start
         ),
         "monitor": SlaveMonitor(slave.arm, _HUMAN_PERIOD),
         "load_estimator": LoadEstimator(
@@ -224,7 +227,9 @@ def AddSlave(
     for name, block in blocks.items():
         builder.AddNamedSystem(name, block)
     contact = slave.sheet is not None
-    AddWristSensor(builder, slave.plant, slave.arm, sensor, 1 / rates.sensor_hz, contact=contact)
+    AddWristSensor(
+        builder, slave.plant, slave.arm, sensor, 1 / rates.sensor_hz, start, contact=contact
+    )
     _connect(builder, _SLAVE_WIRES)
     if not contact:
         return slave, _SLAVE_SIGNALS

@@ -69,7 +69,7 @@ def test_everything_starts_where_it_stays(name):
     """The hand's intent begins at 0.1 s; until then nothing has a reason to move."""
     _, result = run(name, simulation__settle=0.0, simulation__duration=0.1)
     q = result["slave_state"][:, :6]
-    assert np.abs(q - q[0]).max() < 1e-3  # rad
+    assert np.abs(q - q[0]).max() < 2e-4  # rad: the sensor's noise reaches the hand
     assert np.linalg.norm(np.ptp(result["pose_master"][:, 4:], axis=0)) < 1e-4  # m
 
 

@@ -36,7 +36,7 @@ from drake_teleop.master.device import serial_joint_angles
 from drake_teleop.resources import models_dir
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario
-from drake_teleop.slave.plant import ParseSlave
+from drake_teleop.slave.plant import ParseSlave, finalize
 
 Array = NDArray[np.float64]
 
@@ -108,7 +108,7 @@ class ReplayScene:
         sheet = scenario.sheet_spring
         self._sheet = None if sheet is None else AddSheetSpring(self.plant, sheet)
         self._master = _add_master(self.plant)
-        self.plant.Finalize()
+        finalize(self.plant)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
         self._diagram: Diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()

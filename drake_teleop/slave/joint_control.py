@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop.quantities import quantity
@@ -56,9 +57,16 @@ class JointControl(LeafSystem):
         arm: the arm with its tool (the controller knows its own nominal load).
         config: the bandwidths.
         period: sampling period [s].
+        q_start: (n,) where it holds the arm before the first sample [rad].
     """
 
-    def __init__(self, arm: ArmModel, config: JointControlConfig, period: float) -> None:
+    def __init__(
+        self,
+        arm: ArmModel,
+        config: JointControlConfig,
+        period: float,
+        q_start: NDArray[np.float64],
+    ) -> None:
         super().__init__()
         n = arm.num_joints
         self._n = n
@@ -72,9 +80,10 @@ class JointControl(LeafSystem):
         )
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
-        self.DeclareStateOutputPort("joint_torque", self.DeclareDiscreteState(n))
+        still, holding = np.zeros(n), np.zeros(n)
+        inverse_dynamics(arm.table, q_start, still, still, holding)
+        self.DeclareStateOutputPort("joint_torque", self.DeclareDiscreteState(holding))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self._state.Eval(context)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,9 +46,12 @@ class SlavePlant:
 
 
 def AddSlavePlant(
-    builder: DiagramBuilder, position: list[float], sheet_spring: SheetSpring | None
+    builder: DiagramBuilder,
+    position: list[float],
+    sheet_spring: SheetSpring | None,
+    q_start: NDArray[np.float64] | None = None,
 ) -> SlavePlant:
-    """Adds the slave's plant, at rest at home.
+    """Adds the slave's plant, at rest.
 
     A scene graph, which costs time at every step, comes only with something to touch.
 
@@ -55,6 +59,7 @@ def AddSlavePlant(
         builder: the diagram.
         position: (3,) p_WS at the start [m]; the tool points down.
         sheet_spring: what there is to touch, or None.
+        q_start: (6,) joint angles to start at instead [rad].
 
     Raises:
         DrakeTeleopError: if the arm cannot reach the start.
@@ -67,11 +72,12 @@ def AddSlavePlant(
         plant.set_contact_model(ContactModel.kPoint)
     instance, tool = ParseSlave(plant)
     sheet = None if sheet_spring is None else AddSheetSpring(plant, sheet_spring)
-    plant.Finalize()
+    finalize(plant)
     if sheet is not None:
         _remove_visuals(plant, scene_graph)
     arm = ArmModelFromPlant(plant, instance, "sensor")
-    plant.SetDefaultPositions(instance, home_position(arm, position))
+    start = home_position(arm, position) if q_start is None else q_start
+    plant.SetDefaultPositions(instance, start)
     return SlavePlant(plant, instance, tool, arm, sheet)
 
 
@@ -90,6 +96,20 @@ def ParseSlave(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, BodyIndex]:
     sensor = plant.GetFrameByName("sensor", arm)
     plant.AddJoint(WeldJoint("sensor_weld", sensor, tool.body_frame(), RigidTransform.Identity()))
     return arm, tool.index()
+
+
+def finalize(plant: MultibodyPlant) -> None:
+    """Finalizes a continuous plant without Drake's warning that it ignores joint limits.
+
+    The station has a monitor for them.
+    """
+    logger = logging.getLogger("drake")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        plant.Finalize()
+    finally:
+        logger.setLevel(level)
 
 
 def _remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:

@@ -254,6 +254,15 @@ def pack_constants(config: WristSensorConfig, period: float) -> NDArray[np.float
     )
 
 
+def sample_at_rest(arm: ArmModel, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The true sample (16 + n,) of the arm that rests at q (n,) [rad]: what stands before t = 0."""
+    sample, still = np.zeros(_SAMPLE + len(q)), np.zeros(len(q))
+    touching, motion = np.zeros(6), np.zeros(MOTION_SIZE)
+    true_sample(arm.table, arm.phi_load, q, still, still, touching, motion, sample[:15])
+    sample[16:] = q
+    return sample
+
+
 class WristSensor(LeafSystem):
     """Samples force, torque, acceleration and angular velocity of S at the sensor's rate.
 
@@ -274,6 +283,7 @@ class WristSensor(LeafSystem):
         tool: index of the tool's body in the plant.
         config: the sensor.
         period: sampling period [s].
+        q_start: (n,) where the arm rests before the first sample [rad].
         contact: whether there is anything to touch.
     """
 
@@ -283,6 +293,7 @@ class WristSensor(LeafSystem):
         tool: BodyIndex,
         config: WristSensorConfig,
         period: float,
+        q_start: NDArray[np.float64],
         *,
         contact: bool,
     ) -> None:
@@ -298,11 +309,11 @@ class WristSensor(LeafSystem):
         if contact:
             results = Value(ContactResults())
             self._contact = self.DeclareAbstractInputPort("contact_results", results)
-        self.DeclareStateOutputPort("sample", self.DeclareDiscreteState(_SAMPLE + n))
+        first = sample_at_rest(arm, q_start)
+        first[:6] += config.offset
+        self.DeclareStateOutputPort("sample", self.DeclareDiscreteState(first))
         self.DeclareDiscreteState(1 + n + _FILTER + 12 * NOISE_BLOCK)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        # The first sample is there before anyone reads it.
-        self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         memory = discrete_state.get_mutable_value(1)
@@ -340,9 +351,12 @@ class IdealWristSensor(LeafSystem):
         arm: kinematics up to S.
         plant: the plant, with the joint "sensor_weld" between S and the tool.
         period: sampling period [s].
+        q_start: (n,) where the arm rests before the first sample [rad].
     """
 
-    def __init__(self, arm: ArmModel, plant: MultibodyPlant, period: float) -> None:
+    def __init__(
+        self, arm: ArmModel, plant: MultibodyPlant, period: float, q_start: NDArray[np.float64]
+    ) -> None:
         super().__init__()
         n = arm.num_joints
         self._arm, self._n, self._motion = arm.table, n, np.zeros(MOTION_SIZE)
@@ -352,9 +366,9 @@ class IdealWristSensor(LeafSystem):
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
         forces = plant.get_reaction_forces_output_port().Allocate()
         self._reaction = self.DeclareAbstractInputPort("reaction_forces", forces)
-        self.DeclareStateOutputPort("sample", self.DeclareDiscreteState(_SAMPLE + n))
+        first = self.DeclareDiscreteState(sample_at_rest(arm, q_start))
+        self.DeclareStateOutputPort("sample", first)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample, state = discrete_state.get_mutable_value(0), self._state.Eval(context)
@@ -372,6 +386,7 @@ def AddWristSensor(
     arm: ArmModel,
     config: WristSensorConfig,
     period: float,
+    q_start: NDArray[np.float64],
     *,
     contact: bool,
 ) -> None:
@@ -383,18 +398,19 @@ def AddWristSensor(
         arm: kinematics up to S, and the tool as its load.
         config: the sensor.
         period: sampling period [s].
+        q_start: (n,) where the arm rests before the first sample [rad].
         contact: whether there is anything to touch.
     """
     sensor: LeafSystem
     if config.ideal:
-        sensor = IdealWristSensor(arm, plant, period)
+        sensor = IdealWristSensor(arm, plant, period, q_start)
         builder.AddNamedSystem("wrist_sensor", sensor)
         builder.Connect(
             plant.get_reaction_forces_output_port(), sensor.GetInputPort("reaction_forces")
         )
     else:
         tool = plant.GetBodyByName("tool").index()
-        sensor = WristSensor(arm, tool, config, period, contact=contact)
+        sensor = WristSensor(arm, tool, config, period, q_start, contact=contact)
         builder.AddNamedSystem("wrist_sensor", sensor)
         noise = builder.AddNamedSystem(
             "wrist_sensor_noise",
