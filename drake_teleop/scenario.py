@@ -38,7 +38,11 @@ class Rates:
 
 @dataclass
 class Simulation:
-    """How long, and with which integrator."""
+    """How long, and with which integrator.
+
+    The log begins after the settling time, with t = 0; the operator's intent counts its times from
+    the start of the simulation, `settle` earlier.
+    """
 
     duration: float = quantity(1.0, "s", 1e-3, 36000.0, "logged time")
     settle: float = quantity(0.5, "s", 0.0, 60.0, "time before the log starts, at t < 0")
