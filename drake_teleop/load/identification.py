@@ -45,7 +45,12 @@ PARAMETERS = (
 )
 """Names of the 16 parameters in the order of Eq. (7): [offsets; phi]."""
 
-METHODS = ("batch least squares", "recursive least squares")
+METHODS = (
+    *("batch least squares", "recursive least squares"),
+    *("whitened least squares", "robust least squares", "physically consistent least squares"),
+    *("total least squares", "recursive instrumental variables", "recursive total least squares"),
+)
+"""What `Identification.method` may say."""
 
 # Rank: smallest eigenvalue of the scaled Gram over the largest, component of a parameter in the
 # null space, and excitation of a column [m/s^2, rad/s^2] below which it counts as none.
@@ -251,7 +256,7 @@ class NormalEquations:
                 f"{self.samples} samples cannot determine a load",
                 remedy=f"give at least {_FEWEST_SAMPLES}, in different orientations",
             )
-        gram, right = self._weighted(self._weights)
+        gram, right = self.normal_equations()
         inverse, undetermined, condition_number, rank = _pseudo_inverse(gram, self._unexcited())
         theta = inverse @ right
         if theta[6] == 0.0:
@@ -260,9 +265,9 @@ class NormalEquations:
                 where="wrench",
                 remedy="is the sensor connected, and does its orientation change?",
             )
-        squares = self._residual_squares(theta)
+        squares = self.residual_squares(theta)
         variances = self._long_run_variances(theta, squares, rank / 6.0)
-        covariance = inverse @ self._weighted(self._weights**2 * variances)[0] @ inverse
+        covariance = inverse @ self.normal_equations(self._weights**2 * variances)[0] @ inverse
         covariance[undetermined, :] = covariance[:, undetermined] = 0.0
         covariance[undetermined, undetermined] = np.inf
         return Identification(
@@ -277,8 +282,14 @@ class NormalEquations:
             samples=self.samples,
         )
 
-    def _weighted(self, weights: Array) -> tuple[Array, Array]:
-        """Gram (16, 16) and right-hand side (16,) of [E V] with these weights of the channels."""
+    def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
+        """Gram (16, 16) and right-hand side (16,) of [E V], sums over the rows.
+
+        Args:
+            weights: (6,) of the squares of each wrench channel [1/N^2, 1/(N m)^2]; default: those
+                of the noise given at the start.
+        """
+        weights = self._weights if weights is None else checked("weights", weights, 6)
         gram, right = np.zeros((16, 16)), np.zeros(16)
         for c, weight in enumerate(weights):
             columns = np.array([c, *range(6, 16)])
@@ -287,11 +298,21 @@ class NormalEquations:
         return gram, right
 
     def _unexcited(self) -> NDArray[np.bool_]:
-        squares = np.diag(self._weighted(np.ones(6))[0]) / self.samples
+        squares = np.diag(self.normal_equations(np.ones(6))[0]) / self.samples
         return np.sqrt(squares) < _NO_EXCITATION
 
-    def _residual_squares(self, theta: Array) -> Array:
-        """(6,) sums of squared residuals; rounding leaves 1e-7 of the wrench in their roots."""
+    @property
+    def weights(self) -> Array:
+        """(6,) of the squares of each wrench channel, from the noise given at the start."""
+        return self._weights.copy()
+
+    def residual_squares(self, theta: ArrayLike) -> Array:
+        """(6,) sums of squared residuals; rounding leaves 1e-7 of the wrench in their roots.
+
+        Args:
+            theta: (16,) [offsets; phi].
+        """
+        theta = checked("theta", theta, 16)
         squares = np.empty(6)
         for c in range(6):
             x = np.concatenate([[-theta[c], 1.0], -theta[6:]])
