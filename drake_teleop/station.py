@@ -15,6 +15,7 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from drake_teleop.channel.delay import AddChannel
 from drake_teleop.environment.contact import ToolContact
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.excitation import FourierTrajectory
 from drake_teleop.master import device
 from drake_teleop.master.device import MasterDevice
@@ -137,12 +138,15 @@ def MakeTeleopStation(
     Args:
         scenario: what the station is made of.
         load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, as an identification
-            found it; zeros (nothing known) if left out.
+            found it. It may be left out if sigma = gamma, which needs no estimate, and if the
+            estimator learns in the loop.
 
     Raises:
-        DrakeTeleopError: for a value that cannot be right, or a start out of reach.
+        DrakeTeleopError: for a value that cannot be right, a start out of reach, or scales that
+            mean something only if the load is known while it is not.
     """
     scenario.check()
+    _check_load_is_known(scenario, load_estimate)
     period = 1 / scenario.rates.hand_hz
     hand, delay = scenario.operator.hand, scenario.channel.delay
     scaling = scenario.kinematic_scaling
@@ -175,6 +179,17 @@ def MakeTeleopStation(
         builder.Connect(received, _input(builder, receiver))
     builder.ExportInput(_input(builder, "kinematic_scaling.clutch"), "clutch")
     return _finish(builder, "teleop_station", slave_signals | _TELEOP_SIGNALS, scenario)
+
+
+def _check_load_is_known(scenario: Scenario, estimate: NDArray[np.float64] | None) -> None:
+    sigma_gripper, sigma_object, gamma = scenario.force_scaling.scales()
+    needed = not sigma_gripper == sigma_object == gamma
+    if needed and estimate is None and not scenario.load_estimator.enabled:
+        raise DrakeTeleopError(
+            "sigma and gamma differ, but the load is not known",
+            where="load_estimate",
+            remedy="pass the estimate of identify_load, or set load_estimator.enabled",
+        )
 
 
 def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:

@@ -26,7 +26,9 @@ assert home.parent.name == "site-packages", home
 assert models_dir() == home / "models" and scenarios_dir() == home / "scenarios"
 assert files("drake_teleop.experiments").joinpath("report.html.j2").is_file()
 for name in drake_teleop.ScenarioNames():
-    print(drake_teleop.MakeTeleopStation(drake_teleop.LoadScenario(name)).get_name(), name)
+    scenario = drake_teleop.LoadScenario(name)
+    station = drake_teleop.MakeTeleopStation(scenario, load_estimate=[0.0] * 16)
+    print(station.get_name(), name)
 """
 
 

@@ -271,7 +271,7 @@ def test_scales_change_while_running(slave):
 
 def test_every_output_port_is_a_documented_signal():
     scenario = replace(LoadScenario("contact_transition"), simulation=Simulation(duration=0.01))
-    station = MakeTeleopStation(scenario)
+    station = MakeTeleopStation(scenario, load_estimate=np.zeros(16))
     names = {station.get_output_port(i).get_name() for i in range(station.num_output_ports())}
     assert names == set(SIGNALS)
     for name in names:
@@ -305,6 +305,13 @@ def trajectory_of_joint_5(slave, amplitude: float) -> FourierTrajectory:
     cosine[4, 0] = amplitude
     home = slave.plant.GetDefaultPositions(slave.instance)
     return FourierTrajectory.at_rest(home, np.zeros((6, 4)), cosine, 0.5)
+
+
+def test_eliminating_a_load_that_nobody_identified_is_refused():
+    with pytest.raises(DrakeTeleopError, match=r"load_estimate: .* not known; .*identify_load"):
+        MakeTeleopStation(replace(Scenario(), force_scaling__sigma=0.0))
+    MakeTeleopStation(replace(Scenario(), force_scaling__sigma=0.0, load_estimator__enabled=True))
+    MakeTeleopStation(Scenario())
 
 
 def test_leaving_the_joints_range_ends_the_simulation_with_a_clear_message(slave):

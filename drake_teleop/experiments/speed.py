@@ -10,6 +10,7 @@ import statistics
 import time
 from collections.abc import Mapping
 
+import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
@@ -39,7 +40,9 @@ def MakeBarePlant(scenario: Scenario) -> Simulator:
 
 def MakeMovingStation(scenario: Scenario) -> Simulator:
     """The station of a scenario, past its settling time."""
-    simulator = MakeSimulator(MakeTeleopStation(scenario), scenario.simulation)
+    # What the estimate says costs nothing, so none is made.
+    station = MakeTeleopStation(scenario, load_estimate=np.zeros(16))
+    simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
     advance(simulator, scenario.simulation.settle)
     return simulator

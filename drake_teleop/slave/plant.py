@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,17 +98,19 @@ def ParseSlave(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, BodyIndex]:
 
 
 def finalize(plant: MultibodyPlant) -> None:
-    """Finalizes a continuous plant without Drake's warning that it ignores joint limits.
+    """Finalizes a continuous plant whose joint limits somebody else watches.
 
-    The station has a monitor for them.
+    Continuous plants ignore limits, and Drake warns of it, even in the middle of a run. It does
+    not for limits that are given after finalizing; the station's monitor and the inverse
+    kinematics keep them.
     """
-    logger = logging.getLogger("drake")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        plant.Finalize()
-    finally:
-        logger.setLevel(level)
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    limits = [(joint.position_lower_limits(), joint.position_upper_limits()) for joint in joints]
+    for joint, (lower, upper) in zip(joints, limits, strict=True):
+        joint.set_position_limits(np.full_like(lower, -np.inf), np.full_like(upper, np.inf))
+    plant.Finalize()
+    for joint, (lower, upper) in zip(joints, limits, strict=True):
+        joint.set_position_limits(lower, upper)
 
 
 def _remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:

@@ -27,7 +27,8 @@ def scenario() -> Scenario:
 
 @pytest.fixture(scope="module")
 def result(scenario) -> SimulationResult:
-    return simulate(MakeTeleopStation(scenario), scenario.simulation)
+    station = MakeTeleopStation(scenario, load_estimate=np.zeros(16))
+    return simulate(station, scenario.simulation)
 
 
 @pytest.fixture
