@@ -65,8 +65,10 @@ def _cost(
     log: Log, rows: NDArray[np.intp], phi: NDArray[np.float64] | None
 ) -> Callable[[float], float]:
     t, wrench = log.t[rows], log.wrench[rows]
-    # Of all forces, and of all torques: a channel with nothing in it must not weigh most.
-    variance = np.repeat(wrench.var(axis=0).reshape(2, 3).sum(axis=1), 3) + 1e-30
+    # Of all forces, and of all torques: a channel with nothing in it must not weigh most, and the
+    # rounding of a wrench that does not change is nothing.
+    rounding = (1e-9 * np.abs(wrench).max()) ** 2 + 1e-30
+    variance = np.repeat(wrench.var(axis=0).reshape(2, 3).sum(axis=1), 3) + rounding
     scale, floor = np.sqrt(variance), 1e-9 * variance
 
     def residual(shift: float) -> NDArray[np.float64]:
