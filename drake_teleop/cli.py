@@ -66,6 +66,13 @@ _delay = click.option(
 )
 
 
+_gripper = click.option(
+    "--gripper",
+    type=_PATH,
+    help="The identification.json of the gripper without the object, in the same sensor frame.",
+)
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, prog_name="drake-teleop")
 def cli() -> None:
@@ -107,11 +114,19 @@ def run(scenario: str, out: Path, seed: int | None, quiet: bool) -> None:
 
 @cli.command()
 @click.argument("log", type=_PATH)
+@_gripper
 @_out("identify")
 @_cutoff
 @_delay
 @_quiet
-def identify(log: Path, out: Path, cutoff_hz: float, delay: float | str, quiet: bool) -> None:
+def identify(
+    log: Path,
+    gripper: Path | None,
+    out: Path,
+    cutoff_hz: float,
+    delay: float | str,
+    quiet: bool,
+) -> None:
     """Identify the load on the sensor from a log.
 
     LOG is a canonical log (.csv, .parquet) or a log description (.yaml). Finds the load's mass,
@@ -119,18 +134,24 @@ def identify(log: Path, out: Path, cutoff_hz: float, delay: float | str, quiet: 
     """
     from drake_teleop.logs.commands import identify_command
 
-    identify_command(log, out, cutoff_hz=cutoff_hz, delay=delay, quiet=quiet)
+    identify_command(log, out, gripper=gripper, cutoff_hz=cutoff_hz, delay=delay, quiet=quiet)
 
 
 @cli.command()
 @click.argument("log", type=_PATH)
 @click.option("--load", type=_PATH, required=True, help="The identification.json of the load.")
+@_gripper
 @click.option(
     "--sigma",
     type=_Number(min=0),
     default=0.0,
     show_default=True,
-    help="Scale of the non-contact wrench.",
+    help="Scale of the non-contact wrench; of the gripper's, if there is one.",
+)
+@click.option(
+    "--sigma-object",
+    type=_Number(min=0),
+    help="Scale of the object's non-contact wrench, with --gripper.  [default: sigma]",
 )
 @click.option(
     "--gamma", type=_Number(), default=1.0, show_default=True, help="Scale of the contact wrench."
@@ -143,7 +164,9 @@ def identify(log: Path, out: Path, cutoff_hz: float, delay: float | str, quiet: 
 def eliminate(
     log: Path,
     load: Path,
+    gripper: Path | None,
     sigma: float,
+    sigma_object: float | None,
     gamma: float,
     eta: float | None,
     out: Path,
@@ -162,7 +185,9 @@ def eliminate(
         log,
         load,
         out,
+        gripper=gripper,
         sigma=sigma,
+        sigma_object=sigma_object,
         gamma=gamma,
         eta=eta,
         cutoff_hz=cutoff_hz,

@@ -139,7 +139,7 @@ def test_options_reach_the_commands(capsys, install):
         ((Path("out/r"),), {"seed": None, "quiet": False}),
         (
             (Path("a.yaml"), Path("out/identify")),
-            {"cutoff_hz": 30.0, "delay": 0.006, "quiet": False},
+            {"gripper": None, "cutoff_hz": 30.0, "delay": 0.006, "quiet": False},
         ),
     ]
 
@@ -159,7 +159,8 @@ def test_eliminate_hands_on_the_scaling_law(capsys, install):
         (
             (Path("a.csv"), Path("i.json"), Path("out/eliminate")),
             {
-                "sigma": 0.5, "gamma": 2.0, "eta": 0.25, "cutoff_hz": 20.0, "delay": "auto",
+                "gripper": None, "sigma": 0.5, "sigma_object": None, "gamma": 2.0, "eta": 0.25,
+                "cutoff_hz": 20.0, "delay": "auto",
                 "quiet": False,
             },
         )

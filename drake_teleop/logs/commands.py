@@ -30,13 +30,19 @@ physically_consistent  whether phi belongs to a possible body
 condition_number       of the regression
 residual_rms           [f; tau], after the fit
 residual_rms_force     of |F|
+gripper                its file, if --gripper was given; otherwise this and the next are absent
+object                 of phi_total - phi_gr: mass, com, inertia_com, phi with their standard
+                       deviations, identifiable, not_identifiable and physically_consistent as
+                       above; consistency_margin and consistency_margin_std, see
+                       `drake_teleop.load.gripper.consistency_margin`
 ====================== ==========================================================================
 
 ========================= =======================================================================
 eliminate
 ========================= =======================================================================
-load                      the identification file
-sigma, gamma, eta         as given
+load, gripper             the identification files; gripper is null if there is none
+sigma, sigma_object,      as given
+gamma, eta
 tare                      [f; tau], offsets of this record minus those of the load file
 tare_fraction             share of the samples that the offsets were taken from (those that agree)
 raw_rms                   rms of |F| with the offsets removed and nothing else
@@ -53,11 +59,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.load.gripper import SIGNIFICANT, consistency_margin, identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.logs.canonical import WRENCH, Log
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
@@ -67,41 +74,43 @@ def identify_command(
     log: Path,
     out: Path,
     *,
+    gripper: Path | None = None,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
     """`identify_log`, writing identification.json, fit.png and summary.json into `out`.
 
+    Args:
+        gripper: identification.json of the gripper alone; then the object's object.json, of the
+            same format, is written too (see `drake_teleop.load.gripper`).
+
     Returns:
         the summary; its names are explained at the top of this module.
     """
+    gripper_load = None if gripper is None else Identification.load(gripper)
     found = identify_log(log, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
-    deviations = np.asarray(result.standard_deviations)
+    alone = None if gripper_load is None else identified_object(result, gripper_load)
     summary = _common(log, found.log, cutoff_hz, result.delay_s, found.delay_source) | {
         "samples": result.samples,
-        "mass": result.mass,
-        "mass_std": deviations[6],
-        "com": result.com,
-        "com_std": deviations[7:10] / result.mass,
-        "inertia_com": result.inertia_com,
+        **_load_figures(result),
         "offsets": result.offsets,
-        "offsets_std": deviations[:6],
-        "phi": result.phi,
-        "phi_std": deviations[6:],
-        "identifiable": _named(result, True),
-        "not_identifiable": _named(result, False),
-        "physically_consistent": result.physically_consistent,
+        "offsets_std": result.standard_deviations[:6],
         "condition_number": result.condition_number,
         "residual_rms": result.residual_rms,
         "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
     }
+    if alone is not None:
+        summary |= {"gripper": str(gripper), "object": _object_figures(alone)}
+        summary["notes"] += _object_notes(alone)
     summary = _plain(summary)
     from drake_teleop.logs.pictures import draw_fit
 
     out.mkdir(parents=True, exist_ok=True)
     result.save(out / "identification.json")
+    if alone is not None:
+        alone.save(out / "object.json")
     draw_fit(found).savefig(out / "fit.png")
     _write_summary(out, summary)
     if not quiet:
@@ -114,7 +123,9 @@ def eliminate_command(
     load: Path,
     out: Path,
     *,
+    gripper: Path | None = None,
     sigma: float = 0.0,
+    sigma_object: float | None = None,
     gamma: float = 1.0,
     eta: float | None = None,
     cutoff_hz: float | None = 30.0,
@@ -133,7 +144,9 @@ def eliminate_command(
     found = eliminate_log(
         log,
         load_file,
+        gripper=gripper,
         sigma=sigma,
+        sigma_object=sigma_object,
         gamma=gamma,
         eta=eta,
         cutoff_hz=cutoff_hz,
@@ -141,7 +154,9 @@ def eliminate_command(
     )
     summary = _common(log, found.log, cutoff_hz, found.delay_s, found.delay_source) | {
         "load": str(load),
+        "gripper": None if gripper is None else str(gripper),
         "sigma": sigma,
+        "sigma_object": sigma_object,
         "gamma": gamma,
         "eta": eta,
         "tare": found.offsets - load_file.offsets,
@@ -182,6 +197,48 @@ def _common(
         "delay_source": source,
         "notes": list(log.notes),
     }
+
+
+def _load_figures(load: Identification) -> dict[str, Any]:
+    deviations = load.standard_deviations
+    return {
+        "mass": load.mass,
+        "mass_std": deviations[6],
+        "com": load.com,
+        "com_std": deviations[7:10] / load.mass,
+        "inertia_com": load.inertia_com,
+        "phi": load.phi,
+        "phi_std": deviations[6:],
+        "identifiable": _named(load, True),
+        "not_identifiable": _named(load, False),
+        "physically_consistent": load.physically_consistent,
+    }
+
+
+def _object_figures(alone: Identification) -> dict[str, Any]:
+    margin, deviation = consistency_margin(alone)
+    figures = _load_figures(alone)
+    for name in ("identifiable", "not_identifiable"):
+        figures[name] = [entry for entry in figures[name] if entry in PARAMETERS[6:]]
+    return figures | {"consistency_margin": margin, "consistency_margin_std": deviation}
+
+
+def _object_notes(alone: Identification) -> list[str]:
+    """What to know about the object; the mass is not significantly negative here."""
+    deviation = float(alone.standard_deviations[6])
+    if alone.mass < SIGNIFICANT * deviation:
+        return [
+            f"no object: the gripper's mass is exceeded by {alone.mass:.4g} ± {deviation:.2g} kg"
+        ]
+    if not alone.identifiable[6:].all() or alone.physically_consistent:
+        return []
+    margin, deviation = consistency_margin(alone)
+    if margin < -SIGNIFICANT * deviation:
+        return [
+            "no body can have the object's parameters: were gripper and total identified about the"
+            " same sensor frame, with the same gripper?"
+        ]
+    return ["the object's parameters are those of a possible body within their uncertainty only"]
 
 
 def _named(result: Identification, identifiable: bool) -> list[str]:
@@ -250,31 +307,47 @@ def _print_identification(summary: dict[str, Any], out: Path) -> None:
     table = Table(title=f"Load identified from {Path(summary['log']).name}", title_justify="left")
     for heading in ("", "value", "std", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
-    rows = [("mass", summary["mass"], summary["mass_std"], 1.0, "kg", "m")]
-    rows += [
-        (f"com {axis}", summary["com"][i], summary["com_std"][i], 1e3, "mm", f"m c_{axis}")
-        for i, axis in enumerate("xyz")
-    ]
-    rows += [
-        (name, summary["phi"][4 + i], summary["phi_std"][4 + i], 1e3, "g m^2", name)
-        for i, name in enumerate(PARAMETERS[10:])
-    ]
-    rows += [
+    _add_rows(table, _load_rows(summary), summary["identifiable"])
+    rows = [
         (name, value, std, 1.0, "N" if i < 3 else "N m", name)
         for i, (name, value, std) in enumerate(
             zip(PARAMETERS[:6], summary["offsets"], summary["offsets_std"], strict=True)
         )
     ]
-    for label, value, std, scale, unit, name in rows:
-        if name in summary["identifiable"]:
-            table.add_row(label, f"{value * scale:.4f}", f"{std * scale:.4f}", unit)
-        else:
-            table.add_row(f"[dim]{label}", "[dim]not identifiable", "", "")
+    _add_rows(table, rows, summary["identifiable"])
+    if "object" in summary:
+        table.add_section()
+        rows = [(f"object: {row[0]}", *row[1:]) for row in _load_rows(summary["object"])]
+        _add_rows(table, rows, summary["object"]["identifiable"])
     figures = (
         f"residual {summary['residual_rms_force']:.4g} N rms of |F|,"
         f" condition number {summary['condition_number']:.3g}, {summary['samples']} samples"
     )
     _print(table, figures, summary, out)
+
+
+_Row: TypeAlias = tuple[str, float, float, float, str, str]
+"""Label, value, standard deviation, how many of the unit make one of SI, unit, parameter."""
+
+
+def _load_rows(load: dict[str, Any]) -> list[_Row]:
+    rows: list[_Row] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
+    rows += [
+        (f"com {axis}", load["com"][i], load["com_std"][i], 1e3, "mm", f"m c_{axis}")
+        for i, axis in enumerate("xyz")
+    ]
+    return rows + [
+        (name, load["phi"][4 + i], load["phi_std"][4 + i], 1e3, "g m^2", name)
+        for i, name in enumerate(PARAMETERS[10:])
+    ]
+
+
+def _add_rows(table: Any, rows: list[_Row], identifiable: list[str]) -> None:
+    for label, value, std, scale, unit, name in rows:
+        if name in identifiable:
+            table.add_row(label, f"{value * scale:.4f}", f"{std * scale:.4f}", unit)
+        else:
+            table.add_row(f"[dim]{label}", "[dim]not identifiable", "", "")
 
 
 def _print_elimination(summary: dict[str, Any], out: Path) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta
+from drake_teleop.load.gripper import identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification, identify
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
@@ -42,7 +43,7 @@ class EliminatedLog:
 
     Args:
         log: the log with its delay taken out; not low-passed.
-        phi: (10,) the load that was used, see `usable_phi`.
+        phi: (10,) the load that was used, see `usable_phi`; gripper and object together.
         point_mass: names of the inertias that are not of the load file but of a point mass.
         offsets: (6,) of this record.
         tare_fraction: share of the samples that `offsets` were taken from; 1 if not tared.
@@ -103,7 +104,9 @@ def eliminate_log(
     path: str | Path,
     load: str | Path | Identification,
     *,
+    gripper: str | Path | Identification | None = None,
     sigma: float = 0.0,
+    sigma_object: float | None = None,
     gamma: float = 1.0,
     eta: float | None = None,
     cutoff_hz: float | None = 30.0,
@@ -115,23 +118,35 @@ def eliminate_log(
     Args:
         path: canonical table or log description.
         load: identification.json, or what is in it.
-        sigma: share of the non-contact wrench that is kept.
+        gripper: identification.json of the gripper without the object, or what is in it; `load`
+            is then gripper with object. Both about the same origin in the same frame S, which the
+            files cannot tell. None: one load.
+        sigma: share of the non-contact wrench that is kept; of the gripper's, if there is one.
+        sigma_object: share of the object's that is kept; None: sigma. Goes with a gripper only.
         gamma: scale of the contact wrench.
-        eta: Eq. (14), the share that is kept of an object; the load counts as the object. Goes
-            with sigma = 0 and gamma = 1 only.
+        eta: Eq. (14), the share that is kept of the object, and nothing of the gripper; without
+            `gripper` the whole load counts as the object. Goes with sigma = 0, gamma = 1 and no
+            sigma_object.
         cutoff_hz: zero-phase low-pass on everything that comes out; None for none.
         delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
         tare: take the sensor's offsets from this record (they drift between records), not from
             `load`: the constant that most of the record agrees on, see `robust_offsets`.
 
     Raises:
-        DrakeTeleopError: if the log or the load file cannot be used, or eta is given together with
-            sigma or gamma.
+        DrakeTeleopError: if the log or a load file cannot be used, eta is given together with
+            another scale, or sigma_object without a gripper.
     """
     identification = load if isinstance(load, Identification) else Identification.load(load)
-    sigma, gamma = _scales(sigma, gamma, eta)
+    scales = _scales(sigma, sigma_object, gamma, eta, gripper is not None)
     log = read_log(path, bandwidth_hz=cutoff_hz)
     phi, point_mass = usable_phi(identification)
+    # One load without a gripper is all object.
+    phi_gripper = np.zeros(10)
+    if gripper is not None:
+        alone = gripper if isinstance(gripper, Identification) else Identification.load(gripper)
+        identified_object(identification, alone)  # An error for exchanged files.
+        phi_gripper = usable_phi(alone)[0]
+    phi_object = phi - phi_gripper
     delay_s, source = _delay(log, cutoff_hz, delay, phi)
     if source == "undetermined":
         delay_s, source = identification.delay_s, "load"
@@ -145,8 +160,6 @@ def eliminate_log(
         residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
         offsets, fraction = robust_offsets(smooth(residual))
     motion = log.motion
-    # With one load, all of it is the gripper's share: sigma_object has nothing to scale.
-    scales = {"sigma_gripper": sigma, "sigma_object": 0.0, "gamma": gamma}
     gravity_only = None
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
@@ -164,7 +177,9 @@ def eliminate_log(
         measured=smooth(log.wrench - offsets),
         non_contact=smooth(non_contact_wrench(*motion, phi)),
         contact=smooth(contact_wrench(log.wrench, offsets, *motion, phi)),
-        scaled=smooth(scaled_wrench(log.wrench, offsets, *motion, phi, np.zeros(10), **scales)),
+        scaled=smooth(
+            scaled_wrench(log.wrench, offsets, *motion, phi_gripper, phi_object, **scales)
+        ),
         gravity_only=gravity_only,
     )
 
@@ -230,18 +245,29 @@ def _delay(
     return (0.0, "undetermined") if found is None else (found, "estimated")
 
 
-def _scales(sigma: float, gamma: float, eta: float | None) -> tuple[float, float]:
-    if sigma < 0:
+def _scales(
+    sigma: float, sigma_object: float | None, gamma: float, eta: float | None, split: bool
+) -> dict[str, float]:
+    """The three scales of `scaled_wrench`; without a gripper (`split`) the load is all object."""
+    for name, value in (("sigma", sigma), ("sigma_object", sigma_object)):
+        if value is not None and value < 0:
+            raise DrakeTeleopError(
+                f"{name} is {value:g}", where=name, remedy="give a number of at least 0"
+            )
+    if sigma_object is not None and not split:
         raise DrakeTeleopError(
-            f"sigma is {sigma:g}", where="sigma", remedy="give a number of at least 0"
+            "sigma_object needs to know what is gripper and what is object",
+            where="sigma_object",
+            remedy="give the gripper's identification.json as well, or use sigma",
         )
     if eta is None:
-        return sigma, gamma
-    if sigma != 0 or gamma != 1:
+        kept = sigma if sigma_object is None else sigma_object
+        return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma}
+    if sigma != 0 or gamma != 1 or sigma_object is not None:
         raise DrakeTeleopError(
             "eta goes with sigma = 0 and gamma = 1 only (Eq. 14)",
             where="eta",
-            remedy="leave sigma and gamma out",
+            remedy="leave sigma, sigma_object and gamma out",
         )
-    _, sigma_object, gamma = scales_from_eta(eta)
-    return sigma_object, gamma
+    sigma_gripper, kept, gamma = scales_from_eta(eta)
+    return {"sigma_gripper": sigma_gripper, "sigma_object": kept, "gamma": gamma}

@@ -1,0 +1,92 @@
+"""Gripper and object: the difference, its covariance, its consistency, Eq. (14)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.gripper import consistency_margin, identified_object
+from drake_teleop.load.identification import Identification, identify
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+
+GRIPPER = phi_from_mass_com_inertia(1.2, [0.0, 0.01, 0.05], np.diag([0.004, 0.004, 0.002]))
+OBJECT = phi_from_mass_com_inertia(0.7, [0.01, -0.02, 0.16], np.diag([0.003, 0.002, 0.002]))
+NOISE = np.array([0.2, 0.2, 0.2, 0.02, 0.02, 0.02])
+
+
+def recorded(phi: np.ndarray, seed: int, samples: int = 400, noise: float = 1.0) -> Identification:
+    rng = np.random.default_rng(seed)
+    s, omega, alpha = (rng.normal(size=(samples, 3)) * size for size in (9.0, 2.0, 15.0))
+    wrench = non_contact_wrench(s, omega, alpha, phi) + noise * NOISE * rng.normal(
+        size=(samples, 6)
+    )
+    return identify(wrench, s, omega, alpha, noise=NOISE)
+
+
+def test_the_difference_has_the_object_and_the_sum_of_the_covariances() -> None:
+    total, gripper = recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2)
+    found = identified_object(total, gripper)
+    assert np.abs((found.phi - OBJECT) / found.standard_deviations[6:]).max() < 4
+    expected = total.covariance[6:, 6:] + gripper.covariance[6:, 6:]
+    np.testing.assert_allclose(found.covariance[6:, 6:], expected, rtol=1e-12)
+    np.testing.assert_array_equal(found.covariance[:6], total.covariance[:6])
+    assert found.identifiable.all() and found.physically_consistent
+
+
+def test_its_errors_are_as_large_as_the_covariance_says() -> None:
+    scores = []
+    for seed in range(60):
+        found = identified_object(
+            recorded(GRIPPER + OBJECT, 2 * seed), recorded(GRIPPER, 2 * seed + 1)
+        )
+        scores.append((found.phi - OBJECT) / found.standard_deviations[6:])
+    # Root mean square of 60 normal numbers of unit variance: 1 +- 0.09; four of that.
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(scores), axis=0)), 1.0, atol=0.37)
+
+
+def test_it_is_a_file_like_any_other(tmp_path) -> None:
+    found = identified_object(recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2))
+    found.save(tmp_path / "object.json")
+    again = Identification.load(tmp_path / "object.json")
+    np.testing.assert_array_equal(again.covariance, found.covariance)
+    np.testing.assert_array_equal(again.phi, found.phi)
+
+
+def test_what_the_gripper_record_left_undetermined_is_so_in_the_difference() -> None:
+    rng = np.random.default_rng(3)
+    s = rng.normal(size=(30, 3)) * 9
+    rest = np.zeros((30, 3))
+    wrench = non_contact_wrench(s, rest, rest, GRIPPER) + 0.1 * NOISE * rng.normal(size=(30, 6))
+    gripper = identify(wrench, s, rest, rest)
+    found = identified_object(recorded(GRIPPER + OBJECT, 1), gripper)
+    assert found.identifiable.tolist() == [True] * 10 + [False] * 6
+    assert np.isinf(np.diag(found.covariance)[10:]).all()
+    assert consistency_margin(found)[1] == np.inf
+
+
+def test_exchanged_files_are_an_error() -> None:
+    total, gripper = recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2)
+    with pytest.raises(DrakeTeleopError, match=r"-0\.7\d* kg for the object.*gripper alone"):
+        identified_object(gripper, total)
+    with pytest.raises(DrakeTeleopError, match="0 kg"):
+        identified_object(total, total)
+
+
+def test_the_margin_tells_a_body_from_none_and_from_noise() -> None:
+    total, gripper = recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2)
+    margin, deviation = consistency_margin(identified_object(total, gripper))
+    assert margin > 3 * deviation > 0
+    impossible = OBJECT - np.array([0, 0, 0, 0, 0.018, 0, 0, 0, 0, 0])  # I_xx far too small
+    margin, deviation = consistency_margin(
+        identified_object(recorded(GRIPPER + impossible, 1), gripper)
+    )
+    assert margin < -3 * deviation < 0
+
+
+def test_the_margin_s_deviation_is_that_of_its_scatter() -> None:
+    pairs = [consistency_margin(recorded(OBJECT, seed)) for seed in range(80)]
+    margins, deviations = np.array(pairs).T
+    # 80 seeds: a standard deviation is known to 8 %.
+    assert margins.std(ddof=1) == pytest.approx(np.median(deviations), rel=0.3)

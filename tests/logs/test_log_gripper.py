@@ -1,0 +1,130 @@
+"""Gripper and object on logs: `identify --gripper` and `eliminate --gripper`, Eq. (14)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from known_motion import motion_at
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.canonical import Log, write_log
+from drake_teleop.logs.commands import eliminate_command, identify_command
+from drake_teleop.logs.processing import eliminate_log
+
+GRIPPER = phi_from_mass_com_inertia(1.2, [0.0, 0.01, 0.05], np.diag([0.004, 0.004, 0.002]))
+OBJECT = phi_from_mass_com_inertia(0.7, [0.01, -0.02, 0.16], np.diag([0.003, 0.002, 0.002]))
+
+
+def simulated(path: Path, phi: np.ndarray, seed: int, contact: np.ndarray | None = None) -> Path:
+    """A canonical log, 4 s at 500 Hz, with noise and offsets."""
+    t = np.arange(0, 4, 2e-3)
+    motion = motion_at(t)
+    kinematics = motion.specific_force, motion.omega, motion.alpha
+    wrench = non_contact_wrench(*kinematics, phi) + np.array([1.0, 2.0, -1.0, 0.1, 0.0, 0.2])
+    wrench += np.random.default_rng(seed).normal(size=wrench.shape) * np.repeat([0.1, 0.01], 3)
+    if contact is not None:
+        wrench += contact
+    write_log(Log(t, wrench, *kinematics), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """gripper/identification.json, and total/ with identification.json and object.json."""
+    folder = tmp_path_factory.mktemp("gripper")
+    alone = simulated(folder / "gripper.parquet", GRIPPER, 1)
+    identify_command(alone, folder / "gripper", delay=0.0, quiet=True)
+    both = simulated(folder / "total.parquet", GRIPPER + OBJECT, 2)
+    identify_command(
+        both,
+        folder / "total",
+        gripper=folder / "gripper" / "identification.json",
+        delay=0.0,
+        quiet=True,
+    )
+    return folder
+
+
+def test_identify_writes_the_object(files: Path) -> None:
+    summary = json.loads((files / "total" / "summary.json").read_text())
+    total, alone, found = (
+        Identification.load(files / name)
+        for name in (
+            "total/identification.json",
+            "gripper/identification.json",
+            "total/object.json",
+        )
+    )
+    np.testing.assert_allclose(found.phi, total.phi - alone.phi, atol=1e-15)
+    assert found.mass == pytest.approx(0.7, abs=0.005)
+    np.testing.assert_allclose(found.com, [0.01, -0.02, 0.16], atol=2e-3)
+    assert found.physically_consistent
+    assert summary["object"]["mass"] == found.mass
+    assert summary["object"]["not_identifiable"] == []
+    assert len(summary["object"]["identifiable"]) == 10
+    assert summary["object"]["consistency_margin"] > summary["object"]["consistency_margin_std"]
+    assert not [note for note in summary["notes"] if "object" in note]
+
+
+def test_the_table_has_the_object_only_with_a_gripper(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, gripper = files / "total.parquet", files / "gripper" / "identification.json"
+    identify_command(log, tmp_path, gripper=gripper, delay=0.0)
+    assert "object: mass" in capsys.readouterr().out
+    summary = identify_command(log, tmp_path / "single", delay=0.0)
+    assert "object: " not in capsys.readouterr().out
+    assert "object" not in summary
+    assert not (tmp_path / "single" / "object.json").exists()
+
+
+def test_nothing_gripped_is_said(files: Path, tmp_path: Path) -> None:
+    gripper = files / "gripper" / "identification.json"
+    log = simulated(tmp_path / "empty.parquet", GRIPPER, 8)
+    summary = identify_command(log, tmp_path / "out", gripper=gripper, delay=0.0, quiet=True)
+    assert any("no object" in note for note in summary["notes"])
+    assert summary["object"]["identifiable"] == []
+
+
+def test_eta_splits_gripper_and_object(files: Path) -> None:
+    load, gripper = (files / name / "identification.json" for name in ("total", "gripper"))
+    log = files / "total.parquet"
+    options = {"gripper": gripper, "delay": 0.0, "cutoff_hz": None}
+    found = eliminate_log(log, load, eta=0.5, **options)
+    phi_object = Identification.load(files / "total" / "object.json").phi
+    kept = 0.5 * non_contact_wrench(*found.log.motion, phi_object)
+    np.testing.assert_allclose(found.scaled, found.contact + kept, atol=1e-9)
+    by_hand = eliminate_log(log, load, sigma=0.0, sigma_object=0.5, **options)
+    np.testing.assert_array_equal(by_hand.scaled, found.scaled)
+    # The truth: half of the object's own non-contact wrench, and nothing of the gripper's.
+    truth = 0.5 * non_contact_wrench(*found.log.motion, OBJECT)
+    assert np.sqrt(np.mean((found.scaled - truth)[:, :3] ** 2)) < 0.12
+    # Everything kept is the measurement, whatever the split.
+    whole = eliminate_log(log, load, sigma=1.0, **options)
+    np.testing.assert_allclose(whole.scaled, whole.measured, atol=1e-9)
+
+
+def test_scales_that_do_not_go_together(files: Path) -> None:
+    load, gripper = (files / name / "identification.json" for name in ("total", "gripper"))
+    log = files / "total.parquet"
+    with pytest.raises(DrakeTeleopError, match=r"sigma_object.*gripper"):
+        eliminate_log(log, load, sigma_object=0.5)
+    with pytest.raises(DrakeTeleopError, match="eta goes with"):
+        eliminate_log(log, load, gripper=gripper, eta=0.5, sigma_object=0.5)
+    with pytest.raises(DrakeTeleopError, match="sigma_object is -1"):
+        eliminate_log(log, load, gripper=gripper, sigma_object=-1.0)
+
+
+def test_exchanged_files_are_an_error_in_both_commands(files: Path, tmp_path: Path) -> None:
+    load, gripper = (files / name / "identification.json" for name in ("total", "gripper"))
+    with pytest.raises(DrakeTeleopError, match="kg for the object"):
+        identify_command(files / "gripper.parquet", tmp_path / "a", gripper=load, quiet=True)
+    with pytest.raises(DrakeTeleopError, match="kg for the object"):
+        eliminate_command(files / "total.parquet", gripper, tmp_path / "b", gripper=load)
+    assert not (tmp_path / "a").exists() and not (tmp_path / "b").exists()
