@@ -157,6 +157,11 @@ def identify(
     "--gamma", type=_Number(), default=1.0, show_default=True, help="Scale of the contact wrench."
 )
 @click.option("--eta", type=_Number(0, 1), help="Part of a gripped object that is kept.")
+@click.option(
+    "--causal",
+    type=click.Choice(["delayed", "predicted"]),
+    help="Also as a loop would have had it: with its low-pass's lag, or predicted over it.",
+)
 @_out("eliminate")
 @_cutoff
 @_delay
@@ -169,6 +174,7 @@ def eliminate(
     sigma_object: float | None,
     gamma: float,
     eta: float | None,
+    causal: str | None,
     out: Path,
     cutoff_hz: float,
     delay: float | str,
@@ -190,6 +196,7 @@ def eliminate(
         sigma_object=sigma_object,
         gamma=gamma,
         eta=eta,
+        causal=causal,
         cutoff_hz=cutoff_hz,
         delay=delay,
         quiet=quiet,

@@ -160,7 +160,7 @@ def test_eliminate_hands_on_the_scaling_law(capsys, install):
             (Path("a.csv"), Path("i.json"), Path("out/eliminate")),
             {
                 "gripper": None, "sigma": 0.5, "sigma_object": None, "gamma": 2.0, "eta": 0.25,
-                "cutoff_hz": 20.0, "delay": "auto",
+                "causal": None, "cutoff_hz": 20.0, "delay": "auto",
                 "quiet": False,
             },
         )

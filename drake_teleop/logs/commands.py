@@ -51,6 +51,13 @@ residual_rms              rms of |F_c|, the contact force: in free motion, what 
 residual_peak             largest |F_c|
 raw_torque_rms ...        the same four of the torque
 raw_rms_per_channel ...   the same four of each channel [f; tau]
+noise_floor               [f; tau], standard deviation of the contact wrench where it is quiet
+contacts                  list of start_s, stop_s, peak_N, peak_Nm: from where a channel exceeds 8
+                          noise floors until all are below 4; null for static poses
+in_contact                share of the samples in `contacts`; null for static poses
+causal                    null, or, if --causal was given: mode, lag_s (by how much the output is
+                          late, or would be without prediction), residual_rms, noise_floor as
+                          above, and difference_rms, of |F_causal - F_c|
 ========================= =======================================================================
 """
 
@@ -67,6 +74,7 @@ from numpy.typing import NDArray
 from drake_teleop.load.gripper import SIGNIFICANT, consistency_margin, identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.logs.canonical import WRENCH, Log
+from drake_teleop.logs.contact import contacts_of, noise_floor
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
 
 
@@ -128,6 +136,7 @@ def eliminate_command(
     sigma_object: float | None = None,
     gamma: float = 1.0,
     eta: float | None = None,
+    causal: str | None = None,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     quiet: bool = False,
@@ -135,7 +144,8 @@ def eliminate_command(
     """`eliminate_log`, writing contact_wrench.parquet, contact_wrench.png and summary.json.
 
     The Parquet table has `t` and, for each channel such as f_x, `contact_f_x`, `scaled_f_x`,
-    `non_contact_f_x` and `measured_f_x` (offsets removed).
+    `non_contact_f_x` and `measured_f_x` (offsets removed); with `causal` (see `eliminate_log`) also
+    `causal_contact_f_x` and `causal_scaled_f_x`. The flag `in_contact` says where there is contact.
 
     Returns:
         the summary; its names are explained at the top of this module.
@@ -149,6 +159,7 @@ def eliminate_command(
         sigma_object=sigma_object,
         gamma=gamma,
         eta=eta,
+        causal=causal,
         cutoff_hz=cutoff_hz,
         delay=delay,
     )
@@ -172,7 +183,7 @@ def eliminate_command(
             "less than half of the record agrees on the sensor's offsets: if it is in contact most"
             " of the time, the contact wrench may be off by a constant"
         )
-    summary = _plain(summary | _rms_figures(found))
+    summary = _plain(summary | _rms_figures(found) | _contact_figures(found))
     from drake_teleop.logs.pictures import draw_elimination
 
     out.mkdir(parents=True, exist_ok=True)
@@ -261,6 +272,41 @@ def _rms_figures(found: EliminatedLog) -> dict[str, Any]:
     )
 
 
+def _contact_figures(found: EliminatedLog) -> dict[str, Any]:
+    figures: dict[str, Any] = {
+        "noise_floor": found.noise_floor,
+        "contacts": None,
+        "in_contact": None,
+        "causal": None,
+    }
+    if not found.log.static:
+        touches = contacts_of(found.log.t, found.contact, found.touched)
+        figures["contacts"] = [
+            {
+                "start_s": touch.start_s,
+                "stop_s": touch.stop_s,
+                "peak_N": touch.peak_force,
+                "peak_Nm": touch.peak_torque,
+            }
+            for touch in touches
+        ]
+        figures["in_contact"] = found.touched.mean()
+    if found.causal is not None:
+        late = found.causal.contact
+
+        def force_rms(wrench: NDArray[np.float64]) -> float:
+            return float(np.sqrt(np.mean(np.sum(wrench[:, :3] ** 2, axis=1))))
+
+        figures["causal"] = {
+            "mode": found.causal.mode,
+            "lag_s": found.causal.lag_s,
+            "residual_rms": force_rms(late),
+            "noise_floor": noise_floor(late),
+            "difference_rms": force_rms(late - found.contact),
+        }
+    return figures
+
+
 def _reduced(
     name: str,
     suffix: str,
@@ -294,10 +340,15 @@ def _write_summary(out: Path, summary: dict[str, Any]) -> None:
 def _write_wrenches(found: EliminatedLog, path: Path) -> None:
     import polars as pl
 
-    columns = {"t": found.log.t}
+    columns: dict[str, NDArray[Any]] = {"t": found.log.t}
     for name in ("contact", "scaled", "non_contact", "measured"):
         values = getattr(found, name)
         columns |= {f"{name}_{c}": values[:, i] for i, c in enumerate(WRENCH)}
+    if found.causal is not None:
+        for name in ("contact", "scaled"):
+            values = getattr(found.causal, name)
+            columns |= {f"causal_{name}_{c}": values[:, i] for i, c in enumerate(WRENCH)}
+    columns["in_contact"] = found.touched
     pl.DataFrame(columns).write_parquet(path)
 
 
@@ -364,7 +415,22 @@ def _print_elimination(summary: dict[str, Any], out: Path) -> None:
         force, torque = summary[f"{name}_rms"], summary[f"{name}_torque_rms"]
         if force is not None:
             table.add_row(label, f"{force:.4g}", f"{torque:.4g}")
-    _print(table, f"largest contact force {summary['residual_peak']:.4g} N", summary, out)
+    figures = f"largest contact force {summary['residual_peak']:.4g} N"
+    contacts = summary["contacts"]
+    if contacts:
+        first = ", ".join(f"{c['start_s']:.3f}" for c in contacts[:5])
+        more = " ..." if len(contacts) > 5 else ""
+        figures += f"; {len(contacts)} contacts, from {first}{more} s"
+    elif contacts is not None:
+        figures += "; no contact found"
+    causal = summary["causal"]
+    if causal is not None:
+        late = "late" if causal["mode"] == "delayed" else "made up for by prediction"
+        figures += (
+            f"\ncausal: {1e3 * causal['lag_s']:.1f} ms {late},"
+            f" rms of |F| {causal['residual_rms']:.4g} N"
+        )
+    _print(table, figures, summary, out)
 
 
 def _print(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:

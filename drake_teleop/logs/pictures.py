@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 
 from drake_teleop.logs.canonical import Log
 from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
-from drake_teleop.style import BLUE, GREEN, ORANGE, VERMILION, Picture, house_style
+from drake_teleop.style import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    Picture,
+    house_style,
+    shade_contact,
+)
 
 _CHANNELS = ("$f_x$", "$f_y$", "$f_z$", r"$\tau_x$", r"$\tau_y$", r"$\tau_z$")
 _POINTS = 4000
@@ -50,7 +59,7 @@ def draw_elimination(found: EliminatedLog) -> Figure:
     """|F| on top, then six channels: measured, static weight removed, contact wrench.
 
     The three forces share one scale, and so do the three torques. The scaled wrench is drawn if it
-    differs from the contact wrench.
+    differs from the contact wrench, the causal contact wrench if there is one; contacts are shaded.
     """
     curves = [("measured, offsets removed", found.measured, _MEASURED)]
     if found.gravity_only is not None:
@@ -58,6 +67,10 @@ def draw_elimination(found: EliminatedLog) -> Figure:
     curves.append(("contact wrench", found.contact, BLUE))
     if not np.array_equal(found.scaled, found.contact):
         curves.append(("scaled wrench", found.scaled, GREEN))
+    if found.causal is not None:
+        curves.append(
+            (f"contact wrench, causal, {found.causal.mode}", found.causal.contact, PURPLE)
+        )
     t, static = found.log.t, found.log.static
     with house_style():
         figure = Picture(figsize=(10, 9))
@@ -68,10 +81,12 @@ def draw_elimination(found: EliminatedLog) -> Figure:
         magnitude.set_ylim(bottom=0)
         magnitude.set_title("$|F|$, rms: " + ", ".join(_rms_words(norms)))
         magnitude.set_ylabel("force [N]")
+        shade_contact(magnitude, t, found.touched)
         axes = _channel_axes(below)
         for i, axis in enumerate(axes):
             _draw(axis, t, [(n, w[:, i], c) for n, w, c in curves], static)
             axis.set_title(_CHANNELS[i])
+            shade_contact(axis, t, found.touched)
         _finish(figure, axes, Path(found.log.source).name, found.log, found.delay_s)
     return figure
 
@@ -99,7 +114,7 @@ def _draw(
     for order, (name, values, colour) in enumerate(curves):
         if static:
             size = 7.0 if order == 0 else 3.0
-            axes.plot(t + 1, values, "os^D"[order], markersize=size, color=colour, label=name)
+            axes.plot(t + 1, values, "os^Dv"[order], markersize=size, color=colour, label=name)
         else:
             width = 2.2 if order == 0 else 1.1
             axes.plot(t[::every], values[::every], color=colour, linewidth=width, label=name)

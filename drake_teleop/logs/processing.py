@@ -16,6 +16,8 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.alignment import low_pass, low_passed, undelayed
 from drake_teleop.logs.canonical import Log
+from drake_teleop.logs.causal import CausalWrench, causal_wrenches
+from drake_teleop.logs.contact import in_contact, noise_floor
 from drake_teleop.logs.delay import estimate_delay
 from drake_teleop.logs.reading import read_log
 
@@ -55,6 +57,9 @@ class EliminatedLog:
         scaled: (N, 6) gamma F_c + sigma V phi.
         gravity_only: (N, 6) wrench without offsets and static weight, or None if the orientation
             is not known.
+        noise_floor: (6,) of `contact`, see `drake_teleop.logs.contact`.
+        touched: (N,) where `contact` says that something is touched; nowhere in static poses.
+        causal: the same wrenches as a loop would have had them, or None if not asked for.
     """
 
     log: Log
@@ -69,6 +74,9 @@ class EliminatedLog:
     contact: NDArray[np.float64]
     scaled: NDArray[np.float64]
     gravity_only: NDArray[np.float64] | None
+    noise_floor: NDArray[np.float64]
+    touched: NDArray[np.bool_]
+    causal: CausalWrench | None
 
 
 def identify_log(
@@ -112,6 +120,7 @@ def eliminate_log(
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     tare: bool = True,
+    causal: str | None = None,
 ) -> EliminatedLog:
     """Removes (or scales) the non-contact wrench of a known load in a log.
 
@@ -131,14 +140,22 @@ def eliminate_log(
         delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
         tare: take the sensor's offsets from this record (they drift between records), not from
             `load`: the constant that most of the record agrees on, see `robust_offsets`.
+        causal: "delayed" or "predicted" gives `EliminatedLog.causal` as well. The offsets are
+            those of the zero-phase result, as if the sensor had been tared before; accelerations
+            that were differentiated from poses have seen half a smoother's window ahead, which a
+            loop would have to wait for in addition.
 
     Raises:
         DrakeTeleopError: if the log or a load file cannot be used, eta is given together with
-            another scale, or sigma_object without a gripper.
+            another scale, sigma_object without a gripper, or causal for static poses.
     """
     identification = load if isinstance(load, Identification) else Identification.load(load)
     scales = _scales(sigma, sigma_object, gamma, eta, gripper is not None)
     log = read_log(path, bandwidth_hz=cutoff_hz)
+    if log.static and causal is not None:
+        raise DrakeTeleopError(
+            "poses at rest have no order in time", where="causal", remedy="leave it out"
+        )
     phi, point_mass = usable_phi(identification)
     # One load without a gripper is all object.
     phi_gripper = np.zeros(10)
@@ -166,6 +183,17 @@ def eliminate_log(
         weightless = contact_wrench(log.wrench, np.zeros(6), -log.gravity, rest, rest, phi)
         weightless = smooth(weightless)
         gravity_only = weightless - (robust_offsets(weightless)[0] if tare else offsets)
+    contact = contact_wrench(log.wrench, offsets, *motion, phi)
+    scaled = scaled_wrench(log.wrench, offsets, *motion, phi_gripper, phi_object, **scales)
+    late = None
+    if causal is not None:
+        late = causal_wrenches(
+            contact, scaled, log.dt, cutoff_hz=cutoff_hz, delay_s=delay_s, mode=causal
+        )
+    contact = smooth(contact)
+    floor, touched = noise_floor(contact), np.zeros(len(log), bool)
+    if not log.static:
+        touched = in_contact(contact, floor, _hold(log.dt, cutoff_hz))
     return EliminatedLog(
         log=log,
         phi=phi,
@@ -176,11 +204,12 @@ def eliminate_log(
         delay_source=source,
         measured=smooth(log.wrench - offsets),
         non_contact=smooth(non_contact_wrench(*motion, phi)),
-        contact=smooth(contact_wrench(log.wrench, offsets, *motion, phi)),
-        scaled=smooth(
-            scaled_wrench(log.wrench, offsets, *motion, phi_gripper, phi_object, **scales)
-        ),
+        contact=contact,
+        scaled=smooth(scaled),
         gravity_only=gravity_only,
+        noise_floor=floor,
+        touched=touched,
+        causal=late,
     )
 
 
@@ -243,6 +272,11 @@ def _delay(
         )
     found = estimate_delay(log, cutoff_hz, phi)
     return (0.0, "undetermined") if found is None else (found, "estimated")
+
+
+def _hold(dt: float, cutoff_hz: float | None) -> int:
+    """Samples of quiet that end a contact: a period of the low-pass, within which it may swing."""
+    return 0 if cutoff_hz is None else round(1.0 / (cutoff_hz * dt))
 
 
 def _scales(

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from known_motion import motion_at
 
@@ -13,7 +14,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.canonical import Log, write_log
+from drake_teleop.logs.canonical import WRENCH, Log, write_log
 from drake_teleop.logs.commands import eliminate_command, identify_command
 from drake_teleop.logs.processing import eliminate_log
 
@@ -128,3 +129,39 @@ def test_exchanged_files_are_an_error_in_both_commands(files: Path, tmp_path: Pa
     with pytest.raises(DrakeTeleopError, match="kg for the object"):
         eliminate_command(files / "total.parquet", gripper, tmp_path / "b", gripper=load)
     assert not (tmp_path / "a").exists() and not (tmp_path / "b").exists()
+
+
+def test_contacts_and_the_causal_wrench_come_with_eliminate(files: Path, tmp_path: Path) -> None:
+    t = np.arange(0, 4, 2e-3)
+    force = np.where((t > 2.0) & (t < 2.5), 12 * np.sin(2 * np.pi * (t - 2.0)) ** 2, 0.0)
+    touch = np.outer(force, [0.3, 0, -1, 0, 0.05, 0])
+    log = simulated(tmp_path / "log.parquet", GRIPPER + OBJECT, 5, touch)
+    load = files / "total" / "identification.json"
+    out = tmp_path / "out"
+    summary = eliminate_command(log, load, out, causal="delayed", delay=0.0, quiet=True)
+    (found,) = summary["contacts"]
+    assert 2.0 < found["start_s"] < 2.1 and 2.4 < found["stop_s"] < 2.51
+    assert found["peak_N"] == pytest.approx(12 * np.hypot(0.3, 1), abs=0.3)
+    assert found["peak_Nm"] == pytest.approx(0.6, abs=0.05)
+    assert 0.08 < summary["in_contact"] < 0.13
+    # White noise of 0.1 N at 500 Hz through the 30 Hz low-pass, in [f; tau].
+    share = np.sqrt(np.mean(1 / (1 + (np.linspace(0, 250, 5000) / 30) ** 4) ** 2))
+    np.testing.assert_allclose(summary["noise_floor"], share * np.repeat([0.1, 0.01], 3), rtol=0.25)
+    table = pl.read_parquet(out / "contact_wrench.parquet")
+    contact = table.select([f"contact_{c}" for c in WRENCH]).to_numpy()
+    late = table.select([f"causal_contact_{c}" for c in WRENCH]).to_numpy()
+    assert table["in_contact"].mean() == summary["in_contact"]
+    assert summary["causal"]["mode"] == "delayed"
+    assert summary["causal"]["lag_s"] == pytest.approx(0.0075, abs=2e-4)
+    # The same force, later by the lag: 4 samples at 500 Hz.
+    shifted = np.abs(late[4:, 2] - contact[:-4, 2]).max()
+    assert shifted < 0.35 < 0.4 < np.abs(late[:, 2] - contact[:, 2]).max()
+    ahead = eliminate_log(log, load, causal="predicted", delay=0.0).causal
+    assert np.abs(ahead.contact[:, 2] - contact[:, 2]).max() < 0.4
+
+
+def test_a_free_record_has_no_contact(files: Path, tmp_path: Path) -> None:
+    load = files / "total" / "identification.json"
+    summary = eliminate_command(files / "total.parquet", load, tmp_path, delay=0.0, quiet=True)
+    assert summary["contacts"] == [] and summary["in_contact"] == 0.0
+    assert summary["causal"] is None
