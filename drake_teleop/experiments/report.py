@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
+
+from drake_teleop.html import embedded, render
 
 # Eq. (7): symbol, index, unit as printed, and how many of it an SI unit has.
 _PARAMETERS = (
@@ -195,16 +194,14 @@ def write_report(
         parameters: the identification table.
         replay: file name of the Meshcat replay next to the page, if there is one.
     """
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    source = resources.files("drake_teleop.experiments").joinpath("report.html.j2")
-    page = environment.from_string(source.read_text(encoding="utf-8")).render(
+    page = render(
+        "drake_teleop.experiments",
+        "report.html.j2",
         setup=dict(setup),
         versions=versions(),
         tiles=_tiles(summary),
         comparisons=compare_with_paper(summary),
-        figures=[(item, _embedded(item.figure)) for item in figures],
+        figures=[(item, embedded(item.figure)) for item in figures],
         parameters=parameters,
         summary=summary,
         replay=replay,
@@ -221,12 +218,6 @@ def _tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         (f"{lag:.1f}", "ms", "from the touch to its detection"),
         (f"{s['identification.mass_error_percent']:.3f}", "%", "error of the identified mass"),
     ]
-
-
-def _embedded(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=160)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def _between(what: str, paper: str, value: float, unit: str, low: float, high: float) -> Comparison:
