@@ -1,0 +1,202 @@
+"""The load that some body can have and that fits best: a semidefinite program.
+
+Least squares minimises theta^T G theta - 2 b^T theta; here the pseudo-inertia J(phi) must be
+positive semidefinite besides (Wensing, Kim, Slotine, RA-L 2018), which is linear in phi. Offsets
+are eliminated first, and phi is divided by (m0, m0 L, m0 L^2), L the load's radius about So: in SI
+units the inertia of a light tool drowns in the solver's tolerance. If least squares is consistent
+already, it is the solution, to the last bit, and nothing else is done.
+
+A prior phi_0 pulls what the record does not say, with the weight of so many samples:
+
+- entropic: tr(J_0^-1 J) - log det J, the log-det divergence (Lee, Wensing, Park, T-RO 2020);
+- geodesic: 1/2 tr((J_0^-1 (J - J_0))^2), the constant pull-back of the affine-invariant metric
+  (Lee, Park, RA-L 2018), which is a quadratic cost.
+
+An ellipsoid (r - c)^T A (r - c) <= 1 that contains the load's mass makes tr(J E) >= 0, with
+E = [[-A, A c], [c^T A, 1 - c^T A c]] (Wensing, Kim, Slotine 2018).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array, checked
+from drake_teleop.load.inertia import (
+    is_physically_consistent,
+    phi_from_pseudo_inertia,
+    pseudo_inertia,
+)
+
+_UNITS = [pseudo_inertia(unit) for unit in np.eye(10)]
+_SMALLEST_LENGTH = 1e-3  # of the unit of length [m]
+_RANK = 1e-12  # smallest eigenvalue over the largest that counts as information
+_PRIORS = ("entropic", "geodesic")
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What the load was thought to be before the record.
+
+    Attributes:
+        phi: (10,) about So in S, of a body with extent in all directions.
+        weight: in residual variance per sample: small against 1 if the record shall decide.
+        kind: "entropic" or "geodesic" (module docstring).
+    """
+
+    phi: ArrayLike
+    weight: float
+    kind: str = "entropic"
+
+    def __post_init__(self) -> None:
+        if self.kind not in _PRIORS:
+            raise DrakeTeleopError(f"{self.kind!r} is not one of {_PRIORS}", where="prior.kind")
+        if not 0.0 < self.weight < np.inf:
+            raise DrakeTeleopError(f"{self.weight} is not positive", where="prior.weight")
+        if np.linalg.eigvalsh(pseudo_inertia(self.phi))[0] <= 0.0:
+            raise DrakeTeleopError(
+                "has no extent in some direction, or is no body", where="prior.phi"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoid:
+    """Contains the mass of the load: (r - center)^T matrix (r - center) <= 1.
+
+    Attributes:
+        center: (3,) from So in S [m].
+        matrix: (3, 3) positive definite [1/m^2].
+    """
+
+    center: ArrayLike
+    matrix: ArrayLike
+
+    def row(self) -> Array:
+        """(10,) coefficients of phi in tr(J E) >= 0.
+
+        Raises:
+            DrakeTeleopError: for other shapes, or a matrix that is not positive definite.
+        """
+        A, c = checked("ellipsoid.matrix", self.matrix, 3, 3), checked("center", self.center, 3)
+        if np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] <= 0.0:
+            raise DrakeTeleopError("is not positive definite", where="ellipsoid.matrix")
+        E = np.block([[-A, (A @ c)[:, None]], [A @ c, 1.0 - c @ A @ c]])
+        return np.array([np.sum(unit * E) for unit in _UNITS])
+
+
+def consistent_least_squares(
+    gram: Array,
+    right: Array,
+    theta: Array,
+    prior: Prior | None = None,
+    ellipsoid: Ellipsoid | None = None,
+) -> Array:
+    """(16,) [offsets; phi] of the best physically consistent load.
+
+    Args:
+        gram, right: (16, 16), (16,) normal equations, rows weighted by the noise; divided by the
+            number of samples if there is a prior.
+        theta: (16,) their solution.
+        prior: of the load.
+        ellipsoid: that contains it.
+
+    Raises:
+        DrakeTeleopError: if the solver finds no solution.
+    """
+    row = None if ellipsoid is None else ellipsoid.row()
+    inside = row is None or row @ theta[6:] >= 0.0
+    if prior is None and inside and is_physically_consistent(theta[6:]):
+        return theta
+    unit = _units(theta[6:] if prior is None else checked("prior.phi", prior.phi, 10))
+    offsets, cross = np.diag(gram)[:6], gram[:6, 6:]
+    reduced = (gram[6:, 6:] - cross.T @ (cross / offsets[:, None])) * np.outer(unit, unit)
+    linear = (right[6:] - cross.T @ (right[:6] / offsets)) * unit
+    phi = unit * _solve(reduced, linear, unit, prior, row)
+    return np.concatenate([(right[:6] - cross @ phi) / offsets, phi])
+
+
+def _units(phi: Array) -> Array:
+    """(10,) (m0, m0 L, m0 L^2) of a load that need not be consistent."""
+    m = abs(phi[0])
+    if m == 0.0:
+        raise DrakeTeleopError("no mass can be told from this wrench", where="wrench")
+    spread = max(0.0, 0.5 * (phi[4] + phi[7] + phi[9]) / m)
+    L = max(_SMALLEST_LENGTH, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
+    return m * np.repeat([1.0, L, L * L], [1, 3, 6])
+
+
+def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | None) -> Array:
+    """(10,) phi / unit that minimises phi^T H phi / 2 - b^T phi + prior, J(phi) >= 0."""
+    # Drake is imported here: all else of the load core does without, and starts ten times faster.
+    from pydrake.solvers import ClarabelSolver, MathematicalProgram
+
+    program = MathematicalProgram()
+    x = program.NewContinuousVariables(10)
+    program.AddLinearMatrixInequalityConstraint([np.zeros((4, 4)), *_UNITS], x)
+    if row is not None:
+        normalised = row * unit / np.abs(row * unit).max()
+        program.AddLinearConstraint(normalised[None, :], [0.0], [np.inf], x)
+    if prior is not None:
+        J0_inverse = np.linalg.inv(pseudo_inertia(checked("prior.phi", prior.phi, 10) / unit))
+        scaled = [J0_inverse @ part for part in _UNITS]
+        pull = prior.weight * np.array([np.trace(part) for part in scaled])
+        if prior.kind == "geodesic":
+            H = H + prior.weight * np.einsum("aij,bji->ab", scaled, scaled)
+        b = b + (pull if prior.kind == "geodesic" else -pull)
+    if prior is not None and prior.kind == "entropic":
+        scale = 10.0 / np.trace(H)
+        program.AddQuadraticCost(scale * H, -scale * b, x, is_convex=True)
+        _add_log_det(program, x, prior.weight * scale)
+    else:
+        _add_distance(program, x, H, b)
+    result = ClarabelSolver().Solve(program)
+    if not result.is_success():
+        raise DrakeTeleopError(
+            f"the semidefinite program has no solution ({result.get_solution_result().name})",
+            where="consistent",
+            remedy="check the sign of the wrench, and that the load moves",
+        )
+    x = result.GetSolution(x)
+    # The solver's tolerance leaves eigenvalues of -1e-9 or so.
+    values, vectors = np.linalg.eigh(pseudo_inertia(x))
+    J = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return phi_from_pseudo_inertia(0.5 * (J + J.T))
+
+
+def _add_distance(program: Any, x: Any, H: Array, b: Array) -> None:
+    """Minimises |R x - d|, R^T R = H, R^T d = b: where x^T H x / 2 - b^T x is smallest.
+
+    The distance and not its square: the solver stops at 1e-8 of either, and the square root of
+    that would be the error of a load at the edge of consistency.
+    """
+    values, vectors = np.linalg.eigh(H)
+    kept = values > _RANK * values[-1]
+    root = np.sqrt(values[kept] / values[-1])
+    R = root[:, None] * vectors[:, kept].T
+    d = vectors[:, kept].T @ b / (root * values[-1])
+    t = program.NewContinuousVariables(1)
+    cone = np.zeros((len(d) + 1, 11))
+    cone[0, 10], cone[1:, :10] = 1.0, R
+    program.AddLorentzConeConstraint(cone, np.append(0.0, -d), np.append(x, t))
+    program.AddLinearCost([1.0], t)
+
+
+def _add_log_det(program: Any, x: Any, weight: float) -> None:
+    """Adds -weight log det J(x) to the cost; Drake normalises it no further."""
+    m, hx, hy, hz, xx, xy, xz, yy, yz, zz = x
+    half = 0.5 * (xx + yy + zz)
+    J = np.array(
+        [
+            [half - xx, -xy, -xz, hx],
+            [-xy, half - yy, -yz, hy],
+            [-xz, -yz, half - zz, hz],
+            [hx, hy, hz, m],
+        ]
+    )
+    (cost, t, _) = program.AddMaximizeLogDeterminantCost(J)
+    program.RemoveCost(cost)
+    program.AddLinearCost(-weight * np.ones(len(t)), t)

@@ -1,0 +1,202 @@
+"""Second moments of a record, from which every batch estimator but the robust one follows.
+
+The row of channel c of the regressor, a_c = [e_c, V_c] (16), is linear in
+
+    z = [1, F (6), s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]   (19)
+
+with constant coefficients: a_c = T_c z. The mean Z of z z^T is therefore all that least squares
+with any weights between the channels, errors in variables and the residual's covariance need: a
+(19, 19) matrix whatever the length of the record.
+
+Noise of z has a mean covariance Q: constant for the wrench, s and alpha, and for the products of
+angular velocity to first order, d(w_i w_j) = w_i d w_j + w_j d w_i, by the mean of w w^T, which is
+in Z. The mean of w_i^2 grows by the variance of w_i; the covariances have none of that second
+order (of 0.002 rad/s it is 4e-6 rad^2/s^2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array, checked, checked_rows
+from drake_teleop.load.regressor import regressor
+
+_CHUNK = 2**15
+# Singular directions of the scaled Gram, and columns without excitation [m/s^2, rad/s^2]; as in
+# `identification`.
+_RANK, _NO_EXCITATION = 1e-12, 1e-9
+# Where the products of angular velocity stand in z: (3, 3).
+_PRODUCTS = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations of what was measured; white, independent between the channels.
+
+    Attributes:
+        wrench: (6,) of [f; tau] [N, N m]; None to estimate them from the residual.
+        s, omega, alpha: (3,), or a number for all axes, of the motion [m/s^2, rad/s, rad/s^2].
+    """
+
+    wrench: ArrayLike | None = None
+    s: ArrayLike = 0.0
+    omega: ArrayLike = 0.0
+    alpha: ArrayLike = 0.0
+    motion: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        rows = []
+        for name in ("s", "omega", "alpha"):
+            std = checked(f"noise.{name}", np.broadcast_to(getattr(self, name), 3), 3)
+            if (std < 0.0).any():
+                raise DrakeTeleopError("is negative", where=f"noise.{name}")
+            rows.append(std)
+        object.__setattr__(self, "motion", np.stack(rows))
+        if self.wrench is not None and not (checked("noise.wrench", self.wrench, 6) > 0.0).all():
+            raise DrakeTeleopError("is not positive throughout", where="noise.wrench")
+
+
+class Moments:
+    """Sums of z z^T over a record, in memory that does not grow with it."""
+
+    def __init__(self) -> None:
+        self._sums = np.zeros((19, 19))
+
+    @property
+    def samples(self) -> float:
+        """The number of samples, or the sum of their weights."""
+        return float(self._sums[0, 0])
+
+    @property
+    def mean(self) -> Array:
+        """(19, 19) mean of z z^T.
+
+        Raises:
+            DrakeTeleopError: for fewer than 3 samples.
+        """
+        if self.samples < 3:
+            raise DrakeTeleopError(
+                f"{self.samples:.3g} samples cannot determine a load",
+                remedy="give at least 3, in different orientations",
+            )
+        return self._sums / self.samples
+
+    def add(
+        self,
+        wrench: ArrayLike,
+        s: ArrayLike,
+        omega: ArrayLike,
+        alpha: ArrayLike,
+        weights: ArrayLike | None = None,
+    ) -> None:
+        """Adds samples, in any order.
+
+        Args:
+            wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
+            s, omega, alpha: (N, 3) motion of S in S, as for `regressor`.
+            weights: (N,) of the samples; None counts each as 1.
+
+        Raises:
+            DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
+        """
+        _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+        n = rows[0].shape[0]
+        weight = np.ones(n) if weights is None else checked("weights", weights, n)
+        for start in range(0, n, _CHUNK):
+            part = np.zeros((19, 19))
+            stop = start + _CHUNK
+            _accumulate(*(table[start:stop] for table in rows), weight[start:stop], part)
+            self._sums += part + np.triu(part, 1).T
+
+    def noise_covariance(self, noise: Noise, wrench: Array) -> Array:
+        """(19, 19) mean covariance Q of the noise of z (module docstring); wrench: (6,) std."""
+        Q = np.zeros((19, 19))
+        std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
+        Q[np.arange(1, 13), np.arange(1, 13)] = std**2
+        products = self.mean[0, _PRODUCTS]
+        jacobian = np.zeros((3, 3, 19))  # of z by w_k, coefficient of w_i
+        for i in range(3):
+            for j in range(3):
+                jacobian[j, i, _PRODUCTS[i, j]] += 1.0 + (i == j)
+        for k in range(3):
+            Q += noise.motion[1, k] ** 2 * jacobian[k].T @ products @ jacobian[k]
+        return Q
+
+
+@cache
+def coefficients() -> Array:
+    """T (6, 16, 19), with [E V] = T z; read off the regressor itself."""
+    T, unit, none = np.zeros((6, 16, 19)), np.eye(3), np.zeros(3)
+    T[np.arange(6), np.arange(6), 0] = 1.0
+    T[:, 6:, 7:10] = np.moveaxis(regressor(unit, none, none), 0, -1)
+    T[:, 6:, 10:13] = np.moveaxis(regressor(none, none, unit), 0, -1)
+    T[:, 6:, 13:16] = np.moveaxis(regressor(none, unit, none), 0, -1)
+    for k, (i, j) in enumerate([(0, 1), (0, 2), (1, 2)]):
+        both = regressor(none, unit[i] + unit[j], none)
+        T[:, 6:, 16 + k] = both - regressor(none, unit[[i, j]], none).sum(axis=0)
+    T.flags.writeable = False
+    return T
+
+
+def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
+    """Gram (16, 16) = sum W_cd T_c Z T_d^T, and right-hand side (16,), of mean moments.
+
+    Args:
+        Z: (19, 19) mean moments of z, or a covariance of its noise.
+        W: (6, 6) weights between the channels, the inverse of the residual's covariance.
+    """
+    T = coefficients()
+    TZ = (T.reshape(96, 19) @ Z).reshape(6, 16, 19)
+    WT = (W @ T.reshape(6, -1)).reshape(6, 16, 19)
+    gram = TZ.transpose(1, 0, 2).reshape(16, -1) @ WT.transpose(1, 0, 2).reshape(16, -1).T
+    right = np.einsum("cjd,cd->j", TZ[:, :, 1:7], W)
+    return 0.5 * (gram + gram.T), right
+
+
+def residual_covariance(Z: Array, theta: Array) -> Array:
+    """(6, 6) mean of r r^T, r = F - [E V] theta; of a noise covariance, what it does to r."""
+    L = -np.einsum("cjk,j->ck", coefficients(), theta)
+    L[np.arange(6), np.arange(1, 7)] += 1.0
+    S = L @ Z @ L.T
+    return 0.5 * (S + S.T)
+
+
+def excited_columns(Z: Array) -> NDArray[np.bool_]:
+    """(16,) bools, whether a column of [E V] is other than rounding."""
+    return np.diag(normal_equations(Z, np.eye(6))[0]) > _NO_EXCITATION**2
+
+
+def minimum_norm(gram: Array, right: Array, used: NDArray[np.bool_]) -> Array:
+    """(n,) solution of gram theta = right, columns scaled; 0 in what is singular or not used."""
+    scale = np.where(used, 1.0 / np.sqrt(np.where(used, np.diag(gram), 1.0)), 0.0)
+    eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
+    kept = eigenvalues > _RANK * eigenvalues[-1]
+    part = vectors[:, kept]
+    return scale * (part @ ((part.T @ (scale * right)) / eigenvalues[kept]))
+
+
+@njit(cache=True)
+def _accumulate(wrench, s, omega, alpha, weights, sums):
+    """Adds the weighted sum of z z^T to sums (19, 19), upper half."""
+    z = np.empty(19)
+    for i in range(wrench.shape[0]):
+        z[0] = 1.0
+        for k in range(6):
+            z[1 + k] = wrench[i, k]
+        for k in range(3):
+            z[7 + k] = s[i, k]
+            z[10 + k] = alpha[i, k]
+            z[13 + k] = omega[i, k] * omega[i, k]
+        z[16] = omega[i, 0] * omega[i, 1]
+        z[17] = omega[i, 0] * omega[i, 2]
+        z[18] = omega[i, 1] * omega[i, 2]
+        for j in range(19):
+            weighted = weights[i] * z[j]
+            for k in range(j, 19):
+                sums[j, k] += weighted * z[k]

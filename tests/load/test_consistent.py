@@ -1,0 +1,116 @@
+"""The semidefinite program: exact where it should be, consistent always."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from load_cases import OFFSETS, TOOL, rich_motion
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.consistent import Ellipsoid, Prior, consistent_least_squares
+from drake_teleop.load.inertia import (
+    is_physically_consistent,
+    mass_com_inertia,
+    phi_from_mass_com_inertia,
+    pseudo_inertia,
+)
+from drake_teleop.load.moments import Moments, Noise
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.total_least_squares import total_least_squares
+
+ROD = phi_from_mass_com_inertia(0.009, [0, 0.002, 0.06], np.diag([5e-5, 5e-5, 0.0]))
+PLATE = phi_from_mass_com_inertia(0.3, [0, 0.01, 0.1], np.diag([1e-3, 2e-3, 3e-3]))
+POINT = phi_from_mass_com_inertia(1.0, [0, 0.01, 0.1], np.zeros((3, 3)))
+WRENCH_NOISE = np.array([0.1] * 3 + [0.005] * 3)
+
+
+def fit(phi, noise=0.0, seed=0):
+    motion = rich_motion(500)
+    F = OFFSETS + non_contact_wrench(*motion, phi)
+    F = F + noise * WRENCH_NOISE * np.random.default_rng(seed).normal(size=F.shape)
+    moments = Moments()
+    moments.add(F, *motion)
+    return total_least_squares(moments, Noise(), WRENCH_NOISE)
+
+
+def consistent(form, **options):
+    return consistent_least_squares(form.gram, form.right, form.theta, **options)
+
+
+def test_a_consistent_fit_is_returned_as_it_is():
+    form = fit(TOOL, noise=0.1)
+    np.testing.assert_array_equal(consistent(form), form.theta)
+
+
+@pytest.mark.parametrize("phi", [ROD, PLATE, POINT])
+def test_the_edge_of_consistency_without_noise(phi):
+    # A little noise, so that least squares is not consistent and the program is solved.
+    form = next(f for f in (fit(phi, 1e-6, s) for s in range(20)) if not _consistent(f))
+    found = consistent(form)[6:]
+    assert is_physically_consistent(found)
+    scale = np.repeat([phi[0], np.linalg.norm(phi[1:4]), np.abs(phi[4:]).max()], [1, 3, 6])
+    assert np.abs((found - phi) / scale).max() < 1e-6
+
+
+def _consistent(form):
+    return is_physically_consistent(form.theta[6:])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_best_of_the_consistent(seed):
+    form = fit(PLATE, noise=10.0, seed=seed)
+    found = consistent(form)
+    assert is_physically_consistent(found[6:])
+
+    def cost(theta):
+        return theta @ form.gram @ theta - 2.0 * form.right @ theta
+
+    # Optimal: no small step towards another consistent load is better, the truth among them.
+    rng = np.random.default_rng(seed)
+    for _ in range(50):
+        other = found.copy()
+        J = pseudo_inertia(found[6:])
+        values, vectors = np.linalg.eigh(J)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        root = root @ (np.eye(4) + 1e-2 * rng.normal(size=(4, 4)))
+        J = root @ root.T
+        S = J[:3, :3]
+        inertia = np.trace(S) * np.eye(3) - S
+        other[6:] = np.concatenate([[J[3, 3]], J[:3, 3], inertia[np.triu_indices(3)]])
+        assert cost(other) > cost(found) - 1e-9 * abs(cost(found))
+
+
+@pytest.mark.parametrize("kind", ["entropic", "geodesic"])
+def test_priors_pull(kind):
+    form = fit(PLATE, noise=10.0)
+    prior = 1.2 * TOOL / TOOL[0] * PLATE[0]
+    weak = consistent(form, prior=Prior(prior, 1e-9, kind))
+    np.testing.assert_allclose(weak, consistent(form), rtol=0, atol=2e-3)
+    strong = consistent(form, prior=Prior(prior, 1e7, kind))
+    np.testing.assert_allclose(strong[6:], prior, rtol=0, atol=1e-3 * prior[0])
+    middle = consistent(form, prior=Prior(prior, 1.0, kind))
+    assert weak[6] < middle[6] < strong[6]
+
+
+def test_all_mass_in_the_ellipsoid():
+    form = fit(PLATE, noise=10.0)
+    whole = consistent(form)
+    np.testing.assert_array_equal(
+        consistent(fit(TOOL), ellipsoid=Ellipsoid(np.zeros(3), np.eye(3))), fit(TOOL).theta
+    )
+    inside = Ellipsoid([0.0, 0.01, 0.1], np.eye(3) / 0.03**2)
+    assert inside.row() @ whole[6:] < 0.0
+    bound = consistent(form, ellipsoid=inside)[6:]
+    assert inside.row() @ bound >= -1e-6 * PLATE[0]
+    assert np.linalg.norm(mass_com_inertia(bound)[1] - [0.0, 0.01, 0.1]) < 0.03
+
+
+def test_bad_input_is_named():
+    with pytest.raises(DrakeTeleopError, match=r"^prior\.kind: 'guess' is not one of"):
+        Prior(TOOL, 1.0, "guess")
+    with pytest.raises(DrakeTeleopError, match=r"^prior\.weight: 0.0 is not positive"):
+        Prior(TOOL, 0.0)
+    with pytest.raises(DrakeTeleopError, match=r"^prior\.phi: has no extent"):
+        Prior(POINT, 1.0)
+    with pytest.raises(DrakeTeleopError, match=r"^ellipsoid\.matrix: is not positive definite"):
+        Ellipsoid(np.zeros(3), -np.eye(3)).row()

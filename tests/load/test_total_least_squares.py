@@ -1,0 +1,113 @@
+"""Errors in variables: the moments hold what the stacked matrix does, and TLS has no bias."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from load_cases import OFFSETS, TOOL, rich_motion
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.moments import Moments, Noise, normal_equations, residual_covariance
+from drake_teleop.load.regressor import non_contact_wrench, regressor
+from drake_teleop.load.total_least_squares import total_least_squares
+
+TRUTH = np.concatenate([OFFSETS, TOOL])
+WRENCH_NOISE = np.array([0.25] * 3 + [0.012] * 3)
+NOISE = Noise(s=0.1, omega=0.03, alpha=3.0)
+
+
+def record(samples=500, seed=0):
+    motion = rich_motion(samples, seed)
+    return OFFSETS + non_contact_wrench(*motion, TOOL), *motion
+
+
+def noisy(clean, seed):
+    rng = np.random.default_rng(seed)
+    std = [WRENCH_NOISE, 0.1, 0.03, 3.0]
+    return [x + s * rng.normal(size=x.shape) for x, s in zip(clean, std, strict=True)]
+
+
+def moments_of(arrays, **weights):
+    moments = Moments()
+    moments.add(*arrays, **weights)
+    return moments
+
+
+def test_moments_hold_the_stacked_matrix():
+    F, *motion = noisy(record(), 1)
+    A = np.concatenate([np.tile(np.eye(6), (500, 1, 1)), regressor(*motion)], axis=2)
+    root = np.random.default_rng(2).normal(size=(6, 6))
+    W, weights = root @ root.T, np.random.default_rng(3).uniform(size=500)
+    moments = moments_of((F, *motion), weights=weights)
+    gram, right = normal_equations(moments.mean, W)
+    WA = np.einsum("n,cd,ndj->ncj", weights / weights.sum(), W, A)
+    np.testing.assert_allclose(gram, np.einsum("nci,ncj->ij", A, WA), rtol=1e-9, atol=1e-8)
+    np.testing.assert_allclose(right, np.einsum("ncj,nc->j", WA, F), rtol=1e-9, atol=1e-8)
+    r = F - A @ TRUTH
+    expected = np.einsum("n,nc,nd->cd", weights / weights.sum(), r, r)
+    got = residual_covariance(moments.mean, TRUTH)
+    np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_noise_covariance_predicts_the_residual():
+    clean = record(5000)
+    Q = moments_of(clean).noise_covariance(NOISE, WRENCH_NOISE)
+    S = residual_covariance(moments_of(noisy(clean, 4)).mean, TRUTH)
+    scale = np.sqrt(np.outer(np.diag(S), np.diag(S)))
+    np.testing.assert_allclose(S / scale, residual_covariance(Q, TRUTH) / scale, atol=0.06)
+
+
+@pytest.mark.parametrize("noise", [Noise(), NOISE])
+def test_exact_without_noise(noise):
+    form = total_least_squares(moments_of(record()), noise, WRENCH_NOISE)
+    np.testing.assert_allclose(form.theta, TRUTH, rtol=0, atol=1e-9)
+
+
+def test_no_bias_where_least_squares_has_one():
+    clean = record()
+    errors = np.empty((2, 40, 16))
+    for seed in range(40):
+        moments = moments_of(noisy(clean, seed))
+        for k, noise in enumerate([Noise(), NOISE]):
+            errors[k, seed] = total_least_squares(moments, noise, WRENCH_NOISE).theta - TRUTH
+    bias, deviation = errors.mean(axis=1), errors.std(axis=1) / np.sqrt(40)
+    moments_of_inertia = [10, 13, 15]
+    assert (bias[0] < -3 * deviation[0])[moments_of_inertia].all()
+    assert np.abs(bias[1] / bias[0])[moments_of_inertia].max() < 0.2
+    assert np.abs(bias[1] / deviation[1]).max() < 4.0
+
+
+def test_scale_says_how_wrong_the_stated_noise_is():
+    moments = moments_of(noisy(record(4000), 5))
+    stated = Noise(s=0.05, omega=0.015, alpha=1.5)
+    form = total_least_squares(moments, stated, 0.5 * WRENCH_NOISE)
+    assert form.scale == pytest.approx(4.0, rel=0.05)
+    right = total_least_squares(moments, NOISE, WRENCH_NOISE)
+    np.testing.assert_allclose(form.theta, right.theta, rtol=1e-6, atol=1e-8)
+
+
+def test_known_offsets():
+    F, *motion = record()
+    form = total_least_squares(
+        moments_of((F - OFFSETS, *motion)), NOISE, WRENCH_NOISE, offsets=False
+    )
+    np.testing.assert_array_equal(form.theta[:6], np.zeros(6))
+    np.testing.assert_allclose(form.theta[6:], TOOL, rtol=0, atol=1e-9)
+
+
+def test_static_poses_leave_the_inertia_at_zero():
+    s = record(50)[1]
+    F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
+    moments = moments_of((F, s, np.zeros(3), np.zeros(3)))
+    form = total_least_squares(moments, Noise(s=0.1), WRENCH_NOISE)
+    np.testing.assert_allclose(form.theta[:10], TRUTH[:10], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(form.theta[10:], np.zeros(6))
+
+
+def test_bad_input_is_named():
+    with pytest.raises(DrakeTeleopError, match=r"^noise\.alpha: is negative"):
+        Noise(alpha=-1.0)
+    with pytest.raises(DrakeTeleopError, match=r"^noise\.wrench: is not positive"):
+        Noise(wrench=np.zeros(6))
+    with pytest.raises(DrakeTeleopError, match="2 samples cannot determine"):
+        total_least_squares(moments_of([x[:2] for x in record()]), Noise(), WRENCH_NOISE)
