@@ -12,21 +12,39 @@ squares gives numbers for the rest too. Two steps decide what `Identification.id
    (minimum norm), and a parameter that has one is undetermined: its variance is infinite.
 2. The standard deviations must be honest, and small enough for the value to mean something.
    Residuals of real records are coloured (filters, vibration, drift), so that N samples are worth
-   far fewer. The variance of each channel is therefore taken from the means of blocks of samples:
-   for white noise, (block length) x (variance of block means) is the variance of the samples
-   whatever the length; for coloured noise it grows with the length until the blocks are longer than
-   the memory of the noise. The largest value over the lengths 1, 2, 4, ... that leave at least 16
-   blocks is used (batch means; the effective number of samples is N times the ratio of the
-   two variances). A parameter is identifiable if its standard deviation is at most 5 % of what
-   is natural for a load of this mass m and size L (centre of mass from So, at least 3 cm):
+   far fewer; see below. A parameter is identifiable if its standard deviation is at most 5 % of
+   what is natural for a load of this mass m and size L (centre of mass from So, at least 3 cm):
    m g and m g L for the offsets, m, m L for the first moments, and m L^2 / 3 for the inertia,
    which is what a rod from So to as far again beyond the centre of mass has about the latter.
+   `Identification.verdicts` adds what the bools cannot say: up to 50 % is "weakly", more "not".
+
+**Coloured residuals.** With the noise of channel c stationary and independent of the motion, and
+its spectrum flat over the frequencies of the motion, the covariance of the solution is that of
+white noise with the long-run variance v_c (spectral density at zero) in place of the variance of a
+sample: C = G^+ (sum_c w_c^2 v_c G_c) G^+, G_c the Gram matrix of channel c and w_c its weight.
+Noise that is strongest at low frequency makes this cautious for fast motion. v_c comes from blocks
+of n samples whose sums were kept (batch means):
+
+- The residual's power between the B blocks, q_c = sum_b (sum of residual)^2 / n, would be B v_c on
+  average, but the fit has taken part of it away, most at the low frequencies of the motion, where
+  blocks look. With H_c the Gram matrix of the blocks' means, E q_c = v_c (B - 2 w_c tr(H_c G^+))
+  + sum_k w_k^2 v_k tr(H_c G^+ G_k G^+): six linear equations whose solution has no such bias.
+- The length is the first of 1, n, 2 n, 4 n, ... that is at least `_WINDOW` times the noise's memory
+  T = v_c / (variance of a sample), T estimated at that length: the automatic windowing of Sokal
+  (Monte Carlo Methods in Statistical Mechanics, 1997, section 3) applied to batch means. Blocks
+  miss what correlates across their borders; for an AR(1) process that is T / (2 n) of v_c, which is
+  put back. If no length with `_FEWEST_DEGREES` degrees of freedom is long enough (drift), the
+  largest v_c of all lengths is taken: it is then still a lower bound.
+- v_c has about B - w_c tr(H_c G^+) degrees of freedom, few if the noise is slow. The variance of a
+  parameter is a weighted sum of the six v_c; Satterthwaite's formula gives its degrees of freedom
+  nu, and an interval is +- t_nu times the standard deviation (`uncertainty.intervals`).
+  benchmarks/intervals.py counts how often such intervals hold.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +56,9 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array, checked, checked_rows
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
 from drake_teleop.load.regressor import regressor_into
+
+VERDICTS = ("identified", "weakly", "not", "prior")
+"""What `Identification.verdicts` may say of a parameter."""
 
 PARAMETERS = (
     *("f_ox", "f_oy", "f_oz", "tau_ox", "tau_oy", "tau_oz"),
@@ -56,9 +77,11 @@ METHODS = (
 # null space, and excitation of a column [m/s^2, rad/s^2] below which it counts as none.
 _RANK, _NULL_COMPONENT, _NO_EXCITATION = 1e-12, 1e-6, 1e-9
 # Worth stating: standard deviation over natural scale, smallest size of a load [m], gravity.
-_WORTH_STATING, _SMALLEST_SIZE, _GRAVITY = 0.05, 0.03, 9.81
-_MOST_BLOCKS, _FEWEST_BLOCKS = 512, 16
+_WORTH_STATING, _WEAK, _SMALLEST_SIZE, _GRAVITY = 0.05, 0.5, 0.03, 9.81
+# Blocks kept, least length of a block in memories of the noise, degrees of freedom to be trusted.
+_MOST_BLOCKS, _WINDOW, _FEWEST_DEGREES = 1024, 4.0, 8.0
 _FEWEST_SAMPLES = 3
+_OPTIONAL = {"degrees_of_freedom", "prior_dominated", "verdicts"}
 # Where the wrench and the factors of [offset, phi] stand in x of the sums.
 _WRENCH, _MODEL = 1, np.array([0, *range(2, 12)])
 
@@ -80,6 +103,10 @@ class Identification:
         residual_rms: (6,) of the wrench channels [N, N m].
         method: one of `METHODS`.
         samples: number of samples.
+        degrees_of_freedom: (16,) of the variances, for the quantiles of intervals; inf (null in the
+            file) where the noise was given and not estimated. Optional in the file.
+        prior_dominated: (16,) bools, whether the value is mostly a prior's
+            (`uncertainty.prior_dominated`); none for methods without one. Optional in the file.
     """
 
     phi: Array
@@ -91,6 +118,8 @@ class Identification:
     residual_rms: Array
     method: str
     samples: int
+    degrees_of_freedom: Array = field(default_factory=lambda: np.full(16, np.inf))
+    prior_dominated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(16, dtype=bool))
 
     @property
     def mass(self) -> float:
@@ -117,6 +146,17 @@ class Identification:
         """(16,) of [offsets; phi], inf for undetermined parameters."""
         return np.sqrt(np.diag(self.covariance))
 
+    @property
+    def verdicts(self) -> tuple[str, ...]:
+        """(16,) of `VERDICTS`: "identified" is `identifiable`; the others say why it is not.
+
+        "prior": the value is mostly the prior's. "weakly": the standard deviation is at most 50 %
+        of what is natural for the load, so that the value tells its order. "not": nothing is known.
+        """
+        share = self.standard_deviations / natural_scale(self.phi)
+        rest = np.where(self.prior_dominated, "prior", np.where(share <= _WEAK, "weakly", "not"))
+        return tuple(np.where(self.identifiable, "identified", rest).tolist())
+
     def save(self, path: str | Path) -> None:
         """Writes identification.json."""
         covariance = self.covariance.tolist()
@@ -127,12 +167,17 @@ class Identification:
             "offsets": self.offsets.tolist(),
             "covariance": covariance,
             "identifiable": self.identifiable.tolist(),
+            "verdicts": list(self.verdicts),
             **self._derived(),
             "condition_number": self.condition_number,
             "delay_s": self.delay_s,
             "residual_rms": self.residual_rms.tolist(),
             "method": self.method,
             "samples": self.samples,
+            "degrees_of_freedom": [
+                float(n) if np.isfinite(n) else None for n in self.degrees_of_freedom
+            ],
+            "prior_dominated": self.prior_dominated.tolist(),
         }
         Path(path).write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
 
@@ -146,7 +191,8 @@ class Identification:
         """
         document = _read_json(path)
         known = {*cls.__dataclass_fields__, "mass", "com", "inertia_com", "physically_consistent"}
-        for name in sorted(known ^ document.keys()):
+        known |= {"verdicts"}
+        for name in sorted((known ^ document.keys()) - (_OPTIONAL - document.keys())):
             what = "is missing" if name in known else "is not a field of an identification"
             raise DrakeTeleopError(what, where=f"{path}:{name}")
 
@@ -155,6 +201,11 @@ class Identification:
 
         if document["method"] not in METHODS:
             raise DrakeTeleopError(f"is not one of {METHODS}", where=f"{path}:method")
+        optional: dict[str, Any] = {}
+        if (name := "degrees_of_freedom") in document:
+            optional[name] = _read_degrees(f"{path}:{name}", document[name])
+        if (name := "prior_dominated") in document:
+            optional[name] = _read_flags(f"{path}:{name}", document[name])
         result = cls(
             phi=numbers("phi", 10),
             offsets=numbers("offsets", 6),
@@ -165,7 +216,12 @@ class Identification:
             residual_rms=numbers("residual_rms", 6),
             method=document["method"],
             samples=int(numbers("samples")),
+            **optional,
         )
+        if document.get("verdicts", list(result.verdicts)) != list(result.verdicts):
+            raise DrakeTeleopError(
+                "does not follow from phi, covariance and flags", where=f"{path}:verdicts"
+            )
         for name, value in result._derived().items():
             stated = numbers(name, *np.shape(value))
             if not np.allclose(stated, value, rtol=1e-6, atol=1e-9):
@@ -202,7 +258,8 @@ class NormalEquations:
         # Channel c: sum of x x^T, x = [1, wrench c, row c of V (10)]; and its first row by blocks.
         self._moments = np.zeros((6, 12, 12))
         self._blocks = np.zeros((_MOST_BLOCKS, 6, 12))
-        self._last, self._length = 0, 1
+        # Block that is being filled, samples of a full block.
+        self._state = np.array([0, 1])
 
     @property
     def samples(self) -> int:
@@ -221,26 +278,7 @@ class NormalEquations:
             DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
         """
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
-        start, n = 0, rows[0].shape[0]
-        while start < n:
-            stop = min(n, start + self._room())
-            part = np.zeros((6, 12, 12))
-            _accumulate(*(table[start:stop] for table in rows), part)
-            self._moments += part + np.triu(part, 1).transpose(0, 2, 1)
-            self._blocks[self._last] += part[:, 0]
-            start = stop
-
-    def _room(self) -> int:
-        """How many samples the last block still takes; opens one if it is full."""
-        if self._blocks[self._last, 0, 0] < self._length:
-            return int(self._length - self._blocks[self._last, 0, 0])
-        self._last += 1
-        if self._last == _MOST_BLOCKS:
-            self._last //= 2
-            self._length *= 2
-            self._blocks[: self._last] = self._blocks[::2] + self._blocks[1::2]
-            self._blocks[self._last :] = 0.0
-        return self._length
+        _accumulate(*rows, self._moments, self._blocks, self._state)
 
     def solve(self, delay_s: float = 0.0) -> Identification:
         """Least squares with the six offsets.
@@ -266,8 +304,15 @@ class NormalEquations:
                 remedy="is the sensor connected, and does its orientation change?",
             )
         squares = self.residual_squares(theta)
-        variances = self._long_run_variances(theta, squares, rank / 6.0)
-        covariance = inverse @ self.normal_equations(self._weights**2 * variances)[0] @ inverse
+        variances, degrees = self._long_run_variances(theta, inverse, rank)
+        # What each channel adds to the covariance, and Satterthwaite's degrees of freedom.
+        parts = self._channel_grams() * (self._weights**2 * variances)[:, None, None]
+        parts = inverse @ parts @ inverse
+        covariance = parts.sum(axis=0)
+        shares = np.diagonal(parts, axis1=1, axis2=2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            degrees = shares.sum(axis=0) ** 2 / (shares**2 / degrees[:, None]).sum(axis=0)
+        degrees = np.where(undetermined | ~(degrees > 0.0), np.inf, degrees)
         covariance[undetermined, :] = covariance[:, undetermined] = 0.0
         covariance[undetermined, undetermined] = np.inf
         return Identification(
@@ -280,6 +325,7 @@ class NormalEquations:
             residual_rms=np.sqrt(squares / self.samples),
             method=METHODS[0],
             samples=self.samples,
+            degrees_of_freedom=degrees,
         )
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
@@ -290,12 +336,17 @@ class NormalEquations:
                 of the noise given at the start.
         """
         weights = self._weights if weights is None else checked("weights", weights, 6)
-        gram, right = np.zeros((16, 16)), np.zeros(16)
+        gram, right = np.tensordot(weights, self._channel_grams(), 1), np.zeros(16)
         for c, weight in enumerate(weights):
-            columns = np.array([c, *range(6, 16)])
-            gram[np.ix_(columns, columns)] += weight * self._moments[c][np.ix_(_MODEL, _MODEL)]
-            right[columns] += weight * self._moments[c, _MODEL, _WRENCH]
+            right[_columns(c)] += weight * self._moments[c, _MODEL, _WRENCH]
         return gram, right
+
+    def _channel_grams(self) -> Array:
+        """(6, 16, 16) Gram matrices of the rows of each channel."""
+        grams = np.zeros((6, 16, 16))
+        for c in range(6):
+            grams[c][np.ix_(_columns(c), _columns(c))] = self._moments[c][np.ix_(_MODEL, _MODEL)]
+        return grams
 
     def _unexcited(self) -> NDArray[np.bool_]:
         squares = np.diag(self.normal_equations(np.ones(6))[0]) / self.samples
@@ -319,18 +370,73 @@ class NormalEquations:
             squares[c] = max(0.0, x @ self._moments[c] @ x)
         return squares
 
-    def _long_run_variances(self, theta: Array, squares: Array, parameters: float) -> Array:
-        """(6,) variance of a sample by which the mean of many scatters (module docstring)."""
-        largest = squares / (self.samples - parameters)
-        blocks = self._blocks[: self._last + 1]
-        while len(blocks) >= _FEWEST_BLOCKS:
+    def long_run_variances(self, theta: ArrayLike) -> tuple[Array, Array]:
+        """Long-run variances of the channels' residuals, for any estimate (module docstring).
+
+        Args:
+            theta: (16,) [offsets; phi].
+
+        Returns:
+            (6,) variances of a sample by which the mean of many scatters [N^2, N^2 m^2], corrected
+            for what least squares with the present weights takes from the residuals, and (6,) their
+            degrees of freedom.
+        """
+        gram, _ = self.normal_equations()
+        inverse, _, _, rank = _pseudo_inverse(gram, self._unexcited())
+        return self._long_run_variances(checked("theta", theta, 16), inverse, rank)
+
+    def _long_run_variances(self, theta: Array, inverse: Array, rank: int) -> tuple[Array, Array]:
+        grams = self._channel_grams()
+        n = float(self.samples)
+        power = self.residual_squares(theta)
+        variances, degrees = self._unbiased(power, n, grams, grams, inverse)
+        of_samples = variances
+        found = np.zeros(6, dtype=bool)
+        blocks, length = self._blocks[: self._state[0] + 1], float(self._state[1])
+        # An unfinished last block would count as much as a full one.
+        blocks = blocks[: len(blocks) - (blocks[-1, 0, 0] < length)]
+        while len(blocks) > _FEWEST_DEGREES:
             model = blocks[:, :, 0] * theta[:6] + blocks[:, :, 2:] @ theta[6:]
-            sums = blocks[:, :, _WRENCH] - model
-            of_means = np.sum(sums**2 / blocks[:, :, 0], axis=0) / (len(blocks) - parameters)
-            largest = np.maximum(largest, of_means)
+            power = np.sum((blocks[:, :, _WRENCH] - model) ** 2, axis=0) / length
+            between = np.zeros((6, 16, 16))
+            for c in range(6):
+                means = blocks[:, c, _MODEL]
+                between[c][np.ix_(_columns(c), _columns(c))] = means.T @ means / length
+            now, trusted = self._unbiased(power, len(blocks), between, grams, inverse)
+            usable = ~found & (trusted >= _FEWEST_DEGREES)
+            memory = np.divide(now, of_samples, out=np.ones(6), where=of_samples > 0.0)
+            missed = np.minimum(memory / (2.0 * length), 0.5 / _WINDOW)
+            corrected = now / (1.0 - np.where(memory > 1.5, missed, 0.0))
+            enough = usable & (length >= _WINDOW * memory)
+            larger = usable & ~enough & (corrected > variances)
+            take = enough | larger
+            variances = np.where(take, corrected, variances)
+            degrees = np.where(take, trusted, degrees)
+            found |= enough
             even = len(blocks) // 2 * 2
-            blocks = blocks[0:even:2] + blocks[1:even:2]
-        return largest
+            blocks, length = blocks[0:even:2] + blocks[1:even:2], 2.0 * length
+        return variances, degrees
+
+    def _unbiased(
+        self, power: Array, count: float, between: Array, grams: Array, inverse: Array
+    ) -> tuple[Array, Array]:
+        """(6,) v_c and (6,) degrees of freedom from the residual's power between `count` blocks.
+
+        Args:
+            power: (6,) q_c of the module's docstring.
+            between: (6, 16, 16) H_c; grams: (6, 16, 16) G_c; inverse: (16, 16) G^+.
+        """
+        w = self._weights
+        absorbed = w * np.einsum("cij,ji->c", between, inverse)
+        spread = inverse @ grams @ inverse
+        shares = np.einsum("cij,kji->ck", between, spread) * w**2
+        degrees = np.maximum(count - absorbed, 0.0)
+        equations = np.diag(count - 2.0 * absorbed) + shares
+        if not (degrees > 0.0).all() or np.linalg.cond(equations) > 1e6:
+            return power / np.maximum(degrees, 1.0), degrees
+        solution = np.linalg.solve(equations, power)
+        # Noise in q_c can make a small one negative, where the others' errors dominate it.
+        return np.maximum(solution, power / count), degrees
 
 
 def identify(
@@ -367,10 +473,24 @@ def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
         standard_deviations: (16,) of [offsets; phi] [SI].
         phi: (10,) the load.
     """
+    return standard_deviations <= _WORTH_STATING * natural_scale(phi)
+
+
+def natural_scale(phi: Array) -> Array:
+    """(16,) what is natural for [offsets; phi] of a load of this mass and size (module docstring).
+
+    Args:
+        phi: (10,) the load; its mass is not zero.
+    """
     m = abs(phi[0])
     L = max(float(np.linalg.norm(phi[1:4])) / m, _SMALLEST_SIZE)
-    natural = m * np.repeat([_GRAVITY, _GRAVITY * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])
-    return standard_deviations <= _WORTH_STATING * natural
+    scale: Array = m * np.repeat([_GRAVITY, _GRAVITY * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])
+    return scale
+
+
+def _columns(channel: int) -> NDArray[np.int_]:
+    """Columns of [E V] that a row of this channel may use: its offset and phi."""
+    return np.array([channel, *range(6, 16)])
 
 
 def positive(name: str, value: ArrayLike, *shape: int) -> Array:
@@ -382,14 +502,30 @@ def positive(name: str, value: ArrayLike, *shape: int) -> Array:
 
 
 @njit(cache=True)
-def _accumulate(wrench, s, omega, alpha, moments):
-    """Adds sum x x^T, x = [1, wrench, row of V], by channel to moments (6, 12, 12), upper half.
+def _accumulate(wrench, s, omega, alpha, moments, blocks, state):
+    """Adds sum x x^T, x = [1, wrench, row of V], by channel to moments (6, 12, 12), and the sums of
+    x by blocks of samples to blocks (_MOST_BLOCKS, 6, 12).
 
-    Rows of force have no inertia in them: their sums end with the first moments.
+    Rows of force have no inertia in them: their sums end with the first moments. Sums are gathered
+    block by block, which keeps their rounding small. When the table of blocks is full, neighbours
+    are joined. state: the block that is being filled, and how many samples a full one has.
     """
-    V, x = np.empty((6, 10)), np.empty(12)
+    V, x, part = np.empty((6, 10)), np.empty(12), np.zeros((6, 12, 12))
     x[0] = 1.0
+    last, length = state[0], state[1]
+    room = length - int(blocks[last, 0, 0])
     for i in range(wrench.shape[0]):
+        if room == 0:
+            _flush(part, moments, blocks[last])
+            last += 1
+            if last == blocks.shape[0]:
+                last //= 2
+                length *= 2
+                for b in range(last):
+                    blocks[b] = blocks[2 * b] + blocks[2 * b + 1]
+                blocks[last:] = 0.0
+            room = length
+        room -= 1
         regressor_into(s[i], omega[i], alpha[i], V)
         for c in range(6):
             size = 6 if c < 3 else 12
@@ -398,7 +534,22 @@ def _accumulate(wrench, s, omega, alpha, moments):
                 x[2 + k] = V[c, k]
             for j in range(size):
                 for k in range(j, size):
-                    moments[c, j, k] += x[j] * x[k]
+                    part[c, j, k] += x[j] * x[k]
+    _flush(part, moments, blocks[last])
+    state[0], state[1] = last, length
+
+
+@njit(cache=True)
+def _flush(part, moments, block):
+    """Adds the upper halves of part (6, 12, 12) to moments, their first rows to block; clears."""
+    for c in range(6):
+        for j in range(12):
+            block[c, j] += part[c, 0, j]
+            moments[c, j, j] += part[c, j, j]
+            for k in range(j + 1, 12):
+                moments[c, j, k] += part[c, j, k]
+                moments[c, k, j] += part[c, j, k]
+    part[:] = 0.0
 
 
 def _pseudo_inverse(
@@ -446,3 +597,13 @@ def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
     ):
         raise DrakeTeleopError("is not a list of 16 true or false", where=where)
     return np.array(value, dtype=bool)
+
+
+def _read_degrees(where: str, value: Any) -> Array:
+    if not isinstance(value, list):
+        raise DrakeTeleopError("is not a list of 16 numbers or null", where=where)
+    degrees = checked(where, [0.0 if v is None else v for v in value], 16)
+    unknown = np.array([v is None for v in value])
+    if not (degrees[~unknown] > 0.0).all():
+        raise DrakeTeleopError("is not positive throughout", where=where)
+    return np.where(unknown, np.inf, degrees)

@@ -98,9 +98,9 @@ def normalised_errors(noise_of, repetitions=60, samples=4000):
 
 def test_stated_deviations_hold_for_white_noise():
     errors = normalised_errors(lambda rng, n: rng.normal(size=(n, 6)))
-    # 1 would be perfect; the block means err on the cautious side.
-    assert errors.max() < 1.3
-    assert 0.5 < errors.mean() < 1.0
+    # 1 would be perfect; each is the mean of 60 squares and scatters by 0.18.
+    assert errors.max() < 1.6
+    assert 0.8 < errors.mean() < 1.2
 
 
 def test_stated_deviations_hold_for_coloured_noise():
@@ -113,7 +113,7 @@ def test_stated_deviations_hold_for_coloured_noise():
     errors = normalised_errors(coloured)
     # Taken for white, this noise would give about (1 + 0.95) / (1 - 0.95) = 39.
     assert errors.max() < 2.0
-    assert 0.5 < errors.mean() < 1.5
+    assert 0.6 < errors.mean() < 1.4
 
 
 def test_unweighted_deviations_know_newtons_from_newton_metres():
@@ -123,8 +123,8 @@ def test_unweighted_deviations_know_newtons_from_newton_metres():
         noise = NOISE * np.random.default_rng(seed).normal(size=F.shape)
         result = identify(F + noise, *motion)
         squares += ((estimate(result) - TRUTH) / result.standard_deviations) ** 2
-    assert (squares / 40).max() < 1.5
-    assert 0.5 < squares.mean() / 40 < 1.1
+    assert (squares / 40).max() < 1.8
+    assert 0.7 < squares.mean() / 40 < 1.3
 
 
 def test_static_poses_determine_all_but_the_inertia():
@@ -222,7 +222,7 @@ def test_file_round_trip(tmp_path, poses_only):
     assert set(document) == {
         *("phi", "offsets", "covariance", "identifiable", "mass", "com", "inertia_com"),
         *("physically_consistent", "condition_number", "delay_s", "residual_rms", "method"),
-        "samples",
+        *("samples", "verdicts", "degrees_of_freedom", "prior_dominated"),
     }
     assert document["mass"] == result.mass
     nulls = [i for i in range(16) if document["covariance"][i][i] is None]
