@@ -20,6 +20,8 @@ from drake_teleop.load.inertia import pseudo_inertia
 SIGNIFICANT = 3.0
 """Standard deviations below zero from which on a quantity counts as negative."""
 
+_PHI = np.arange(16) >= 6
+
 
 def identified_object(total: Identification, gripper: Identification) -> Identification:
     """What was identified of the object, from gripper with object and gripper alone.
@@ -28,8 +30,9 @@ def identified_object(total: Identification, gripper: Identification) -> Identif
     phi add. Offsets (with their covariances) are those of the sensor in the record with the object.
     A parameter that one of the two leaves undetermined is undetermined in the difference; which
     are identifiable is judged by the object's own mass and size, and a parameter that the total
-    does not show cannot be one of them. Condition number, delay, residual, method and samples are
-    those of the record with the object.
+    does not show cannot be one of them. Degrees of freedom are Satterthwaite's for the sum of two
+    variances. Condition number, delay, residual, method and samples are those of the record with
+    the object.
 
     Args:
         total: gripper with object.
@@ -54,7 +57,25 @@ def identified_object(total: Identification, gripper: Identification) -> Identif
         )
     identifiable = worth_stating(deviations, phi) & ~unknown
     identifiable[6:] &= total.identifiable[6:]
-    return replace(total, phi=phi, covariance=covariance, identifiable=identifiable)
+    return replace(
+        total,
+        phi=phi,
+        covariance=covariance,
+        identifiable=identifiable,
+        degrees_of_freedom=_degrees_of_freedom(total, gripper),
+        prior_dominated=total.prior_dominated | gripper.prior_dominated & _PHI,
+    )
+
+
+def _degrees_of_freedom(total: Identification, gripper: Identification) -> Array:
+    """(16,) of the sums of two variances, by Satterthwaite; offsets are those of the total."""
+    a, b = (np.diag(load.covariance) for load in (total, gripper))
+    b = np.where(_PHI, b, 0.0)
+    known = np.isfinite(a + b) & (a + b > 0.0)
+    a, b = np.where(known, a, 1.0), np.where(known, b, 0.0)
+    with np.errstate(divide="ignore"):
+        sums = (a + b) ** 2 / (a**2 / total.degrees_of_freedom + b**2 / gripper.degrees_of_freedom)
+    return np.where(known, sums, np.inf)
 
 
 def consistency_margin(load: Identification) -> tuple[float, float]:

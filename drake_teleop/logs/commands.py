@@ -24,6 +24,9 @@ com, com_std           m; the standard deviation is of com with the mass held
 inertia_com            kg m^2, about the centre of mass, axes of S
 offsets, offsets_std   [f; tau]
 phi, phi_std           Eq. (6), in the order of this project
+phi_interval           (10, 2) ends of the 95 % intervals
+verdicts               of each parameter: identified, weakly, not, prior; see
+                       `drake_teleop.load.identification.Identification.verdicts`
 identifiable           the names of what the record determines
 not_identifiable       the names of what it does not: do not use their values
 physically_consistent  whether phi belongs to a possible body
@@ -73,6 +76,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.load.gripper import SIGNIFICANT, consistency_margin, identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.load.uncertainty import intervals
 from drake_teleop.logs.canonical import WRENCH, Log
 from drake_teleop.logs.contact import contacts_of, noise_floor
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
@@ -87,7 +91,10 @@ def identify_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """`identify_log`, writing identification.json, fit.png and summary.json into `out`.
+    """`identify_log`, writing its results into `out`.
+
+    Files: identification.json; summary.json; report.html; report.png, the pictures of the report
+    on one page; fit.png, the upper half of it.
 
     Args:
         gripper: identification.json of the gripper alone; then the object's object.json, of the
@@ -113,13 +120,16 @@ def identify_command(
         summary |= {"gripper": str(gripper), "object": _object_figures(alone)}
         summary["notes"] += _object_notes(alone)
     summary = _plain(summary)
-    from drake_teleop.logs.pictures import draw_fit
+    from drake_teleop.logs.pictures import draw_fit, draw_report
+    from drake_teleop.logs.report import write_report
 
     out.mkdir(parents=True, exist_ok=True)
     result.save(out / "identification.json")
     if alone is not None:
         alone.save(out / "object.json")
     draw_fit(found).savefig(out / "fit.png")
+    draw_report(found).savefig(out / "report.png")
+    write_report(out / "report.html", found, summary, alone)
     _write_summary(out, summary)
     if not quiet:
         _print_identification(summary, out)
@@ -212,6 +222,7 @@ def _common(
 
 def _load_figures(load: Identification) -> dict[str, Any]:
     deviations = load.standard_deviations
+    ends = intervals(load)
     return {
         "mass": load.mass,
         "mass_std": deviations[6],
@@ -220,6 +231,8 @@ def _load_figures(load: Identification) -> dict[str, Any]:
         "inertia_com": load.inertia_com,
         "phi": load.phi,
         "phi_std": deviations[6:],
+        "phi_interval": np.stack(ends, axis=1)[6:],
+        "verdicts": dict(zip(PARAMETERS, load.verdicts, strict=True)),
         "identifiable": _named(load, True),
         "not_identifiable": _named(load, False),
         "physically_consistent": load.physically_consistent,
@@ -328,7 +341,7 @@ def _plain(value: Any) -> Any:
         return [_plain(entry) for entry in value]
     if isinstance(value, (np.ndarray, np.generic)):
         return _plain(value.tolist())
-    return None if value == float("inf") else value
+    return None if value in (float("inf"), float("-inf")) else value
 
 
 def _write_summary(out: Path, summary: dict[str, Any]) -> None:

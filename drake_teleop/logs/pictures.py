@@ -9,13 +9,18 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from drake_teleop.load.identification import VERDICTS, Identification, natural_scale
+from drake_teleop.load.uncertainty import intervals
 from drake_teleop.logs.canonical import Log
 from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 from drake_teleop.style import (
+    BLACK,
     BLUE,
     GREEN,
+    GREY,
     ORANGE,
     PURPLE,
     VERMILION,
@@ -25,6 +30,20 @@ from drake_teleop.style import (
 )
 
 _CHANNELS = ("$f_x$", "$f_y$", "$f_z$", r"$\tau_x$", r"$\tau_y$", r"$\tau_z$")
+_SYMBOLS = (
+    *(rf"$f_{{o{a}}}$" for a in "xyz"),
+    *(rf"$\tau_{{o{a}}}$" for a in "xyz"),
+    *("$m$", "$m c_x$", "$m c_y$", "$m c_z$"),
+    *(f"$I_{{{axes}}}$" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
+)
+VERDICT_COLOURS = dict(zip(VERDICTS, (GREEN, ORANGE, VERMILION, PURPLE), strict=True))
+VERDICT_WORDS = dict(
+    zip(
+        VERDICTS,
+        ("identified", "weakly identified", "not identified", "mostly the prior's"),
+        strict=True,
+    )
+)
 _POINTS = 4000
 # Lighter than the house's grey: it lies under all the other curves.
 _MEASURED = "#A3AAB5"
@@ -35,6 +54,58 @@ def draw_fit(found: IdentifiedLog) -> Figure:
 
     The three forces share one scale, and so do the three torques.
     """
+    with house_style():
+        figure = Picture(figsize=(10, 7))
+        _fit_into(figure, found)
+    return figure
+
+
+def draw_knowledge(found: IdentifiedLog) -> Figure:
+    """What the record says beyond the values: residual spectrum, intervals, identifiability."""
+    with house_style():
+        figure = Picture(figsize=(10, 7.4))
+        _knowledge_into(figure, found)
+    return figure
+
+
+def draw_report(found: IdentifiedLog) -> Figure:
+    """One page: `draw_fit` above `draw_knowledge`."""
+    with house_style():
+        figure = Picture(figsize=(10, 14.4))
+        top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[7, 7.4])[:, 0]
+        _fit_into(top, found)
+        _knowledge_into(below, found)
+    return figure
+
+
+def spectrum(x: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Amplitude spectral density, one-sided, by Welch's averaged periodograms.
+
+    Hann windows of an eighth of the record, overlapping by half, each without its mean.
+
+    Args:
+        x: (N, k) samples.
+        dt: their spacing [s].
+
+    Returns:
+        frequencies (m,) without zero [Hz], densities (m, k) [unit of x / sqrt(Hz)].
+    """
+    length = min(len(x), max(16, len(x) // 8))
+    window = np.hanning(length + 1)[:-1, None]
+    starts = range(0, len(x) - length + 1, max(1, length // 2))
+    power = np.mean(
+        [
+            np.abs(np.fft.rfft(window * (part - part.mean(axis=0)), axis=0)) ** 2
+            for part in (x[start : start + length] for start in starts)
+        ],
+        axis=0,
+    )
+    density: NDArray[np.float64] = np.sqrt(2.0 * dt * power / np.sum(window**2))
+    rates: NDArray[np.float64] = np.fft.rfftfreq(length, dt)
+    return rates[1:], density[1:]
+
+
+def _fit_into(figure: Any, found: IdentifiedLog) -> None:
     log, result = found.log, found.identification
     curves = [
         ("measured, offsets removed", log.wrench - result.offsets, _MEASURED),
@@ -44,15 +115,76 @@ def draw_fit(found: IdentifiedLog) -> Figure:
     rms = np.asarray(result.residual_rms)
     com = ", ".join(f"{1e3 * c:.2f}" for c in result.com)
     title = f"{result.mass:.4f} kg, centre of mass ({com}) mm"
-    with house_style():
-        figure = Picture(figsize=(10, 7))
-        axes = _channel_axes(figure)
-        for i, axis in enumerate(axes):
-            _draw(axis, log.t, [(n, w[:, i], c) for n, w, c in curves], log.static)
-            unit = "N" if i < 3 else "N m"
-            axis.set_title(f"{_CHANNELS[i]}: residual {rms[i]:.3g} {unit} rms")
-        _finish(figure, axes, title, log, result.delay_s)
-    return figure
+    axes = _channel_axes(figure)
+    for i, axis in enumerate(axes):
+        _draw(axis, log.t, [(n, w[:, i], c) for n, w, c in curves], log.static)
+        unit = "N" if i < 3 else "N m"
+        axis.set_title(f"{_CHANNELS[i]}: residual {rms[i]:.3g} {unit} rms")
+    _finish(figure, axes, title, log, result.delay_s)
+
+
+def _knowledge_into(figure: Any, found: IdentifiedLog) -> None:
+    log, result = found.log, found.identification
+    residual = log.wrench - found.predicted
+    spectra, known = figure.subfigures(2, 1, height_ratios=[1, 1.5])
+    left, right = spectra.subplots(1, 2)
+    for axis, columns, unit in ((left, slice(0, 3), "N"), (right, slice(3, 6), "N m")):
+        for name, colour, values in zip(
+            _CHANNELS[columns], (BLUE, VERMILION, GREEN), residual[:, columns].T, strict=True
+        ):
+            if log.static:
+                axis.plot(np.arange(1, len(values) + 1), values, "o", color=colour, label=name)
+                continue
+            rate, density = spectrum(values[:, None], log.dt)
+            axis.loglog(rate, density[:, 0], color=colour, label=name)
+        if log.static:
+            axis.set(xlabel="pose", ylabel=f"residual [{unit}]", title="Residual of each pose")
+        else:
+            axis.set(xlabel="frequency [Hz]", ylabel=f"[{unit}/√Hz]", title="Residual spectrum")
+            # What a low-pass has taken away is no noise of the sensor's.
+            top = axis.get_ylim()[1]
+            axis.set_ylim(bottom=max(axis.get_ylim()[0], 1e-6 * top), top=top)
+        axis.legend(ncols=3)
+    _draw_parameters(known, result)
+
+
+def _draw_parameters(figure: Any, result: Identification) -> None:
+    """Intervals on the left and standard deviations on the right, both in shares of the natural
+    scale of a load of this mass and size, in the colour of the verdict."""
+    natural = natural_scale(result.phi)
+    theta = np.concatenate([result.offsets, result.phi]) / natural
+    low, high = (end / natural for end in intervals(result))
+    deviations = result.standard_deviations / natural
+    rows = np.arange(16)
+    colours = [VERDICT_COLOURS[verdict] for verdict in result.verdicts]
+    left, right = figure.subplots(1, 2, sharey=True)
+    left.set_yticks(rows, [_SYMBOLS[i] for i in rows])
+    left.invert_yaxis()
+    shown = np.abs(theta[np.isfinite(deviations) & result.identifiable])
+    limit = 1.25 * max(1.0, float(shown.max()) if len(shown) else 1.0)
+    ends = np.clip(low, -2 * limit, 2 * limit), np.clip(high, -2 * limit, 2 * limit)
+    left.hlines(rows, *ends, colors=colours, linewidth=5, alpha=0.35)
+    # Arrows point to estimates outside of the picture.
+    for row, (value, colour) in enumerate(zip(theta, colours, strict=True)):
+        marker = "o" if abs(value) < limit else ">" if value > 0 else "<"
+        left.plot(np.clip(value, -0.97 * limit, 0.97 * limit), row, marker, color=colour, ms=4.5)
+    left.set(xlim=(-limit, limit), title="95 % intervals, over the natural scale")
+    left.axvline(0, color=GREY, linewidth=0.8)
+    floor = 1e-5
+    widths = np.clip(np.where(np.isfinite(deviations), deviations, 10.0), floor, 10.0)
+    right.set_xscale("log")
+    right.barh(rows, widths - floor / 2, left=floor / 2, color=colours, height=0.7)
+    right.set_xlim(floor / 2, 10.0)
+    for share, words in ((0.05, "5 %"), (0.5, "50 %")):
+        right.axvline(share, color=BLACK, linewidth=0.8, linestyle="--")
+        right.text(share, -0.9, words, fontsize=8, ha="center", va="bottom")
+    right.set_title("Standard deviation over the natural scale", pad=16)
+    handles = [
+        Patch(color=VERDICT_COLOURS[verdict], label=VERDICT_WORDS[verdict])
+        for verdict in VERDICTS
+        if verdict in result.verdicts
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
 
 
 def draw_elimination(found: EliminatedLog) -> Figure:
@@ -64,13 +196,11 @@ def draw_elimination(found: EliminatedLog) -> Figure:
     curves = [("measured, offsets removed", found.measured, _MEASURED)]
     if found.gravity_only is not None:
         curves.append(("static weight removed", found.gravity_only, ORANGE))
+    if found.causal is not None:
+        curves.append((f"contact, causal ({found.causal.mode})", found.causal.contact, PURPLE))
     curves.append(("contact wrench", found.contact, BLUE))
     if not np.array_equal(found.scaled, found.contact):
         curves.append(("scaled wrench", found.scaled, GREEN))
-    if found.causal is not None:
-        curves.append(
-            (f"contact wrench, causal, {found.causal.mode}", found.causal.contact, PURPLE)
-        )
     t, static = found.log.t, found.log.static
     with house_style():
         figure = Picture(figsize=(10, 9))
@@ -120,7 +250,7 @@ def _draw(
             axes.plot(t[::every], values[::every], color=colour, linewidth=width, label=name)
 
 
-def _finish(figure: Figure, axes: Sequence[Axes], title: str, log: Log, delay_s: float) -> None:
+def _finish(figure: Any, axes: Sequence[Axes], title: str, log: Log, delay_s: float) -> None:
     for bottom in (axes[2], axes[5]):
         bottom.set_xlabel("pose" if log.static else "time [s]")
     if not log.static:

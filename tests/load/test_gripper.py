@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,3 +92,20 @@ def test_the_margin_s_deviation_is_that_of_its_scatter() -> None:
     margins, deviations = np.array(pairs).T
     # 80 seeds: a standard deviation is known to 8 %.
     assert margins.std(ddof=1) == pytest.approx(np.median(deviations), rel=0.3)
+
+
+def test_degrees_of_freedom_are_those_of_a_sum_of_variances() -> None:
+    total, gripper = recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2)
+    total = replace(total, degrees_of_freedom=np.full(16, 20.0))
+    gripper = replace(
+        gripper, degrees_of_freedom=np.full(16, 20.0), covariance=total.covariance.copy()
+    )
+    found = identified_object(total, gripper)
+    # Two equal variances with 20 degrees each have 40; the offsets are the total's alone.
+    np.testing.assert_allclose(found.degrees_of_freedom, [20.0] * 6 + [40.0] * 10)
+    given = replace(total, degrees_of_freedom=np.full(16, np.inf))
+    assert np.isinf(identified_object(given, given_as_gripper(given)).degrees_of_freedom).all()
+
+
+def given_as_gripper(load: Identification) -> Identification:
+    return replace(load, phi=load.phi / 2)

@@ -1,0 +1,154 @@
+"""The report of `identify`: one self-contained HTML page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.html import embedded, render
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.uncertainty import intervals
+from drake_teleop.logs.pictures import VERDICT_WORDS, draw_fit, draw_knowledge
+from drake_teleop.logs.processing import IdentifiedLog
+
+# Eq. (7): symbol, index, unit as printed, and how many of it an SI unit has.
+_PARAMETERS = (
+    *(("f", f"o,{axis}", "N", 1.0) for axis in "xyz"),
+    *(("τ", f"o,{axis}", "N m", 1.0) for axis in "xyz"),
+    ("m", "", "kg", 1.0),
+    *(("m c", axis, "g m", 1e3) for axis in "xyz"),
+    *(("I", axes, "g m²", 1e3) for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
+)
+_PILLS = {"identified": "agrees", "not": "differs"}
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One parameter as printed, all in `unit`; empty where there is nothing to say."""
+
+    symbol: str
+    index: str
+    value: str
+    deviation: str
+    interval: str
+    unit: str
+    verdict: str
+    pill: str
+
+
+def parameter_rows(load: Identification) -> list[ParameterRow]:
+    """(16) the table of [offsets; phi], Eq. (7).
+
+    Values that are not identified are not printed: somebody would use them.
+    """
+    theta = np.concatenate([load.offsets, load.phi])
+    columns = np.stack([theta, load.standard_deviations, *intervals(load)], axis=1)
+    rows = []
+    for (symbol, index, unit, scale), values, verdict in zip(
+        _PARAMETERS, columns, load.verdicts, strict=True
+    ):
+        words, pill = VERDICT_WORDS[verdict], _PILLS.get(verdict, "")
+        texts = ("–", "", "")
+        if verdict != "not" and np.isfinite(values).all():
+            value, deviation, low, high = scale * values
+            # Two digits of the uncertainty say how many digits of the value mean something.
+            exponent = np.floor(np.log10(deviation)) if deviation > 0 else -3
+            decimals = int(np.clip(1 - exponent, 0, 9))
+            value, deviation, low, high = (
+                f"{x:.{decimals}f}" for x in (value, deviation, low, high)
+            )
+            texts = (value, deviation, f"{low} … {high}")
+        rows.append(ParameterRow(symbol, index, *texts, unit, words, pill))
+    return rows
+
+
+def write_report(
+    path: Path,
+    found: IdentifiedLog,
+    summary: Mapping[str, Any],
+    alone: Identification | None = None,
+) -> None:
+    """Writes the page; pictures are inside it, so that it can be moved and mailed.
+
+    Args:
+        path: of the HTML file.
+        found: what was identified.
+        summary: the figures of `identify_command`.
+        alone: the object, if the gripper was known.
+    """
+    log, result = found.log, found.identification
+    tables = [
+        (
+            "The load and the sensor's offsets",
+            "About the origin of the sensor frame S, in its axes. The intervals hold the truth in"
+            " 95 of 100 records, as far as the residual is noise. Nothing is printed where the"
+            " record says nothing.",
+            parameter_rows(result),
+        )
+    ]
+    if alone is not None:
+        tables.append(
+            (
+                "The object alone",
+                "The load less the gripper of the file that was given; uncertainties of both add.",
+                parameter_rows(alone)[6:],
+            )
+        )
+    samples = f"{summary['samples']} poses at rest"
+    if not log.static:
+        samples = (
+            f"{summary['samples']} samples, {summary['duration_s']:.1f} s at"
+            f" {summary['rate_hz']:.4g} Hz; motion {1e3 * summary['delay_s']:.2f} ms behind the"
+            f" wrench ({summary['delay_source']})"
+        )
+    spectrum = "each pose" if log.static else "each frequency"
+    page = render(
+        "drake_teleop.logs",
+        "report.html.j2",
+        name=Path(summary["log"]).name,
+        setting=f"{samples}. Method: {result.method}.",
+        tiles=_tiles(result),
+        notes=summary["notes"],
+        tables=tables,
+        figures=[
+            (
+                "Fit",
+                embedded(draw_fit(found)),
+                "Measured wrench and V φ without the offsets, and what is left between them.",
+            ),
+            (
+                "What the record determines",
+                embedded(draw_knowledge(found)),
+                f"Top: the residual at {spectrum}. Below: each parameter with its interval, and "
+                "its standard deviation, as shares of what is natural for a load of this mass and "
+                "size: up to 5 % it is identified, up to 50 % weakly, beyond that not.",
+            ),
+        ],
+        summary=dict(summary),
+    )
+    path.write_text(page, encoding="utf-8")
+
+
+def _tiles(load: Identification) -> list[tuple[str, str, str]]:
+    """(number, unit, what it is) of what a reader wants to know first."""
+    deviation = load.standard_deviations[6]
+    mass = f"{load.mass:.4g}" if load.identifiable[6] else "–"
+    com = ", ".join(
+        f"{1e3 * c:.1f}" if known else "–"
+        for c, known in zip(load.com, load.identifiable[7:10], strict=True)
+    )
+    count = int(load.identifiable[6:].sum())
+    return [
+        (mass, "kg", f"mass, ± {deviation:.2g} kg" if load.identifiable[6] else "mass"),
+        (com, "mm", "centre of mass from the origin of S: x, y, z"),
+        (f"{count} of 10", "", "parameters of the load are identified"),
+        (
+            f"{np.linalg.norm(load.residual_rms[:3]):.3g}",
+            "N",
+            "rms of the force that the load does not explain",
+        ),
+    ]
