@@ -100,8 +100,8 @@ def spectrum(x: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], ND
         ],
         axis=0,
     )
-    density: NDArray[np.float64] = np.sqrt(2.0 * dt * power / np.sum(window**2))
-    rates: NDArray[np.float64] = np.fft.rfftfreq(length, dt)
+    density = np.asarray(np.sqrt(2.0 * dt * power / np.sum(window**2)), np.float64)
+    rates = np.asarray(np.fft.rfftfreq(length, dt), np.float64)
     return rates[1:], density[1:]
 
 
