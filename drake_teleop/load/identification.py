@@ -73,11 +73,14 @@ METHODS = (
 )
 """What `Identification.method` may say."""
 
+WORTH_STATING = 0.05
+"""Standard deviation over natural scale up to which a parameter is identified."""
+
 # Rank: smallest eigenvalue of the scaled Gram over the largest, component of a parameter in the
 # null space, and excitation of a column [m/s^2, rad/s^2] below which it counts as none.
 _RANK, _NULL_COMPONENT, _NO_EXCITATION = 1e-12, 1e-6, 1e-9
 # Worth stating: standard deviation over natural scale, smallest size of a load [m], gravity.
-_WORTH_STATING, _WEAK, _SMALLEST_SIZE, _GRAVITY = 0.05, 0.5, 0.03, 9.81
+_WEAK, _SMALLEST_SIZE, _GRAVITY = 0.5, 0.03, 9.81
 # Blocks kept, least length of a block in memories of the noise, degrees of freedom to be trusted.
 _MOST_BLOCKS, _WINDOW, _FEWEST_DEGREES = 1024, 4.0, 8.0
 _FEWEST_SAMPLES = 3
@@ -294,27 +297,17 @@ class NormalEquations:
                 f"{self.samples} samples cannot determine a load",
                 remedy=f"give at least {_FEWEST_SAMPLES}, in different orientations",
             )
-        gram, right = self.normal_equations()
-        inverse, undetermined, condition_number, rank = _pseudo_inverse(gram, self._unexcited())
-        theta = inverse @ right
+        inverse, undetermined, condition_number = self._pseudo_inverse()
+        theta = inverse @ self.normal_equations()[1]
         if theta[6] == 0.0:
             raise DrakeTeleopError(
                 "no mass can be told from this wrench",
                 where="wrench",
                 remedy="is the sensor connected, and does its orientation change?",
             )
-        squares = self.residual_squares(theta)
-        variances, degrees = self._long_run_variances(theta, inverse, rank)
-        # What each channel adds to the covariance, and Satterthwaite's degrees of freedom.
-        parts = self._channel_grams() * (self._weights**2 * variances)[:, None, None]
-        parts = inverse @ parts @ inverse
-        covariance = parts.sum(axis=0)
-        shares = np.diagonal(parts, axis1=1, axis2=2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            degrees = shares.sum(axis=0) ** 2 / (shares**2 / degrees[:, None]).sum(axis=0)
-        degrees = np.where(undetermined | ~(degrees > 0.0), np.inf, degrees)
+        covariance, degrees = self._covariance(theta, inverse)
         covariance[undetermined, :] = covariance[:, undetermined] = 0.0
-        covariance[undetermined, undetermined] = np.inf
+        covariance[undetermined, undetermined] = degrees[undetermined] = np.inf
         return Identification(
             phi=theta[6:],
             offsets=theta[:6],
@@ -322,11 +315,36 @@ class NormalEquations:
             identifiable=worth_stating(np.sqrt(np.diag(covariance)), theta[6:]),
             condition_number=condition_number,
             delay_s=float(delay_s),
-            residual_rms=np.sqrt(squares / self.samples),
+            residual_rms=np.sqrt(self.residual_squares(theta) / self.samples),
             method=METHODS[0],
             samples=self.samples,
             degrees_of_freedom=degrees,
         )
+
+    def covariance(self) -> Array:
+        """(16, 16) covariance of the least squares solution of minimum norm, columns scaled.
+
+        Unlike `Identification.covariance` it has no infinite entries: the variance c^T C c of a
+        combination c that the record determines is right even if its parts are undetermined.
+        """
+        inverse, _, _ = self._pseudo_inverse()
+        return self._covariance(inverse @ self.normal_equations()[1], inverse)[0]
+
+    def _covariance(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
+        """(16, 16) covariance without infinities and (16,) degrees of freedom of its diagonal."""
+        variances, degrees = self._long_run_variances(theta, inverse)
+        # What each channel adds to the covariance, and Satterthwaite's degrees of freedom.
+        parts = self._channel_grams() * (self._weights**2 * variances)[:, None, None]
+        parts = inverse @ parts @ inverse
+        shares = np.diagonal(parts, axis1=1, axis2=2)
+        total, of_squares = shares.sum(axis=0), (shares**2 / degrees[:, None]).sum(axis=0)
+        known = (total > 0.0) & (of_squares > 0.0)
+        return parts.sum(axis=0), np.divide(
+            total**2, of_squares, out=np.full(16, np.inf), where=known
+        )
+
+    def _pseudo_inverse(self) -> tuple[Array, NDArray[np.bool_], float]:
+        return _pseudo_inverse(self.normal_equations()[0], self.unexcited)
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
         """Gram (16, 16) and right-hand side (16,) of [E V], sums over the rows.
@@ -348,7 +366,9 @@ class NormalEquations:
             grams[c][np.ix_(_columns(c), _columns(c))] = self._moments[c][np.ix_(_MODEL, _MODEL)]
         return grams
 
-    def _unexcited(self) -> NDArray[np.bool_]:
+    @property
+    def unexcited(self) -> NDArray[np.bool_]:
+        """(16,) parameters that had no part in the wrench at all, up to rounding."""
         squares = np.diag(self.normal_equations(np.ones(6))[0]) / self.samples
         return np.sqrt(squares) < _NO_EXCITATION
 
@@ -381,11 +401,10 @@ class NormalEquations:
             for what least squares with the present weights takes from the residuals, and (6,) their
             degrees of freedom.
         """
-        gram, _ = self.normal_equations()
-        inverse, _, _, rank = _pseudo_inverse(gram, self._unexcited())
-        return self._long_run_variances(checked("theta", theta, 16), inverse, rank)
+        inverse, _, _ = self._pseudo_inverse()
+        return self._long_run_variances(checked("theta", theta, 16), inverse)
 
-    def _long_run_variances(self, theta: Array, inverse: Array, rank: int) -> tuple[Array, Array]:
+    def _long_run_variances(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
         grams = self._channel_grams()
         n = float(self.samples)
         power = self.residual_squares(theta)
@@ -473,7 +492,7 @@ def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
         standard_deviations: (16,) of [offsets; phi] [SI].
         phi: (10,) the load.
     """
-    return standard_deviations <= _WORTH_STATING * natural_scale(phi)
+    return standard_deviations <= WORTH_STATING * natural_scale(phi)
 
 
 def natural_scale(phi: Array) -> Array:
@@ -554,15 +573,15 @@ def _flush(part, moments, block):
 
 def _pseudo_inverse(
     gram: Array, unexcited: NDArray[np.bool_]
-) -> tuple[Array, NDArray[np.bool_], float, int]:
-    """(inverse, undetermined (16,), condition number, rank) of a Gram matrix, columns scaled."""
+) -> tuple[Array, NDArray[np.bool_], float]:
+    """(inverse, undetermined (16,), condition number) of a Gram matrix, columns scaled."""
     scale = np.where(unexcited, 0.0, 1.0 / np.sqrt(np.where(unexcited, 1.0, np.diag(gram))))
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
     kept = eigenvalues > _RANK * eigenvalues[-1]
     half = scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept])
     undetermined = (np.abs(vectors[:, ~kept]) > _NULL_COMPONENT).any(axis=1)
     condition_number = float(np.sqrt(eigenvalues[-1] / eigenvalues[kept][0]))
-    return half @ half.T, undetermined, condition_number, int(kept.sum())
+    return half @ half.T, undetermined, condition_number
 
 
 def _read_json(path: str | Path) -> dict[str, Any]:

@@ -1,0 +1,347 @@
+"""Intervals that hold, verdicts that are not wishes, combinations that the motion determines."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from load_cases import OFFSETS, TOOL, rich_motion
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.identification import (
+    PARAMETERS,
+    Identification,
+    NormalEquations,
+    identify,
+    natural_scale,
+)
+from drake_teleop.load.recursive import RecursiveLeastSquares
+from drake_teleop.load.regressor import non_contact_wrench, regressor
+from drake_teleop.load.uncertainty import (
+    base_parameters,
+    intervals,
+    prior_dominated,
+    wrench_standard_deviations,
+)
+
+TRUTH = np.concatenate([OFFSETS, TOOL])
+NOISE = np.array([0.3, 0.3, 0.5, 0.01, 0.01, 0.005])
+LEVER = 0.2
+
+
+def _study():
+    path = Path(__file__).parents[2] / "benchmarks" / "intervals.py"
+    spec = importlib.util.spec_from_file_location("intervals_study", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+study = _study()
+
+
+def equations_of(motion, noise=0.0, seed=0):
+    equations = NormalEquations(NOISE)
+    ideal = OFFSETS + non_contact_wrench(*motion, TOOL)
+    random = np.random.default_rng(seed).normal(size=ideal.shape)
+    equations.add(ideal + noise * NOISE * random, *motion)
+    return equations
+
+
+def turntable(samples=400):
+    """Turning about a vertical axis, parallel to z of S and `LEVER` from So along -x of S."""
+    t = np.linspace(0.0, 10.0, samples)
+    rate, acceleration = np.cos(t) + 0.3 * np.sin(3 * t), -np.sin(t) + 0.9 * np.cos(3 * t)
+    zero = 0.0 * t
+    s = np.stack([-LEVER * rate**2, LEVER * acceleration, zero + 9.81], axis=1)
+    return s, np.stack([zero, zero, rate], axis=1), np.stack([zero, zero, acceleration], axis=1)
+
+
+# ---- coverage
+
+
+@pytest.mark.parametrize("colour", study.COLOURS)
+def test_intervals_hold_in_noise_of_any_colour(colour):
+    # A share of 60 at 95 % has a standard deviation of 2.8 %: fewer than 50 of 60 has a chance of
+    # 2e-4 for each parameter. The mean over 16 parameters, mostly independent, is sharper.
+    shares = study.coverage(colour, 60, seconds=4.0)
+    assert shares["coverage"].min() >= 50 / 60
+    assert 0.92 <= shares["coverage"].mean() <= 0.98
+    # The stated variance is that of the errors; mean of 16 x 60 squares.
+    assert 0.75 < shares["z"].mean() < 1.25
+
+
+def test_noise_is_what_its_name_says():
+    for colour in study.COLOURS:
+        noise = study.coloured_noise(np.random.default_rng(0), 100_000, colour)
+        np.testing.assert_allclose(noise.std(axis=0), 1.0, atol=0.08)
+    noise = study.coloured_noise(np.random.default_rng(0), 100_000, "AR(1) 0.95, 1 kHz")[:, 0]
+    assert np.mean(noise[1:] * noise[:-1]) == pytest.approx(0.95, abs=0.02)
+
+
+def test_the_study_prints_and_judges(capsys):
+    ok = study.main(["--json", "--seeds", "2"])
+    document = json.loads(capsys.readouterr().out)
+    assert set(document) == {"seeds", "colours", "called identified"}
+    assert len(document["colours"]["white, 1 kHz"]["coverage"]) == 16
+    # Shares of two records are 0, 50 or 100 %: never all within 90-98 %.
+    assert ok == 1
+    assert study.main(["--seeds", "1"]) == 1
+    assert "smallest" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", study.unexcited_records())
+def test_what_does_not_move_is_never_identified(name):
+    assert set(study.false_verdicts(name, 20).values()) == {0}
+
+
+def test_long_run_variance_of_known_noise():
+    motion = rich_motion(60_000)
+    colour = "AR(1) 0.9, 1 kHz"
+    noise = NOISE * study.coloured_noise(np.random.default_rng(5), 60_000, colour)
+    equations = NormalEquations(NOISE)
+    equations.add(OFFSETS + non_contact_wrench(*motion, TOOL) + noise, *motion)
+    variances, degrees = equations.long_run_variances(TRUTH)
+    # (1 + 0.9) / (1 - 0.9) = 19; the relative deviation of a variance is sqrt(2 / degrees).
+    errors = (variances / NOISE**2 / 19.0 - 1.0) / np.sqrt(2.0 / degrees)
+    assert np.abs(errors).max() < 4.0
+    assert (degrees > 100.0).all()
+
+
+def test_few_seconds_of_slow_noise_leave_few_degrees_of_freedom():
+    motion = study.motion(1e3, 2.0)
+    ideal = OFFSETS + non_contact_wrench(*motion, TOOL)
+    fast, slow = (
+        identify(
+            ideal + NOISE * study.coloured_noise(np.random.default_rng(0), 2000, colour),
+            *motion,
+            noise=NOISE,
+        )
+        for colour in ("white, 1 kHz", "AR(1) 0.95, 1 kHz")
+    )
+    assert slow.degrees_of_freedom.max() < 100.0 < fast.degrees_of_freedom.min()
+
+
+# ---- intervals
+
+
+def plain(**changes):
+    load = equations_of(rich_motion(500), noise=1.0).solve()
+    return dataclasses.replace(load, **changes)
+
+
+def test_quantiles():
+    normal = plain(degrees_of_freedom=np.full(16, np.inf))
+    low, high = intervals(normal)
+    np.testing.assert_allclose(high - low, 2 * 1.959964 * normal.standard_deviations, rtol=1e-5)
+    np.testing.assert_allclose((high + low) / 2, [*normal.offsets, *normal.phi], atol=1e-12)
+    low, high = intervals(plain(degrees_of_freedom=np.full(16, 4.0)), level=0.99)
+    np.testing.assert_allclose(high - low, 2 * 4.604095 * normal.standard_deviations, rtol=1e-5)
+    with pytest.raises(DrakeTeleopError, match=r"^level: 1\.0 is not within"):
+        intervals(normal, 1.0)
+
+
+def test_undetermined_parameters_can_be_anything():
+    load = equations_of(turntable()).solve()
+    low, high = intervals(load)
+    unknown = np.isinf(load.standard_deviations)
+    assert unknown.any()
+    assert (low[unknown] == -np.inf).all() and (high[unknown] == np.inf).all()
+
+
+# ---- verdicts
+
+
+def test_verdicts_follow_from_the_deviations():
+    load = plain()
+    share = np.array([0.049, 0.051, 0.49, 0.51, np.inf, *[0.01] * 11])
+    variances = (share * natural_scale(load.phi)) ** 2
+    load = plain(
+        covariance=np.diag(variances),
+        identifiable=share <= 0.05,
+        prior_dominated=np.arange(16) == 3,
+    )
+    expected = ("identified", "weakly", "weakly", "prior", "not", *["identified"] * 11)
+    assert load.verdicts == expected
+
+
+def test_prior_dominated_is_what_the_data_did_not_tell():
+    assert prior_dominated([0.1, 0.5, 1.0, 1.0], [1.0, 1.0, 1.0, np.inf]).tolist() == [
+        *(False, True, True, False)
+    ]
+    with pytest.raises(DrakeTeleopError, match=r"^prior_std: takes positive numbers"):
+        prior_dominated([1.0, 1.0], [1.0, 0.0])
+    with pytest.raises(DrakeTeleopError, match=r"^prior_std: takes positive numbers"):
+        prior_dominated([1.0, 1.0], [1.0])
+    prior = np.full(16, 10.0)
+    estimator = RecursiveLeastSquares(NOISE, prior_std=prior)
+    motion = turntable(200)
+    for i in range(200):
+        sample = tuple(x[i] for x in motion)
+        estimator.update(OFFSETS + non_contact_wrench(*sample, TOOL), *sample)
+    deviations = np.sqrt(np.diag(estimator.covariance))
+    names = {PARAMETERS[i] for i in np.flatnonzero(prior_dominated(deviations, prior))}
+    assert {"I_xx", "I_xy", "I_yy"} <= names
+    assert not names & {"f_ox", "f_oy", "m c_y"}
+
+
+def test_old_files_without_the_optional_fields_are_read(tmp_path):
+    path = tmp_path / "identification.json"
+    load = plain(prior_dominated=np.arange(16) == 15)
+    load.save(path)
+    again = Identification.load(path)
+    np.testing.assert_array_equal(again.degrees_of_freedom, load.degrees_of_freedom)
+    np.testing.assert_array_equal(again.prior_dominated, load.prior_dominated)
+    document = json.loads(path.read_text())
+    assert document["verdicts"] == list(load.verdicts)
+    for name in ("degrees_of_freedom", "prior_dominated", "verdicts"):
+        document.pop(name)
+    path.write_text(json.dumps(document))
+    old = Identification.load(path)
+    assert np.isinf(old.degrees_of_freedom).all() and not old.prior_dominated.any()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("degrees_of_freedom", [1.0] * 15, r"json:degrees_of_freedom: has shape \(15,\)"),
+        ("degrees_of_freedom", [0.0] * 16, "json:degrees_of_freedom: is not positive"),
+        ("degrees_of_freedom", 3.0, "json:degrees_of_freedom: is not a list of 16"),
+        ("prior_dominated", [1.5] * 16, "json:prior_dominated: is not a list of 16"),
+        ("verdicts", ["identified"] * 15, "json:verdicts: does not follow"),
+    ],
+)
+def test_spoilt_optional_fields(tmp_path, field, value, message):
+    path = tmp_path / "identification.json"
+    plain().save(path)
+    document = json.loads(path.read_text())
+    document[field] = value
+    path.write_text(json.dumps(document))
+    with pytest.raises(DrakeTeleopError, match=message):
+        Identification.load(path)
+
+
+# ---- combinations
+
+
+def stacked(motion):
+    V = regressor(*motion)
+    return np.concatenate([np.tile(np.eye(6), (len(V), 1, 1)), V], axis=2).reshape(-1, 16)
+
+
+def test_a_turntable_determines_sums():
+    motion = turntable()
+    base = base_parameters(equations_of(motion, noise=1e-3))
+    rows = stacked(motion)
+    assert base.rank == np.linalg.matrix_rank(rows, tol=1e-9 * np.linalg.norm(rows))
+    assert set(base.without_influence) == {"I_xx", "I_xy", "I_yy"}
+    coefficients = np.array([c.coefficients for c in base.combinations])
+    # No combination changes along the null space, and its estimate is the truth's.
+    _, singular, vectors = np.linalg.svd(rows)
+    null = vectors[(singular > 1e-9 * singular[0]).sum() :]
+    np.testing.assert_allclose(coefficients @ null.T, 0.0, atol=1e-5)
+    for c in base.combinations:
+        assert abs(c.value - c.coefficients @ TRUTH) < 5 * c.standard_deviation + 1e-6
+        assert c.coefficients[c.leading] == 1.0
+    # Of I_zz only I_zz + 0.2 m c_x, and of the mass only m c_x + 0.2 m, have a part in the wrench.
+    for known in (unit("I_zz") + LEVER * unit("m c_x"), unit("m c_x") + LEVER * unit("m")):
+        solution = np.linalg.lstsq(coefficients.T, known, rcond=None)[0]
+        np.testing.assert_allclose(coefficients.T @ solution, known, atol=1e-5)
+    for unknown in (unit("I_zz"), unit("m"), unit("m c_x")):
+        solution = np.linalg.lstsq(coefficients.T, unknown, rcond=None)[0]
+        assert np.abs(coefficients.T @ solution - unknown).max() > 1e-3
+
+
+def unit(name):
+    return np.eye(16)[PARAMETERS.index(name)]
+
+
+def test_one_pose_in_words():
+    still = np.zeros((100, 3))
+    lines = base_parameters(
+        equations_of((still + np.array([0.0, 0.0, 9.81]), still, still), noise=1e-3)
+    ).lines()
+    assert lines[0] == "6 of 16 combinations of offsets and load are determined"
+    assert lines[1].endswith("m c_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz")
+    together = {line.split(" = ")[0] for line in lines[2:]}
+    assert together == {
+        "only together: m + 0.102 f_oz",
+        "only together: m c_x - 0.102 tau_oy",
+        "only together: m c_y + 0.102 tau_ox",
+    }
+
+
+def test_a_full_record_has_nothing_to_add():
+    base = base_parameters(equations_of(rich_motion(2000), noise=1.0))
+    assert base.rank == 16 and not base.without_influence and not base.directions
+    assert base.lines() == ["16 of 16 combinations of offsets and load are determined"]
+    names = [PARAMETERS[c.leading] for c in base.combinations]
+    assert names == list(PARAMETERS)
+    load = equations_of(rich_motion(2000), noise=1.0).solve()
+    deviations = [c.standard_deviation for c in base.combinations]
+    np.testing.assert_allclose(deviations, load.standard_deviations, rtol=1e-9)
+
+
+def test_weak_directions_are_principal_directions_of_the_covariance():
+    motion = study.motion(1e3, 0.5)
+    equations = equations_of(motion, noise=8.0)
+    load, base = equations.solve(), base_parameters(equations)
+    weak = np.flatnonzero(~load.identifiable)
+    assert 2 <= len(weak) == len(base.directions)
+    shares = [c.share for c in base.directions]
+    assert shares == sorted(shares)
+    assert shares[-1] > 0.05
+    for c in base.directions:
+        assert set(np.flatnonzero(c.coefficients)) <= set(weak)
+        variance = c.coefficients @ load.covariance @ c.coefficients
+        assert c.standard_deviation == pytest.approx(np.sqrt(variance))
+    worst = base.directions[-1]
+    assert any(worst.words in line and line.startswith("weak: ") for line in base.lines())
+
+
+# ---- predicted wrench
+
+
+def test_predicted_wrench_scatters_as_stated():
+    motion, other = rich_motion(1500), tuple(x[::100] for x in rich_motion(1500, seed=9))
+    ideal = non_contact_wrench(*other, TOOL)
+    squares, seeds = np.zeros(ideal.shape), 150
+    for seed in range(seeds):
+        load = equations_of(motion, noise=1.0, seed=seed).solve()
+        error = non_contact_wrench(*other, load.phi) - ideal
+        squares += (error / wrench_standard_deviations(load, *other)) ** 2
+    squares /= seeds
+    # A mean of 150 squares scatters by 0.115; 90 of them.
+    assert squares.max() < 1.6 and squares.min() > 0.6
+    assert squares.mean() == pytest.approx(1.0, abs=0.12)
+
+
+def test_predicted_wrench_in_any_shape_and_number():
+    load = plain()
+    motion = rich_motion(9000)
+    whole = wrench_standard_deviations(load, *motion)
+    V = regressor(*(x[8500] for x in motion))
+    expected = np.sqrt(np.diag(V @ load.covariance[6:, 6:] @ V.T))
+    np.testing.assert_allclose(whole[8500], expected, rtol=1e-9)
+    one = wrench_standard_deviations(load, *(x[8500] for x in motion))
+    assert one.shape == (6,)
+    np.testing.assert_allclose(one, expected, rtol=1e-9)
+    grid = wrench_standard_deviations(load, *(x[:12].reshape(3, 4, 3) for x in motion))
+    np.testing.assert_allclose(grid.reshape(12, 6), whole[:12], rtol=1e-9)
+    with pytest.raises(DrakeTeleopError, match=r"^s: has shape"):
+        wrench_standard_deviations(load, np.zeros(4), np.zeros(3), np.zeros(3))
+
+
+def test_undetermined_inertia_makes_no_promise_for_turning():
+    up = np.random.default_rng(0).normal(size=(24, 3))
+    still = np.zeros((24, 3))
+    s = 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
+    load = equations_of((s, still, still), noise=1.0).solve()
+    assert np.isfinite(wrench_standard_deviations(load, s, still, still)).all()
+    turning = wrench_standard_deviations(load, s[0], still[0], [1.0, 0.0, 0.0])
+    assert np.isfinite(turning[:3]).all()
+    assert np.isinf(turning[3:]).tolist() == [True, True, True]
