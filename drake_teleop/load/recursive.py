@@ -4,19 +4,28 @@ A sample's six rows of [E V] theta = F are taken one after the other, each a ran
 covariance P of theta = [offsets; phi], Eq. (7), weighted by the channel's noise. Without forgetting
 the result is that of the batch with a weak prior (P's start). Ljung, System Identification,
 section 11.2; the structural zeros of V are skipped.
+
+`RecursiveEstimator` is what the recursive estimators share; the others are
+`recursive_tls.RecursiveTotalLeastSquares` and `instrumental.RecursiveInstrumentalVariables`.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array
-from drake_teleop.load.identification import METHODS, Identification, positive, worth_stating
+from drake_teleop.load.arrays import Array, checked_rows
+from drake_teleop.load.identification import (
+    WORTH_STATING,
+    Identification,
+    positive,
+    worth_stating,
+)
 from drake_teleop.load.regressor import regressor_into
 
 PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
@@ -24,6 +33,11 @@ PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
 
 # A parameter whose standard deviation is still above this share of the prior's was not learnt.
 _STILL_PRIOR = 0.5
+SETTLED = 0.05
+"""Default bound of `RecursiveEstimator.settled`."""
+
+# What a sample is made of.
+_PARTS = {"wrench": 6, "s": 3, "omega": 3, "alpha": 3, "instruments": 9}
 # The least variance of a row relative to the sum of the variances that it is made of: below it,
 # rounding would make P indefinite. It only slows the first samples of a sensor that is nearly ideal
 # by the measure of the prior (with the default prior, one better than about 1 mN).
@@ -83,33 +97,63 @@ def rls_update(theta, P, wrench, s, omega, alpha, noise_std, forgetting, largest
                 P[i, j] -= gain[i] * gain[j] * inverse
 
 
-class RecursiveLeastSquares:
-    """The recursive estimator of load and offsets.
+@njit(cache=True)
+def _rls_over(theta, P, samples, noise_std, forgetting, largest, V, gain, squares):
+    """`rls_update` for each row of samples (N, 15)."""
+    for k in range(samples.shape[0]):
+        row = samples[k]
+        rls_update(
+            theta,
+            P,
+            row[:6],
+            row[6:9],
+            row[9:12],
+            row[12:15],
+            noise_std,
+            forgetting,
+            largest,
+            V,
+            gain,
+            squares,
+        )
+
+
+class RecursiveEstimator(ABC):
+    """An estimate [offsets; phi] that learns sample by sample, and what all of them offer.
+
+    What an estimator knows is theta (16,) and a `memory`, an array of its own making. They can be
+    kept outside, as in the state of a Drake system: `initial_memory`, `update_into`,
+    `covariance_of`, `settled_at`.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
         forgetting: factor per sample on the weight of the past, 0 < forgetting <= 1.
-        prior_std: (16,) standard deviations of [offsets; phi] about zero to begin with; default
-            `PRIOR_STD`. Forgetting never widens the estimate beyond them.
+        prior_std: (16,) standard deviations of [offsets; phi] to begin with. Forgetting never
+            widens the estimate beyond them: while the motion excites nothing, nothing winds up.
+        bound: of `settled`.
 
     Raises:
         DrakeTeleopError: for other shapes or values.
     """
 
+    #: How `Identification.method` calls it.
+    method: str
+    #: Numbers that a sample has to begin with.
+    sample_size = 15
+
     def __init__(
-        self,
-        noise_std: ArrayLike,
-        forgetting: float = 1.0,
-        prior_std: ArrayLike = PRIOR_STD,
+        self, noise_std: ArrayLike, forgetting: float, prior_std: ArrayLike, bound: float
     ) -> None:
         if not 0.0 < forgetting <= 1.0:
             raise DrakeTeleopError(f"{forgetting} is not within (0, 1]", where="forgetting")
+        if not bound > 0.0:
+            raise DrakeTeleopError(f"{bound} is not positive", where="bound")
         self._noise_std = positive("noise_std", noise_std, 6)
-        self._forgetting = float(forgetting)
+        self._forgetting, self._bound = float(forgetting), float(bound)
         self._prior = positive("prior_std", prior_std, 16) ** 2
-        self._theta, self._covariance = np.zeros(16), np.diag(self._prior)
-        self._V, self._gain, self._squares = np.empty((6, 10)), np.empty(16), np.zeros(6)
-        self._samples = 0
+        self._squares = np.zeros(6)
+        self._theta, self._samples = np.zeros(16), 0
+        self._memory = self.initial_memory(self._theta)
 
     @property
     def phi(self) -> Array:
@@ -123,41 +167,193 @@ class RecursiveLeastSquares:
 
     @property
     def covariance(self) -> Array:
-        """(16, 16) of [offsets; phi] [SI], taking the noise for white and as large as stated."""
-        return self._covariance.copy()
+        """(16, 16) of [offsets; phi] [SI], taking the noise for white."""
+        return self.covariance_of(self._theta, self._memory)
 
-    def update(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
+    @property
+    def settled(self) -> bool:
+        """Whether every parameter is predicted to be known well enough.
+
+        The bound is a share of what is natural for a load of this mass and size, as the 5 % of
+        `Identification.identifiable`: 0.05 asks the mass for 5 %.
+        """
+        return self.settled_at(self._theta, self._memory)
+
+    def settled_at(self, theta: Array, memory: Array) -> bool:
+        """`settled` for an estimate that is kept elsewhere."""
+        if theta[6] == 0.0:
+            return False
+        deviations = np.sqrt(np.diag(self.covariance_of(theta, memory)))
+        return bool(self._known(deviations, theta, self._bound).all())
+
+    @abstractmethod
+    def initial_memory(self, theta: Array) -> Array:
+        """The memory that goes with an estimate theta (16,) from which nothing is known yet."""
+
+    @abstractmethod
+    def covariance_of(self, theta: Array, memory: Array) -> Array:
+        """`covariance` of an estimate that is kept elsewhere."""
+
+    @abstractmethod
+    def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
+        """The update of an estimate that is kept elsewhere; compiled, checks nothing.
+
+        Args:
+            theta: (16,) estimate, updated in place.
+            memory: C-contiguous, as from `initial_memory`, updated in place.
+            sample: begins with `sample_size` numbers [wrench, s, omega, alpha, ...].
+        """
+
+    @abstractmethod
+    def _learn(self, samples: Array) -> None:
+        """Updates the own estimate by each row of samples (N, sample_size)."""
+
+    def update(
+        self,
+        wrench: ArrayLike,
+        s: ArrayLike,
+        omega: ArrayLike,
+        alpha: ArrayLike,
+        instruments: ArrayLike | None = None,
+    ) -> None:
         """Learns from one sample of a free motion.
 
         Args:
             wrench: (6,) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
             s, omega, alpha: (3,) specific force [m/s^2], angular velocity [rad/s] and
                 acceleration [rad/s^2] of S in S.
+            instruments: (9,) the motion [s; omega; alpha] once more with other noise, for the
+                estimator that takes it.
 
         Raises:
-            DrakeTeleopError: for other shapes or numbers that are not finite; the estimate is
-                then as it was.
+            DrakeTeleopError: for other shapes or numbers that are not finite, or instruments too
+                many or missing; the estimate is then as it was.
         """
-        sample = np.concatenate([wrench, s, omega, alpha], dtype=np.float64)
-        sizes = [np.shape(part) for part in (wrench, s, omega, alpha)]
-        if sizes != [(6,), (3,), (3,), (3,)]:
-            raise DrakeTeleopError(f"wrench, s, omega, alpha have shapes {sizes}", where="sample")
+        parts = self._parts([wrench, s, omega, alpha], instruments)
+        shapes = [np.shape(part) for part in parts]
+        if shapes != [(size,) for size in _PARTS.values()][: len(parts)]:
+            names = ", ".join(list(_PARTS)[: len(parts)])
+            raise DrakeTeleopError(f"{names} have shapes {shapes}", where="sample")
+        sample = np.concatenate(parts, dtype=np.float64)
         if not math.isfinite(sample.sum()):
             raise DrakeTeleopError("is not finite", where="sample")
-        self.update_into(self._theta, self._covariance, sample)
+        self.update_into(self._theta, self._memory, sample)
         self._samples += 1
 
-    def update_into(self, theta: Array, covariance: Array, sample: Array) -> None:
-        """The same update of an estimate that is kept elsewhere; checks nothing.
+    def learn(
+        self,
+        wrench: ArrayLike,
+        s: ArrayLike,
+        omega: ArrayLike,
+        alpha: ArrayLike,
+        instruments: ArrayLike | None = None,
+    ) -> None:
+        """`update` with each of N samples of a log, in a compiled loop.
 
         Args:
-            theta: (16,) estimate, updated in place.
-            covariance: (16, 16) C-contiguous, updated in place.
-            sample: at least 15 numbers [wrench (6), s (3), omega (3), alpha (3)].
+            wrench, s, omega, alpha, instruments: (N, 6), (N, 3), (N, 3), (N, 3), (N, 9).
+
+        Raises:
+            DrakeTeleopError: as `update`.
         """
+        parts = self._parts([wrench, s, omega, alpha], instruments)
+        columns = zip(_PARTS, parts, strict=False)
+        _, rows = checked_rows(**{name: (part, _PARTS[name]) for name, part in columns})
+        self._learn(np.concatenate(rows, axis=1))
+        self._samples += len(rows[0])
+
+    def _parts(self, parts: list[ArrayLike], instruments: ArrayLike | None) -> list[ArrayLike]:
+        if (instruments is None) == (self.sample_size > 15):
+            needs = "needs" if instruments is None else "takes no"
+            raise DrakeTeleopError(f"{self.method} {needs} instruments", where="sample")
+        return parts if instruments is None else [*parts, instruments]
+
+    def identification(self) -> Identification:
+        """The present estimate.
+
+        `covariance` is that of white noise; a parameter that is still as uncertain as the prior
+        (above half its standard deviation) is not identifiable. The residuals are the recursion's,
+        each after learning from its row, weighted by forgetting.
+
+        Raises:
+            DrakeTeleopError: before the first update.
+        """
+        if self._theta[6] == 0.0:
+            raise DrakeTeleopError("no sample has been learnt from", where="estimator")
+        covariance = self.covariance
+        deviations = np.sqrt(np.diag(covariance))
+        return Identification(
+            phi=self.phi,
+            offsets=self.offsets,
+            covariance=covariance,
+            identifiable=self._known(deviations, self._theta, WORTH_STATING),
+            condition_number=self._condition_number(),
+            delay_s=0.0,
+            residual_rms=np.sqrt(self._squares / self._weight()),
+            method=self.method,
+            samples=self._samples,
+        )
+
+    def _known(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
+        """(16,) whether known better than the prior, and to `bound` of what is natural."""
+        learnt = deviations < _STILL_PRIOR * np.sqrt(self._prior)
+        return learnt & worth_stating(deviations * (WORTH_STATING / bound), theta[6:])
+
+    def _weight(self) -> float:
+        """The sum of the weights of the samples so far."""
+        if self._forgetting == 1.0:
+            return float(self._samples)
+        return (1.0 - self._forgetting**self._samples) / (1.0 - self._forgetting)
+
+    def _condition_number(self) -> float:
+        """Of the information matrix, prior included, columns scaled as in the batch."""
+        information = np.linalg.inv(self.covariance)
+        scale = 1.0 / np.sqrt(np.diag(information))
+        eigenvalues = np.linalg.eigvalsh(information * np.outer(scale, scale))
+        return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
+
+
+class RecursiveLeastSquares(RecursiveEstimator):
+    """Recursive least squares: exact if the motion is known exactly.
+
+    The memory is the covariance. Noise in the measured motion biases it, see `recursive_tls`.
+
+    Args:
+        noise_std: (6,) standard deviations of the wrench channels [N, N m].
+        forgetting: factor per sample on the weight of the past, 0 < forgetting <= 1.
+        prior_std: (16,) standard deviations of [offsets; phi] about zero to begin with; default
+            `PRIOR_STD`. Forgetting never widens the estimate beyond them.
+        bound: of `settled`.
+
+    Raises:
+        DrakeTeleopError: for other shapes or values.
+    """
+
+    method = "recursive least squares"
+
+    def __init__(
+        self,
+        noise_std: ArrayLike,
+        forgetting: float = 1.0,
+        prior_std: ArrayLike = PRIOR_STD,
+        bound: float = SETTLED,
+    ) -> None:
+        super().__init__(noise_std, forgetting, prior_std, bound)
+        self._V, self._gain = np.empty((6, 10)), np.empty(16)
+
+    def initial_memory(self, theta: Array) -> Array:
+        """(16, 16) the prior's covariance, whatever theta."""
+        return np.diag(self._prior)
+
+    def covariance_of(self, theta: Array, memory: Array) -> Array:
+        """(16, 16), the memory itself."""
+        return memory.copy()
+
+    def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
+        """See `RecursiveEstimator`; memory: (16, 16)."""
         rls_update(
             theta,
-            covariance,
+            memory,
             sample[:6],
             sample[6:9],
             sample[9:12],
@@ -170,41 +366,15 @@ class RecursiveLeastSquares:
             self._squares,
         )
 
-    def identification(self) -> Identification:
-        """The present estimate.
-
-        `covariance` is that of white noise as large as stated; a parameter that is still as
-        uncertain as the prior (above half its standard deviation) is not identifiable. The
-        residuals are the recursion's, each after learning from its row, weighted by forgetting.
-
-        Raises:
-            DrakeTeleopError: before the first update.
-        """
-        if self._theta[6] == 0.0:
-            raise DrakeTeleopError("no sample has been learnt from", where="estimator")
-        deviations = np.sqrt(np.diag(self._covariance))
-        learnt = deviations < _STILL_PRIOR * np.sqrt(self._prior)
-        return Identification(
-            phi=self.phi,
-            offsets=self.offsets,
-            covariance=self.covariance,
-            identifiable=learnt & worth_stating(deviations, self._theta[6:]),
-            condition_number=self._condition_number(),
-            delay_s=0.0,
-            residual_rms=np.sqrt(self._squares / self._memory()),
-            method=METHODS[1],
-            samples=self._samples,
+    def _learn(self, samples: Array) -> None:
+        _rls_over(
+            self._theta,
+            self._memory,
+            samples,
+            self._noise_std,
+            self._forgetting,
+            self._prior,
+            self._V,
+            self._gain,
+            self._squares,
         )
-
-    def _memory(self) -> float:
-        """The sum of the weights of the samples so far."""
-        if self._forgetting == 1.0:
-            return float(self._samples)
-        return (1.0 - self._forgetting**self._samples) / (1.0 - self._forgetting)
-
-    def _condition_number(self) -> float:
-        """Of the information matrix, prior included, columns scaled as in the batch."""
-        information = np.linalg.inv(self._covariance)
-        scale = 1.0 / np.sqrt(np.diag(information))
-        eigenvalues = np.linalg.eigvalsh(information * np.outer(scale, scale))
-        return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))

@@ -140,6 +140,37 @@ def test_updates_an_estimate_that_is_kept_elsewhere():
     np.testing.assert_array_equal(estimator.phi, np.zeros(10))
 
 
+def test_a_log_in_one_call_gives_the_same():
+    F, motion = noisy_record(300)
+    own, log = learnt(F, motion, forgetting=0.999), RecursiveLeastSquares(NOISE, 0.999)
+    log.learn(F[:100], *(x[:100] for x in motion))
+    log.learn(F[100:], *(x[100:] for x in motion))
+    np.testing.assert_array_equal(log.phi, own.phi)
+    np.testing.assert_array_equal(log.covariance, own.covariance)
+    assert log.identification().samples == 300
+    with pytest.raises(DrakeTeleopError, match="the numbers of samples differ"):
+        log.learn(F, *(x[:100] for x in motion))
+    with pytest.raises(DrakeTeleopError, match="is not finite"):
+        log.learn(np.full((1, 6), np.nan), REST, REST, REST)
+
+
+def test_settles_when_the_bound_is_reached():
+    F, motion = noisy_record(3000)
+    estimators = [RecursiveLeastSquares(NOISE, bound=bound) for bound in (0.1, 0.05, 0.02)]
+    settled = []
+    for estimator in estimators:
+        assert not estimator.settled
+        settled.append(3000)
+        for k, sample in enumerate(zip(F, *motion, strict=True)):
+            estimator.update(*sample)
+            if estimator.settled:
+                settled[-1] = k
+                break
+        deviations = np.sqrt(np.diag(estimator.covariance))
+        assert deviations[6] < 0.1 * TOOL[0]
+    assert 2 < settled[0] < settled[1] < settled[2] < 3000
+
+
 def test_bad_input_is_named_and_leaves_the_estimate():
     F, motion = noisy_record(5)
     estimator = learnt(F, motion)
@@ -151,6 +182,10 @@ def test_bad_input_is_named_and_leaves_the_estimate():
     np.testing.assert_array_equal(estimator.phi, before)
     with pytest.raises(DrakeTeleopError, match=r"^forgetting: 1\.1 is not within \(0, 1\]"):
         RecursiveLeastSquares(NOISE, forgetting=1.1)
+    with pytest.raises(DrakeTeleopError, match=r"^bound: -1\.0 is not positive"):
+        RecursiveLeastSquares(NOISE, bound=-1.0)
+    with pytest.raises(DrakeTeleopError, match="takes no instruments"):
+        estimator.learn(F, *motion, instruments=np.zeros((5, 9)))
     with pytest.raises(DrakeTeleopError, match=r"^noise_std: is not positive"):
         RecursiveLeastSquares(-NOISE)
     with pytest.raises(DrakeTeleopError, match=r"^prior_std: has shape \(10,\)"):
