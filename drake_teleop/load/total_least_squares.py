@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import eigh
 
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.moments import (
     Moments,
@@ -79,9 +80,15 @@ def total_least_squares(
             theta (16,). It is then that from which the next weights are made.
 
     Raises:
-        DrakeTeleopError: for fewer than 3 samples.
+        DrakeTeleopError: for fewer than 3 samples, or if the wrench is zero throughout.
     """
     Z, Q = moments.mean, moments.noise_covariance(noise, wrench_noise)
+    if not Z[1:7, 1:7].any():
+        raise DrakeTeleopError(
+            "no mass can be told from this wrench",
+            where="wrench",
+            remedy="is the sensor connected, and does its orientation change?",
+        )
     W: Array = np.diag(wrench_noise**-2.0)
     before = np.zeros(16)
     for _ in range(_ITERATIONS):

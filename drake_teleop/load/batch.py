@@ -1,0 +1,301 @@
+"""Batch estimators by name, for the load and the sensor's offsets from a record.
+
+| name | what it does | when |
+|---|---|---|
+| `ordinary` | least squares, N and N m alike, Eqs. (7)-(8) | to compare with |
+| `whitened` | rows divided by each channel's noise, given or estimated | better than that |
+| `robust` | the same without knocks and short contacts | disturbed records |
+| `total` | errors in variables (`total_least_squares`) | the motion's noise is known |
+| `consistent` | the same, and a body can have these parameters (`consistent`) | default |
+
+All but `robust` see the record only as a (19, 19) matrix of second moments (`moments`), in one
+pass. The noise of the wrench, if not given, comes from the residual of a first fit, without what
+the noise of the motion explains of it, and once more from the residual of the second.
+
+`robust` is iteratively reweighted least squares with Huber's weights (Huber, Robust Statistics,
+1981, chapter 7), which a few bad samples cannot lead far astray, then least squares on the samples
+within 4.5 robust standard deviations (1.4826 x median of the absolute residual) in all channels,
+repeated until they stay the same. Of normal noise it rejects one sample in 25000.
+
+The covariance is that of `identification.NormalEquations` with the same weights of the rows, so
+coloured noise is accounted for. Errors in variables enlarge it: with G theta_LS = b and
+(G - lambda C) theta = b it is K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G. That of `consistent` is
+of the same fit without the constraint, which is cautious.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array, checked_rows
+from drake_teleop.load.consistent import Ellipsoid, Prior, consistent_least_squares
+from drake_teleop.load.identification import Identification, NormalEquations, worth_stating
+from drake_teleop.load.moments import Moments, Noise, normal_equations, residual_covariance
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.total_least_squares import NormalForm, total_least_squares
+
+_CHUNK = 2**15
+# Least noise of a channel, relative to the wrench: what rounding leaves of a perfect record.
+_ROUNDING = 1e-7
+# A wrench's variance is at least this share of the residual's, whatever the motion's explains.
+_LEAST_SHARE = 0.01
+# Huber's limit and the rejection's, in robust standard deviations; fits at most; and how many
+# samples the median looks at.
+_HUBER, _REJECT, _FITS, _MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
+_NORMAL_MAD = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class Options:
+    """What an estimator may know beyond the record.
+
+    Attributes:
+        noise: of wrench and motion.
+        offsets: whether to estimate the sensor's; otherwise they were subtracted before.
+        prior, ellipsoid: for `consistent`.
+    """
+
+    noise: Noise
+    offsets: bool = True
+    prior: Prior | None = None
+    ellipsoid: Ellipsoid | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A checked record: (N, 6), (N, 3), (N, 3), (N, 3), as for `identification.identify`."""
+
+    wrench: Array
+    s: Array
+    omega: Array
+    alpha: Array
+
+    @property
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
+        return self.wrench, self.s, self.omega, self.alpha
+
+    @cached_property
+    def moments(self) -> Moments:
+        moments = Moments()
+        moments.add(*self.arrays)
+        return moments
+
+    def residual(self, theta: Array, part: slice) -> Array:
+        """(n, 6) F - [E V] theta of a part of the samples [N, N m]."""
+        F, s, omega, alpha = (table[part] for table in self.arrays)
+        return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What an estimator found: the normal form, and of the wrench's noise (6,) what it used;
+    `rejected` are (N,) bools, the samples it did without."""
+
+    form: NormalForm
+    wrench_noise: Array
+    moments: Moments
+    rejected: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class BatchResult:
+    """An identification by one of `METHODS`, and what it rests upon.
+
+    Attributes:
+        identification: the load.
+        noise: (6,) standard deviations of the wrench channels that gave the weights [N, N m].
+        rejected: (N,) bools, samples that the fit did without.
+    """
+
+    identification: Identification
+    noise: Array
+    rejected: NDArray[np.bool_]
+
+    @property
+    def rejected_fraction(self) -> float:
+        return float(self.rejected.mean())
+
+
+def _ordinary(record: Record, options: Options) -> Fit:
+    form = total_least_squares(record.moments, Noise(), np.ones(6), offsets=options.offsets)
+    return Fit(form, np.ones(6), record.moments, np.zeros(len(record.s), bool))
+
+
+def _whitened(record: Record, options: Options) -> Fit:
+    return _weighted(record.moments, replace(options, noise=Noise(options.noise.wrench)), record)
+
+
+def _total(record: Record, options: Options) -> Fit:
+    return _weighted(record.moments, options, record)
+
+
+def _consistent(record: Record, options: Options) -> Fit:
+    def nearest(form: NormalForm) -> Array:
+        return consistent_least_squares(
+            form.gram, form.right, form.theta, options.prior, options.ellipsoid
+        )
+
+    return _weighted(record.moments, options, record, nearest)
+
+
+def _robust(record: Record, options: Options) -> Fit:
+    options = replace(options, noise=Noise(options.noise.wrench))
+    n = len(record.s)
+    moments, weights, rejected = record.moments, np.ones(n), np.zeros(n, bool)
+    for _ in range(_FITS):
+        before = weights
+        form = _weighted(moments, options, record).form
+        weights = np.minimum(1.0, _HUBER / np.maximum(_distances(record, form.theta), _HUBER))
+        if np.abs(weights - before).max() < 0.01:
+            break
+        moments = Moments()
+        moments.add(*record.arrays, weights=weights)
+    for _ in range(_FITS):
+        last = rejected
+        rejected = _distances(record, form.theta) > _REJECT
+        moments = Moments()
+        moments.add(*record.arrays, weights=~rejected)
+        fit = _weighted(moments, options, record)
+        form = fit.form
+        if (rejected == last).all():
+            break
+    return replace(fit, rejected=rejected)
+
+
+METHODS: dict[str, Callable[[Record, Options], Fit]] = {
+    "ordinary": _ordinary,
+    "whitened": _whitened,
+    "robust": _robust,
+    "total": _total,
+    "consistent": _consistent,
+}
+"""The estimators by name, all with one signature."""
+
+DEFAULT_METHOD = "consistent"
+
+NAMES = {
+    "ordinary": "batch least squares",
+    "whitened": "whitened least squares",
+    "robust": "robust least squares",
+    "total": "total least squares",
+    "consistent": "physically consistent least squares",
+}
+"""What `Identification.method` calls them."""
+
+
+def identify_batch(
+    wrench: ArrayLike,
+    s: ArrayLike,
+    omega: ArrayLike,
+    alpha: ArrayLike,
+    *,
+    method: str = DEFAULT_METHOD,
+    noise: Noise | None = None,
+    offsets: bool = True,
+    prior: Prior | None = None,
+    ellipsoid: Ellipsoid | None = None,
+    delay_s: float = 0.0,
+) -> BatchResult:
+    """Load and sensor offsets of a free motion by any of `METHODS`.
+
+    Args:
+        wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
+        s, omega, alpha: (N, 3) specific force a - g [m/s^2], angular velocity [rad/s] and angular
+            acceleration [rad/s^2] of S in S, in the order of time.
+        method: one of `METHODS`.
+        noise: of wrench and motion; default: that of the wrench is estimated, the motion is exact.
+        offsets: whether to estimate the sensor's; otherwise they were subtracted before.
+        prior, ellipsoid: what is known of the load, for "consistent".
+        delay_s: the delay that was taken out of the motion, for the record [s].
+
+    Raises:
+        DrakeTeleopError: for an unknown method, arrays of another shape, numbers that are not
+            finite, fewer than 3 samples, or a wrench that is zero throughout.
+    """
+    if method not in METHODS:
+        raise DrakeTeleopError(f"{method!r} is not one of {sorted(METHODS)}", where="method")
+    if method != "consistent" and (prior, ellipsoid) != (None, None):
+        raise DrakeTeleopError(
+            f"{method!r} takes no prior and no ellipsoid", where="method", remedy="use consistent"
+        )
+    _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+    record = Record(*rows)
+    fit = METHODS[method](record, Options(noise or Noise(), offsets, prior, ellipsoid))
+    equations = NormalEquations(np.diag(fit.form.weights) ** -0.5)
+    kept = ~fit.rejected
+    equations.add(*(rows if kept.all() else [table[kept] for table in rows]))
+    plain = equations.solve(delay_s)
+    theta, Z = fit.form.theta, fit.moments.mean
+    covariance = _covariance(plain.covariance, fit.form, Z, offsets)
+    identification = replace(
+        plain,
+        phi=theta[6:],
+        offsets=theta[:6],
+        covariance=covariance,
+        identifiable=worth_stating(np.sqrt(np.diag(covariance)), theta[6:]),
+        residual_rms=np.sqrt(np.diag(residual_covariance(Z, theta)).clip(0.0)),
+        method=NAMES[method],
+    )
+    return BatchResult(identification, fit.wrench_noise, fit.rejected)
+
+
+def _weighted(
+    moments: Moments,
+    options: Options,
+    record: Record,
+    refine: Callable[[NormalForm], Array] | None = None,
+) -> Fit:
+    """Errors in variables with the noise that is given, or with the residual's."""
+    noise, Z = options.noise, moments.mean
+    if noise.wrench is not None:
+        std = np.asarray(noise.wrench, np.float64)
+    else:
+        std = np.ones(6)
+        floor = _ROUNDING * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
+        floor = np.where(floor > 0.0, floor, 1.0)
+        for known in (Noise(), noise):
+            theta = total_least_squares(moments, known, std, offsets=options.offsets).theta
+            squares = np.diag(residual_covariance(Z, theta))
+            motion = moments.noise_covariance(noise, np.zeros(6))
+            explained = np.diag(residual_covariance(motion, theta))
+            std = np.sqrt(np.maximum(squares - explained, _LEAST_SHARE * squares).clip(floor**2))
+    form = total_least_squares(moments, noise, std, offsets=options.offsets, refine=refine)
+    return Fit(form, std, moments, np.zeros(len(record.s), bool))
+
+
+def _distances(record: Record, theta: Array) -> Array:
+    """(N,) largest residual of a sample's channels over the channel's robust deviation."""
+    n = len(record.s)
+    some = record.residual(theta, slice(0, n, max(1, n // _MEDIAN_SAMPLES)))
+    rms = np.sqrt(np.mean(record.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
+    scale = np.maximum(_NORMAL_MAD * np.median(np.abs(some), axis=0), _ROUNDING * rms)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    out = np.empty(n)
+    for start in range(0, n, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        out[part] = (np.abs(record.residual(theta, part)) / scale).max(axis=1)
+    return out
+
+
+def _covariance(plain: Array, form: NormalForm, Z: Array, offsets: bool) -> Array:
+    """(16, 16) of the form's solution, from that of least squares (module docstring)."""
+    covariance = plain.copy()
+    known = np.isfinite(np.diag(plain))
+    gram, _ = normal_equations(Z, form.weights)
+    if not offsets:  # what is left when the offsets are known
+        inner = plain[:6, :6]
+        covariance -= np.where(known, 1.0, 0.0) * (
+            plain[:, :6] @ np.linalg.pinv(inner, hermitian=True) @ plain[:6]
+        )
+        covariance[:6], covariance[:, :6] = 0.0, 0.0
+        gram[:6, 6:] = gram[6:, :6] = 0.0
+    block = np.ix_(known, known)
+    K = np.linalg.solve(form.gram[block], gram[block])
+    covariance[block] = K @ covariance[block] @ K.T
+    return covariance

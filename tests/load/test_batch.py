@@ -1,0 +1,210 @@
+"""Every batch estimator: exact without noise; each does what it is for."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from load_cases import OFFSETS, TOOL, rich_motion
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.batch import METHODS, NAMES, identify_batch
+from drake_teleop.load.consistent import Prior
+from drake_teleop.load.identification import METHODS as KNOWN_NAMES
+from drake_teleop.load.identification import Identification, identify
+from drake_teleop.load.inertia import mass_com_inertia
+from drake_teleop.load.moments import Noise
+from drake_teleop.load.regressor import non_contact_wrench
+
+TRUTH = np.concatenate([OFFSETS, TOOL])
+WRENCH_NOISE = np.array([0.3, 0.3, 0.5, 0.01, 0.01, 0.005])
+TOOLS = Path(__file__).parents[2] / ".." / "shared" / "data" / "utias_workshop_tools"
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+
+def estimate(result):
+    return np.concatenate([result.identification.offsets, result.identification.phi])
+
+
+def record(samples=2000, noise=0.0, seed=0):
+    motion = rich_motion(samples)
+    F = OFFSETS + non_contact_wrench(*motion, TOOL)
+    return F + noise * WRENCH_NOISE * np.random.default_rng(seed).normal(size=F.shape), *motion
+
+
+def knocks(wrench, seed=0):
+    """Twelve of 30 samples each, 20 N and 1 N m, dying out; (wrench, which samples)."""
+    wrench, hit = wrench.copy(), np.zeros(len(wrench), bool)
+    decay = np.exp(-np.arange(30) / 10.0)[:, None]
+    for start in np.random.default_rng(seed).integers(0, len(wrench) - 30, 12):
+        wrench[start : start + 30] += np.array([20.0, 5.0, -10.0, 0.5, 1.0, 0.2]) * decay
+        hit[start : start + 10] = True
+    return wrench, hit
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("noise", [Noise(), Noise(WRENCH_NOISE, s=0.1, omega=0.01, alpha=1.0)])
+def test_exact_without_noise(method, noise):
+    result = identify_batch(*record(), method=method, noise=noise)
+    np.testing.assert_allclose(estimate(result), TRUTH, rtol=0, atol=1e-9)
+    assert result.identification.identifiable.all()
+    assert result.identification.method == NAMES[method] in KNOWN_NAMES
+    assert not result.rejected.any()
+
+
+@pytest.mark.parametrize("offsets", [True, False])
+def test_whitened_is_least_squares_with_the_channels_noise(offsets):
+    F, *motion = record(noise=1.0)
+    result = identify_batch(F, *motion, method="whitened", noise=Noise(WRENCH_NOISE))
+    expected = identify(F, *motion, noise=WRENCH_NOISE)
+    np.testing.assert_allclose(estimate(result)[6:], expected.phi, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(result.identification.covariance, expected.covariance, rtol=1e-6)
+    np.testing.assert_allclose(result.identification.residual_rms, expected.residual_rms)
+
+
+def test_ordinary_is_least_squares():
+    F, *motion = record(noise=1.0)
+    result = identify_batch(F, *motion, method="ordinary")
+    np.testing.assert_allclose(estimate(result)[6:], identify(F, *motion).phi, rtol=1e-8)
+
+
+def test_noise_is_estimated():
+    F, *motion = record(noise=1.0)
+    result = identify_batch(F, *motion, method="whitened")
+    np.testing.assert_allclose(result.noise, WRENCH_NOISE, rtol=0.08)
+    given = identify_batch(F, *motion, method="whitened", noise=Noise(WRENCH_NOISE))
+    deviations = given.identification.standard_deviations
+    assert (np.abs(estimate(result) - estimate(given)) / deviations).max() < 0.2
+
+
+def test_noise_of_the_motion_is_not_taken_for_the_wrenchs():
+    F, s, omega, alpha = record(4000, noise=1.0)
+    rng = np.random.default_rng(3)
+    arrays = F, s + 0.2 * rng.normal(size=s.shape), omega, alpha + rng.normal(size=s.shape)
+    result = identify_batch(*arrays, method="total", noise=Noise(s=0.2, alpha=1.0))
+    np.testing.assert_allclose(result.noise[:3], WRENCH_NOISE[:3], rtol=0.15)
+
+
+def test_robust_fit_does_without_knocks():
+    F, *motion = record(3000, noise=1.0)
+    undisturbed = identify_batch(F, *motion, method="robust")
+    assert undisturbed.rejected_fraction < 2e-3
+    knocked, hit = knocks(F)
+    plain = identify_batch(knocked, *motion, method="whitened")
+    robust = identify_batch(knocked, *motion, method="robust")
+    assert robust.rejected[hit].all()
+    assert robust.rejected_fraction < 0.14  # 12 x 30 samples are 12 %
+    deviations = undisturbed.identification.standard_deviations
+    shift = np.abs(estimate(robust) - estimate(undisturbed)) / deviations
+    assert shift.max() < 3.0
+    assert (np.abs(estimate(plain) - estimate(undisturbed)) / deviations).max() > 10.0
+    assert robust.identification.samples == (~robust.rejected).sum()
+
+
+def test_robust_fit_does_without_a_short_contact():
+    F, *motion = record(3000, noise=1.0)
+    contact = np.zeros(3000, bool)
+    contact[900:1350] = True
+    F[contact] += [8.0, 0.0, -6.0, 0.0, 0.3, 0.0]
+    result = identify_batch(F, *motion, method="robust")
+    assert result.rejected[contact].all() and result.rejected[~contact].mean() < 2e-3
+    errors = np.abs(estimate(result) - TRUTH) / result.identification.standard_deviations
+    assert errors.max() < 4.5
+
+
+def normalised_errors(method, noise, std, repetitions=60, **options):
+    clean = record(1000)
+    squares = np.zeros(16)
+    for seed in range(repetitions):
+        rng = np.random.default_rng(seed)
+        arrays = [x + e * rng.normal(size=x.shape) for x, e in zip(clean, std, strict=True)]
+        result = identify_batch(*arrays, method=method, noise=noise, **options)
+        deviations = result.identification.standard_deviations
+        squares += ((estimate(result) - TRUTH) / np.where(deviations, deviations, 1.0)) ** 2
+    return squares / repetitions
+
+
+def test_stated_deviations_hold_with_errors_in_variables():
+    noise = Noise(WRENCH_NOISE, s=0.1, omega=0.02, alpha=2.0)
+    errors = normalised_errors("total", noise, [WRENCH_NOISE, 0.1, 0.02, 2.0])
+    assert errors.max() < 2.0
+    assert 0.4 < errors.mean() < 1.3
+
+
+def test_known_offsets():
+    F, *motion = record(noise=1.0)
+    free = identify_batch(F - OFFSETS, *motion)
+    known = identify_batch(F - OFFSETS, *motion, offsets=False)
+    assert (known.identification.offsets == 0.0).all()
+    deviations = known.identification.standard_deviations
+    assert (deviations[:6] == 0.0).all()
+    # To the rounding of the noise, which is estimated from another residual.
+    assert (deviations[6:] <= 1.001 * free.identification.standard_deviations[6:]).all()
+    assert (np.abs(known.identification.phi - TOOL) / deviations[6:]).max() < 4.5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_static_poses_say_nothing_of_the_inertia(method):
+    s = record(50)[1]
+    F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
+    F = F + 0.1 * WRENCH_NOISE * np.random.default_rng(1).normal(size=F.shape)
+    result = identify_batch(F, s, np.zeros(3), np.zeros(3), method=method).identification
+    assert result.identifiable.tolist() == 10 * [True] + 6 * [False]
+    assert np.isinf(result.standard_deviations[10:]).all()
+    assert result.mass == pytest.approx(TOOL[0], rel=0.01)
+    assert method != "consistent" or result.physically_consistent
+
+
+def test_a_file_of_each(tmp_path):
+    for method in METHODS:
+        result = identify_batch(*record(200, noise=1.0), method=method).identification
+        result.save(tmp_path / "identification.json")
+        loaded = Identification.load(tmp_path / "identification.json")
+        np.testing.assert_array_equal(loaded.phi, result.phi)
+        assert loaded.method == NAMES[method]
+
+
+def test_bad_input_is_named():
+    arrays = record(20)
+    with pytest.raises(DrakeTeleopError, match=r"^method: 'guess' is not one of"):
+        identify_batch(*arrays, method="guess")
+    with pytest.raises(DrakeTeleopError, match=r"^method: 'robust' takes no prior"):
+        identify_batch(*arrays, method="robust", prior=Prior(TOOL, 1.0))
+    with pytest.raises(DrakeTeleopError, match="2 samples cannot determine"):
+        identify_batch(*(x[:2] for x in arrays))
+    with pytest.raises(DrakeTeleopError, match="no mass can be told"):
+        identify_batch(np.zeros((20, 6)), *arrays[1:])
+    with pytest.raises(DrakeTeleopError, match=r"^wrench: is not finite at index"):
+        identify_batch(np.full((20, 6), np.nan), *arrays[1:])
+
+
+# ---- the UTIAS workshop tools
+
+
+@pytest.fixture(scope="module")
+def utias():
+    import utias
+
+    if not TOOLS.is_dir():
+        pytest.skip("needs the UTIAS tools, which the project does not ship")
+    return utias
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_tool_without_noise(utias, method):
+    for file in sorted(TOOLS.glob("*.npz")):
+        *arrays, phi = utias.load(file)
+        found = identify_batch(*arrays, method=method).identification.phi
+        mass, com, inertia = utias.errors(found, phi)
+        com /= np.linalg.norm(mass_com_inertia(phi)[1])
+        assert max(mass, com, inertia) < 1e-6, file.stem
+
+
+def test_utias_protocol(utias):
+    for level, methods in utias.run(TOOLS, seeds=5).items():
+        *errors, consistent = methods["consistent"]
+        assert (np.array(errors) <= utias.TARGETS[level][:3]).all(), (level, errors)
+        assert consistent == 100.0
+        assert (np.array(errors[1:]) < np.array(methods["ordinary"][1:3]) / 2.5).all()
