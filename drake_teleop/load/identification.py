@@ -84,6 +84,8 @@ _WEAK, _SMALLEST_SIZE, _GRAVITY = 0.5, 0.03, 9.81
 # Blocks kept, least length of a block in memories of the noise, degrees of freedom to be trusted.
 _MOST_BLOCKS, _WINDOW, _FEWEST_DEGREES = 1024, 4.0, 8.0
 _FEWEST_SAMPLES = 3
+# Residual over wrench that rounding of the sums may leave.
+_ROUNDING = 1e-6
 _OPTIONAL = {"degrees_of_freedom", "prior_dominated", "verdicts"}
 # Where the wrench and the factors of [offset, phi] stand in x of the sums.
 _WRENCH, _MODEL = 1, np.array([0, *range(2, 12)])
@@ -332,7 +334,7 @@ class NormalEquations:
 
     def _covariance(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
         """(16, 16) covariance without infinities and (16,) degrees of freedom of its diagonal."""
-        variances, degrees = self._long_run_variances(theta, inverse)
+        variances, degrees, _ = self._long_run_variances(theta, inverse)
         # What each channel adds to the covariance, and Satterthwaite's degrees of freedom.
         parts = self._channel_grams() * (self._weights**2 * variances)[:, None, None]
         parts = inverse @ parts @ inverse
@@ -402,15 +404,27 @@ class NormalEquations:
             degrees of freedom.
         """
         inverse, _, _ = self._pseudo_inverse()
-        return self._long_run_variances(checked("theta", theta, 16), inverse)
+        return self._long_run_variances(checked("theta", theta, 16), inverse)[:2]
 
-    def _long_run_variances(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
+    def slow_noise(self) -> NDArray[np.bool_]:
+        """(6,) channels whose noise remembers longer than the record can tell, as drift does.
+
+        The standard deviations that follow from them are lower bounds.
+        """
+        inverse, _, _ = self._pseudo_inverse()
+        return self._long_run_variances(inverse @ self.normal_equations()[1], inverse)[2]
+
+    def _long_run_variances(
+        self, theta: Array, inverse: Array
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
         grams = self._channel_grams()
         n = float(self.samples)
         power = self.residual_squares(theta)
         variances, degrees = self._unbiased(power, n, grams, grams, inverse)
         of_samples = variances
-        found = np.zeros(6, dtype=bool)
+        # Rounding in the sums is no noise of the wrench.
+        wrench = self._moments[:, _WRENCH, _WRENCH]
+        found, slow = np.zeros(6, dtype=bool), np.zeros(6, dtype=bool)
         blocks, length = self._blocks[: self._state[0] + 1], float(self._state[1])
         # An unfinished last block would count as much as a full one.
         blocks = blocks[: len(blocks) - (blocks[-1, 0, 0] < length)]
@@ -432,9 +446,11 @@ class NormalEquations:
             variances = np.where(take, corrected, variances)
             degrees = np.where(take, trusted, degrees)
             found |= enough
+            significant = memory > 1.0 + 3.0 * np.sqrt(2.0 / np.maximum(trusted, 1.0))
+            slow = np.where(usable, significant & ~found, slow & ~found)
             even = len(blocks) // 2 * 2
             blocks, length = blocks[0:even:2] + blocks[1:even:2], 2.0 * length
-        return variances, degrees
+        return variances, degrees, slow & (n * of_samples > _ROUNDING**2 * wrench)
 
     def _unbiased(
         self, power: Array, count: float, between: Array, grams: Array, inverse: Array

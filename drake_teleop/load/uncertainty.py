@@ -25,6 +25,9 @@ from drake_teleop.load.identification import (
 from drake_teleop.load.regressor import regressor
 
 _MANY_DEGREES = 1e6  # beyond, Student's t is the normal distribution to six digits
+CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
+"""Names of the wrench channels."""
+
 _UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
 # Directions of the scaled Gram below which nothing is determined (as in `identification`), and
 # coefficients of combinations that count as zero: rounding.
@@ -126,11 +129,14 @@ class BaseParameters:
         directions: of the parameters that are determined but not identified, the independent
             combinations from the best to the worst known, in units natural for the load. One that
             has a share of at most 5 % is identified although its parts are not.
+        slow_noise: names of the wrench channels whose noise remembers longer than the record can
+            tell (drift): the standard deviations are then lower bounds.
     """
 
     combinations: tuple[Combination, ...]
     without_influence: tuple[str, ...]
     directions: tuple[Combination, ...]
+    slow_noise: tuple[str, ...]
 
     @property
     def rank(self) -> int:
@@ -148,9 +154,13 @@ class BaseParameters:
         ]
         for c in self.directions:
             if np.count_nonzero(c.coefficients) == 1 or c.share > WORTH_STATING:
-                lines.append(f"weak: {c} ({100.0 * c.share:.0f} % of what is natural for the load)")
+                much = f"{100.0 * c.share:.0f} % of" if c.share < 1.0 else "more than"
+                lines.append(f"weak: {c} ({much} what is natural for the load)")
             else:
                 lines.append(f"identified although its parts are not: {c}")
+        if self.slow_noise:
+            names = ", ".join(self.slow_noise)
+            lines.append(f"drift or slow noise in {names}: all +- are lower bounds")
         return lines
 
 
@@ -206,7 +216,8 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
         c[weak] = direction / natural[weak]
         directions.append(combination(c, int(weak[np.argmax(np.abs(direction))])))
     names = tuple(PARAMETERS[i] for i in np.flatnonzero(unexcited))
-    return BaseParameters(tuple(combinations), names, tuple(directions))
+    slow = tuple(CHANNELS[i] for i in np.flatnonzero(equations.slow_noise()))
+    return BaseParameters(tuple(combinations), names, tuple(directions), slow)
 
 
 def _sum_in_words(coefficients: Array, leading: int, weights: Array) -> str:

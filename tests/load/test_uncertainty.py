@@ -126,6 +126,28 @@ def test_few_seconds_of_slow_noise_leave_few_degrees_of_freedom():
     assert slow.degrees_of_freedom.max() < 100.0 < fast.degrees_of_freedom.min()
 
 
+def test_slow_noise_is_told():
+    motion = study.motion(1e3, 4.0)
+    ideal = OFFSETS + non_contact_wrench(*motion, TOOL)
+
+    def slow(noise):
+        equations = NormalEquations(NOISE)
+        equations.add(ideal + NOISE * noise, *motion)
+        return base_parameters(equations)
+
+    rng = np.random.default_rng(0)
+    white = rng.normal(size=ideal.shape)
+    assert slow(0.0 * white).slow_noise == ()
+    assert slow(white).slow_noise == ()
+    walk = np.cumsum(white, axis=0) / np.sqrt(len(white))
+    drifting = slow(np.where(np.arange(6) == 4, white + 30.0 * walk, white))
+    assert drifting.slow_noise == ("tau_y",)
+    assert drifting.lines()[-1] == "drift or slow noise in tau_y: all +- are lower bounds"
+    for seed in range(20):
+        noise = study.coloured_noise(np.random.default_rng(seed), len(white), "AR(1) 0.9, 1 kHz")
+        assert slow(noise).slow_noise == ()
+
+
 # ---- intervals
 
 
