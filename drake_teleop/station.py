@@ -234,6 +234,7 @@ def AddSlave(
         "load_estimator": LoadEstimator(
             scenario.load_estimator,
             sensor.wrench_std(),
+            sensor.motion_std(),
             1 / rates.estimator_hz,
             _SAMPLE_SIZE,
             np.zeros(16) if load_estimate is None else load_estimate,

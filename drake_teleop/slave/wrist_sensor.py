@@ -92,6 +92,16 @@ class WristSensorConfig:
         quantum = self.resolution * self.ranges()[:6]
         return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
 
+    def motion_std(self) -> NDArray[np.float64]:
+        """(9,) noise and quantisation of s [m/s^2], omega [rad/s], alpha [rad/s^2].
+
+        Before the filter, as the wrench's. Nothing for omega: the rounding of the encoders is
+        differentiated, and the filter takes its high frequencies away; what is left is small.
+        """
+        quantum = self.resolution * self.ranges()[6:]
+        std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
+        return np.concatenate([std[:3], np.zeros(3), std[3:]])
+
     def ranges(self) -> NDArray[np.float64]:
         """The 12 ranges in the order of the noise."""
         return np.concatenate(
