@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from load_cases import OFFSETS, TOOL, rich_motion
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from load_cases import OFFSETS, TOOL, rich_motion, rotations
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import (
@@ -146,6 +148,45 @@ def test_slow_noise_is_told():
     for seed in range(20):
         noise = study.coloured_noise(np.random.default_rng(seed), len(white), "AR(1) 0.9, 1 kHz")
         assert slow(noise).slow_noise == ()
+
+
+# ---- properties
+
+
+@settings(max_examples=25, deadline=None)
+@given(unit=st.floats(1e-3, 1e3), seed=st.integers(0, 1000))
+def test_covariance_under_units_of_the_wrench(unit, seed):
+    motion = rich_motion(600, seed)
+    wrench = OFFSETS + non_contact_wrench(*motion, TOOL)
+    wrench = wrench + NOISE * np.random.default_rng(seed).normal(size=wrench.shape)
+    one, other = (identify(u * wrench, *motion, noise=u * NOISE) for u in (1.0, unit))
+    np.testing.assert_allclose(other.phi, unit * one.phi, rtol=1e-7, atol=1e-9 * unit)
+    np.testing.assert_allclose(other.standard_deviations, unit * one.standard_deviations, rtol=1e-5)
+    np.testing.assert_allclose(other.degrees_of_freedom, one.degrees_of_freedom, rtol=1e-3)
+    assert other.verdicts == one.verdicts
+
+
+@settings(max_examples=25, deadline=None)
+@given(R=rotations(), seed=st.integers(0, 1000))
+def test_prediction_and_its_uncertainty_do_not_depend_on_the_axes(R, seed):
+    # With isotropic noise and white residuals; R turns the axes of S.
+    motion = rich_motion(600, seed)
+    wrench = OFFSETS + non_contact_wrench(*motion, TOOL)
+    std = np.repeat([0.3, 0.01], 3)
+    wrench = wrench + std * np.random.default_rng(seed).normal(size=wrench.shape)
+    turned = tuple(x @ R.T for x in motion)
+    both = np.kron(np.eye(2), R)
+    one = identify(wrench, *motion, noise=std)
+    other = identify(wrench @ both.T, *turned, noise=std)
+    assert other.mass == pytest.approx(one.mass, rel=1e-9)
+    np.testing.assert_allclose(other.com, R @ one.com, atol=1e-9)
+    np.testing.assert_allclose(other.inertia_com, R @ one.inertia_com @ R.T, atol=1e-9)
+    # The variances of the channels are estimated one by one, and scatter: 600 samples, sqrt(1/600).
+    np.testing.assert_allclose(
+        np.sqrt((wrench_standard_deviations(other, *turned)[::50] ** 2).reshape(-1, 2, 3).sum(2)),
+        np.sqrt((wrench_standard_deviations(one, *motion)[::50] ** 2).reshape(-1, 2, 3).sum(2)),
+        rtol=0.35,
+    )
 
 
 # ---- intervals
