@@ -36,6 +36,8 @@ _STILL_PRIOR = 0.5
 SETTLED = 0.05
 """Default bound of `RecursiveEstimator.settled`."""
 
+# The least share of the largest eigenvalue that is not rounding.
+_ROUNDING = 1e-16
 # What a sample is made of.
 _PARTS = {"wrench": 6, "s": 3, "omega": 3, "alpha": 3, "instruments": 9}
 # The least variance of a row relative to the sum of the variances that it is made of: below it,
@@ -310,7 +312,7 @@ class RecursiveEstimator(ABC):
         information = np.linalg.inv(self.covariance)
         scale = 1.0 / np.sqrt(np.diag(information))
         eigenvalues = np.linalg.eigvalsh(information * np.outer(scale, scale))
-        return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
+        return float(np.sqrt(eigenvalues[-1] / max(eigenvalues[0], _ROUNDING * eigenvalues[-1])))
 
 
 class RecursiveLeastSquares(RecursiveEstimator):

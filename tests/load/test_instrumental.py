@@ -1,0 +1,141 @@
+"""Recursive instrumental variables: no bias, whatever the noise; weak instruments; bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from load_cases import OFFSETS, TOOL, rich_motion
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.instrumental import RecursiveInstrumentalVariables
+from drake_teleop.load.recursive import PRIOR_STD, RecursiveLeastSquares
+from drake_teleop.load.regressor import non_contact_wrench
+
+NOISE = np.repeat([0.25, 0.012], 3)
+MOTION = np.repeat([0.06, 0.002, 1.5], 3)
+TRUTH = np.concatenate([OFFSETS, TOOL])
+INERTIAS = [10, 13, 15]
+REST = np.zeros(3)
+
+
+def record(seed, samples=1500):
+    """Wrench, measured motion, and the motion as commanded: 10 samples late, and 3 % too small."""
+    rng = np.random.default_rng(seed)
+    motion = rich_motion(samples)
+    F = OFFSETS + non_contact_wrench(*motion, TOOL) + NOISE * rng.normal(size=(samples, 6))
+    noise = np.split(MOTION * rng.normal(size=(samples, 9)), 3, axis=1)
+    commanded = 0.97 * np.roll(np.hstack(motion), 10, axis=0)
+    return F, [x + n for x, n in zip(motion, noise, strict=True)], commanded
+
+
+def learnt(F, motion, instruments, **options):
+    estimator = RecursiveInstrumentalVariables(NOISE, **options)
+    estimator.learn(F, *motion, instruments)
+    return estimator
+
+
+def theta(estimator):
+    return np.concatenate([estimator.offsets, estimator.phi])
+
+
+def test_with_the_motion_as_its_own_instrument_it_is_least_squares():
+    F, motion, _ = record(0)
+    own = learnt(F, motion, np.hstack(motion))
+    least = RecursiveLeastSquares(NOISE)
+    least.learn(F, *motion)
+    np.testing.assert_allclose(theta(own), theta(least), rtol=1e-4, atol=1e-6)
+
+
+def test_the_bias_is_gone_without_knowing_the_noise_and_the_covariance_is_honest():
+    errors, leasts, squares = [], [], []
+    for seed in range(30):
+        F, motion, commanded = record(seed)
+        estimator = learnt(F, motion, commanded)
+        errors.append(theta(estimator) - TRUTH)
+        squares.append(np.square(errors[-1]) / np.diag(estimator.covariance))
+        least = RecursiveLeastSquares(NOISE)
+        least.learn(F, *motion)
+        leasts.append(theta(least) - TRUTH)
+    mean = np.mean(leasts, axis=0)
+    assert (np.abs(mean) > 3.0 * np.std(leasts, axis=0) / np.sqrt(30))[INERTIAS].all()
+    assert np.abs(np.mean(errors, axis=0) / mean)[INERTIAS].max() < 0.2
+    honest = np.mean(squares, axis=0)
+    assert honest.min() > 0.3 and honest.max() < 2.2
+    assert honest.mean() == pytest.approx(1.0, abs=0.3)
+
+
+def test_useless_instruments_leave_the_prior():
+    F, motion, _ = record(1)
+    estimator = learnt(F, motion, np.zeros((1500, 9)))
+    assert not estimator.settled
+    assert (np.abs(estimator.phi) < 0.1 * np.array(PRIOR_STD[6:])).all()
+    deviations = np.sqrt(np.diag(estimator.covariance))
+    np.testing.assert_allclose(deviations[6:], PRIOR_STD[6:], rtol=0.05)
+
+
+def test_static_instruments_leave_the_inertia():
+    F, motion, commanded = record(2)
+    commanded[:, 3:] = 0.0
+    result = learnt(F, motion, commanded).identification()
+    assert not result.identifiable[10:].any()
+    assert np.isfinite(result.phi).all()
+
+
+def test_standing_still_does_not_wind_up():
+    F, motion, commanded = record(3)
+    estimator = learnt(F, motion, commanded, forgetting=0.99)
+    s = np.tile([0.0, 0.0, 9.81], (20_000, 1))
+    still = OFFSETS + non_contact_wrench(s, 0.0 * s, 0.0 * s, TOOL)
+    still += NOISE * np.random.default_rng(0).normal(size=still.shape)
+    estimator.learn(still, s, 0.0 * s, 0.0 * s, np.hstack([s, 0.0 * s, 0.0 * s]))
+    assert np.isfinite(theta(estimator)).all()
+    assert (np.abs(estimator.phi) <= PRIOR_STD[6:]).all()
+    deviations = np.sqrt(np.diag(estimator.covariance))
+    assert (deviations <= np.array(PRIOR_STD) * (1 + 1e-9)).all()
+    assert not estimator.settled
+    estimator.learn(F, *motion, commanded)
+    assert estimator.phi[0] == pytest.approx(TOOL[0], abs=0.15)
+
+
+def test_forgetting_follows_a_new_load():
+    thing = np.array([0.5, 0.0, 0.0, 0.06, 0.008, 0.0, 0.0, 0.008, 0.0, 0.001])
+    F, motion, commanded = record(4, samples=3000)
+    estimator = learnt(F, motion, commanded, forgetting=0.995)
+    F += non_contact_wrench(*rich_motion(3000), thing)
+    estimator.learn(F, *motion, commanded)
+    assert estimator.phi[0] == pytest.approx(TOOL[0] + 0.5, abs=0.05)
+
+
+def test_sample_by_sample_on_a_log_and_kept_elsewhere_are_the_same(tmp_path):
+    F, motion, commanded = record(5, samples=400)
+    log = learnt(F, motion, commanded)
+    single, elsewhere = (RecursiveInstrumentalVariables(NOISE) for _ in range(2))
+    state = np.zeros(16)
+    memory = elsewhere.initial_memory(state)
+    for sample in zip(F, *motion, commanded, strict=True):
+        single.update(*sample)
+        elsewhere.update_into(state, memory, np.concatenate(sample))
+    np.testing.assert_array_equal(theta(single), theta(log))
+    np.testing.assert_array_equal(state, theta(log))
+    np.testing.assert_array_equal(elsewhere.covariance_of(state, memory), log.covariance)
+    result = single.identification()
+    assert (result.method, result.samples) == ("recursive instrumental variables", 400)
+    result.save(tmp_path / "identification.json")
+    read = Identification.load(tmp_path / "identification.json")
+    np.testing.assert_array_equal(read.phi, result.phi)
+
+
+def test_bad_input_is_named_and_leaves_the_estimate():
+    F, motion, commanded = record(6, samples=50)
+    estimator = learnt(F, motion, commanded)
+    before = theta(estimator)
+    with pytest.raises(DrakeTeleopError, match="needs instruments"):
+        estimator.update(F[0], REST, REST, REST)
+    with pytest.raises(DrakeTeleopError, match=r"instruments have shapes"):
+        estimator.update(F[0], REST, REST, REST, np.zeros(3))
+    with pytest.raises(DrakeTeleopError, match=r"^sample: is not finite"):
+        estimator.update(F[0], REST, REST, REST, np.full(9, np.inf))
+    np.testing.assert_array_equal(theta(estimator), before)
+    with pytest.raises(DrakeTeleopError, match="no sample has been learnt from"):
+        RecursiveInstrumentalVariables(NOISE).identification()
