@@ -19,8 +19,8 @@ repeated until they stay the same. Of normal noise it rejects one sample in 2500
 
 The covariance is that of `identification.NormalEquations` with the same weights of the rows, so
 coloured noise is accounted for. Errors in variables enlarge it: with G theta_LS = b and
-(G - lambda C) theta = b it is K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G. That of `consistent` is
-of the same fit without the constraint, which is cautious.
+(G - lambda C) theta = b it is K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of
+`consistent` is of the same fit without the constraint, which is cautious.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array, checked_rows
 from drake_teleop.load.consistent import Ellipsoid, Prior, consistent_least_squares
 from drake_teleop.load.identification import Identification, NormalEquations, worth_stating
-from drake_teleop.load.moments import Moments, Noise, normal_equations, residual_covariance
+from drake_teleop.load.moments import Moments, Noise, residual_covariance
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.total_least_squares import NormalForm, total_least_squares
 
@@ -136,12 +136,10 @@ def _total(record: Record, options: Options) -> Fit:
 
 
 def _consistent(record: Record, options: Options) -> Fit:
-    def nearest(form: NormalForm) -> Array:
-        return consistent_least_squares(
-            form.gram, form.right, form.theta, options.prior, options.ellipsoid
-        )
-
-    return _weighted(record.moments, options, record, nearest)
+    fit = _total(record, options)
+    gram, right, theta = fit.form[:3]
+    theta = consistent_least_squares(gram, right, theta, options.prior, options.ellipsoid)
+    return replace(fit, form=fit.form._replace(theta=theta))
 
 
 def _robust(record: Record, options: Options) -> Fit:
@@ -232,7 +230,7 @@ def identify_batch(
     equations.add(*(rows if kept.all() else [table[kept] for table in rows]))
     plain = equations.solve(delay_s)
     theta, Z = fit.form.theta, fit.moments.mean
-    covariance = _covariance(plain.covariance, fit.form, Z, offsets)
+    covariance = _covariance(plain.covariance, fit.form, offsets)
     identification = replace(
         plain,
         phi=theta[6:],
@@ -245,12 +243,7 @@ def identify_batch(
     return BatchResult(identification, fit.wrench_noise, fit.rejected)
 
 
-def _weighted(
-    moments: Moments,
-    options: Options,
-    record: Record,
-    refine: Callable[[NormalForm], Array] | None = None,
-) -> Fit:
+def _weighted(moments: Moments, options: Options, record: Record) -> Fit:
     """Errors in variables with the noise that is given, or with the residual's."""
     noise, Z = options.noise, moments.mean
     if noise.wrench is not None:
@@ -265,7 +258,7 @@ def _weighted(
             motion = moments.noise_covariance(noise, np.zeros(6))
             explained = np.diag(residual_covariance(motion, theta))
             std = np.sqrt(np.maximum(squares - explained, _LEAST_SHARE * squares).clip(floor**2))
-    form = total_least_squares(moments, noise, std, offsets=options.offsets, refine=refine)
+    form = total_least_squares(moments, noise, std, offsets=options.offsets)
     return Fit(form, std, moments, np.zeros(len(record.s), bool))
 
 
@@ -283,19 +276,16 @@ def _distances(record: Record, theta: Array) -> Array:
     return out
 
 
-def _covariance(plain: Array, form: NormalForm, Z: Array, offsets: bool) -> Array:
+def _covariance(plain: Array, form: NormalForm, offsets: bool) -> Array:
     """(16, 16) of the form's solution, from that of least squares (module docstring)."""
-    covariance = plain.copy()
-    known = np.isfinite(np.diag(plain))
-    gram, _ = normal_equations(Z, form.weights)
+    unknown = np.isinf(np.diag(plain))
+    covariance = np.where(unknown[:, None] | unknown, 0.0, plain)
     if not offsets:  # what is left when the offsets are known
-        inner = plain[:6, :6]
-        covariance -= np.where(known, 1.0, 0.0) * (
-            plain[:, :6] @ np.linalg.pinv(inner, hermitian=True) @ plain[:6]
-        )
+        inner = np.linalg.pinv(covariance[:6, :6], hermitian=True)
+        covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0
-        gram[:6, 6:] = gram[6:, :6] = 0.0
-    block = np.ix_(known, known)
-    K = np.linalg.solve(form.gram[block], gram[block])
-    covariance[block] = K @ covariance[block] @ K.T
+    covariance = form.transfer @ covariance @ form.transfer.T
+    unknown = unknown | form.undetermined
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = np.inf
     return covariance

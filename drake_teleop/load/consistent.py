@@ -34,7 +34,8 @@ from drake_teleop.load.inertia import (
 
 _UNITS = [pseudo_inertia(unit) for unit in np.eye(10)]
 _SMALLEST_LENGTH = 1e-3  # of the unit of length [m]
-_RANK = 1e-12  # smallest eigenvalue over the largest that counts as information
+# Smallest eigenvalue over the largest that is information, and what the others are taken for.
+_RANK, _RIDGE = 1e-12, 1e-12
 _PRIORS = ("entropic", "geodesic")
 
 
@@ -112,11 +113,12 @@ def consistent_least_squares(
     if prior is None and inside and is_physically_consistent(theta[6:]):
         return theta
     unit = _units(theta[6:] if prior is None else checked("prior.phi", prior.phi, 10))
-    offsets, cross = np.diag(gram)[:6], gram[:6, 6:]
-    reduced = (gram[6:, 6:] - cross.T @ (cross / offsets[:, None])) * np.outer(unit, unit)
-    linear = (right[6:] - cross.T @ (right[:6] / offsets)) * unit
-    phi = unit * _solve(reduced, linear, unit, prior, row)
-    return np.concatenate([(right[:6] - cross @ phi) / offsets, phi])
+    cross = gram[:6, 6:]
+    offsets = np.linalg.solve(gram[:6, :6], np.column_stack([right[:6], cross]))  # less phi's share
+    reduced = (gram[6:, 6:] - cross.T @ offsets[:, 1:]) * np.outer(unit, unit)
+    linear = (right[6:] - cross.T @ offsets[:, 0]) * unit
+    phi = unit * _solve(0.5 * (reduced + reduced.T), linear, unit, prior, row)
+    return np.concatenate([offsets[:, 0] - offsets[:, 1:] @ phi, phi])
 
 
 def _units(phi: Array) -> Array:
@@ -171,15 +173,17 @@ def _add_distance(program: Any, x: Any, H: Array, b: Array) -> None:
     """Minimises |R x - d|, R^T R = H, R^T d = b: where x^T H x / 2 - b^T x is smallest.
 
     The distance and not its square: the solver stops at 1e-8 of either, and the square root of
-    that would be the error of a load at the edge of consistency.
+    that would be the error of a load at the edge of consistency. What the record does not determine
+    is kept small.
     """
     values, vectors = np.linalg.eigh(H)
-    kept = values > _RANK * values[-1]
-    root = np.sqrt(values[kept] / values[-1])
-    R = root[:, None] * vectors[:, kept].T
-    d = vectors[:, kept].T @ b / (root * values[-1])
+    scale = values[-1]
+    values = values / scale
+    root = np.sqrt(np.maximum(values, _RIDGE))
+    R = root[:, None] * vectors.T
+    d = np.where(values > _RANK, vectors.T @ b / root, 0.0) / scale
     t = program.NewContinuousVariables(1)
-    cone = np.zeros((len(d) + 1, 11))
+    cone = np.zeros((11, 11))
     cone[0, 10], cone[1:, :10] = 1.0, R
     program.AddLorentzConeConstraint(cone, np.append(0.0, -d), np.append(x, t))
     program.AddLinearCost([1.0], t)

@@ -172,13 +172,15 @@ def excited_columns(Z: Array) -> NDArray[np.bool_]:
     return np.diag(normal_equations(Z, np.eye(6))[0]) > _NO_EXCITATION**2
 
 
-def minimum_norm(gram: Array, right: Array, used: NDArray[np.bool_]) -> Array:
-    """(n,) solution of gram theta = right, columns scaled; 0 in what is singular or not used."""
+def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
+    """(n, rank) R with R^T gram R = 1: R R^T right is the minimum norm solution, columns scaled.
+
+    It is 0 in columns that are not used and along singular directions.
+    """
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, np.diag(gram), 1.0)), 0.0)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
     kept = eigenvalues > _RANK * eigenvalues[-1]
-    part = vectors[:, kept]
-    return scale * (part @ ((part.T @ (scale * right)) / eigenvalues[kept]))
+    return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept]), np.float64)
 
 
 @njit(cache=True)

@@ -18,15 +18,20 @@ from the solution and the step repeated, which is the element-wise weighted TLS 
 whose covariance is the same in every sample (Kukush, Van Huffel, Metrika 59, 2004); omega's noise
 has another in every sample, of which this uses the mean. Without noise in the motion C = 0, and it
 is weighted least squares.
+
+Where the motion is no more than its noise, as the angular acceleration in static poses, there is
+nothing to learn, and dividing by the difference of G and lambda C would sell noise for inertias.
+Directions v in which v^T G v exceeds lambda v^T C v by less than the fraction 5 sqrt(2 / N), five
+standard deviations of a sum of squares of N samples of noise, are therefore left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import eigh
+from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array
@@ -34,13 +39,14 @@ from drake_teleop.load.moments import (
     Moments,
     Noise,
     excited_columns,
-    minimum_norm,
+    inverse_root,
     normal_equations,
     residual_covariance,
 )
 
-# At most so many weights, until theta changes by less; and what keeps a singular matrix definite.
-_ITERATIONS, _CONVERGED, _ROUNDING = 10, 1e-8, 1e-14
+# At most so many weights, until theta changes by less; how near to a pole a root may be; and
+# standard deviations of noise that a signal must exceed.
+_ITERATIONS, _CONVERGED, _ROUNDING, _SIGNIFICANT = 10, 1e-8, 1e-12, 5.0
 
 
 class NormalForm(NamedTuple):
@@ -52,6 +58,9 @@ class NormalForm(NamedTuple):
         theta: (16,) [offsets; phi] [SI].
         weights: (6, 6) W between the channels, the inverse of the residual's covariance.
         scale: lambda, residual variance over what the noise predicts.
+        transfer: (16, 16) from the solution of plain least squares with these weights to theta.
+        undetermined: (16,) bools, parameters whose variance in plain least squares comes for the
+            most part from directions that were left out.
     """
 
     gram: Array
@@ -59,6 +68,8 @@ class NormalForm(NamedTuple):
     theta: Array
     weights: Array
     scale: float
+    transfer: Array
+    undetermined: NDArray[np.bool_]
 
 
 def total_least_squares(
@@ -67,7 +78,6 @@ def total_least_squares(
     wrench_noise: Array,
     *,
     offsets: bool = True,
-    refine: Callable[[NormalForm], Array] | None = None,
 ) -> NormalForm:
     """Offsets and load where wrench and motion are noisy.
 
@@ -76,8 +86,6 @@ def total_least_squares(
         noise: of the motion.
         wrench_noise: (6,) standard deviations of the wrench channels [N, N m].
         offsets: whether to estimate them; otherwise they are 0, subtracted already.
-        refine: what becomes of each step's solution, such as the nearest consistent load: form ->
-            theta (16,). It is then that from which the next weights are made.
 
     Raises:
         DrakeTeleopError: for fewer than 3 samples, or if the wrench is zero throughout.
@@ -90,11 +98,10 @@ def total_least_squares(
             remedy="is the sensor connected, and does its orientation change?",
         )
     W: Array = np.diag(wrench_noise**-2.0)
-    before = np.zeros(16)
+    excess = _SIGNIFICANT * np.sqrt(2.0 / moments.samples)
+    before, least = np.zeros(16), excess / (1.0 + excess)
     for _ in range(_ITERATIONS):
-        form = _step(Z, Q, W, offsets)
-        if refine is not None:
-            form = form._replace(theta=refine(form))
+        form = _step(Z, Q, W, offsets, least)
         change = np.linalg.norm(form.theta - before)
         if not noise.motion.any() or change <= _CONVERGED * np.linalg.norm(before):
             break
@@ -103,25 +110,49 @@ def total_least_squares(
     return form
 
 
-def _step(Z: Array, Q: Array, W: Array, offsets: bool) -> NormalForm:
-    """Mixed TLS with the weight W."""
+def _step(Z: Array, Q: Array, W: Array, offsets: bool, least: float) -> NormalForm:
+    """Mixed TLS with the weight W, without directions of which less than `least` is signal."""
     gram, right = normal_equations(Z, W)
     if not offsets:  # uncorrelated with all else, their estimate is 0
         gram[:6, 6:] = gram[6:, :6] = 0.0
         right[:6] = 0.0
     compensation, _ = normal_equations(Q, W)
-    # The smallest lambda with [gram, -right; -right^T, tr(W Z_F)] - lambda [C, 0; 0, tr(W Q_F)]
-    # singular is the largest reciprocal of the pencil turned round.
-    whole, noise = np.zeros((17, 17)), np.zeros((17, 17))
-    whole[:16, :16], whole[16, 16] = gram, np.sum(W * Z[1:7, 1:7])
-    whole[16, :16] = whole[:16, 16] = -right
-    noise[:16, :16], noise[16, 16] = compensation, np.sum(W * Q[1:7, 1:7])
-    used = excited_columns(Z)
-    kept = np.append(used, True)
-    unit = 1.0 / np.sqrt(np.diag(whole)[kept])
-    whole = whole[np.ix_(kept, kept)] * np.outer(unit, unit)
-    whole += _ROUNDING * np.eye(len(whole))  # a record without noise is singular
-    noise = noise[np.ix_(kept, kept)] * np.outer(unit, unit)
-    scale = 1.0 / float(eigh(noise, whole, eigvals_only=True)[-1])
-    gram = gram - scale * compensation
-    return NormalForm(gram, right, minimum_norm(gram, right, used), W, scale)
+    root = inverse_root(gram, excited_columns(Z))
+    # In these coordinates G is the identity: nu is the share of noise in each direction.
+    nu, vectors = np.linalg.eigh(root.T @ compensation @ root)
+    basis = root @ vectors
+    scale = _ratio(basis.T @ right, nu, float(np.sum(W * Z[1:7, 1:7])), np.sum(W * Q[1:7, 1:7]))
+    gain = 1.0 - scale * nu
+    kept = gain > (least if nu[-1] > 0.0 else 0.0)
+    inverse = (basis[:, kept] / gain[kept]) @ basis[:, kept].T
+    theta = inverse @ right
+    if not offsets:
+        theta[:6] = 0.0
+    along = gram @ basis[:, kept]
+    variance = np.sum(basis**2, axis=1)
+    return NormalForm(
+        gram=(along * gain[kept]) @ along.T,
+        right=along @ (basis[:, kept].T @ right),
+        theta=theta,
+        weights=W,
+        scale=scale,
+        transfer=inverse @ gram,
+        undetermined=np.sum(basis[:, ~kept] ** 2, axis=1) > 0.5 * variance,
+    )
+
+
+def _ratio(right: Array, nu: Array, squares: float, noise: float) -> float:
+    """The smallest lambda with [I, -b; -b^T, squares] - lambda [diag(nu), 0; 0, noise] singular.
+
+    It is the one root below 1 / max nu of the secular equation.
+    """
+
+    def excess(ratio: float) -> float:
+        return float(squares - ratio * noise - np.sum(right**2 / (1.0 - ratio * nu)))
+
+    highest = squares / noise
+    if highest * nu[-1] >= 1.0:
+        highest = (1.0 - _ROUNDING) / nu[-1]
+    if excess(0.0) <= 0.0:  # no residual
+        return 0.0
+    return highest if excess(highest) >= 0.0 else float(brentq(excess, 0.0, highest, rtol=1e-14))

@@ -10,11 +10,15 @@ import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.batch import METHODS, NAMES, identify_batch
+from drake_teleop.load.batch import METHODS, NAMES, Options, Record, identify_batch
 from drake_teleop.load.consistent import Prior
 from drake_teleop.load.identification import METHODS as KNOWN_NAMES
 from drake_teleop.load.identification import Identification, identify
-from drake_teleop.load.inertia import mass_com_inertia
+from drake_teleop.load.inertia import (
+    is_physically_consistent,
+    mass_com_inertia,
+    phi_from_mass_com_inertia,
+)
 from drake_teleop.load.moments import Noise
 from drake_teleop.load.regressor import non_contact_wrench
 
@@ -133,6 +137,28 @@ def test_stated_deviations_hold_with_errors_in_variables():
     assert 0.4 < errors.mean() < 1.3
 
 
+def test_consistent_is_the_constrained_total():
+    """With offsets, and noise that correlates the channels."""
+    plate = phi_from_mass_com_inertia(0.3, [0, 0.01, 0.1], np.diag([1e-3, 2e-3, 3e-3]))
+    motion = rich_motion(1000)
+    F = OFFSETS + non_contact_wrench(*motion, plate)
+    noise, cost = Noise(WRENCH_NOISE, s=0.3, alpha=3.0), []
+    rng = np.random.default_rng(4)
+    F = F + WRENCH_NOISE * rng.normal(size=F.shape)
+    s, omega, alpha = motion
+    s, alpha = s + 0.3 * rng.normal(size=s.shape), alpha + 3.0 * rng.normal(size=s.shape)
+    fits = [METHODS[m](Record(F, s, omega, alpha), Options(noise)) for m in ("total", "consistent")]
+    gram, right, free = fits[0].form[:3]
+    found = fits[1].form.theta
+    assert not is_physically_consistent(free[6:]) and is_physically_consistent(found[6:])
+    truth = np.concatenate([OFFSETS, plate])
+    for theta in (free, found, truth):
+        cost.append(theta @ gram @ theta - 2.0 * right @ theta)
+    assert cost[0] < cost[1] < cost[2]
+    # The offsets are the best for this load.
+    np.testing.assert_allclose((gram @ found - right)[:6], 0.0, atol=1e-8 * np.abs(right).max())
+
+
 def test_known_offsets():
     F, *motion = record(noise=1.0)
     free = identify_batch(F - OFFSETS, *motion)
@@ -155,6 +181,26 @@ def test_static_poses_say_nothing_of_the_inertia(method):
     assert np.isinf(result.standard_deviations[10:]).all()
     assert result.mass == pytest.approx(TOOL[0], rel=0.01)
     assert method != "consistent" or result.physically_consistent
+
+
+@pytest.mark.parametrize("method", ["total", "consistent"])
+def test_noise_is_not_taken_for_excitation(method):
+    s = np.repeat(static_poses(), 100, axis=0)
+    rng = np.random.default_rng(2)
+    F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
+    F = F + WRENCH_NOISE * rng.normal(size=F.shape)
+    motion = [x + e * rng.normal(size=s.shape) for x, e in ((s, 0.06), (0.0, 0.002), (0.0, 1.5))]
+    noise = Noise(s=0.06, omega=0.002, alpha=1.5)
+    result = identify_batch(F, *motion, method=method, noise=noise).identification
+    assert result.identifiable.tolist() == 10 * [True] + 6 * [False]
+    assert result.mass == pytest.approx(TOOL[0], rel=0.005)
+    np.testing.assert_allclose(result.com, TOOL[1:4] / TOOL[0], atol=1e-3)
+    assert np.abs(result.phi[4:]).max() < 0.1
+
+
+def static_poses():
+    up = np.random.default_rng(1).normal(size=(24, 3))
+    return 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
 def test_a_file_of_each(tmp_path):
