@@ -1,0 +1,43 @@
+"""The errors-in-variables benchmark with 20 seeds."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FILE = Path(__file__).parents[2] / "benchmarks" / "errors_in_variables.py"
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    spec = importlib.util.spec_from_file_location("errors_in_variables", FILE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_motion_is_that_of_a_body(benchmark):
+    """alpha is the derivative of omega, and turning s with the body leaves gravity in the mean."""
+    s, omega, alpha = benchmark.motion()
+    change = np.gradient(omega, 1 / benchmark.RATE, axis=0)[1:-1]
+    np.testing.assert_allclose(change, alpha[1:-1], atol=0.01 * np.abs(alpha).max())
+    assert np.linalg.norm(s, axis=1).mean() == pytest.approx(9.81, rel=0.1)
+    assert 2.0 < np.abs(alpha).max() < 60.0
+
+
+@pytest.mark.parametrize("level", ["JR3", "UTIAS High"])
+def test_total_least_squares_and_instruments_take_out_the_bias(benchmark, level):
+    figures = benchmark.summary(benchmark.study(level, 20))
+    assert {"I_xx", "I_yy", "I_zz"} <= set(figures["biased"])
+    for name in ("RIV", "RTLS"):
+        # A fifth of the bias, or of its own scatter what 20 records cannot tell from none.
+        ratio = np.array(figures[name]["bias_over_rls"])
+        own = np.array(figures[name]["bias_over_own_standard_error"])
+        assert ((ratio <= 0.2) | (own <= 3.0)).all()
+        inertias = [figures["biased"].index(parameter) for parameter in ("I_xx", "I_yy", "I_zz")]
+        assert ratio[inertias].max() <= 0.2
+    assert figures["RTLS"]["mass_error_max_percent"] <= 2.0
+    assert figures["RTLS"]["com_error_max_percent"] <= 5.0
