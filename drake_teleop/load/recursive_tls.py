@@ -49,6 +49,8 @@ _EXCESS = 4.0
 _SIZE = 0.1
 # The least pivot relative to its diagonal element: below it is rounding.
 _PIVOT = 1e-13
+# Share of the sum of squared wrenches below which a residual is rounding.
+_RESOLUTION = 1e-14
 # Samples from which on the residuals tell the scale of the noise.
 _FEWEST = 20
 
@@ -425,17 +427,17 @@ class RecursiveTotalLeastSquares(RecursiveEstimator):
         G, N, Q = (_whole(memory[i : i + 16]) for i in (0, 16, 32))
         samples = memory[49, 2]
         scale = _noise_scale(theta, memory) if samples > _FEWEST else 1.0
-        root = np.linalg.inv(np.linalg.cholesky(G + _PIVOT * np.diag(np.diag(G))))
+        root = np.linalg.inv(_root(G))
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
         excess = 1.0 - shares
         excited = (shares < _PIVOT) | (excess > _EXCESS * math.sqrt(2.0 / max(samples, 1.0)))
         inverse = (directions[:, excited] / excess[excited]) @ directions[:, excited].T
         information = np.diag(1.0 / self._prior)
-        covariance = inverse @ (scale * (Q - information) + information) @ inverse
+        half = inverse @ _root(scale * (Q - information) + information)
         unknown = directions[:, ~excited]
         unknown = unknown / np.sqrt(np.sum(unknown**2 / self._prior[:, None], axis=0))
-        covariance += unknown @ unknown.T
+        covariance = half @ half.T + unknown @ unknown.T
         # Forgetting's mixture of old and new can exceed the prior, which bounds what is unknown.
         wider = np.sqrt(np.diag(covariance) / self._prior)
         shrink = 1.0 / np.maximum(1.0, wider)
@@ -462,7 +464,12 @@ def _whole(lower: Array) -> Array:
     return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
 
+def _root(A: Array) -> Array:
+    """The Cholesky factor of A, its diagonal raised by what is rounding."""
+    return np.asarray(np.linalg.cholesky(A + _PIVOT * np.diag(np.diag(A))))
+
+
 def _noise_scale(theta: Array, memory: Array) -> float:
     G, N, (right, sums) = _whole(memory[:16]), _whole(memory[16:32]), memory[48:]
-    above = sums[0] - 2.0 * theta @ right + theta @ G @ theta
-    return float(max(0.0, above) / (sums[1] + theta @ N @ theta)) if sums[1] > 0.0 else 1.0
+    above = max(sums[0] - 2.0 * theta @ right + theta @ G @ theta, _RESOLUTION * sums[0])
+    return float(above / (sums[1] + theta @ N @ theta)) if sums[1] > 0.0 else 1.0

@@ -156,13 +156,18 @@ def test_forgetting_follows_a_new_load():
     assert estimator.phi[0] == pytest.approx(TOOL[0] + 0.5, abs=0.05)
 
 
-def test_an_ideal_sensor_is_no_trouble():
+@pytest.mark.parametrize("motion_std", [0.0, 1e-6])
+@pytest.mark.parametrize("noise_std", [1e-9, 1e-6])
+def test_an_ideal_sensor_is_no_trouble(noise_std, motion_std):
     motion = rich_motion(3000)
     F = OFFSETS + non_contact_wrench(*motion, TOOL)
-    estimator = RecursiveTotalLeastSquares(np.full(6, 1e-6), np.full(9, 1e-6))
-    estimator.learn(F, *motion)
+    estimator = RecursiveTotalLeastSquares(np.full(6, noise_std), np.full(9, motion_std))
+    for part in np.split(np.arange(3000), [1, 2, 5, 20, 200]):
+        estimator.learn(F[part], *(x[part] for x in motion))
+        assert (np.linalg.eigvalsh(estimator.covariance) >= -1e-12).all()
     np.testing.assert_allclose(estimator.phi, TOOL, rtol=0, atol=1e-7)
     np.testing.assert_allclose(estimator.offsets, OFFSETS, rtol=0, atol=1e-6)
+    assert estimator.settled and estimator.identification().identifiable.all()
 
 
 def test_sample_by_sample_on_a_log_and_kept_elsewhere_are_the_same():
