@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from load_cases import OFFSETS, TOOL, rich_motion
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from load_cases import OFFSETS, TOOL, rich_motion, rotations
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.batch import METHODS, NAMES, Options, Record, identify_batch
@@ -18,6 +20,7 @@ from drake_teleop.load.inertia import (
     is_physically_consistent,
     mass_com_inertia,
     phi_from_mass_com_inertia,
+    transform_phi,
 )
 from drake_teleop.load.moments import Noise
 from drake_teleop.load.regressor import non_contact_wrench
@@ -201,6 +204,32 @@ def test_noise_is_not_taken_for_excitation(method):
 def static_poses():
     up = np.random.default_rng(1).normal(size=(24, 3))
     return 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("method", ["whitened", "robust", "total"])
+@settings(max_examples=15, deadline=None)
+@given(rotation=rotations(), seed=st.integers(0, 1000), force=st.floats(0.1, 10.0))
+def test_order_frame_and_units_do_not_matter(method, rotation, seed, force):
+    isotropic = np.repeat([0.3, 0.01], 3)
+    noise = Noise(isotropic, s=0.1, omega=0.01, alpha=1.0)
+    F, *motion = record(300, noise=1.0, seed=seed)
+
+    def phi(wrench, motion, noise):
+        return identify_batch(wrench, *motion, method=method, noise=noise).identification.phi
+
+    expected, scale = phi(F, motion, noise), np.repeat([1.0, 0.1, 0.01], [1, 3, 6])
+    order = np.random.default_rng(seed).permutation(300)
+    shuffled = phi(F[order], [x[order] for x in motion], noise)
+    np.testing.assert_allclose(shuffled / scale, expected / scale, rtol=0, atol=1e-7)
+    # Forces in other units: the load is heavier by as much.
+    other = Noise(force * isotropic, s=0.1, omega=0.01, alpha=1.0)
+    scaled = phi(force * F, motion, other) / force
+    np.testing.assert_allclose(scaled / scale, expected / scale, rtol=0, atol=1e-6)
+    if method != "robust":  # which looks at one axis after the other
+        turned = (F.reshape(-1, 2, 3) @ rotation.T).reshape(-1, 6)
+        back = phi(turned, [x @ rotation.T for x in motion], noise)
+        back = transform_phi(back, rotation.T, np.zeros(3))
+        np.testing.assert_allclose(back / scale, expected / scale, rtol=0, atol=1e-6)
 
 
 def test_a_file_of_each(tmp_path):
