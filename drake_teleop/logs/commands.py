@@ -30,6 +30,8 @@ verdicts               of each parameter: identified, weakly, not, prior; see
 identifiable           the names of what the record determines
 not_identifiable       the names of what it does not: do not use their values
 physically_consistent  whether phi belongs to a possible body
+method                 of the fit, in words
+rejected               share of the samples that a robust fit took for disturbed and left out
 condition_number       of the regression
 residual_rms           [f; tau], after the fit
 residual_rms_force     of |F|
@@ -87,6 +89,7 @@ def identify_command(
     out: Path,
     *,
     gripper: Path | None = None,
+    method: str = "ordinary",
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     quiet: bool = False,
@@ -97,6 +100,7 @@ def identify_command(
     on one page; fit.png, the upper half of it.
 
     Args:
+        method: of the fit, one of `drake_teleop.load.batch.METHODS`.
         gripper: identification.json of the gripper alone; then the object's object.json, of the
             same format, is written too (see `drake_teleop.load.gripper`).
 
@@ -104,7 +108,7 @@ def identify_command(
         the summary; its names are explained at the top of this module.
     """
     gripper_load = None if gripper is None else Identification.load(gripper)
-    found = identify_log(log, cutoff_hz=cutoff_hz, delay=delay)
+    found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
     alone = None if gripper_load is None else identified_object(result, gripper_load)
     summary = _common(log, found.log, cutoff_hz, result.delay_s, found.delay_source) | {
@@ -112,6 +116,8 @@ def identify_command(
         **_load_figures(result),
         "offsets": result.offsets,
         "offsets_std": result.standard_deviations[:6],
+        "method": result.method,
+        "rejected": found.rejected.mean(),
         "condition_number": result.condition_number,
         "residual_rms": result.residual_rms,
         "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
@@ -387,6 +393,8 @@ def _print_identification(summary: dict[str, Any], out: Path) -> None:
         f"residual {summary['residual_rms_force']:.4g} N rms of |F|,"
         f" condition number {summary['condition_number']:.3g}, {summary['samples']} samples"
     )
+    if summary["rejected"] > 0:
+        figures += f"; {summary['rejected']:.1%} of them rejected as disturbed"
     _print(table, figures, summary, out)
 
 

@@ -52,7 +52,7 @@ _MEASURED = "#A3AAB5"
 def draw_fit(found: IdentifiedLog) -> Figure:
     """Six channels: measured, offsets + V phi, and the residual, from which the offsets are gone.
 
-    The three forces share one scale, and so do the three torques.
+    The three forces share one scale, and so do the three torques. Rejected samples are shaded.
     """
     with house_style():
         figure = Picture(figsize=(10, 7))
@@ -120,6 +120,8 @@ def _fit_into(figure: Any, found: IdentifiedLog) -> None:
         _draw(axis, log.t, [(n, w[:, i], c) for n, w, c in curves], log.static)
         unit = "N" if i < 3 else "N m"
         axis.set_title(f"{_CHANNELS[i]}: residual {rms[i]:.3g} {unit} rms")
+        if not log.static:
+            shade_contact(axis, log.t, found.rejected)
     _finish(figure, axes, title, log, result.delay_s)
 
 

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.batch import identify_batch
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta
 from drake_teleop.load.gripper import identified_object
-from drake_teleop.load.identification import PARAMETERS, Identification, identify
+from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.alignment import low_pass, low_passed, undelayed
@@ -31,12 +32,14 @@ class IdentifiedLog:
         identification: the result.
         predicted: (N, 6) offsets + V phi at the same instants.
         delay_source: as in the summary: "estimated", "given" ...
+        rejected: (N,) samples that the method "robust" took for disturbed; none by any other.
     """
 
     log: Log
     identification: Identification
     predicted: NDArray[np.float64]
     delay_source: str
+    rejected: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,11 @@ class EliminatedLog:
 
 
 def identify_log(
-    path: str | Path, *, cutoff_hz: float | None = 30.0, delay: str | float = "auto"
+    path: str | Path,
+    *,
+    method: str = "ordinary",
+    cutoff_hz: float | None = 30.0,
+    delay: str | float = "auto",
 ) -> IdentifiedLog:
     """Identifies the load and the sensor's offsets from a log.
 
@@ -88,16 +95,19 @@ def identify_log(
 
     Args:
         path: canonical table or log description.
+        method: one of `drake_teleop.load.batch.METHODS`; the motion is taken as exact.
         cutoff_hz: of the low-pass; None for none.
         delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
 
     Raises:
-        DrakeTeleopError: if the log cannot be used, or the fitted mass is negative.
+        DrakeTeleopError: if the log cannot be used, the method is unknown, or the fitted mass is
+            negative.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz)
     delay_s, source = _delay(log, cutoff_hz, delay)
     log = low_passed(undelayed(log, delay_s), cutoff_hz)
-    result = identify(log.wrench, *log.motion, delay_s=delay_s)
+    fit = identify_batch(log.wrench, *log.motion, method=method, delay_s=delay_s)
+    result = fit.identification
     if result.mass < 0 and result.identifiable[6]:
         raise DrakeTeleopError(
             f"the fitted mass is {result.mass:.4g} kg: the sign of the wrench is probably inverted",
@@ -105,7 +115,7 @@ def identify_log(
             remedy="set `sign: -1` in the log description (or remove it if it is there)",
         )
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
-    return IdentifiedLog(log, result, predicted, source)
+    return IdentifiedLog(log, result, predicted, source, fit.rejected)
 
 
 def eliminate_log(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from known_motion import motion_at
 
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import PARAMETERS, identify
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
@@ -16,6 +18,7 @@ from drake_teleop.logs.canonical import Log, write_log
 from drake_teleop.logs.commands import identify_command
 from drake_teleop.logs.pictures import draw_report, spectrum
 from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.reading import read_log
 from drake_teleop.logs.report import parameter_rows
 
 PHI = phi_from_mass_com_inertia(1.9, [0.0, 0.01, 0.09], np.diag([0.008, 0.007, 0.004]))
@@ -109,3 +112,28 @@ def test_the_spectrum_has_the_power_of_the_signal() -> None:
     t = dt * np.arange(40_000)
     rate, density = spectrum(np.sin(2 * np.pi * 50 * t)[:, None], dt)
     assert rate[np.argmax(density)] == pytest.approx(50, abs=0.3)
+
+
+def test_a_robust_fit_says_what_it_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = record(tmp_path / "log.parquet")
+    whole = identify_command(log, tmp_path / "a", delay=0.0, method="ordinary")
+    assert whole["rejected"] == 0.0 and whole["method"] == "batch least squares"
+    assert "rejected" not in capsys.readouterr().out
+    tapped = read_log(log)
+    wrench = tapped.wrench.copy()
+    wrench[600:640] += [30.0, -20.0, 40.0, 2.0, 1.0, 0.5]
+    write_log(replace(tapped, wrench=wrench), tmp_path / "tapped.parquet")
+    errors = {}
+    for method in ("ordinary", "robust"):
+        summary = identify_command(tmp_path / "tapped.parquet", tmp_path / method, method=method,
+                                   delay=0.0)  # fmt: skip
+        errors[method] = np.linalg.norm(np.array(summary["phi"])[:4] - PHI[:4])
+    assert summary["method"] == "robust least squares"
+    # The low-pass at 30 Hz lengthens the 40 samples by some 20.
+    assert 40 / 1500 < summary["rejected"] < 90 / 1500
+    assert "rejected as disturbed" in capsys.readouterr().out
+    assert errors["robust"] < 0.1 * errors["ordinary"]
+    with pytest.raises(DrakeTeleopError, match="'best' is not one of"):
+        identify_log(log, method="best")
