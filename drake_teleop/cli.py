@@ -115,6 +115,13 @@ def run(scenario: str, out: Path, seed: int | None, quiet: bool) -> None:
 @cli.command()
 @click.argument("log", type=_PATH)
 @_gripper
+@click.option(
+    "--method",
+    type=click.Choice(["ordinary", "whitened", "robust", "consistent"]),
+    default="ordinary",
+    show_default=True,
+    help="Least squares; rows by their noise; without knocks; of a possible body.",
+)
 @_out("identify")
 @_cutoff
 @_delay
@@ -122,6 +129,7 @@ def run(scenario: str, out: Path, seed: int | None, quiet: bool) -> None:
 def identify(
     log: Path,
     gripper: Path | None,
+    method: str,
     out: Path,
     cutoff_hz: float,
     delay: float | str,
@@ -134,7 +142,15 @@ def identify(
     """
     from drake_teleop.logs.commands import identify_command
 
-    identify_command(log, out, gripper=gripper, cutoff_hz=cutoff_hz, delay=delay, quiet=quiet)
+    identify_command(
+        log,
+        out,
+        gripper=gripper,
+        method=method,
+        cutoff_hz=cutoff_hz,
+        delay=delay,
+        quiet=quiet,
+    )
 
 
 @cli.command()

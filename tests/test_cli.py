@@ -139,7 +139,13 @@ def test_options_reach_the_commands(capsys, install):
         ((Path("out/r"),), {"seed": None, "quiet": False}),
         (
             (Path("a.yaml"), Path("out/identify")),
-            {"gripper": None, "cutoff_hz": 30.0, "delay": 0.006, "quiet": False},
+            {
+                "gripper": None,
+                "method": "ordinary",
+                "cutoff_hz": 30.0,
+                "delay": 0.006,
+                "quiet": False,
+            },
         ),
     ]
 
