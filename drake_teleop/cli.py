@@ -219,6 +219,21 @@ def eliminate(
     )
 
 
+@cli.command()
+@click.argument("log", type=_PATH)
+@_out("inspect")
+@_quiet
+def inspect(log: Path, out: Path, quiet: bool) -> None:
+    """Say what is in a log and what is suspicious in it.
+
+    LOG is a canonical log, a log description (.yaml), or a table of any columns, for which a draft
+    description is written. Rates, gaps, noise, saturation and suspected errors of convention.
+    """
+    from drake_teleop.logs.inspection import inspect_command
+
+    inspect_command(log, out, quiet=quiet)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command line and exits: 0, 2 for unusable input, 130 for Ctrl-C."""
     try:

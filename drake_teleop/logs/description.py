@@ -127,6 +127,7 @@ class Orientation(_Strict):
     columns: tuple[Column, ...]
     form: Literal["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector"]
     unit: Literal["rad", "deg"] = "rad"
+    inverse: bool = Field(default=False, description="the columns hold R_SW, the world in S")
 
 
 class Position(_Strict):

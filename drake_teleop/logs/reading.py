@@ -90,6 +90,27 @@ def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
     )
 
 
+def read_description(
+    description: Description,
+    source: str,
+    *,
+    tables: dict[Path, Table] | None = None,
+    bandwidth_hz: float | None = 30.0,
+) -> Log:
+    """The log of a description in memory; arguments as those of `read_log`.
+
+    Args:
+        description: with absolute paths.
+        source: the file, for messages.
+        tables: files that are read already.
+        bandwidth_hz: of the smoother that differentiates.
+
+    Raises:
+        DrakeTeleopError: if the log cannot be used.
+    """
+    return _Reader(description, source, tables).log(bandwidth_hz)
+
+
 class _Reader:
     """Reads the streams of one description; holds what they have in common."""
 
@@ -309,7 +330,7 @@ class _Reader:
                 where=where,
                 remedy=f"check the columns and their order; form is {orientation.form}",
             )
-        return nearest_rotation(R)
+        return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def _common_time(
         self, wrench_t: NDArray[np.float64], streams: Sequence[_Stream]

@@ -73,6 +73,24 @@ class Table:
             )
         return np.hstack(columns)
 
+    def raw(self, name: str | int, where: str) -> NDArray[np.float64]:
+        """(N, k) numbers of one column, whatever they are: NaN and infinity included.
+
+        Args:
+            name: of the column.
+            where: the field that names it, for messages.
+
+        Raises:
+            DrakeTeleopError: if the column is absent or a cell is no number.
+        """
+        name = str(name)
+        if name not in self.columns:
+            return self._column(name, where)
+        column = self.columns[name]
+        return _as_numbers(column, lambda row, cell: self._bad(name, row, cell)).reshape(
+            len(column), -1
+        )
+
     def _column(self, name: str, where: str) -> NDArray[np.float64]:
         if name not in self.columns:
             near = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
