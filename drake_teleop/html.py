@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -38,4 +39,13 @@ def embedded(figure: Figure, dpi: int = 160) -> str:
     """The figure as a PNG in a data: URL."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return _data(buffer.getvalue())
+
+
+def embedded_png(path: Path) -> str:
+    """A PNG file in a data: URL."""
+    return _data(path.read_bytes())
+
+
+def _data(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode()

@@ -96,8 +96,8 @@ def identify_command(
 ) -> dict[str, Any]:
     """`identify_log`, writing its results into `out`.
 
-    Files: identification.json; summary.json; report.html; report.png, the pictures of the report
-    on one page; fit.png, the upper half of it.
+    Files: identification.json; summary.json; report.html; fit.png and knowledge.png, its
+    pictures; report.png, both on one page.
 
     Args:
         method: of the fit, one of `drake_teleop.load.batch.METHODS`.
@@ -126,7 +126,7 @@ def identify_command(
         summary |= {"gripper": str(gripper), "object": _object_figures(alone)}
         summary["notes"] += _object_notes(alone)
     summary = _plain(summary)
-    from drake_teleop.logs.pictures import draw_fit, draw_report
+    from drake_teleop.logs.pictures import draw_fit, draw_knowledge, one_page
     from drake_teleop.logs.report import write_report
 
     out.mkdir(parents=True, exist_ok=True)
@@ -134,7 +134,8 @@ def identify_command(
     if alone is not None:
         alone.save(out / "object.json")
     draw_fit(found).savefig(out / "fit.png")
-    draw_report(found).savefig(out / "report.png")
+    draw_knowledge(found).savefig(out / "knowledge.png")
+    one_page(out / "fit.png", out / "knowledge.png", out / "report.png")
     write_report(out / "report.html", found, summary, alone)
     _write_summary(out, summary)
     if not quiet:

@@ -68,14 +68,11 @@ def draw_knowledge(found: IdentifiedLog) -> Figure:
     return figure
 
 
-def draw_report(found: IdentifiedLog) -> Figure:
-    """One page: `draw_fit` above `draw_knowledge`."""
-    with house_style():
-        figure = Picture(figsize=(10, 14.4))
-        top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[7, 7.4])[:, 0]
-        _fit_into(top, found)
-        _knowledge_into(below, found)
-    return figure
+def one_page(upper: Path, lower: Path, page: Path) -> None:
+    """Writes two PNG files of the same width as one, the first above the second."""
+    from matplotlib.image import imread, imsave
+
+    imsave(page, np.concatenate([imread(upper), imread(lower)]))
 
 
 def spectrum(x: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.html import embedded, render
+from drake_teleop.html import embedded_png, render
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.uncertainty import intervals
-from drake_teleop.logs.pictures import VERDICT_WORDS, draw_fit, draw_knowledge
+from drake_teleop.logs.pictures import VERDICT_WORDS
 from drake_teleop.logs.processing import IdentifiedLog
 
 # Eq. (7): symbol, index, unit as printed, and how many of it an SI unit has.
@@ -75,7 +75,7 @@ def write_report(
     """Writes the page; pictures are inside it, so that it can be moved and mailed.
 
     Args:
-        path: of the HTML file.
+        path: of the HTML file; fit.png and knowledge.png are next to it already.
         found: what was identified.
         summary: the figures of `identify_command`.
         alone: the object, if the gripper was known.
@@ -117,12 +117,12 @@ def write_report(
         figures=[
             (
                 "Fit",
-                embedded(draw_fit(found)),
+                embedded_png(path.parent / "fit.png"),
                 "Measured wrench and V φ without the offsets, and what is left between them.",
             ),
             (
                 "What the record determines",
-                embedded(draw_knowledge(found)),
+                embedded_png(path.parent / "knowledge.png"),
                 f"Top: the residual at {spectrum}. Below: each parameter with its interval, and "
                 "its standard deviation, as shares of what is natural for a load of this mass and "
                 "size: up to 5 % it is identified, up to 50 % weakly, beyond that not.",

@@ -16,7 +16,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.canonical import Log, write_log
 from drake_teleop.logs.commands import identify_command
-from drake_teleop.logs.pictures import draw_report, spectrum
+from drake_teleop.logs.pictures import draw_fit, draw_knowledge, spectrum
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.reading import read_log
 from drake_teleop.logs.report import parameter_rows
@@ -89,8 +89,7 @@ def test_static_poses_have_a_page_too(tmp_path: Path) -> None:
 
 def test_the_page_of_pictures_shows_all_channels_and_parameters(tmp_path: Path) -> None:
     found = identify_log(record(tmp_path / "log.parquet"), delay=0.0)
-    figure = draw_report(found)
-    axes = [axis for part in figure.subfigs for axis in _all_axes(part)]
+    axes = [*_all_axes(draw_fit(found)), *_all_axes(draw_knowledge(found))]
     # Six channels, two spectra, intervals, deviations.
     assert len(axes) == 10
     (intervals_axis,) = [axis for axis in axes if "intervals" in axis.get_title("left")]
