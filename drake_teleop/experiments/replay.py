@@ -8,6 +8,7 @@ slave, 4 mm a newton.
 
 from __future__ import annotations
 
+import gc
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -67,6 +68,19 @@ def write_replay(
         scenario: that was run.
         slow_motion: seconds of the film for one second of the run.
     """
+    # Meshcat may be destroyed by no other thread than the one that made it, and Drake's objects
+    # hold on to each other until the garbage collector comes, in whichever thread: it comes here.
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        path.write_text(_film(result, scenario, slow_motion), encoding="utf-8")
+        gc.collect()
+    finally:
+        if collects:
+            gc.enable()
+
+
+def _film(result: SimulationResult, scenario: Scenario, slow_motion: float) -> str:
     with _quiet_drake():  # nobody is to connect to its server
         meshcat = Meshcat(MeshcatParams(host="localhost"))
     scene = ReplayScene(meshcat, scenario)
@@ -79,7 +93,7 @@ def write_replay(
     meshcat.StopRecording()
     meshcat.get_mutable_recording().set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
     meshcat.PublishRecording()
-    path.write_text(meshcat.StaticHtml(), encoding="utf-8")
+    return meshcat.StaticHtml()
 
 
 @contextmanager

@@ -8,6 +8,7 @@ Every field is documented in docs/logs.md. A number x of a file becomes a quanti
 from __future__ import annotations
 
 import difflib
+import json
 import types
 import typing
 from collections.abc import Iterator, Sequence
@@ -17,7 +18,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    WithJsonSchema,
+    model_validator,
+)
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.rotations import nearest_rotation, rotation_error
@@ -71,6 +80,13 @@ def _gravity(value: Any) -> Any:
 Column = str | int
 Vector = Annotated[tuple[float, float, float], Field(strict=False)]
 Rotation = tuple[Vector, Vector, Vector]
+_GRAVITY_SCHEMA = {
+    "anyOf": [
+        {"type": "number"},
+        {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
+    ],
+    "description": "magnitude, or the vector in the world, m/s^2",
+}
 Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_frame)]
 
 
@@ -199,7 +215,11 @@ class Static(_Stream):
 class Description(_Strict):
     """A whole log: a wrench stream with imu, pose, or both; or static poses."""
 
-    gravity: Annotated[Vector, BeforeValidator(_gravity)] = (0.0, 0.0, -STANDARD_GRAVITY)
+    gravity: Annotated[Vector, BeforeValidator(_gravity), WithJsonSchema(_GRAVITY_SCHEMA)] = (
+        0.0,
+        0.0,
+        -STANDARD_GRAVITY,
+    )
     wrench: Wrench | None = None
     imu: Imu | None = None
     pose: Pose | None = None
@@ -229,6 +249,12 @@ class Description(_Strict):
     def scale(self, unit: str) -> float:
         """SI value of a unit; "g" is the magnitude of this description's gravity."""
         return float(np.linalg.norm(self.gravity)) if unit == "g" else UNITS[unit]
+
+
+def json_schema() -> str:
+    """The JSON schema of a description, as text: what docs/log-description.schema.json holds."""
+    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    return json.dumps(schema | Description.model_json_schema(), indent=2) + "\n"
 
 
 def load_description(path: str | Path) -> Description:

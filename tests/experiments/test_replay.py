@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 
 import numpy as np
 import pytest
@@ -106,3 +107,18 @@ def test_the_film_has_fifty_frames_a_second(
     assert len(shown) == frames
     np.testing.assert_allclose(np.diff(times), 1 / 50)
     np.testing.assert_allclose(result.t[list(samples)], np.array(times) / slow_motion, atol=1e-9)
+
+
+def test_its_server_is_gone_when_it_returns(tmp_path, result, scenario, monkeypatch):
+    """Collected later, in a thread of the progress bars, Meshcat would abort the program."""
+    ports = []
+
+    def remember(params):
+        meshcat = Meshcat(params)
+        ports.append(meshcat.port())
+        return meshcat
+
+    monkeypatch.setattr(replay, "Meshcat", remember)
+    replay.write_replay(tmp_path / "replay.html", result, scenario)
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("localhost", ports[0]))

@@ -1,0 +1,23 @@
+"""The JSON schema of log descriptions that is shipped is the one that the code follows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from drake_teleop.logs.description import Description, json_schema
+
+SHIPPED = Path(__file__).parents[2] / "docs" / "log-description.schema.json"
+
+
+def test_the_shipped_schema_is_that_of_the_code() -> None:
+    assert json.loads(SHIPPED.read_text(encoding="utf-8")) == json.loads(json_schema())
+
+
+def test_the_schema_knows_every_field_and_both_forms_of_gravity() -> None:
+    schema = json.loads(json_schema())
+    assert set(schema["properties"]) == set(Description.model_fields)
+    assert schema["additionalProperties"] is False
+    kinds = [form["type"] for form in schema["properties"]["gravity"]["anyOf"]]
+    assert kinds == ["number", "array"]
+    assert "inverse" in schema["$defs"]["Orientation"]["properties"]
