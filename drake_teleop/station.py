@@ -39,8 +39,9 @@ _SLAVE_WIRES = (
     ("slave_plant.rx90_state", "monitor.slave_state"),
     ("slave_plant.rx90_state", "wrist_sensor.slave_state"),
     ("slave_plant.rx90_generalized_acceleration", "wrist_sensor.slave_acceleration"),
-    ("wrist_sensor.sample", "load_estimator.sample"),
 )
+# Only when it learns: at 8 kHz even a wire that nobody reads costs time.
+_LEARNING_WIRES = (("wrist_sensor.sample", "load_estimator.sample"),)
 _CONTACT_WIRES = (("slave_plant.contact_results", "tool_contact.contact_results"),)
 _TELEOP_WIRES = (
     # The operator holds the master.
@@ -247,6 +248,8 @@ def AddSlave(
         builder, slave.plant, slave.arm, sensor, 1 / rates.sensor_hz, start, contact=contact
     )
     _connect(builder, _SLAVE_WIRES)
+    if scenario.load_estimator.enabled:
+        _connect(builder, _LEARNING_WIRES)
     if not contact:
         return slave, _SLAVE_SIGNALS
     builder.AddNamedSystem("tool_contact", ToolContact(slave.tool))
