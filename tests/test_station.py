@@ -16,7 +16,7 @@ from drake_teleop.master.device import JointFriction
 from drake_teleop.master.operator import OperatorConfig, Sine
 from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.signals import SIGNALS
-from drake_teleop.simulation import MakeSimulator, simulate
+from drake_teleop.simulation import MakeSimulator, advance, simulate
 from drake_teleop.slave.arm import MOTION_SIZE, sensor_motion
 from drake_teleop.slave.inverse_kinematics import IkStatus
 from drake_teleop.slave.plant import AddSlavePlant
@@ -256,17 +256,39 @@ def test_an_open_clutch_stops_the_slave(slave):
     assert abs(master[6] - 0.03) > 0.005
 
 
-def test_scales_change_while_running(slave):
+def test_scales_change_while_running_without_a_step_of_the_force(slave):
+    """From the whole inertia at 1/17.5 to none at 1/10, in the middle of a fast movement."""
     scenario = vertical(0.03, 1.0)
     station = MakeTeleopStation(scenario, load_estimate=true_estimate(slave))
-    simulator = MakeSimulator(station, scenario.simulation)
-    simulator.AdvanceTo(0.2)
     block = station.GetSubsystemByName("force_scaling")
-    context = block.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    block.SetScales(context, sigma_gripper=0.0, sigma_object=0.0, gamma=1.0, force_scale=0.1)
-    simulator.AdvanceTo(0.21)
-    scaled = station.GetOutputPort("scaled_wrench_S").Eval(simulator.get_context())
-    assert np.abs(scaled).max() < 1e-9
+
+    def forces(duration: float | None) -> np.ndarray:
+        simulator = MakeSimulator(station, scenario.simulation)
+        advance(simulator, 0.7)
+        context = simulator.get_mutable_context()
+        shown = [station.GetOutputPort("force_to_master").Eval(context)[:3].copy()]
+        if duration is not None:
+            block.SetScales(
+                block.GetMyMutableContextFromRoot(context),
+                sigma_gripper=0.0,
+                sigma_object=0.0,
+                gamma=1.0,
+                force_scale=0.1,
+                duration=duration,
+            )
+        for time in np.arange(0.7, 1.0, 1 / scenario.rates.hand_hz):
+            advance(simulator, time)
+            shown.append(station.GetOutputPort("force_to_master").Eval(context)[:3].copy())
+        return np.array(shown)
+
+    def largest_step(force: np.ndarray) -> float:
+        return float(np.linalg.norm(np.diff(force, axis=0), axis=1).max())
+
+    changed, unchanged, at_once = forces(0.25), forces(None), forces(0.0)
+    np.testing.assert_allclose(changed[-50:], 0.0, atol=1e-9)
+    assert np.linalg.norm(unchanged[-50:], axis=1).max() > 0.1
+    assert largest_step(changed) < 2 * largest_step(unchanged) + 0.01
+    assert largest_step(at_once) > 10 * largest_step(changed)
 
 
 def test_every_output_port_is_a_documented_signal():

@@ -54,6 +54,22 @@ class ForceScalingConfig:
 
 
 @njit(cache=True)
+def scales_at(change, time, scales):
+    """Writes the four scales at `time` into `scales`: a minimum-jerk blend from old to new.
+
+    Args:
+        change: (10,) old scales (4), new scales (4), start of the change [s], its length [s].
+        time: now [s].
+        scales: (4,) written: sigma_gripper, sigma_object, gamma, force scale.
+    """
+    u = min(max((time - change[8]) / change[9], 0.0), 1.0) if change[9] > 0.0 else 1.0
+    share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
+    for i in range(4):
+        # Exact at both ends: the scales of a station that never changes them are as configured.
+        scales[i] = (1.0 - share) * change[i] + share * change[4 + i]
+
+
+@njit(cache=True)
 def _scaled_into(sample, estimate, phi_gripper, scales, out):
     """F' of one sample; what of the load is not gripper is object."""
     phi_object = np.empty(10)
@@ -78,7 +94,8 @@ class ForceScaling(LeafSystem):
     """Removes or scales the non-contact wrench, then scales the rest down and turns it to the hand.
 
     F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj). The scales are a numeric parameter of
-    the context, so that they may be changed while a simulation runs (`SetScales`).
+    the context, so that they may be changed while a simulation runs (`SetScales`), and without a
+    step of the force.
 
     .. pydrake_system::
 
@@ -104,14 +121,14 @@ class ForceScaling(LeafSystem):
         super().__init__()
         self._gripper_phi = None if config.gripper_phi is None else np.array(config.gripper_phi)
         self._arm, self._R_WB = arm.table, np.ascontiguousarray(R_WB)
-        # sigma_gripper, sigma_object, gamma, force scale.
-        self._scales = self.DeclareNumericParameter(
-            BasicVector([*config.scales(), config.force_scale])
-        )
+        # Old and new scales, start and length of the change; see `scales_at`.
+        scales = [*config.scales(), config.force_scale]
+        self._change = self.DeclareNumericParameter(BasicVector([*scales, *scales, 0.0, 0.0]))
+        self._scales = np.empty(4)
         size = sum(sample_parts(arm.num_joints).values())
         self._sample = self.DeclareVectorInputPort("sample", size)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
-        # Not time: what does not depend on it need not be looked at in every step.
+        # Not time: a change of scales goes on with each new sample, which is soon enough.
         inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         for name, calc in (
             ("scaled_wrench_S", self._calc_scaled),
@@ -129,13 +146,32 @@ class ForceScaling(LeafSystem):
         sigma_object: float,
         gamma: float,
         force_scale: float,
+        duration: float = 0.25,
     ) -> None:
-        """Changes the scales in a running simulation."""
-        parameter = context.get_mutable_numeric_parameter(self._scales)
-        parameter.SetFromVector([sigma_gripper, sigma_object, gamma, force_scale])
+        """Changes the scales in a running simulation, from now on, within `duration` [s].
+
+        The scales go over on a minimum-jerk ramp (the force takes no step), from where they are if
+        an earlier change is not over yet.
+
+        Raises:
+            DrakeTeleopError: for a scale or duration that is negative or not finite.
+        """
+        wanted = np.array([sigma_gripper, sigma_object, gamma, force_scale, duration], dtype=float)
+        if not (wanted >= 0.0).all() or not np.isfinite(wanted).all():
+            raise DrakeTeleopError(
+                "scales and duration are not finite or negative", where="SetScales"
+            )
+        now = self._present_scales(context).copy()
+        change = np.concatenate([now, wanted[:4], [context.get_time(), wanted[4]]])
+        context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
+
+    def _present_scales(self, context: Context) -> NDArray[np.float64]:
+        change = context.get_numeric_parameter(self._change).value()
+        scales_at(change, context.get_time(), self._scales)
+        return self._scales
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
-        scales = context.get_numeric_parameter(self._scales).value()
+        scales = self._present_scales(context)
         _scaled_into(*self._inputs(context), scales, output.get_mutable_value())
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
@@ -148,8 +184,7 @@ class ForceScaling(LeafSystem):
         )
 
     def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
-        scales = context.get_numeric_parameter(self._scales).value()
-        inputs = self._inputs(context)
+        inputs, scales = self._inputs(context), self._present_scales(context)
         _felt_into(*inputs, scales, self._arm, self._R_WB, output.get_mutable_value())
 
     def _inputs(self, context: Context) -> tuple[NDArray[np.float64], ...]:

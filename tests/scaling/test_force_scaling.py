@@ -77,3 +77,11 @@ def test_what_the_hand_feels_is_the_scaled_reaction(arm):
 def test_eta_asks_for_sigma_0_gamma_1_and_a_gripper(config, arm):
     with pytest.raises(DrakeTeleopError, match=r"force_scaling\.eta"):
         ForceScaling(config, arm, np.eye(3))
+
+
+def test_scales_that_cannot_be_are_refused(arm):
+    block = ForceScaling(ForceScalingConfig(), arm, np.eye(3))
+    context = block.CreateDefaultContext()
+    scales = dict(sigma_gripper=0.0, sigma_object=0.0, gamma=1.0, force_scale=np.nan)
+    with pytest.raises(DrakeTeleopError, match="SetScales"):
+        block.SetScales(context, **scales)
