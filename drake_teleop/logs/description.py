@@ -71,6 +71,16 @@ def _frame(value: Any) -> Any:
     return tuple(map(tuple, nearest_rotation(matrix).tolist()))
 
 
+def _imu_frame(value: Any) -> Any:
+    return value if value == "auto" else _frame(value)
+
+
+def _place(value: Any) -> Any:
+    if isinstance(value, str) and value != "auto":
+        raise ValueError("must be three numbers [m], or auto")
+    return value
+
+
 def _gravity(value: Any) -> Any:
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         value = [0.0, 0.0, -float(value)]
@@ -88,6 +98,8 @@ _GRAVITY_SCHEMA = {
     "description": "magnitude, or the vector in the world, m/s^2",
 }
 Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_frame)]
+ImuFrame = Annotated[Literal["sensor", "base", "auto"] | Rotation, BeforeValidator(_imu_frame)]
+Place = Annotated[Vector | Literal["auto"], BeforeValidator(_place)]
 
 
 class _Strict(BaseModel):
@@ -101,6 +113,9 @@ class Time(_Strict):
     unit: Literal["s", "ms", "us", "ns"] = "s"
     rate: float | None = Field(default=None, gt=0, description="Hz, if there is no column")
     offset: float = Field(default=0.0, description="s, added to the stream's clock")
+    scale: float = Field(
+        default=1.0, gt=0, description="of the time since the first row, for a clock that drifts"
+    )
 
     @model_validator(mode="after")
     def _one_of(self) -> Time:
@@ -170,16 +185,24 @@ class Imu(_Stream):
     angular_velocity: AngularVelocity | None = None
     angular_acceleration: AngularAcceleration | None = None
     sign: Literal[1, -1] = Field(default=1, description="of the specific force; -1 for g - a")
-    frame: Frame = "sensor"
-    position: Vector = Field(
-        default=(0.0, 0.0, 0.0), description="p_SoIo_S of the accelerometer, m"
+    frame: ImuFrame = Field(default="sensor", description="auto: the rotation is found")
+    position: Place = Field(
+        default=(0.0, 0.0, 0.0),
+        description="p_SoIo_S of the accelerometer, m; auto: it is found",
     )
 
     @model_validator(mode="after")
     def _not_empty(self) -> Imu:
         if not (self.specific_force or self.angular_velocity):
             raise ValueError("give specific_force, angular_velocity, or both")
+        if self.automatic and not self.specific_force:
+            raise ValueError("frame and position are found from specific_force: give it, or them")
         return self
+
+    @property
+    def automatic(self) -> bool:
+        """Whether the data shall tell the frame or the position."""
+        return self.frame == "auto" or self.position == "auto"
 
 
 class Pose(_Stream):
@@ -239,6 +262,8 @@ class Description(_Strict):
             raise ValueError("nothing gives the angular velocity: add imu.angular_velocity or pose")
         if self.pose is None and (self.imu is None or self.imu.specific_force is None):
             raise ValueError("nothing gives the specific force: add imu.specific_force or pose")
+        if self.pose is None and self.imu is not None and self.imu.frame == "auto":
+            raise ValueError("imu.frame: auto compares the IMU with a pose: add pose")
         return self
 
     @property

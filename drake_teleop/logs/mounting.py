@@ -16,6 +16,8 @@ RIGHT_ANGLED_DEG = 5.0
 _REACH = 1.0
 _CUTOFF = 8.0
 _SAMPLES = 1500
+# A drift is believed from this likelihood ratio (twice its logarithm), and if it amounts to this.
+_LIKELIHOOD, _DRIFTED = 50.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,10 @@ class Mounting:
     Args:
         R_SI: (3, 3) rotation from the axes of the IMU's stream to S: `imu.frame` on top of what the
             description says already.
-        lag_s: how far the IMU's clock is behind that of the pose [s].
+        lag_s: how far the IMU's clock is behind that of the pose: the best single shift [s].
+        lag_middle_s: the same in the middle of the record, if the clocks drift; else `lag_s`.
+        middle_s: that instant, on the clock of the pose [s].
+        drift: growth of the lag [s/s]; 0 if the record does not show one.
         unexplained: share of the variance of the specific force that this leaves.
         mirrored: a reflection fits decisively better, so R_SI means nothing.
         speed_ratio: rms angular speed of the gyroscope over that of the pose; None without one.
@@ -33,6 +38,9 @@ class Mounting:
 
     R_SI: NDArray[np.float64]
     lag_s: float
+    lag_middle_s: float
+    middle_s: float
+    drift: float
     unexplained: float
     mirrored: bool
     speed_ratio: float | None
@@ -58,7 +66,7 @@ def find_mounting(imu: Log, pose: Log) -> Mounting | None:
     At every shift s_pose = R s_imu + b is fitted with a rotation R (Kabsch 1976) and a constant b,
     both signals low-passed at 8 Hz; the shift is that of the smallest residual of free linear maps
     of specific force and, with a gyroscope, angular velocity, which do not depend on the axes,
-    within +-1 s, refined by a parabola.
+    within +-1 s, refined by a parabola. A drift of the clocks is fitted on top, see `_drift`.
 
     Args:
         imu: specific force and angular velocity from the IMU.
@@ -76,23 +84,14 @@ def find_mounting(imu: Log, pose: Log) -> Mounting | None:
     variance = float(expected.var(axis=0).sum())
     if variance < 0.25:
         return None
-    y = expected - expected.mean(axis=0)
-
     turn = low_pass(imu.angular_velocity, imu.dt, cutoff)
     turned = resample(t, pose.t, low_pass(pose.angular_velocity, pose.dt, cutoff))
     # Without a gyroscope both readings have the angular velocity of the pose.
     gyroscope = not np.allclose(resample(t, imu.t, turn), turned, atol=1e-9)
-
-    def moved(shift: float) -> NDArray[np.float64]:
-        x = resample(t + shift, imu.t, measured)
-        return x - x.mean(axis=0)
+    pairs = [(expected, measured)] + ([(turned, turn)] if gyroscope else [])
 
     def cost(shift: float) -> float:
-        x = moved(shift)
-        share = _unmapped(y, x)
-        if gyroscope:
-            share += _unmapped(turned, resample(t + shift, imu.t, turn))
-        return share
+        return sum(_unmapped(y, resample(t + shift, imu.t, x)) for y, x in pairs)
 
     step = 0.01
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
@@ -100,9 +99,11 @@ def find_mounting(imu: Log, pose: Log) -> Mounting | None:
     best = int(np.argmin(costs))
     lag = float(shifts[best])
     if 0 < best < len(shifts) - 1:
-        left, middle, right = costs[best - 1 : best + 2]
-        lag += 0.5 * step * float((left - right) / (left - 2 * middle + right + 1e-300))
-    x = moved(lag)
+        below, least, above = costs[best - 1 : best + 2]
+        lag += 0.5 * step * float((below - above) / (below - 2 * least + above + 1e-300))
+    middle, drift = _drift(t, pairs, imu.t, lag, 2 * cutoff * float(t[-1] - t[0]))
+    x = resample(t + middle + drift * (t - t.mean()), imu.t, measured)
+    x, y = x - x.mean(axis=0), expected - expected.mean(axis=0)
     U, _, Vt = np.linalg.svd(y.T @ x)
     side = np.linalg.det(U @ Vt)
     R, mirror = U @ np.diag([1.0, 1.0, side]) @ Vt, U @ np.diag([1.0, 1.0, -side]) @ Vt
@@ -112,10 +113,62 @@ def find_mounting(imu: Log, pose: Log) -> Mounting | None:
     return Mounting(
         R_SI=R,
         lag_s=lag,
+        lag_middle_s=middle,
+        middle_s=float(t.mean()),
+        drift=drift,
         unexplained=left_over,
         mirrored=reflected < 0.25 * left_over and reflected < 0.05,
         speed_ratio=speeds[0] / speeds[1] if speeds[1] > 0.05 else None,
     )
+
+
+def _drift(
+    t: NDArray[np.float64],
+    pairs: list[tuple[NDArray[np.float64], NDArray[np.float64]]],
+    t_imu: NDArray[np.float64],
+    lag: float,
+    independent: float,
+) -> tuple[float, float]:
+    """Lag in the middle and its growth, by Gauss-Newton steps from a constant lag.
+
+    Args:
+        t: (N,) times on the clock of the pose.
+        pairs: of signals at `t` and signals of the IMU at `t_imu`, each mapped freely.
+        t_imu: times on the clock of the IMU.
+        lag: the best constant lag [s].
+        independent: how many samples of such signals say something new.
+
+    Returns:
+        the lag in the middle [s] and its growth [s/s]; `lag` and 0 if the likelihood of a constant
+        lag is not exceeded decisively, or the lag changes by less than 10 ms.
+    """
+    tau = t - t.mean()
+    found = np.array([lag, 0.0])
+    start = cost = np.inf
+    for step in range(10):
+        rows, left, cost = [], [], 0.0
+        for y, x in pairs:
+            at = t + found[0] + found[1] * tau
+            moved, h = resample(at, t_imu, x), 0.01
+            rate = (resample(at + h, t_imu, x) - resample(at - h, t_imu, x)) / (2 * h)
+            basis = np.column_stack([np.ones(len(t)), moved])
+            Q = np.linalg.qr(basis)[0]
+            mapped = np.linalg.lstsq(basis, y, rcond=1e-6)[0][1:]
+            # What a small shift does, beyond what another map could do as well.
+            effects = [rate @ mapped, tau[:, None] * (rate @ mapped)]
+            size = np.sqrt(y.var(axis=0).sum() + 1e-12)
+            rows.append(np.stack([(e - Q @ (Q.T @ e)).ravel() / size for e in effects], axis=1))
+            left.append(((y - y.mean(axis=0)) - (moved - moved.mean(axis=0)) @ mapped) / size)
+            cost += float(left[-1].var(axis=0).sum())
+        if step == 0:
+            start = cost
+        residual = np.concatenate([r.ravel() for r in left])
+        found = found + np.linalg.lstsq(np.vstack(rows), residual, rcond=1e-6)[0]
+    gain = independent * np.log(start / (cost + 1e-300))
+    moved_s = abs(found[1]) * float(t[-1] - t[0])
+    if gain < _LIKELIHOOD or moved_s < _DRIFTED:
+        return lag, 0.0
+    return float(found[0]), float(found[1])
 
 
 def right_angled_rotations() -> list[NDArray[np.float64]]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.alignment import (
+    SMOOTHER_WINDOW,
     angular_motion,
     low_pass,
     resample,
@@ -19,6 +20,7 @@ from drake_teleop.logs.alignment import (
     uniform_times,
 )
 from drake_teleop.logs.canonical import Log, describe_canonical
+from drake_teleop.logs.clocks import Clock, gaps, read_clock
 from drake_teleop.logs.description import (
     ROTATION_TOLERANCE,
     Description,
@@ -26,7 +28,6 @@ from drake_teleop.logs.description import (
     Orientation,
     Pose,
     Static,
-    Time,
     Wrench,
     load_description,
 )
@@ -40,7 +41,6 @@ from drake_teleop.logs.tables import FORMATS, Table, read_table
 
 MINIMUM_SAMPLES = 16
 MINIMUM_POSES = 3
-GAP = 10.0
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,12 @@ def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
 
     Streams are brought to the wrench's clock and its median rate by linear interpolation, over the
     time that all of them cover; faster streams pass a zero-phase low-pass first, so that nothing
-    is folded down. Angular velocity is taken from the gyroscope if there is one, else from the
-    orientation; angular acceleration from the file, else by differentiating the angular velocity,
-    else the orientation; the specific force from the accelerometer (moved to the origin of S by
-    its lever arm), else from the position, else it is minus gravity, and a note says so.
+    is folded down. What becomes of doubtful time stamps, and what a gap is, stands in
+    `drake_teleop.logs.clocks`; gaps are marked in `Log.bridged`. Angular velocity is taken from
+    the gyroscope if there is one, else from the orientation; angular acceleration from the file,
+    else by differentiating the angular velocity, else the orientation; the specific force from the
+    accelerometer (moved to the origin of S by its lever arm), else from the position, else it is
+    minus gravity, and a note says so.
 
     Args:
         path: the file.
@@ -78,11 +80,12 @@ def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
     """
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):
-        return _Reader(load_description(path), str(path)).log(bandwidth_hz)
+        return _Reader(load_description(path), str(path), bandwidth_hz).log()
     if path.suffix.lower() in FORMATS:
         table = read_table(path)
-        reader = _Reader(describe_canonical(path, table), str(path), {path: table})
-        return reader.log(bandwidth_hz, keep_origin=True)
+        description = describe_canonical(path, table)
+        reader = _Reader(description, str(path), bandwidth_hz, {path: table})
+        return reader.log(keep_origin=True)
     raise DrakeTeleopError(
         f"format {path.suffix!r} is not known",
         where=str(path),
@@ -108,30 +111,36 @@ def read_description(
     Raises:
         DrakeTeleopError: if the log cannot be used.
     """
-    return _Reader(description, source, tables).log(bandwidth_hz)
+    return _Reader(description, source, bandwidth_hz, tables).log()
 
 
 class _Reader:
     """Reads the streams of one description; holds what they have in common."""
 
     def __init__(
-        self, description: Description, source: str, tables: dict[Path, Table] | None = None
+        self,
+        description: Description,
+        source: str,
+        bandwidth_hz: float | None,
+        tables: dict[Path, Table] | None = None,
     ) -> None:
         self._description = description
         self._source = source
+        self._bandwidth_hz = bandwidth_hz
         self._notes: list[str] = []
+        self._gaps: list[NDArray[np.float64]] = []
         self._tables = dict(tables or {})
 
-    def log(self, bandwidth_hz: float | None, *, keep_origin: bool = False) -> Log:
+    def log(self, *, keep_origin: bool = False) -> Log:
         if self._description.static is not None:
             return self._static(self._description.static)
         assert self._description.wrench is not None
         wrench_t, wrench = self._wrench(self._description.wrench)
         pose = imu = None
         if self._description.pose is not None:
-            pose = self._pose(self._description.pose, bandwidth_hz)
+            pose = self._pose(self._description.pose)
         if self._description.imu is not None:
-            imu = self._imu(self._description.imu, pose, bandwidth_hz)
+            imu = self._imu(self._description.imu, pose)
         streams = [stream for stream in (imu, pose) if stream is not None]
         t = self._common_time(wrench_t, streams)
         log = self._assembled(t, resample(t, wrench_t, wrench), imu, pose)
@@ -144,8 +153,8 @@ class _Reader:
 
     def _wrench(self, stream: Wrench) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         table = self._table(stream)
-        t = self._time("wrench", stream.time, table)
-        return t, self._forces("wrench", stream, table, len(t))
+        clock = self._clock("wrench", stream, table)
+        return clock.t, self._forces("wrench", stream, table, clock.total)[clock.rows]
 
     def _forces(
         self, name: str, stream: Wrench | Static, table: Table, rows: int
@@ -160,10 +169,11 @@ class _Reader:
             both = [vectors @ R.T for vectors in both]
         return np.hstack(both)
 
-    def _pose(self, stream: Pose, bandwidth_hz: float | None) -> _Stream:
+    def _pose(self, stream: Pose) -> _Stream:
         table = self._table(stream)
-        raw_t = self._time("pose", stream.time, table)
-        raw_R = self._rotations("pose", stream.orientation, table, len(raw_t))
+        clock = self._clock("pose", stream, table)
+        raw_t = clock.t
+        raw_R = self._rotations("pose", stream.orientation, table, clock.total)[clock.rows]
         if isinstance(stream.frame, tuple):
             raw_R = raw_R @ np.array(stream.frame).T
         t = uniform_times(raw_t)
@@ -172,20 +182,23 @@ class _Reader:
         acceleration = np.zeros(3)
         if stream.position is not None:
             where = f"{self._source}:pose.position.columns"
-            position = table.numbers(stream.position.columns, 3, where, len(raw_t))
-            position = resample(t, raw_t, position) * self._description.scale(stream.position.unit)
-            acceleration = smooth_derivatives(position, dt, bandwidth_hz)[2]
+            position = table.numbers(stream.position.columns, 3, where, clock.total)
+            position = resample(t, raw_t, position[clock.rows]) * self._description.scale(
+                stream.position.unit
+            )
+            acceleration = smooth_derivatives(position, dt, self._bandwidth_hz)[2]
         return _Stream(
             "pose",
             t,
             _in_S(R_WS, acceleration - self._description.gravity_W),
-            *angular_motion(R_WS, dt, bandwidth_hz),
+            *angular_motion(R_WS, dt, self._bandwidth_hz),
             R_WS,
         )
 
-    def _imu(self, stream: Imu, pose: _Stream | None, bandwidth_hz: float | None) -> _Stream:
+    def _imu(self, stream: Imu, pose: _Stream | None) -> _Stream:
         table = self._table(stream)
-        raw_t = self._time("imu", stream.time, table)
+        clock = self._clock("imu", stream, table)
+        raw_t = clock.t
         t = uniform_times(raw_t)
         dt = spacing(t)
 
@@ -194,14 +207,15 @@ class _Reader:
             if quantity is None:
                 return None
             where = f"{self._source}:imu.{field}.columns"
-            unbiased = table.numbers(quantity.columns, 3, where, len(raw_t)) - quantity.bias
+            values = table.numbers(quantity.columns, 3, where, clock.total)
+            unbiased = values[clock.rows] - quantity.bias
             scaled = resample(t, raw_t, unbiased) * (sign * self._description.scale(quantity.unit))
             return self._to_S("imu", stream.frame, scaled, t, pose)
 
         s = vectors("specific_force", stream.sign)
         omega, alpha = vectors("angular_velocity"), vectors("angular_acceleration")
         if omega is not None and alpha is None:
-            alpha = smooth_derivatives(omega, dt, bandwidth_hz)[1]
+            alpha = smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
         if s is not None and any(stream.position):
             s = self._at_S(s, np.array(stream.position), t, omega, alpha, pose)
         return _Stream("imu", t, s, omega, alpha)
@@ -280,38 +294,34 @@ class _Reader:
             source=self._source,
         )
 
-    def _time(self, name: str, time: Time, table: Table) -> NDArray[np.float64]:
-        """(N,) strictly increasing times of a stream on the common clock [s]."""
-        where = f"{self._source}:{name}.time"
-        if time.column is None:
-            assert time.rate is not None
-            t = np.arange(table.rows) / time.rate
-        else:
-            t = table.numbers([time.column], 1, f"{where}.column")[:, 0]
-            t = t * self._description.scale(time.unit)
-        steps = np.diff(t)
-        if (steps <= 0).any():
-            first = int(np.argmax(steps <= 0))
-            kind = "repeated" if steps[first] == 0 else "going back"
-            raise DrakeTeleopError(
-                f"{int((steps <= 0).sum())} time stamps do not increase, the first is row"
-                f" {first + 1 + table.first_row} of {table.path.name} ({kind})",
-                where=where,
-                remedy="sort the rows and delete repeated ones, or give time.rate",
-            )
+    def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
+        """Strictly increasing times of a stream, and the rows of the table that they belong to."""
+        columns = [
+            column
+            for field in type(stream).model_fields
+            for column in getattr(getattr(stream, field), "columns", ())
+        ]
+        clock = read_clock(stream.time, table, columns, f"{self._source}:{name}.time")
+        t = clock.t
         if len(t) < MINIMUM_SAMPLES or len(uniform_times(t)) < MINIMUM_SAMPLES:
             raise DrakeTeleopError(
                 f"{len(t)} samples in {table.path.name} are too few",
                 where=f"{self._source}:{name}",
                 remedy=f"record at least {MINIMUM_SAMPLES}, evenly spaced",
             )
-        longest = int(np.argmax(steps))
-        if steps[longest] > GAP * np.median(steps):
+        self._notes += [f"{name}: {note}" for note in clock.notes]
+        holes = gaps(t, self._bandwidth_hz)
+        if len(holes):
+            start, stop = holes[int(np.argmax(holes[:, 1] - holes[:, 0]))]
             self._notes.append(
-                f"{name}: a gap of {steps[longest]:.3g} s at {t[longest] - t[0]:.3g} s is bridged"
-                " by a straight line"
+                f"{name}: {len(holes)} gaps, the longest of {stop - start:.3g} s at"
+                f" {start - t[0]:.3g} s; what lies in them and close by is not used"
             )
-        return t + time.offset
+            # A derivative has seen half a smoother's window.
+            window = SMOOTHER_WINDOW / self._bandwidth_hz if self._bandwidth_hz else 0.0
+            seen = max(4 * float(np.median(np.diff(t))), 0.5 * window)
+            self._gaps.append(holes + np.array([-seen, seen]))
+        return clock
 
     def _rotations(
         self, name: str, orientation: Orientation, table: Table, rows: int
@@ -388,9 +398,25 @@ class _Reader:
             *(t, wrench, signal("specific_force"), signal("angular_velocity")),
             signal("angular_acceleration"),
             gravity=gravity,
+            bridged=self._bridged(t),
             notes=tuple(self._notes),
             source=self._source,
         )
+
+    def _bridged(self, t: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+        """(N,) samples that a gap of any stream has touched; None without gaps."""
+        if not self._gaps:
+            return None
+        flags = np.zeros(len(t), bool)
+        for start, stop in np.concatenate(self._gaps):
+            flags[slice(*np.searchsorted(t, [start, stop]))] = True
+        if (~flags).sum() < MINIMUM_SAMPLES:
+            raise DrakeTeleopError(
+                f"only {int((~flags).sum())} samples are outside of gaps",
+                where=self._source,
+                remedy="record without interruptions",
+            )
+        return flags
 
     def _check_base_wrench(self, pose: _Stream | None) -> None:
         described = self._description.wrench
