@@ -118,9 +118,9 @@ def run(scenario: str, out: Path, seed: int | None, quiet: bool) -> None:
 @click.option(
     "--method",
     type=click.Choice(["ordinary", "whitened", "robust", "consistent"]),
-    default="ordinary",
+    default="consistent",
     show_default=True,
-    help="Least squares; rows by their noise; without knocks; of a possible body.",
+    help="Least squares; rows by their noise; also without knocks; also of a possible body.",
 )
 @_out("identify")
 @_cutoff

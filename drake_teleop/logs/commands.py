@@ -76,6 +76,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.load.batch import DEFAULT_METHOD
 from drake_teleop.load.gripper import SIGNIFICANT, consistency_margin, identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.uncertainty import intervals
@@ -89,7 +90,7 @@ def identify_command(
     out: Path,
     *,
     gripper: Path | None = None,
-    method: str = "ordinary",
+    method: str = DEFAULT_METHOD,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     quiet: bool = False,

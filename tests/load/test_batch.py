@@ -121,6 +121,64 @@ def test_robust_fit_does_without_a_short_contact():
     assert errors.max() < 4.5
 
 
+def test_motion_is_not_rejected_for_a_disturbance():
+    """A delay that nobody took out, in a record that rests three quarters of the time."""
+    F, s, omega, alpha = record(4000, noise=0.3)
+    rests = np.tile(np.repeat([False, True, True, True], 250), 4)
+    F[rests] = OFFSETS + non_contact_wrench(s[[0]], [0, 0, 0], [0, 0, 0], TOOL)
+    F[rests] += 0.3 * WRENCH_NOISE * np.random.default_rng(5).normal(size=(rests.sum(), 6))
+    motion = [np.where(rests[:, None], rest, x) for rest, x in ((s[0], s), (0, omega), (0, alpha))]
+    exact = identify_batch(F, *motion)
+    assert exact.rejected_fraction < 1e-2 and exact.note == ""
+    late = identify_batch(F, *(np.roll(x, 4, axis=0) for x in motion))
+    assert not late.rejected.any() and "no sample was rejected" in late.note
+    assert late.identification.mass == pytest.approx(TOOL[0], rel=0.05)
+
+
+def test_poses_share_a_noise():
+    s = static_poses()
+    F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
+    F = F + WRENCH_NOISE * np.random.default_rng(3).normal(size=F.shape)
+    shared = identify_batch(F, s, np.zeros(3), np.zeros(3), shared_noise=True)
+    assert len(set(shared.noise[:3])) == len(set(shared.noise[3:])) == 1
+    # At rest forces give mass and torques the first moments: their ratio does not matter.
+    plain = identify_batch(F, s, np.zeros(3), np.zeros(3), method="ordinary")
+    np.testing.assert_allclose(estimate(shared)[:10], estimate(plain)[:10], rtol=1e-6)
+
+
+def test_few_samples_reject_none():
+    s = static_poses()[:8]
+    F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
+    F[3] += 5.0
+    assert not identify_batch(F, s, np.zeros(3), np.zeros(3)).rejected.any()
+
+
+def test_the_default_is_robust_consistent_and_knows_the_motions_noise():
+    plate = phi_from_mass_com_inertia(0.3, [0, 0.01, 0.1], np.diag([1e-3, 2e-3, 3e-3]))
+    motion = rich_motion(3000)
+    rng = np.random.default_rng(8)
+    F, hit = knocks(OFFSETS + non_contact_wrench(*motion, plate))
+    F = F + 0.1 * WRENCH_NOISE * rng.normal(size=F.shape)
+    s, omega, alpha = motion
+    alpha = alpha + 2.0 * rng.normal(size=alpha.shape)
+    noise = Noise(alpha=2.0)
+    found = identify_batch(F, s, omega, alpha, noise=noise)
+    assert found.rejected[hit].all() and found.identification.physically_consistent
+    errors = {
+        method: np.abs(identify_batch(F, s, omega, alpha, method=method, noise=noise)
+                       .identification.phi - plate)[4:].max()
+        for method in ("whitened", "total", "consistent")
+    }  # fmt: skip
+    assert errors["consistent"] < 0.4 * min(errors["whitened"], errors["total"])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_negative_mass_is_shown(method):
+    F, *motion = record(noise=1.0)
+    found = identify_batch(-F, *motion, method=method).identification
+    assert found.mass == pytest.approx(-TOOL[0], rel=0.01)
+
+
 def normalised_errors(method, noise, std, repetitions=60, **options):
     clean = record(1000)
     squares = np.zeros(16)
