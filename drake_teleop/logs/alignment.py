@@ -12,6 +12,8 @@ from drake_teleop.logs.canonical import Log
 
 _SMOOTHER_SAMPLES = 9
 _SMOOTHER_DEGREE = 5
+SMOOTHER_WINDOW = 1.8
+"""Length of the smoother's window [s] times the bandwidth [Hz]."""
 
 
 def spacing(t: NDArray[np.float64]) -> float:
@@ -111,7 +113,7 @@ def noise_gain(dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
 
 def _smoother(n: int, dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
     """(6, w) weights of a window's samples in the coefficients of its polynomial."""
-    window = 0.0 if bandwidth_hz is None else 1.8 / bandwidth_hz
+    window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW / bandwidth_hz
     half = max(_SMOOTHER_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
     powers = np.vander(np.arange(-half, half + 1) / half, _SMOOTHER_DEGREE + 1, increasing=True)
     # Fitted on -1 ... 1, where the powers are of one size, then scaled to seconds.
@@ -184,18 +186,37 @@ def undelayed(log: Log, delay_s: float) -> Log:
     at = log.t + delay_s
     known = (at >= log.t[0]) & (at <= log.t[-1])
     s, omega, alpha = (resample(at[known], log.t, x) for x in log.motion)
+    bridged = None
+    if log.bridged is not None:
+        # A gap may be one of the wrench or one of the motion: where either would now be.
+        moved = resample(at[known], log.t, log.bridged.astype(float)) > 0
+        bridged = log.bridged[known] | moved
     return replace(
-        _rows(log, known), specific_force=s, angular_velocity=omega, angular_acceleration=alpha
+        log.only(known),
+        specific_force=s,
+        angular_velocity=omega,
+        angular_acceleration=alpha,
+        bridged=bridged,
     )
 
 
-def _rows(log: Log, rows: slice | NDArray[np.bool_]) -> Log:
-    return replace(
-        log,
-        t=log.t[rows],
-        wrench=log.wrench[rows],
-        specific_force=log.specific_force[rows],
-        angular_velocity=log.angular_velocity[rows],
-        angular_acceleration=log.angular_acceleration[rows],
-        gravity=None if log.gravity is None else log.gravity[rows],
-    )
+def measured(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
+    """(N,) samples that owe nothing to a bridged gap, even after `low_pass`.
+
+    Two periods of the cut-off beside a gap are left out as well: beyond them its impulse response
+    has fallen to 1e-4 of its peak.
+
+    Args:
+        log: the log.
+        cutoff_hz: of the low-pass; None for none.
+    """
+    if log.bridged is None:
+        return np.ones(len(log), bool)
+    return ~widened(log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt)))
+
+
+def widened(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+    """`flags` (N,), true also where one within `by` samples is."""
+    count = np.concatenate([[0], np.cumsum(flags)])
+    at = np.arange(len(flags))
+    return count[np.minimum(at + by + 1, len(flags))] > count[np.maximum(at - by, 0)]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,15 @@ ANGULAR_VELOCITY = ("omega_x", "omega_y", "omega_z")
 ANGULAR_ACCELERATION = ("alpha_x", "alpha_y", "alpha_z")
 ORIENTATION = ("q_w", "q_x", "q_y", "q_z")
 POSITION = ("p_x", "p_y", "p_z")
+_ARRAYS = (
+    "t",
+    "wrench",
+    "specific_force",
+    "angular_velocity",
+    "angular_acceleration",
+    "gravity",
+    "bridged",
+)
 
 
 @dataclass(frozen=True)
@@ -47,6 +57,8 @@ class Log:
         angular_acceleration: (N, 3) alpha_WS_S [rad/s^2].
         gravity: (N, 3) g_S, gravity in S [m/s^2], if the orientation is known.
         static: the samples are separate poses at rest; there is nothing to filter or to shift.
+        bridged: (N,) where a straight line stands in for samples that a stream does not have; None
+            if there are no gaps.
         notes: what the reader had to assume, in words.
         source: the file, for messages.
 
@@ -62,6 +74,7 @@ class Log:
     angular_acceleration: NDArray[np.float64]
     gravity: NDArray[np.float64] | None = None
     static: bool = False
+    bridged: NDArray[np.bool_] | None = None
     notes: tuple[str, ...] = ()
     source: str = "log"
 
@@ -74,6 +87,7 @@ class Log:
             "angular_velocity": (n, 3),
             "angular_acceleration": (n, 3),
             "gravity": (n, 3),
+            "bridged": (n,),
         }
         for name, shape in shapes.items():
             value = getattr(self, name)
@@ -97,8 +111,19 @@ class Log:
 
     @property
     def dt(self) -> float:
-        """Time between samples [s]."""
-        return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
+        """Time between samples [s]; where samples in gaps were taken out, between the others."""
+        steps = np.diff(self.t)
+        return float(steps[steps < 1.5 * np.median(steps)].mean())
+
+    def only(self, rows: slice | NDArray[np.bool_]) -> Log:
+        """These samples of the log.
+
+        Args:
+            rows: which.
+        """
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        taken: dict[str, Any] = {k: None if x is None else x[rows] for k, x in arrays.items()}
+        return replace(self, **taken)
 
     @property
     def motion(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -151,7 +176,8 @@ def describe_canonical(path: Path, table: Table) -> Description:
             table.numbers(names, len(names), str(path))
         return bool(found)
 
-    table.numbers(("t", *WRENCH), 7, str(path))
+    table.raw("t", str(path))
+    table.numbers(WRENCH, 6, str(path))
     time = Time(column="t")
     s, omega, alpha, q, p = (
         present(names)

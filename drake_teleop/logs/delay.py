@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
-from drake_teleop.logs.alignment import low_passed, resample
+from drake_teleop.logs.alignment import low_passed, measured, resample, widened
 from drake_teleop.logs.canonical import Log
 
 SEARCH_RANGE = 0.25
 _MOST_SAMPLES = 5000
+_FEWEST = 32
 
 
 def estimate_delay(
@@ -41,7 +42,10 @@ def estimate_delay(
     smooth = low_passed(log, cutoff)
     reach = min(SEARCH_RANGE, 0.1 * float(log.t[-1] - log.t[0]))
     step = min(1 / (8 * cutoff), reach / 8)
-    inside = np.flatnonzero((smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach))
+    inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
+    inside = np.flatnonzero(inside & _known(log, cutoff, reach))
+    if len(inside) < _FEWEST:
+        return None
     stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MOST_SAMPLES)
     cost = _cost(smooth, inside[::stride], phi)
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
@@ -51,6 +55,12 @@ def estimate_delay(
     if best in (0, len(shifts) - 1) or costs.max() - costs[best] < 0.1 + 50 / independent:
         return None
     return _refined(cost, float(shifts[best]), step)
+
+
+def _known(log: Log, cutoff: float, reach: float) -> NDArray[np.bool_]:
+    """(N,) samples that have no gap within reach of any shift."""
+    gap = ~measured(log, cutoff)
+    return ~widened(gap, math.ceil(reach / log.dt)) if gap.any() else ~gap
 
 
 def _refined(cost: Callable[[float], float], best: float, step: float) -> float:

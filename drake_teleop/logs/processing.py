@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.batch import identify_batch
+from drake_teleop.load.batch import DEFAULT_METHOD, identify_batch
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta
 from drake_teleop.load.gripper import identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.alignment import low_pass, low_passed, undelayed
+from drake_teleop.logs.alignment import low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.canonical import Log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
 from drake_teleop.logs.contact import in_contact, noise_floor
@@ -28,11 +28,11 @@ class IdentifiedLog:
     """A log and what was identified from it.
 
     Args:
-        log: the samples that were used: delay taken out, low-passed.
+        log: the samples that were used: delay taken out, low-passed, none from gaps.
         identification: the result.
         predicted: (N, 6) offsets + V phi at the same instants.
         delay_source: as in the summary: "estimated", "given" ...
-        rejected: (N,) samples that the method "robust" took for disturbed; none by any other.
+        rejected: (N,) samples that "robust" and "consistent" fits took for disturbed.
     """
 
     log: Log
@@ -47,7 +47,7 @@ class EliminatedLog:
     """A log without its non-contact wrench. All arrays are low-passed and in S, sign of Eq. (1).
 
     Args:
-        log: the log with its delay taken out; not low-passed.
+        log: the log with its delay taken out, without what lay in gaps; not low-passed.
         phi: (10,) the load that was used, see `usable_phi`; gripper and object together.
         point_mass: names of the inertias that are not of the load file but of a point mass.
         offsets: (6,) of this record.
@@ -85,7 +85,7 @@ class EliminatedLog:
 def identify_log(
     path: str | Path,
     *,
-    method: str = "ordinary",
+    method: str = DEFAULT_METHOD,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
 ) -> IdentifiedLog:
@@ -105,8 +105,11 @@ def identify_log(
     """
     log = read_log(path, bandwidth_hz=cutoff_hz)
     delay_s, source = _delay(log, cutoff_hz, delay)
-    log = low_passed(undelayed(log, delay_s), cutoff_hz)
-    fit = identify_batch(log.wrench, *log.motion, method=method, delay_s=delay_s)
+    log = undelayed(log, delay_s)
+    log = low_passed(log, cutoff_hz).only(measured(log, cutoff_hz))
+    fit = identify_batch(
+        log.wrench, *log.motion, method=method, shared_noise=log.static, delay_s=delay_s
+    )
     result = fit.identification
     if result.mass < 0 and result.identifiable[6]:
         raise DrakeTeleopError(
@@ -114,6 +117,8 @@ def identify_log(
             where=f"{log.source}:wrench.sign",
             remedy="set `sign: -1` in the log description (or remove it if it is there)",
         )
+    if fit.note:
+        log = replace(log, notes=(*log.notes, fit.note))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     return IdentifiedLog(log, result, predicted, source, fit.rejected)
 
@@ -178,9 +183,10 @@ def eliminate_log(
     if source == "undetermined":
         delay_s, source = identification.delay_s, "load"
     log = undelayed(log, delay_s)
+    known = measured(log, cutoff_hz)
 
     def smooth(wrench: NDArray[np.float64]) -> NDArray[np.float64]:
-        return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)
+        return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
     offsets, fraction = identification.offsets, 1.0
     if tare:
@@ -200,12 +206,13 @@ def eliminate_log(
         late = causal_wrenches(
             contact, scaled, log.dt, cutoff_hz=cutoff_hz, delay_s=delay_s, mode=causal
         )
+        late = replace(late, contact=late.contact[known], scaled=late.scaled[known])
     contact = smooth(contact)
-    floor, touched = noise_floor(contact), np.zeros(len(log), bool)
+    floor, touched = noise_floor(contact), np.zeros(len(contact), bool)
     if not log.static:
         touched = in_contact(contact, floor, _hold(log.dt, cutoff_hz))
     return EliminatedLog(
-        log=log,
+        log=log.only(known),
         phi=phi,
         point_mass=point_mass,
         offsets=offsets,

@@ -101,8 +101,11 @@ def test_orientation_alone_is_taken_for_slow_motion_and_says_so(tmp_path: Path) 
         (lambda f: f.drop(*SPECIFIC_FORCE), "without kinematics: no columns s_x s_y s_z"),
         (lambda f: f.drop(*ANGULAR_VELOCITY), "no columns omega_x omega_y omega_z"),
         (lambda f: f.head(15), "15 samples in log.csv are too few"),
-        (lambda f: f.with_columns(t=pl.col("t").reverse()), "do not increase, the first is row 3"),
-        (lambda f: pl.concat([f[:4], f[3:]]), "1 time stamps do not increase, the first is row 6"),
+        (
+            lambda f: f.with_columns(t=pl.col("t").reverse()),
+            "1499 time stamps go back, the first is row 3",
+        ),
+        (lambda f: pl.concat([f[:9], f[4:]]), "1 time stamps go back, the first is row 11"),
         (lambda f: f.with_columns(s_x=pl.lit("?")), "log.csv:s_x: '?' in row 2 is not a number"),
         (lambda f: f.with_columns(f_x=pl.lit(float("nan"))), "no finite number in 1500 rows"),
     ],
@@ -256,10 +259,10 @@ def test_base_axes_are_turned_by_the_orientation(tmp_path: Path) -> None:
         ({"imu__specific_force__columns": ["clock"]}, ["imu.specific_force.columns", "1 columns"]),
         (
             {"wrench__time": {"column": "time", "unit": "ms"}},
-            ["do not overlap in time", "wrench 1.7e+12", "time.offset"],
+            ["wrench.time.unit", "a rate of 0.7 Hz", "`unit: us`"],
         ),
         ({"pose__time": {"column": "sec"}}, ["do not overlap in time", "pose 0.03"]),
-        ({"pose__time": {"column": "q0"}}, ["pose.time", "do not increase", "going back"]),
+        ({"pose__time": {"column": "q0"}}, ["pose.time", "go back", "time.rate"]),
         (
             {"pose__orientation": {"columns": ["q0", "q1", "q2"], "form": "quaternion_wxyz"}},
             ["pose.orientation.columns", "3 columns where 4"],
@@ -309,12 +312,27 @@ def test_nominal_rate_in_place_of_time_stamps(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.specific_force, motion_at(T).specific_force, atol=1e-12)
 
 
-def test_a_gap_is_bridged_and_noted(tmp_path: Path) -> None:
+def test_a_gap_is_noted_and_marked(tmp_path: Path) -> None:
     frame = canonical("s", "omega")
     pl.concat([frame[:500], frame[600:]]).write_csv(tmp_path / "log.csv")
     log = read_log(tmp_path / "log.csv")
-    assert any("a gap of 0.202 s at 0.998 s" in note for note in log.notes)
+    assert any("1 gaps, the longest of 0.202 s at 0.998 s" in note for note in log.notes)
     assert log.t[-1] == pytest.approx(T[-1])
+    assert log.bridged is not None
+    # Half of the smoother's 60 ms on either side.
+    marked = log.t[log.bridged]
+    assert [marked[0], marked[-1]] == pytest.approx([0.998 - 0.03, 1.2 + 0.03], abs=0.003)
+    known = log.only(~log.bridged)
+    np.testing.assert_allclose(known.wrench, a_wrench(motion_at(known.t)), atol=1e-3)
+    np.testing.assert_allclose(known.angular_acceleration, motion_at(known.t).alpha, atol=0.02)
+
+
+def test_too_many_gaps(tmp_path: Path) -> None:
+    frame = canonical("s", "omega")
+    pieces = [frame[i : i + 14] for i in range(0, 600, 30)]
+    pl.concat(pieces).write_csv(tmp_path / "log.csv")
+    with pytest.raises(DrakeTeleopError, match=r"only 0 samples are outside of gaps; record"):
+        read_log(tmp_path / "log.csv")
 
 
 def test_static_poses_from_gravity_or_orientation(tmp_path: Path) -> None:
