@@ -67,7 +67,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     if time.column is None:
         assert time.rate is not None
         rows = np.arange(table.rows)
-        return Clock(rows / time.rate + time.offset, rows, table.rows)
+        return Clock(_common(rows / time.rate, time), rows, table.rows)
     stamps = table.raw(time.column, f"{where}.column")
     if stamps.shape[1] != 1 or not np.isfinite(stamps).any():
         table.numbers([time.column], 1, f"{where}.column")
@@ -97,7 +97,12 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
         t = even
     _check_rate(t, time, where)
     _check_even(t, rows, table, where)
-    return Clock(t + time.offset, rows, len(stamps), tuple(notes))
+    return Clock(_common(t, time), rows, len(stamps), tuple(notes))
+
+
+def _common(t: NDArray[np.float64], time: Time) -> NDArray[np.float64]:
+    """Times of the stream's clock on the common one."""
+    return t[0] + time.scale * (t - t[0]) + time.offset
 
 
 def spread(t: NDArray[np.float64]) -> NDArray[np.float64]:
