@@ -1,0 +1,172 @@
+"""The methods by name, their parameters, and one step of either end of the channel.
+
+The two ports of the station's bilateral part are
+
+- the master's: the wrench that the hand shall feel, and the motion of the slave's command before
+  the channel (after kinematic scaling);
+- the slave's: the contact wrench, and the actual motion of the slave.
+
+Motion and wrenches are in world axes. Wrenches are in the *master's power units*: scaled so that
+wrench times motion of the slave's command is the work at the hand. The hand puts -f . dx into the
+channel, the environment f . dx; what comes out of a passive channel never exceeds what was put in.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.passivity import none
+from drake_teleop.passivity.memory import (
+    COMMAND,
+    DAMPING,
+    LIMIT,
+    MEMORY,
+    METHOD,
+    PACKET,
+    PARAMETERS,
+    STEPS,
+    STIFFNESS,
+)
+from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, SEQUENCE, finite
+from drake_teleop.quantities import choice, quantity
+
+METHODS = ("none",)
+
+
+@dataclass
+class PassivityConfig:
+    """Which method keeps the station passive, and the parameters of each.
+
+    The servo is what the methods that act at the slave's motor port (`two_layer`, `pspm`) and
+    `four_channel` believe of it: it pulls the slave with K (x_command - x) - D v.
+    """
+
+    method: str = choice("none", METHODS, "what keeps the channel passive")
+    force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest force that the hand shall feel")
+    torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest torque that the hand shall feel")
+    servo_stiffness: list[float] = quantity(
+        [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in the slave's units (E)"
+    )
+    servo_damping: list[float] = quantity(
+        [3.5e3, 117.0], "N s/m, N m s/rad", 0.0, 1e8, "D of the slave's servo, likewise (E)"
+    )
+
+
+def parameters(
+    config: PassivityConfig, power_scale: Sequence[float] = (1.0, 1.0)
+) -> NDArray[np.float64]:
+    """The parameters of the chosen method as one vector for the compiled steps.
+
+    Args:
+        config: the method and its parameters.
+        power_scale: (2,) the master's power units over the slave's, for translation and rotation:
+            force scale over kinematic scale.
+
+    Returns:
+        (PARAMETERS,) packed as `drake_teleop.passivity.memory` says.
+    """
+    p = np.zeros(PARAMETERS)
+    p[LIMIT : LIMIT + 2] = config.force_limit, config.torque_limit
+    p[STIFFNESS : STIFFNESS + 2] = np.multiply(config.servo_stiffness, power_scale)
+    p[DAMPING : DAMPING + 2] = np.multiply(config.servo_damping, power_scale)
+    own = _own_parameters(config)
+    p[METHOD : METHOD + len(own)] = own
+    return p
+
+
+def _own_parameters(config: PassivityConfig) -> list[float]:
+    return []
+
+
+def initial_memory(
+    method: str, parameters: NDArray[np.float64], pose: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(MEMORY,) the memory of an end before its first step.
+
+    Args:
+        method: one of `METHODS`.
+        parameters: of `parameters`.
+        pose: (7,) X_WS where this end starts: the slave's command until a packet arrives.
+
+    Raises:
+        DrakeTeleopError: for a method that does not exist.
+    """
+    if method not in METHODS:
+        raise DrakeTeleopError(
+            f"there is no method '{method}'",
+            where="passivity.method",
+            remedy=f"choose one of {', '.join(METHODS)}",
+        )
+    memory = np.zeros(MEMORY)
+    memory[COMMAND : COMMAND + 7] = pose
+    memory[PACKET + 2 : PACKET + 9] = pose
+    return memory
+
+
+@njit(cache=True)
+def _finish(healthy, memory, packet):
+    """Numbers the packet; one of an end whose inputs are not finite repeats the last good one."""
+    if healthy:
+        packet[HEALTHY] = 1.0
+        memory[PACKET : PACKET + PACKET_SIZE] = packet
+    else:
+        packet[:] = memory[PACKET : PACKET + PACKET_SIZE]
+        packet[HEALTHY] = 0.0
+    packet[SEQUENCE] = memory[STEPS]
+    memory[STEPS] += 1.0
+
+
+@njit(cache=True)
+def master_step(method, received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+    """One step of the master's end, allocation-free: what the hand feels, and what is sent.
+
+    Args:
+        method: index in `METHODS`.
+        received: (PACKET_SIZE,) the newest packet of the slave; zeros before the first.
+        fresh: whether it is seen for the first time.
+        pose: (7,) X_WS of the command, after kinematic scaling, before the channel.
+        twist: (6,) its twist [v; omega], in W.
+        dx: (6,) its increment since the last step [dp; log(R_k R_(k-1)^T)], in W.
+        hand: (6,) wrench of the hand on the device, in W and master power units (0 if it is not
+            measured; `four_channel` alone uses it).
+        T: time between steps [s].
+        p: (PARAMETERS,) of `parameters`.
+        memory: (MEMORY,) of `initial_memory`, changed.
+        wrench: (6,) written: what the hand shall feel until the next step. Zero if an input is
+            not finite.
+        packet: (PACKET_SIZE,) written: what is sent.
+    """
+    healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(hand)
+    if not healthy:
+        wrench[:] = 0.0
+    else:
+        none.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
+    _finish(healthy, memory, packet)
+
+
+@njit(cache=True)
+def slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
+    """One step of the slave's end, allocation-free: where the slave shall go, and what is sent.
+
+    Args:
+        method, received, fresh, T, p, memory, packet: as for `master_step`; the newest packet is
+            the master's.
+        pose: (7,) X_WS of the slave, actual.
+        twist: (6,) its twist [v; omega], in W.
+        dx: (6,) its increment since the last step, in W.
+        wrench: (6,) contact wrench, scaled, in W and master power units.
+        command: (13,) written: pose (7,) and twist (6,) that the slave shall follow. The last one,
+            at rest, if an input is not finite.
+    """
+    healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(wrench)
+    if not healthy:
+        memory[COMMAND + 7 : COMMAND + 13] = 0.0
+        command[:] = memory[COMMAND : COMMAND + 13]
+    else:
+        none.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
+    _finish(healthy, memory, packet)

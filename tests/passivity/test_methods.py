@@ -1,0 +1,180 @@
+"""What every method owes: finite and limited outputs, packets that count, frame-independence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.passivity.memory import MEMORY
+from drake_teleop.passivity.methods import (
+    METHODS,
+    PassivityConfig,
+    initial_memory,
+    master_step,
+    parameters,
+    slave_step,
+)
+from drake_teleop.passivity.packet import (
+    HEALTHY,
+    PACKET_SIZE,
+    SEQUENCE,
+    difference_into,
+    moved_into,
+)
+from drake_teleop.quantities import check_ranges
+from drake_teleop.quaternions import multiply, normalized, rotate
+
+T = 1e-3
+START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
+
+
+def poses(rng: np.random.Generator, steps: int) -> np.ndarray:
+    """(steps, 7) a smooth random motion from `START` in all six degrees of freedom."""
+    t = np.arange(steps) * T
+    pose = np.tile(START, (steps, 1))
+    phase, rate = rng.uniform(0, 6, 6), rng.uniform(3, 12, 6)
+    e = 0.05 * (np.sin(np.outer(t, rate) + phase) - np.sin(phase))
+    for k in range(steps):
+        moved_into(START, e[k], pose[k])
+    return pose
+
+
+def wrenches(rng: np.random.Generator, steps: int) -> np.ndarray:
+    """(steps, 6) a random contact wrench that is zero half of the time."""
+    t = np.arange(steps) * T
+    f = np.array([6.0, 6.0, 6.0, 0.1, 0.1, 0.1]) * np.sin(
+        np.outer(t, rng.uniform(2, 30, 6)) + rng.uniform(0, 6, 6)
+    )
+    return f * (np.sin(7.0 * t) > 0)[:, None]
+
+
+def run(method, config, master_poses, slave_poses, f_e, newest):
+    """Both ends over a line on which packet `newest[way, k]` is the newest at step k (-1: none).
+
+    Returns:
+        wrench at the hand (N, 6), command of the slave (N, 13), both packets (2, N, PACKET_SIZE),
+        increments of both ends (2, N, 6), both memories.
+    """
+    steps = len(f_e)
+    p = parameters(config)
+    memory = [initial_memory(method, p, ends[0]) for ends in (master_poses, slave_poses)]
+    sent = np.zeros((2, steps, PACKET_SIZE))
+    wrench, command, dx = np.zeros((steps, 6)), np.zeros((steps, 13)), np.zeros((2, steps, 6))
+    nothing = np.zeros(PACKET_SIZE)
+    m = METHODS.index(method)
+    for k in range(steps):
+        for end, pose in enumerate((master_poses, slave_poses)):
+            difference_into(pose[k], pose[max(k - 1, 0)], dx[end, k])
+            j, before = newest[1 - end, k], newest[1 - end, max(k - 1, 0)]
+            received = nothing if j < 0 else sent[1 - end, j]
+            fresh = j >= 0 and (k == 0 or j != before)
+            twist = dx[end, k] / T
+            if end == 0:
+                master_step(
+                    m, received, fresh, pose[k], twist, dx[end, k], np.zeros(6), T, p,
+                    memory[end], wrench[k], sent[end, k],
+                )  # fmt: skip
+            else:
+                slave_step(
+                    m, received, fresh, pose[k], twist, dx[end, k], f_e[k], T, p,
+                    memory[end], command[k], sent[end, k],
+                )  # fmt: skip
+    return wrench, command, sent, dx, memory
+
+
+def line(rng: np.random.Generator, steps: int, delay: int = 20, jitter: int = 20) -> np.ndarray:
+    """(2, steps) newest packets of a line that delays, reorders and loses a tenth."""
+    newest = np.full((2, steps), -1)
+    for way in range(2):
+        arrival = np.arange(steps) + delay + rng.integers(0, jitter + 1, steps)
+        for j in np.flatnonzero(rng.uniform(size=steps) > 0.1):
+            if arrival[j] < steps:
+                newest[way, arrival[j]] = max(newest[way, arrival[j]], j)
+        newest[way] = np.maximum.accumulate(newest[way])
+    return newest
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_outputs_are_finite_limited_and_numbered(method):
+    rng = np.random.default_rng(1)
+    config = PassivityConfig(method=method, force_limit=2.0, torque_limit=0.04)
+    f_e = wrenches(rng, 1500)
+    wrench, command, sent, *_ = run(
+        method, config, poses(rng, 1500), poses(rng, 1500), f_e, line(rng, 1500)
+    )
+    assert np.isfinite(wrench).all() and np.isfinite(command).all() and np.isfinite(sent).all()
+    assert np.linalg.norm(wrench[:, :3], axis=1).max() <= 2.0 + 1e-12
+    assert np.linalg.norm(wrench[:, 3:], axis=1).max() <= 0.04 + 1e-12
+    assert np.linalg.norm(wrench[:, :3], axis=1).max() > 1e-3, "nothing was ever displayed"
+    np.testing.assert_allclose(np.linalg.norm(command[:, :4], axis=1), 1.0, atol=1e-9)
+    for end in range(2):
+        np.testing.assert_array_equal(sent[end, :, SEQUENCE], np.arange(1500))
+        assert (sent[end, :, HEALTHY] == 1).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_world_axes_do_not_matter(method):
+    """Everything turned by a constant R gives turned results."""
+    rng = np.random.default_rng(2)
+    config = PassivityConfig(method=method)
+    master, slave, f_e, newest = (
+        poses(rng, 800),
+        poses(rng, 800),
+        wrenches(rng, 800),
+        line(rng, 800),
+    )
+    R = normalized(tuple(rng.normal(size=4)))
+
+    def turned(vectors):
+        return np.array([[*rotate(R, v[:3]), *rotate(R, v[3:6])] for v in vectors])
+
+    def turned_poses(x):
+        return np.array([[*multiply(R, tuple(row[:4])), *rotate(R, row[4:])] for row in x])
+
+    wrench, command, *_ = run(method, config, master, slave, f_e, newest)
+    wrench_R, command_R, *_ = run(
+        method, config, turned_poses(master), turned_poses(slave), turned(f_e), newest
+    )
+    np.testing.assert_allclose(wrench_R, turned(wrench), atol=1e-8)
+    np.testing.assert_allclose(command_R[:, :7], turned_poses(command[:, :7]), atol=1e-9)
+    np.testing.assert_allclose(command_R[:, 7:], turned(command[:, 7:]), atol=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_finite_gives_no_force_and_leaves_the_ledgers_alone(method, bad):
+    p = parameters(PassivityConfig(method=method))
+    memory = initial_memory(method, p, START)
+    received, zero = np.zeros(PACKET_SIZE), np.zeros(6)
+    wrench, command, packet = np.ones(6), np.zeros(13), np.zeros(PACKET_SIZE)
+    m = METHODS.index(method)
+    master_step(m, received, False, START, zero, zero, zero, T, p, memory, wrench, packet)
+    before = memory.copy()
+    received[20] = bad
+    wrench[:] = 1.0
+    master_step(m, received, True, START, zero, zero, zero, T, p, memory, wrench, packet)
+    assert (wrench == 0).all() and packet[HEALTHY] == 0 and np.isfinite(packet).all()
+    np.testing.assert_array_equal(memory[1:], before[1:])
+    slave_step(m, received, True, START, zero, zero, zero, T, p, memory, command, packet)
+    np.testing.assert_array_equal(command[:7], START)
+    assert (command[7:] == 0).all() and packet[HEALTHY] == 0 and packet[SEQUENCE] == 2
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_slave_stays_until_a_packet_arrives(method):
+    rng = np.random.default_rng(3)
+    config = PassivityConfig(method=method)
+    still = np.tile(START, (50, 1))
+    _, command, *_ = run(
+        method, config, poses(rng, 50), still, np.zeros((50, 6)), np.full((2, 50), -1)
+    )
+    np.testing.assert_allclose(command, np.tile([*START, *np.zeros(6)], (50, 1)), atol=1e-12)
+
+
+def test_a_method_that_does_not_exist_is_refused():
+    with pytest.raises(DrakeTeleopError, match="there is no method 'waves'"):
+        initial_memory("waves", np.zeros(1), START)
+    with pytest.raises(DrakeTeleopError, match="method"):
+        check_ranges(PassivityConfig(method="waves"), "passivity")
+    assert initial_memory("none", np.zeros(1), START).shape == (MEMORY,)
