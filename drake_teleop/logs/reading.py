@@ -31,6 +31,7 @@ from drake_teleop.logs.description import (
     Wrench,
     load_description,
 )
+from drake_teleop.logs.mounting import describe_mounting
 from drake_teleop.logs.rotations import (
     WIDTHS,
     nearest_rotation,
@@ -135,6 +136,8 @@ class _Reader:
         if self._description.static is not None:
             return self._static(self._description.static)
         assert self._description.wrench is not None
+        if self._description.imu is not None and self._description.imu.automatic:
+            self._find_mounting()
         wrench_t, wrench = self._wrench(self._description.wrench)
         pose = imu = None
         if self._description.pose is not None:
@@ -145,6 +148,18 @@ class _Reader:
         t = self._common_time(wrench_t, streams)
         log = self._assembled(t, resample(t, wrench_t, wrench), imu, pose)
         return log if keep_origin else replace(log, t=log.t - wrench_t[0])
+
+    def _find_mounting(self) -> None:
+        """Puts what the data say in the place of `auto`."""
+        for name in ("wrench", "imu", "pose"):
+            if (stream := getattr(self._description, name)) is not None:
+                self._table(stream)
+        self._description, notes = describe_mounting(
+            self._description,
+            self._source,
+            lambda description: _Reader(description, self._source, 30.0, self._tables).log(),
+        )
+        self._notes += notes
 
     def _table(self, stream: Wrench | Imu | Pose | Static) -> Table:
         if stream.file not in self._tables:
@@ -216,6 +231,7 @@ class _Reader:
         omega, alpha = vectors("angular_velocity"), vectors("angular_acceleration")
         if omega is not None and alpha is None:
             alpha = smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
+        assert stream.position != "auto"
         if s is not None and any(stream.position):
             s = self._at_S(s, np.array(stream.position), t, omega, alpha, pose)
         return _Stream("imu", t, s, omega, alpha)
