@@ -11,9 +11,9 @@ streams         of each: rows, rate_hz, duration_s, longest_gap_s, gaps, clock_j
                 white noise, from third differences), saturated (samples at the end of the range)
 findings        list of name and message: what is suspicious and what to change
 fit             of a load to the description as given: mass [kg] and unexplained, the share of the
-                wrench's variance; null if nothing could be fitted
-mounting        of the IMU against the pose: R_SI, angle_deg, right_angled, lag_s, unexplained;
-                null without both
+                wrench's variance; null if the log cannot be read
+mounting        of the IMU against the pose: R_SI, angle_deg, right_angled, lag_s (the best
+                constant), drift of the clock [s/s], unexplained; null without both
 delay_s         of the motion behind the wrench; null if the log does not determine it
 draft           the file with a draft description of an unknown table, or null
 =============== =================================================================================
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.canonical import describe_canonical
-from drake_teleop.logs.conventions import Finding, check_conventions
+from drake_teleop.logs.conventions import Finding, check_conventions, white_noise
 from drake_teleop.logs.description import Description, load_description
 from drake_teleop.logs.tables import FORMATS, Table, read_table
 
@@ -135,14 +135,14 @@ def _inspect(
     else:
         findings += found.findings
         summary["delay_s"] = found.delay_s
-        if found.fit is not None:
-            summary["fit"] = {"mass": found.fit.mass, "unexplained": found.fit.unexplained}
+        summary["fit"] = {"mass": found.fit.mass, "unexplained": found.fit.unexplained}
         if found.mounting is not None:
             summary["mounting"] = {
                 "R_SI": found.mounting.R_SI.tolist(),
                 "angle_deg": found.mounting.angle_deg,
                 "right_angled": found.mounting.is_right_angled,
                 "lag_s": found.mounting.lag_s,
+                "drift": found.mounting.drift,
                 "unexplained": found.mounting.unexplained,
             }
     summary["findings"] = [{"name": f.name, "message": f.message} for f in findings]
@@ -197,7 +197,7 @@ def _stream(
             "min": float(finite.min()),
             "max": float(finite.max()),
             "mean": float(finite.mean()),
-            "noise": _noise(finite),
+            "noise": float(white_noise(finite[:, None])[0]),
             "saturated": saturated,
         }
         if saturated:
@@ -275,14 +275,6 @@ def _longest(flags: NDArray[np.bool_]) -> int:
     """Length of the longest run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return int((edges[1::2] - edges[::2]).max(initial=0))
-
-
-def _noise(x: NDArray[np.float64]) -> float:
-    """Standard deviation of white noise: third differences know nothing of smooth motion."""
-    if len(x) < 4:
-        return 0.0
-    # The squares of 1, 3, 3, 1 sum to 20; 1.4826 median |x| is the deviation of a normal x.
-    return float(1.4826 * np.median(np.abs(np.diff(x, 3))) / np.sqrt(20))
 
 
 def _saturated(x: NDArray[np.float64], same: NDArray[np.bool_]) -> int:
