@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +110,7 @@ class Log:
     def __len__(self) -> int:
         return len(self.t)
 
-    @property
+    @cached_property
     def dt(self) -> float:
         """Time between samples [s]; where samples in gaps were taken out, between the others."""
         steps = np.diff(self.t)
@@ -121,6 +122,8 @@ class Log:
         Args:
             rows: which.
         """
+        if not isinstance(rows, slice) and rows.all():
+            return self
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         taken: dict[str, Any] = {k: None if x is None else x[rows] for k, x in arrays.items()}
         return replace(self, **taken)

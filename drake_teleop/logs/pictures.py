@@ -44,7 +44,7 @@ VERDICT_WORDS = dict(
         strict=True,
     )
 )
-_POINTS = 4000
+_POINTS, _LONGEST_WINDOW = 4000, 2**14
 # Lighter than the house's grey: it lies under all the other curves.
 _MEASURED = "#A3AAB5"
 
@@ -78,7 +78,8 @@ def one_page(upper: Path, lower: Path, page: Path) -> None:
 def spectrum(x: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Amplitude spectral density, one-sided, by Welch's averaged periodograms.
 
-    Hann windows of an eighth of the record, overlapping by half, each without its mean.
+    Hann windows of an eighth of the record, but of no more samples than a picture has room for,
+    overlapping by half, each without its mean.
 
     Args:
         x: (N, k) samples.
@@ -87,7 +88,7 @@ def spectrum(x: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], ND
     Returns:
         frequencies (m,) without zero [Hz], densities (m, k) [unit of x / sqrt(Hz)].
     """
-    length = min(len(x), max(16, len(x) // 8))
+    length = min(len(x), max(16, len(x) // 8), _LONGEST_WINDOW)
     window = np.hanning(length + 1)[:-1, None]
     starts = range(0, len(x) - length + 1, max(1, length // 2))
     power = np.mean(
@@ -125,17 +126,19 @@ def _fit_into(figure: Any, found: IdentifiedLog) -> None:
 def _knowledge_into(figure: Any, found: IdentifiedLog) -> None:
     log, result = found.log, found.identification
     residual = log.wrench - found.predicted
+    if log.static:
+        rate, shown = 1.0 + np.arange(len(log)), residual
+    else:
+        rate, shown = spectrum(residual, log.dt)
     spectra, known = figure.subfigures(2, 1, height_ratios=[1, 1.5])
     left, right = spectra.subplots(1, 2)
     for axis, columns, unit in ((left, slice(0, 3), "N"), (right, slice(3, 6), "N m")):
-        for name, colour, values in zip(
-            _CHANNELS[columns], (BLUE, VERMILION, GREEN), residual[:, columns].T, strict=True
-        ):
+        curves = zip(_CHANNELS[columns], (BLUE, VERMILION, GREEN), shown[:, columns].T, strict=True)
+        for name, colour, values in curves:
             if log.static:
-                axis.plot(np.arange(1, len(values) + 1), values, "o", color=colour, label=name)
-                continue
-            rate, density = spectrum(values[:, None], log.dt)
-            axis.loglog(rate, density[:, 0], color=colour, label=name)
+                axis.plot(rate, values, "o", color=colour, label=name)
+            else:
+                axis.loglog(rate, values, color=colour, label=name)
         if log.static:
             axis.set(xlabel="pose", ylabel=f"residual [{unit}]", title="Residual of each pose")
         else:
