@@ -28,9 +28,10 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.batch import identify_batch
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import regressor
-from drake_teleop.logs.alignment import low_passed, resample, undelayed
+from drake_teleop.logs.alignment import low_passed, measured, resample, undelayed
+from drake_teleop.logs.bags import read_stream
 from drake_teleop.logs.canonical import Log, describe_canonical
-from drake_teleop.logs.delay import estimate_delay
+from drake_teleop.logs.delay import SEARCH_RANGE, estimate_delay
 from drake_teleop.logs.description import Description, Time, load_description
 from drake_teleop.logs.mounting import Mounting, find_mounting, right_angled_rotations
 from drake_teleop.logs.reading import read_description
@@ -115,7 +116,7 @@ def load_fit(log: Log) -> LoadFit:
         log: the log; it is low-passed at 15 Hz for this.
     """
     cutoff = _cutoff(log)
-    smooth = low_passed(log, cutoff)
+    smooth = low_passed(log, cutoff).only(measured(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _SAMPLES))
     wrench = smooth.wrench[rows]
     w = wrench - wrench.mean(axis=0)
@@ -209,7 +210,8 @@ def check_conventions(
     if mounting is not None and mounting.mirrored:
         return Conventions(tuple(findings), fit, mounting, None)
     more, delay = _against_load(description, data)
-    return Conventions((*findings, *more), fit, mounting, delay)
+    findings = _one_clock(description, [*findings, *more], mounting, delay)
+    return Conventions(tuple(findings), fit, mounting, delay)
 
 
 class _Data:
@@ -221,14 +223,15 @@ class _Data:
         self._thinned: dict[Path, Table] = {}
         steps: dict[Path, list[int]] = {}
         for stream in _streams(description):
-            if stream.file not in tables:
-                tables[stream.file] = read_table(stream.file, header=stream.header)
-            steps.setdefault(stream.file, []).append(self._stride(description, stream))
+            if stream.source not in tables:
+                tables[stream.source] = read_stream(stream)
+            steps.setdefault(stream.source, []).append(self._stride(description, stream))
         for stream in _streams(description):
             thin = self._thinned.setdefault(
-                stream.file, replace(tables[stream.file], columns=dict(tables[stream.file].columns))
+                stream.source,
+                replace(tables[stream.source], columns=dict(tables[stream.source].columns)),
             )
-            self._thin(stream, thin, min(steps[stream.file]))
+            self._thin(stream, thin, min(steps[stream.source]))
 
     def read(self, description: Description) -> Log:
         """The whole log."""
@@ -250,7 +253,7 @@ class _Data:
         """When the stream's first row was taken, on the common clock [s]."""
         if stream.time.column is None:
             return float(stream.time.offset)
-        t = self._tables[stream.file].raw(stream.time.column, "time")
+        t = self._tables[stream.source].raw(stream.time.column, "time")
         return float(t[0, 0]) * description.scale(stream.time.unit) + stream.time.offset
 
     def _stride(self, description: Description, stream: Any) -> int:
@@ -261,13 +264,13 @@ class _Data:
         if time.rate is not None:
             rate = time.rate
         else:
-            t = self._tables[stream.file].raw(str(time.column), "time")[:, 0]
+            t = self._tables[stream.source].raw(str(time.column), "time")[:, 0]
             rate = 1 / max(1e-12, float(np.median(np.diff(t))) * description.scale(time.unit))
         return max(1, math.floor((rate / _RATE - 1) / 2) * 2 + 1)
 
     def _thin(self, stream: Any, thin: Table, k: int) -> None:
         """Means over k rows; of an orientation, which has no mean, the row in the middle."""
-        table = self._tables[stream.file]
+        table = self._tables[stream.source]
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):
@@ -495,6 +498,27 @@ def _imu_clock(description: Description, found: Mounting, data: _Data) -> _Edit:
     return finding, _edit(edited, "imu.time.scale", factor)
 
 
+def _one_clock(
+    description: Description,
+    findings: list[Finding],
+    mounting: Mounting | None,
+    delay: float | None,
+) -> list[Finding]:
+    """If IMU and wrench disagree with the pose by the same time, its clock is wrong, not theirs."""
+    clocks = [finding for finding in findings if finding.name == "clock"]
+    if len(clocks) < 2 or mounting is None or mounting.drift or delay is None:
+        return findings
+    if abs(mounting.lag_s + delay) > CLOCK:
+        return findings
+    assert description.pose is not None
+    finding = Finding(
+        "clock",
+        f"the clock of the pose is {delay:.3f} s ahead of those of IMU and wrench;"
+        f" set pose.time.offset: {description.pose.time.offset - delay:.3f}",
+    )
+    return [finding, *(other for other in findings if other.name != "clock")]
+
+
 def _tried(function: Callable[[Description], Any], edited: Description) -> Any:
     """What the function makes of an edited description; None if such a log cannot be read."""
     try:
@@ -566,11 +590,15 @@ def _against_load(description: Description, data: _Data) -> tuple[list[Finding],
         return min(fits, key=lambda fit: fit.unexplained)
 
     given = fitted(description)
-    if given.good:
-        return _lag(description, delay), delay
+    # Slow motion fits well enough with a wrong clock, but not with a delay within the range.
+    inside = delay is not None and abs(delay) < 0.9 * SEARCH_RANGE
+    edits: list[tuple[Finding | None, Description]] = []
+    if not (given.good and inside):
+        edits += _shifted(description, thin)
+    if not given.good:
+        edits = [*_load_edits(description), *edits]
     found: list[tuple[LoadFit, Finding | None, Description]] = []
-    edits: Iterator[tuple[Finding | None, Description]] = _load_edits(description)
-    for finding, edited in [*edits, *_shifted(description, thin)]:
+    for finding, edited in edits:
         fit = _tried(fitted, edited)
         if fit is not None and fit.mass > 0:
             found.append((fit, finding, edited))
@@ -578,6 +606,8 @@ def _against_load(description: Description, data: _Data) -> tuple[list[Finding],
     limit = given.unexplained * 1.01 if given.mass < 0 else given.unexplained / _worse(given)
     limit = min(limit, BELIEVABLE + given.noise)
     found = [entry for entry in found if entry[0].unexplained < limit]
+    if not found and given.good:
+        return _lag(description, delay), delay
     if not found:
         return _without_remedy(description, log, given, delay)
     least = 1.2 * min(fit.unexplained for fit, *_ in found) + 1e-9
@@ -589,7 +619,7 @@ def _against_load(description: Description, data: _Data) -> tuple[list[Finding],
         shift = edited.wrench.time.offset - description.wrench.time.offset + (delay or 0.0)
         return _lag(description, shift), shift
     others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
-    message = "; or as well ".join([finding.message, *others.values()])
+    message = "; just as possible: ".join([finding.message, *others.values()])
     return [Finding(finding.name, message), *_lag(description, delay)], delay
 
 

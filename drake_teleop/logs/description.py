@@ -13,7 +13,7 @@ import types
 import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import yaml
@@ -166,21 +166,73 @@ class Position(_Strict):
     unit: Literal["m", "mm"] = "m"
 
 
+def _named(group: str, axes: str = "xyz") -> list[str]:
+    return [f"{group}.{axis}" for axis in axes]
+
+
+_OF_TOPIC: dict[str, dict[str, Any]] = {
+    "force": {"columns": _named("force")},
+    "torque": {"columns": _named("torque")},
+    "specific_force": {"columns": _named("linear_acceleration")},
+    "angular_velocity": {"columns": _named("angular_velocity")},
+    "orientation": {"columns": _named("orientation", "wxyz"), "form": "quaternion_wxyz"},
+    "position": {"columns": _named("position")},
+}
+
+
 class _Stream(_Strict):
     file: Path
     header: bool = True
 
+    @property
+    def source(self) -> Path:
+        """The file, or, in a bag, the file and the topic behind it."""
+        return self.file
 
-class Wrench(_Stream):
+
+class _Recorded(_Stream):
+    """A stream with a clock: a table, or a topic of a bag, for which much has defaults."""
+
+    topic: str | None = Field(default=None, description="of a ROS bag or MCAP file")
+    child_frame: str | None = Field(default=None, description="which transform of the topic")
     time: Time
+
+    _defaults: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_topic(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or data.get("topic") is None:
+            return data
+        data = {"time": {}, **{name: {} for name in cls._defaults}, **data}
+        time = data["time"]
+        if isinstance(time, dict) and not {"column", "rate"} & set(time):
+            data["time"] = {"column": "stamp", **time}
+        for name in cls._defaults:
+            given = data[name]
+            if isinstance(given, dict) and not {"columns", "form"} & set(given):
+                data[name] = {**_OF_TOPIC[name], **given}
+        return data
+
+    @property
+    def source(self) -> Path:
+        if self.topic is None:
+            return self.file
+        return self.file.joinpath(*f"{self.topic}/{self.child_frame or ''}".split("/"))
+
+
+class Wrench(_Recorded):
+    _defaults = ("force", "torque")
+
     force: Force
     torque: Torque
     sign: Literal[1, -1] = 1
     frame: Frame = "sensor"
 
 
-class Imu(_Stream):
-    time: Time
+class Imu(_Recorded):
+    _defaults = ("specific_force", "angular_velocity")
+
     specific_force: Acceleration | None = None
     angular_velocity: AngularVelocity | None = None
     angular_acceleration: AngularAcceleration | None = None
@@ -205,8 +257,9 @@ class Imu(_Stream):
         return self.frame == "auto" or self.position == "auto"
 
 
-class Pose(_Stream):
-    time: Time
+class Pose(_Recorded):
+    _defaults = ("orientation", "position")
+
     orientation: Orientation
     position: Position | None = None
     frame: Frame = "sensor"
@@ -278,8 +331,16 @@ class Description(_Strict):
 
 def json_schema() -> str:
     """The JSON schema of a description, as text: what docs/log-description.schema.json holds."""
-    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    return json.dumps(schema | Description.model_json_schema(), indent=2) + "\n"
+    schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    schema |= Description.model_json_schema()
+    # With a topic a stream needs its file and nothing else.
+    for name in ("Wrench", "Imu", "Pose"):
+        stream = schema["$defs"][name]
+        without = [field for field in stream["required"] if field != "file"]
+        stream |= {"required": ["file"], "anyOf": [{"required": ["topic"]}, {"required": without}]}
+    for name in ("Force", "Torque", "Acceleration", "AngularVelocity", "Position"):
+        del schema["$defs"][name]["required"]
+    return json.dumps(schema, indent=2) + "\n"
 
 
 def load_description(path: str | Path) -> Description:

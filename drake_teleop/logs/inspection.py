@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.bags import read_stream
 from drake_teleop.logs.canonical import describe_canonical
 from drake_teleop.logs.conventions import Finding, check_conventions, white_noise
 from drake_teleop.logs.description import Description, load_description
@@ -117,17 +118,17 @@ def _inspect(
         stream = getattr(description, name)
         if stream is None:
             continue
-        if stream.file not in tables:
-            tables[stream.file] = read_table(stream.file, header=stream.header)
-        figures, more, columns = _stream(name, stream, tables[stream.file], description, source)
+        if stream.source not in tables:
+            tables[stream.source] = read_stream(stream)
+        figures, more, columns = _stream(name, stream, tables[stream.source], description, source)
         summary["streams"][name] = figures
         findings += more
-        needed.setdefault(stream.file, []).extend(columns)
+        needed.setdefault(stream.source, []).extend(columns)
     clean = {path: _finite(tables[path], columns) for path, columns in needed.items()}
     for name in ("wrench", "imu", "pose"):
         stream = getattr(description, name)
         if stream is not None and stream.time.column is not None:
-            clean[stream.file] = _increasing(clean[stream.file], str(stream.time.column))
+            clean[stream.source] = _increasing(clean[stream.source], str(stream.time.column))
     try:
         found = check_conventions(description, source, clean)
     except DrakeTeleopError as error:
@@ -178,21 +179,15 @@ def _stream(
     same = np.zeros(len(values), bool)
     same[1:] = (values[1:] == values[:-1]).all(axis=1)
     figures["repeated_rows"] = int(same.sum())
-    noisy = name in ("wrench", "imu") and not same[1:].all()
-    if noisy and (same.mean() > REPEATED or _longest(same) >= BLOCK):
-        findings.append(
-            Finding(
-                "repeated rows",
-                f"{at}: {int(same.sum())} rows repeat the one before, up to {_longest(same)} in"
-                " a row: the recorder held old values; delete the repeated rows",
-            )
-        )
+    moving = name in ("wrench", "imu") and not same[1:].all()
+    if moving:
+        findings += _repeated(at, values, same, figures.get("rate_hz"), time)
     figures["columns"] = {}
     for column, x in zip(_labels(columns, table), values.T, strict=True):
         finite = x[np.isfinite(x)]
         if not len(finite):
             continue
-        saturated = 0 if time is None or not noisy else _saturated(x, same)
+        saturated = 0 if time is None or not moving else _saturated(x, same)
         figures["columns"][column] = {
             "min": float(finite.min()),
             "max": float(finite.max()),
@@ -210,6 +205,39 @@ def _stream(
             )
     used = columns if time is None or time.column is None else [*columns, str(time.column)]
     return figures, findings, used
+
+
+def _repeated(
+    at: str,
+    values: NDArray[np.float64],
+    same: NDArray[np.bool_],
+    rate: float | None,
+    time: Any,
+) -> list[Finding]:
+    """Whether rows were held by the recorder, and at what rate new ones came.
+
+    A coarse sensor at rest repeats rows by itself; but then rows in which all channels but one
+    repeat are as common, whereas held rows repeat in all channels at once.
+    """
+    held = int(same.sum())
+    changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
+    equal = (changing[1:] == changing[:-1]).sum(axis=1)
+    nearly = int((equal == changing.shape[1] - 1).sum())
+    enough = same.mean() > REPEATED or _longest(same) >= BLOCK
+    if not enough or (changing.shape[1] > 1 and held < 3 * nearly):
+        return []
+    longest = _longest(same)
+    fresh = np.flatnonzero(~same)
+    period = int(np.median(np.diff(fresh)))
+    news = "" if rate is None else f": new values come at {rate * len(fresh) / len(same):.4g} Hz"
+    if period > 1 and rate is not None:
+        what = f"every value is held for {period} rows{news}, not {rate:.4g} Hz"
+    else:
+        what = f"{held} rows repeat the one before in all channels, up to {longest} in a row{news}"
+    remedy = "delete the repeated rows"
+    if time is not None and time.column is None:
+        remedy = f"give time stamps (time.column) and {remedy}"
+    return [Finding("repeated rows", f"{at}: {what}; {remedy}")]
 
 
 def _clock(

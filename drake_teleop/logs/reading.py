@@ -19,6 +19,7 @@ from drake_teleop.logs.alignment import (
     spacing,
     uniform_times,
 )
+from drake_teleop.logs.bags import is_bag, read_stream, topic_missing
 from drake_teleop.logs.canonical import Log, describe_canonical
 from drake_teleop.logs.clocks import Clock, gaps, read_clock
 from drake_teleop.logs.description import (
@@ -87,6 +88,8 @@ def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
         description = describe_canonical(path, table)
         reader = _Reader(description, str(path), bandwidth_hz, {path: table})
         return reader.log(keep_origin=True)
+    if is_bag(path):
+        raise topic_missing(path)
     raise DrakeTeleopError(
         f"format {path.suffix!r} is not known",
         where=str(path),
@@ -162,9 +165,9 @@ class _Reader:
         self._notes += notes
 
     def _table(self, stream: Wrench | Imu | Pose | Static) -> Table:
-        if stream.file not in self._tables:
-            self._tables[stream.file] = read_table(stream.file, header=stream.header)
-        return self._tables[stream.file]
+        if stream.source not in self._tables:
+            self._tables[stream.source] = read_stream(stream)
+        return self._tables[stream.source]
 
     def _wrench(self, stream: Wrench) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         table = self._table(stream)
@@ -326,6 +329,10 @@ class _Reader:
                 remedy=f"record at least {MINIMUM_SAMPLES}, evenly spaced",
             )
         self._notes += [f"{name}: {note}" for note in clock.notes]
+        if stream.topic and stream.time.column == "stamp" and "header.stamp" not in table.columns:
+            self._notes.append(
+                f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
+            )
         holes = gaps(t, self._bandwidth_hz)
         if len(holes):
             start, stop = holes[int(np.argmax(holes[:, 1] - holes[:, 0]))]

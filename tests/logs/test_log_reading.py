@@ -123,7 +123,9 @@ def test_bad_canonical_logs(
 
 
 def test_unknown_kind_of_log(tmp_path: Path) -> None:
-    with pytest.raises(DrakeTeleopError, match=r"'\.bag' is not known; give a canonical log"):
+    with pytest.raises(DrakeTeleopError, match=r"'\.xls' is not known; give a canonical log"):
+        read_log(tmp_path / "log.xls")
+    with pytest.raises(DrakeTeleopError, match=r"is a bag, .*; describe it"):
         read_log(tmp_path / "log.bag")
 
 
