@@ -202,11 +202,12 @@ def _of_child(
     if child_frame is None and len(children) <= 1:
         return pairs
     if child_frame not in children:
+        named = ", ".join(filter(None, children))
         what = "several child frames" if child_frame is None else f"no child frame {child_frame!r}"
         raise DrakeTeleopError(
             f"has {what}",
             where=where,
-            remedy=f"give child_frame, one of {', '.join(filter(None, children)) or 'none'}",
+            remedy=f"give child_frame, one of {named}" if named else "leave it out",
         )
     return [(time, part) for time, part in pairs if part.child_frame_id == child_frame]
 
