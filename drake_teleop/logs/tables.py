@@ -155,14 +155,15 @@ def _read_frame(path: Path, header: bool) -> Table:
     try:
         if is_csv:
             frame = pl.read_csv(path, has_header=header, infer_schema_length=None)
+            names = [name.strip() if header else str(i) for i, name in enumerate(frame.columns)]
+            found = [_frame_column(series) for series in frame.get_columns()]
         else:
-            frame = pl.read_parquet(path)
+            # One column at a time: the whole table would be in memory twice.
+            names = list(pl.read_parquet_schema(path))
+            found = [_frame_column(pl.read_parquet(path, columns=[n]).to_series()) for n in names]
     except pl.exceptions.PolarsError as error:
         raise _unreadable(path, error) from error
-    named = [name.strip() if header else str(i) for i, name in enumerate(frame.columns)]
-    columns = {
-        name: _frame_column(series) for name, series in zip(named, frame.get_columns(), strict=True)
-    }
+    columns = {name.strip(): column for name, column in zip(names, found, strict=True)}
     return Table(path, columns, first_row=2 if is_csv and header else 1)
 
 
@@ -182,7 +183,7 @@ def _as_numbers(
     column: NDArray, bad: Callable[[int, object], DrakeTeleopError]
 ) -> NDArray[np.float64]:
     if column.dtype.kind in "fiu":
-        return column.astype(float)
+        return column.astype(float, copy=False)
     numbers = np.empty(len(column))
     for row, cell in enumerate(column):
         try:
