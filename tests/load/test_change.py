@@ -1,0 +1,258 @@
+"""Noticing another load online: what is told apart from what, and what is then known."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.batch import identify_batch
+from drake_teleop.load.change import HOLD, STATES, WIDE, LoadChangeMonitor
+from drake_teleop.load.gripper import identified_object
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.moments import Noise
+from drake_teleop.load.regressor import non_contact_wrench, regressor
+
+FILE = Path(__file__).parents[2] / "benchmarks" / "load_change.py"
+KNOWN, DISTURBED, CHANGED, IDENTIFIED = range(4)
+SEEDS = range(6)
+
+
+@pytest.fixture(scope="module")
+def bench():
+    spec = importlib.util.spec_from_file_location("load_change", FILE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def tool(bench) -> Identification:
+    return bench.known("JR3")
+
+
+def share(phi, whole):
+    return phi[0] / whole[0] - 1.0
+
+
+def test_the_motion_of_the_benchmark_is_that_of_a_body(bench):
+    """alpha is the derivative of omega, and the vertical turns against the body."""
+    _, (s, omega, alpha), up = bench.motion(3)
+    change = np.gradient(omega, bench.PERIOD, axis=0)[1:-1]
+    np.testing.assert_allclose(change, alpha[1:-1], atol=1e-3 * np.abs(alpha).max())
+    turning = np.gradient(up, bench.PERIOD, axis=0)[1:-1]
+    np.testing.assert_allclose(turning, -np.cross(omega, up)[1:-1], atol=1e-3)
+    assert np.linalg.norm(s - 9.81 * up, axis=1).max() < 10.0
+
+
+def test_a_free_motion_is_no_change(bench, tool):
+    for seed in SEEDS:
+        states = bench.monitor("JR3", tool).watch(*bench.record("JR3", seed))
+        assert states.max() == KNOWN
+
+
+@pytest.mark.parametrize("kind", ["grasp", "release"])
+def test_an_object_is_noticed_and_known(bench, tool, kind):
+    """At the instant of the alarm, as a change within half a second, its mass within 1 %."""
+    full = bench.TOOL + bench.OBJECT
+    before = tool if kind == "grasp" else bench.known("JR3", full)
+    for seed in SEEDS:
+        monitor = bench.monitor("JR3", before)
+        rows = bench.record("JR3", seed, kind, bench.TOOL if kind == "grasp" else full)
+        states = monitor.watch(*rows)
+        assert states[: int(bench.EVENT / bench.PERIOD)].max() == KNOWN
+        alarm, change = (int(np.argmax(states >= k)) * bench.PERIOD - bench.EVENT for k in (1, 2))
+        assert 0.0 < alarm < 0.05
+        assert alarm + HOLD - 0.02 < change < 0.5
+        assert -0.02 < monitor.changed_at - bench.EVENT < 0.3
+        assert monitor.state == "identified"
+        pair = (monitor.load, before) if kind == "grasp" else (before, monitor.load)
+        found = identified_object(*pair)
+        error = np.concatenate([[share(found.phi, bench.OBJECT)], (found.phi - bench.OBJECT)[1:4]])
+        assert abs(error[0]) < 0.01
+        # The stated uncertainty covers it: covariances add.
+        assert (np.abs(error[1:]) < 4.5 * found.standard_deviations[7:10]).all()
+        assert abs(error[0]) * 0.8 < 4.5 * found.standard_deviations[6]
+        assert (np.abs(monitor.load.offsets - bench.OFFSETS) < 0.2).all()
+        # What the fit leaves is the noise of a sample: of the force at least the sensor's.
+        assert (monitor.load.residual_rms[:3] > 0.2).all()
+        assert (monitor.load.residual_rms[:3] < 1.2).all()
+
+
+def test_an_ideal_sensor_finds_the_object_exactly_and_then_the_next(bench):
+    monitor = bench.monitor("ideal", bench.known("ideal"))
+    states = monitor.watch(*bench.record("ideal", 1, "grasp"))
+    assert states[-1] == IDENTIFIED
+    np.testing.assert_allclose(monitor.load.phi, bench.TOOL + bench.OBJECT, atol=1e-9)
+    # With the object known, putting it down is a change again.
+    full = bench.TOOL + bench.OBJECT
+    again = monitor.watch(*bench.record("ideal", 2, "release", full))
+    assert again[: int(bench.EVENT / bench.PERIOD)].max() == IDENTIFIED
+    assert DISTURBED in again
+    assert again[-1] == IDENTIFIED
+    np.testing.assert_allclose(monitor.load.phi, bench.TOOL, atol=1e-9)
+
+
+@pytest.mark.parametrize("sensor", ["JR3", "ideal"])
+@pytest.mark.parametrize("kind", ["knock", "push", "hand", "along g"])
+def test_a_contact_is_never_identified_and_forgotten_when_it_ends(bench, sensor, kind):
+    before = bench.known(sensor)
+    for seed in SEEDS:
+        monitor = bench.monitor(sensor, before)
+        states = monitor.watch(*bench.record(sensor, seed, kind))
+        assert states.max() < IDENTIFIED
+        assert states[-1] == KNOWN and monitor.load is before
+        assert states.max() >= DISTURBED
+        if kind == "knock" or sensor == "ideal":
+            assert states.max() < CHANGED
+
+
+def test_a_vertical_push_at_rest_is_a_weight_until_the_tool_moves(bench, tool):
+    """Nothing can tell them apart while nothing moves; the push does not follow the motion."""
+    t, moving, up = bench.motion(5)
+    still = [np.tile(x[:1] * keep, (len(t), 1)) for x, keep in zip(moving, (1, 0, 0), strict=True)]
+    still[0] = np.tile(9.81 * up[:1], (len(t), 1))
+    arm = np.array([0.0, 0.0, 0.2])
+    rng = np.random.default_rng(0)
+    monitor = bench.monitor("JR3", tool)
+    for clean, vertical, expected in (
+        (still, np.tile(up[:1], (len(t), 1)), CHANGED),
+        (moving, up, 1),
+    ):
+        F = bench.OFFSETS + non_contact_wrench(*clean, bench.TOOL)
+        F += 6.0 * np.hstack([vertical, np.cross(arm, vertical)])
+        wrench_std, motion_std = bench.SENSORS["JR3"]
+        F += np.repeat(wrench_std, 3) * rng.normal(size=F.shape)
+        clean = [x + n * rng.normal(size=x.shape) for x, n in zip(clean, motion_std, strict=True)]
+        states = monitor.watch(F, *clean)
+        assert states.max() < IDENTIFIED
+        assert np.bincount(states[1000:]).argmax() == expected
+
+
+def test_coloured_noise_of_the_stated_long_run_variance_is_no_change(bench, tool):
+    """AR(1) noise with a memory of 2 ms, much louder in the long run than from sample to sample."""
+    pole = 0.6
+    for seed in SEEDS:
+        rng, (t, clean, _) = np.random.default_rng(seed), bench.motion(seed)
+        white = np.repeat([0.25, 0.012], 3) * rng.normal(size=(len(t), 6))
+        F = bench.OFFSETS + non_contact_wrench(*clean, bench.TOOL)
+        F += lfilter([1.0 - pole], [1.0, -pole], white, axis=0)
+        states = LoadChangeMonitor(tool, np.repeat([0.25, 0.012], 3), np.zeros(9), 1e-3).watch(
+            F, *clean
+        )
+        assert states.max() == KNOWN
+
+
+def test_errors_of_gain_and_cross_talk_are_no_change_if_stated(bench, tool):
+    """The load was identified in the same sensor's units, but in another motion."""
+    noise = Noise(np.repeat([0.25, 0.012], 3), 0.06, 0.0, 1.5)
+    alarms = {0.0: 0, 0.01: 0}
+    for seed in SEEDS:
+        per_channel = np.repeat([1.0, 0.1], 3)
+        wrong = np.random.default_rng(seed).uniform(-0.01, 0.01, (6, 6))
+        gains = np.eye(6) + wrong * np.outer(per_channel, 1.0 / per_channel)
+        F, *measured = bench.record("JR3", seed + 1000)
+        load = identify_batch(F @ gains.T, *measured, method="total", noise=noise).identification
+        F, *measured = bench.record("JR3", seed)
+        grasped, *also = bench.record("JR3", seed, "grasp")
+        std = [np.repeat(x, 3) for x in bench.SENSORS["JR3"]]
+        for error in alarms:
+            monitor = LoadChangeMonitor(load, *std, 1e-3, model_error=error)
+            alarms[error] += int(monitor.watch(F @ gains.T, *measured).max() > KNOWN)
+        monitor = LoadChangeMonitor(load, *std, 1e-3, model_error=0.01)
+        assert monitor.watch(grasped @ gains.T, *also)[-1] == IDENTIFIED
+        assert monitor.load.mass - load.mass == pytest.approx(0.8, rel=0.03)
+    assert alarms[0.01] == 0 < alarms[0.0]
+
+
+def test_the_new_load_is_the_least_squares_solution_with_the_known_prior(bench, tool):
+    """By numpy, from the means of the same blocks."""
+    noise = np.repeat([0.25, 0.012], 3)
+    monitor = LoadChangeMonitor(tool, noise, np.zeros(9), 1e-3, offset_drift=np.full(6, 0.01))
+    _, clean, _ = bench.motion(4)
+    F = bench.OFFSETS + non_contact_wrench(*clean, bench.TOOL + bench.OBJECT)
+    F += noise * np.random.default_rng(4).normal(size=F.shape)
+    states = monitor.watch(F, *clean)
+    stop, start = int(np.argmax(states == IDENTIFIED)) + 1, round(monitor.changed_at * 1e3)
+    assert stop > start >= 16 and (stop - start) % 16 == 0
+    assert monitor.load.samples == stop - start
+
+    def means(x):
+        return x[start:stop].reshape(-1, 16, *x.shape[1:]).mean(axis=1)
+
+    V = means(regressor(*clean))
+    rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
+    weights = 16.0 / noise**2
+    prior = tool.covariance.copy()
+    prior[np.arange(16), np.arange(16)] += np.concatenate([np.full(6, 1e-4), np.square(WIDE)])
+    information = np.linalg.inv(prior)
+    gram = np.einsum("nci,c,ncj->ij", rows, weights, rows) + information
+    right = np.einsum("nci,c,nc->i", rows, weights, means(F))
+    right += information @ np.concatenate([tool.offsets, tool.phi])
+    expected = np.linalg.solve(gram, right)
+    np.testing.assert_allclose(monitor.load.phi, expected[6:], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(monitor.load.offsets, expected[:6], rtol=1e-6)
+    np.testing.assert_allclose(monitor.load.covariance, np.linalg.inv(gram), rtol=1e-4, atol=1e-12)
+
+
+def test_one_by_one_and_kept_elsewhere_is_the_same(bench, tool):
+    rows = bench.record("JR3", 7, "grasp")
+    rows = [x[2900:3400] for x in rows]
+    at_once, single = bench.monitor("JR3", tool), bench.monitor("JR3", tool)
+    states = at_once.watch(*rows)
+    memory = single.initial_memory()
+    for k, row in enumerate(zip(*rows, strict=True)):
+        assert single.update(*row) == STATES[states[k]]
+        single.update_into(memory, np.concatenate([*row, [0.0]]))
+        assert single.state_of(memory) == STATES[states[k]]
+    assert states[-1] == CHANGED
+    assert at_once.changed_at == single.changed_at
+
+
+def test_what_the_known_load_leaves_open_is_open(bench, tool):
+    """Inertias that were not determined may be anything: no alarm, and a file that can be saved."""
+    covariance = tool.covariance.copy()
+    covariance[10:, :] = covariance[:, 10:] = 0.0
+    covariance[range(10, 16), range(10, 16)] = np.inf
+    phi = np.concatenate([tool.phi[:4], np.zeros(6)])
+    poses = replace(tool, phi=phi, covariance=covariance)
+    monitor = bench.monitor("JR3", poses)
+    assert monitor.watch(*bench.record("JR3", 0)).max() == KNOWN
+    assert monitor.watch(*bench.record("JR3", 1, "grasp"))[-1] == IDENTIFIED
+    assert monitor.load.phi[0] == pytest.approx(3.93, abs=0.02)
+    assert np.isfinite(monitor.load.covariance).all()
+
+
+def test_a_slower_log(bench, tool):
+    """At 100 Hz a block is two samples."""
+    rows = [x[::10] for x in bench.record("JR3", 3, "grasp")]
+    std = [np.repeat(x, 3) for x in bench.SENSORS["JR3"]]
+    states = LoadChangeMonitor(tool, *std, 1e-2).watch(*rows)
+    assert states[:300].max() == KNOWN
+    assert (states == CHANGED).any()
+    assert np.argmax(states == CHANGED) < 350
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"period": 0.0}, "period: is not positive"),
+        ({"model_error": 1.0}, r"model_error: 1.0 is not within \[0, 1\)"),
+        ({"bound": -1.0}, "bound: is not positive"),
+        ({"wrench_std": np.zeros(6)}, "wrench_std: is not positive"),
+        ({"motion_std": np.zeros(6)}, "motion_std: has shape"),
+        ({"offset_drift": np.full(6, np.nan)}, "offset_drift: is not finite"),
+    ],
+)
+def test_bad_input(tool, change, words):
+    good = {"wrench_std": np.ones(6), "motion_std": np.zeros(9), "period": 1e-3}
+    with pytest.raises(DrakeTeleopError, match=words):
+        LoadChangeMonitor(tool, **(good | change))
+    monitor = LoadChangeMonitor(tool, **good)
+    with pytest.raises(DrakeTeleopError, match="wrench: is not finite"):
+        monitor.update(np.full(6, np.inf), *np.zeros((3, 3)))
