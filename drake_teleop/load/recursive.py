@@ -27,12 +27,11 @@ from drake_teleop.load.identification import (
     worth_stating,
 )
 from drake_teleop.load.regressor import regressor_into
+from drake_teleop.load.uncertainty import prior_dominated
 
 PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
 """Default prior of [offsets [N, N m]; phi [kg, kg m, kg m^2]] about zero: wide for hand tools."""
 
-# A parameter whose standard deviation is still above this share of the prior's was not learnt.
-_STILL_PRIOR = 0.5
 SETTLED = 0.05
 """Default bound of `RecursiveEstimator.settled`."""
 
@@ -47,77 +46,57 @@ _RESOLUTION = 1e-10
 
 
 @njit(cache=True)
-def rls_update(theta, P, wrench, s, omega, alpha, noise_std, forgetting, largest, V, gain, squares):
-    """One sample, in place; compiled, allocates nothing, checks nothing.
+def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
+    """One sample after the other, in place; compiled, checks nothing.
 
     Args:
         theta: (16,) [offsets; phi], updated.
         P: (16, 16) its covariance, exactly symmetric, updated.
-        wrench, s, omega, alpha: (6,), (3,), (3,), (3,) the sample, as for `identify`.
+        samples: (N, at least 15) [wrench, s, omega, alpha], as for `identify`.
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
         forgetting: factor per sample on the weight of the past, 1 for none.
         largest: (16,) variances up to which forgetting may raise the diagonal of P. Without this
             bound P grows without end while the motion does not excite a parameter.
-        V: (6, 10) and gain: (16,) scratch.
         squares: (6,) sums of squared residuals, forgotten likewise, updated [N^2, N^2 m^2].
     """
-    if forgetting < 1.0:
-        step = 1.0 / math.sqrt(forgetting)
-        for i in range(16):
-            gain[i] = max(1.0, min(step, math.sqrt(largest[i] / P[i, i])))
-        for i in range(16):
-            for j in range(16):
-                P[i, j] *= gain[i] * gain[j]
-        for c in range(6):
-            squares[c] *= forgetting
-
-    regressor_into(s, omega, alpha, V)
-    for c in range(6):
-        first, last = (0, 4) if c < 3 else (1, 10)
-        for i in range(16):
-            gain[i] = P[c, i]
-        for j in range(first, last):
-            v = V[c, j]
+    V, gain = np.empty((6, 10)), np.empty(16)
+    step = 1.0 / math.sqrt(forgetting)
+    for n in range(len(samples)):
+        sample = samples[n]
+        if forgetting < 1.0:
             for i in range(16):
-                gain[i] += v * P[6 + j, i]
-        innovation = wrench[c] - theta[c]
-        predicted, uncorrelated = gain[c], P[c, c]
-        for j in range(first, last):
-            v = V[c, j]
-            innovation -= v * theta[6 + j]
-            predicted += v * gain[6 + j]
-            uncorrelated += v * v * P[6 + j, 6 + j]
-        variance = max(noise_std[c] * noise_std[c], _RESOLUTION * uncorrelated)
-        total = variance + predicted
-        share = innovation / total
-        squares[c] += variance * innovation * share
-        inverse = 1.0 / total
-        for i in range(16):
-            theta[i] += gain[i] * share
-            # (a b) c is the same as (b a) c to the last bit: P stays symmetric.
-            for j in range(16):
-                P[i, j] -= gain[i] * gain[j] * inverse
+                gain[i] = max(1.0, min(step, math.sqrt(largest[i] / P[i, i])))
+            for i in range(16):
+                for j in range(16):
+                    P[i, j] *= gain[i] * gain[j]
+            for c in range(6):
+                squares[c] *= forgetting
 
-
-@njit(cache=True)
-def _rls_over(theta, P, samples, noise_std, forgetting, largest, V, gain, squares):
-    """`rls_update` for each row of samples (N, 15)."""
-    for k in range(samples.shape[0]):
-        row = samples[k]
-        rls_update(
-            theta,
-            P,
-            row[:6],
-            row[6:9],
-            row[9:12],
-            row[12:15],
-            noise_std,
-            forgetting,
-            largest,
-            V,
-            gain,
-            squares,
-        )
+        regressor_into(sample[6:9], sample[9:12], sample[12:15], V)
+        for c in range(6):
+            first, last = (0, 4) if c < 3 else (1, 10)
+            for i in range(16):
+                gain[i] = P[c, i]
+            for j in range(first, last):
+                v = V[c, j]
+                for i in range(16):
+                    gain[i] += v * P[6 + j, i]
+            innovation = sample[c] - theta[c]
+            predicted, uncorrelated = gain[c], P[c, c]
+            for j in range(first, last):
+                v = V[c, j]
+                innovation -= v * theta[6 + j]
+                predicted += v * gain[6 + j]
+                uncorrelated += v * v * P[6 + j, 6 + j]
+            variance = max(noise_std[c] * noise_std[c], _RESOLUTION * uncorrelated)
+            inverse = 1.0 / (variance + predicted)
+            share = innovation * inverse
+            squares[c] += variance * innovation * share
+            for i in range(16):
+                theta[i] += gain[i] * share
+                # (a b) c is the same as (b a) c to the last bit: P stays symmetric.
+                for j in range(16):
+                    P[i, j] -= gain[i] * gain[j] * inverse
 
 
 class RecursiveEstimator(ABC):
@@ -153,7 +132,6 @@ class RecursiveEstimator(ABC):
         self._noise_std = positive("noise_std", noise_std, 6)
         self._forgetting, self._bound = float(forgetting), float(bound)
         self._prior = positive("prior_std", prior_std, 16) ** 2
-        self._squares = np.zeros(6)
         self._theta, self._samples = np.zeros(16), 0
         self._memory = self.initial_memory(self._theta)
 
@@ -196,7 +174,6 @@ class RecursiveEstimator(ABC):
     def covariance_of(self, theta: Array, memory: Array) -> Array:
         """`covariance` of an estimate that is kept elsewhere."""
 
-    @abstractmethod
     def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
         """The update of an estimate that is kept elsewhere; compiled, checks nothing.
 
@@ -205,10 +182,15 @@ class RecursiveEstimator(ABC):
             memory: C-contiguous, as from `initial_memory`, updated in place.
             sample: begins with `sample_size` numbers [wrench, s, omega, alpha, ...].
         """
+        self._learn(theta, memory, np.array(sample, dtype=np.float64, ndmin=2))
 
     @abstractmethod
-    def _learn(self, samples: Array) -> None:
-        """Updates the own estimate by each row of samples (N, sample_size)."""
+    def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
+        """Updates an estimate by each row of samples (N, at least `sample_size`), compiled."""
+
+    @abstractmethod
+    def _residual_rms(self) -> Array:
+        """(6,) of the own estimate's residuals, weighted by forgetting."""
 
     def update(
         self,
@@ -261,7 +243,7 @@ class RecursiveEstimator(ABC):
         parts = self._parts([wrench, s, omega, alpha], instruments)
         columns = zip(_PARTS, parts, strict=False)
         _, rows = checked_rows(**{name: (part, _PARTS[name]) for name, part in columns})
-        self._learn(np.concatenate(rows, axis=1))
+        self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
         self._samples += len(rows[0])
 
     def _parts(self, parts: list[ArrayLike], instruments: ArrayLike | None) -> list[ArrayLike]:
@@ -273,9 +255,8 @@ class RecursiveEstimator(ABC):
     def identification(self) -> Identification:
         """The present estimate.
 
-        `covariance` is that of white noise; a parameter that is still as uncertain as the prior
-        (above half its standard deviation) is not identifiable. The residuals are the recursion's,
-        each after learning from its row, weighted by forgetting.
+        `covariance` is that of white noise. A parameter of which the prior still says most
+        (`uncertainty.prior_dominated`) is not identifiable, and its verdict is "prior".
 
         Raises:
             DrakeTeleopError: before the first update.
@@ -291,21 +272,16 @@ class RecursiveEstimator(ABC):
             identifiable=self._known(deviations, self._theta, WORTH_STATING),
             condition_number=self._condition_number(),
             delay_s=0.0,
-            residual_rms=np.sqrt(self._squares / self._weight()),
+            residual_rms=self._residual_rms(),
             method=self.method,
             samples=self._samples,
+            prior_dominated=prior_dominated(deviations, np.sqrt(self._prior)),
         )
 
     def _known(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
         """(16,) whether known better than the prior, and to `bound` of what is natural."""
-        learnt = deviations < _STILL_PRIOR * np.sqrt(self._prior)
+        learnt = ~prior_dominated(deviations, np.sqrt(self._prior))
         return learnt & worth_stating(deviations * (WORTH_STATING / bound), theta[6:])
-
-    def _weight(self) -> float:
-        """The sum of the weights of the samples so far."""
-        if self._forgetting == 1.0:
-            return float(self._samples)
-        return (1.0 - self._forgetting**self._samples) / (1.0 - self._forgetting)
 
     def _condition_number(self) -> float:
         """Of the information matrix, prior included, columns scaled as in the batch."""
@@ -341,7 +317,7 @@ class RecursiveLeastSquares(RecursiveEstimator):
         bound: float = SETTLED,
     ) -> None:
         super().__init__(noise_std, forgetting, prior_std, bound)
-        self._V, self._gain = np.empty((6, 10)), np.empty(16)
+        self._squares = np.zeros(6)
 
     def initial_memory(self, theta: Array) -> Array:
         """(16, 16) the prior's covariance, whatever theta."""
@@ -351,32 +327,12 @@ class RecursiveLeastSquares(RecursiveEstimator):
         """(16, 16), the memory itself."""
         return memory.copy()
 
-    def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
-        """See `RecursiveEstimator`; memory: (16, 16)."""
-        rls_update(
-            theta,
-            memory,
-            sample[:6],
-            sample[6:9],
-            sample[9:12],
-            sample[12:15],
-            self._noise_std,
-            self._forgetting,
-            self._prior,
-            self._V,
-            self._gain,
-            self._squares,
-        )
+    def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
+        options = (self._noise_std, self._forgetting, self._prior)
+        rls_update(theta, memory, samples, *options, self._squares)
 
-    def _learn(self, samples: Array) -> None:
-        _rls_over(
-            self._theta,
-            self._memory,
-            samples,
-            self._noise_std,
-            self._forgetting,
-            self._prior,
-            self._V,
-            self._gain,
-            self._squares,
-        )
+    def _residual_rms(self) -> Array:
+        """Of each residual after learning from its row."""
+        factor, n = self._forgetting, self._samples
+        weight = n if factor == 1.0 else (1.0 - factor**n) / (1.0 - factor)
+        return np.sqrt(self._squares / weight)

@@ -79,6 +79,7 @@ def test_static_poses_leave_the_prior_of_the_inertia():
         estimator.update(wrench, specific_force, REST, REST)
     result = estimator.identification()
     assert result.identifiable.tolist() == 10 * [True] + 6 * [False]
+    assert result.verdicts == 10 * ("identified",) + 6 * ("prior",)
     np.testing.assert_allclose(result.standard_deviations[10:], PRIOR_STD[10:])
     assert result.mass == pytest.approx(TOOL[0], abs=1e-4)
 

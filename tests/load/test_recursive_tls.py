@@ -7,7 +7,9 @@ import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.batch import identify_batch
 from drake_teleop.load.identification import Identification, identify
+from drake_teleop.load.moments import Noise
 from drake_teleop.load.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench
@@ -55,6 +57,15 @@ def test_without_noise_in_the_motion_it_is_least_squares():
     ratio = np.diag(total.covariance) / np.diag(least.covariance)
     np.testing.assert_allclose(ratio, total.noise_scale, rtol=1e-4)
     assert total.noise_scale == pytest.approx(1.0, abs=0.05)
+
+
+def test_it_is_the_batch_of_the_samples_so_far():
+    F, motion = record(9)
+    estimator = learnt(F, motion)
+    noise = Noise(NOISE, *(std[0] for std in np.split(MOTION, 3)))
+    batch = identify_batch(F, *motion, method="total", noise=noise).identification
+    np.testing.assert_allclose(estimator.phi, batch.phi, rtol=2e-4, atol=1e-7)
+    np.testing.assert_allclose(estimator.offsets, batch.offsets, rtol=2e-4)
 
 
 def test_the_bias_of_the_inertias_is_gone_and_the_covariance_is_honest():
@@ -113,6 +124,7 @@ def test_without_rotation_the_inertia_stays_bounded_and_is_not_called_known():
     assert not estimator.settled
     result = estimator.identification()
     assert not result.identifiable[INERTIAS].any()
+    assert [result.verdicts[i] for i in INERTIAS] == ["prior"] * 3
     np.testing.assert_allclose(result.standard_deviations[INERTIAS], 1.0, rtol=0.2)
     error = np.abs(theta(estimator) - TRUTH) / np.sqrt(np.diag(estimator.covariance))
     assert error[:10].max() < 4.0
