@@ -2,9 +2,9 @@
 
 One packet leaves at each step k. It is lost, or it travels d steps, and so may a second copy of it.
 All counters and integrals in a packet are cumulative, so the receiver only ever needs the newest:
-a ring of slots holds what arrives when, newest_at[k + d] = max(newest_at[k + d], k), and a packet
-older than one that was received before is dropped. Loss, reordering and duplicates then change
-nothing but which packet is the newest.
+a ring of slots holds the newest packet that arrives at each step, newest_at[k + d] = k, and what is
+older than a packet received before is dropped. Loss, reordering and duplicates then change nothing
+but which packet is the newest.
 
 * Delay. `jitter` j spreads it about its mean D with standard deviation j D / sqrt(3), whatever the
   distribution: uniform from (1 - j) D to (1 + j) D; normal; or (1 - j) D, the way through an empty
@@ -114,13 +114,13 @@ and the way on the ground, RTT 600 ms. lunar: 384 400 km are 1.28 s; with the st
 
 # The parameters of a line as one array: these, then the trace in steps, -1 where it lost a packet.
 _KEY, _PERIOD, _DELAY, _JITTER, _DISTRIBUTION, _LONGEST, _BAD_SHARE, _BAD_MEMORY = range(8)
-_BURST_LOSS, _DUPLICATE, _RATE, _PLAYOUT, _REDUNDANT, _SLOTS, _POLICY, _TRACE = range(8, 16)
+_BURST_LOSS, _DUPLICATE, _RATE, _PLAYOUT, _REDUNDANT, _SLOTS, _POLICY, _LEAST, _TRACE = range(8, 17)
 # The state of a line as one array: these, the slots, the packet received last, the packets sent.
 _BAD, _ARRIVED, _RECEIVED, _SILENT, _FIRST_SLOT = range(5)
 
 
 def parameters(
-    config: NetworkConfig, seed: int, direction: int, period: float
+    config: NetworkConfig, seed: int, direction: int, period: float, least: int = 0
 ) -> NDArray[np.float64]:
     """The parameters of one direction of a network, for the compiled functions below.
 
@@ -129,6 +129,7 @@ def parameters(
         seed: of the scenario.
         direction: FORWARD or BACKWARD, which are random independently of each other.
         period: time between steps [s].
+        least: steps that any packet takes at least.
 
     Raises:
         DrakeTeleopError: for a value out of range, or naming file, column and row of a bad trace.
@@ -139,6 +140,7 @@ def parameters(
     longest = math.floor(mean * (1 + _TAILS[config.distribution] * config.jitter) + 0.5)
     if trace.size:
         longest = max(int(trace.max()), 0)
+    longest = max(longest, least)
     bad = config.loss / config.burst_loss
     sojourn = config.burst * (1 - bad)  # time constant of the chain
     p = np.empty(_TRACE + trace.size)
@@ -150,7 +152,7 @@ def parameters(
     p[_BURST_LOSS], p[_DUPLICATE] = config.burst_loss, config.duplicate
     p[_RATE] = min(1.0, period * config.rate_hz) if config.rate_hz is not None else 1.0
     p[_PLAYOUT], p[_REDUNDANT], p[_SLOTS] = playout, config.redundant, max(longest, playout) + 1
-    p[_POLICY] = _SILENCE.index(config.silence)
+    p[_POLICY], p[_LEAST] = _SILENCE.index(config.silence), least
     p[_TRACE:] = trace
     return p
 
@@ -199,7 +201,8 @@ def _uniform(p, k, draw):
 def _travel(p, k, draw):
     """How many steps the packet k travels, -1 if the trace has lost it. Takes three numbers."""
     if p.shape[0] > _TRACE:
-        return int(p[_TRACE + k % (p.shape[0] - _TRACE)])
+        steps = p[_TRACE + k % (p.shape[0] - _TRACE)]
+        return int(max(steps, p[_LEAST])) if steps >= 0.0 else -1
     mean, spread = p[_DELAY], p[_DELAY] * p[_JITTER]
     if spread == 0.0:
         return int(p[_LONGEST])
@@ -212,7 +215,7 @@ def _travel(p, k, draw):
     else:  # three exponential waits one after the other
         u *= _uniform(p, k, draw + 1) * _uniform(p, k, draw + 2)
         delay = mean - spread - spread / 3.0 * math.log(u)
-    return int(min(max(delay + 0.5, 0.0), p[_LONGEST]))
+    return int(min(max(delay + 0.5, p[_LEAST]), p[_LONGEST]))
 
 
 @njit(cache=True)
@@ -256,8 +259,8 @@ def send(p, state, k, packet):
         if travel >= 0:
             if p[_REDUNDANT] == 0.0:
                 travel = max(travel, int(p[_PLAYOUT]))
-            slot = _FIRST_SLOT + (k + travel) % slots
-            state[slot] = max(state[slot], float(k))
+            # What the slot held was sent before.
+            state[_FIRST_SLOT + (k + travel) % slots] = k
     # What is lost is written too: a redundant packet after it may bring it.
     row = _FIRST_SLOT + slots + size * (1 + k % slots)
     state[row : row + size] = packet
@@ -276,8 +279,8 @@ def receive(p, state, k, packet):
     """
     slots, size = int(p[_SLOTS]), packet.shape[0]
     slot, last = _FIRST_SLOT + k % slots, _FIRST_SLOT + slots
+    # What a slot still holds from a round ago is older, and changes nothing.
     state[_ARRIVED] = max(state[_ARRIVED], state[slot])
-    state[slot] = -1.0
     newest = state[_ARRIVED]
     if p[_REDUNDANT] != 0.0:
         newest = min(newest, k - p[_PLAYOUT])

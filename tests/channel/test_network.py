@@ -68,7 +68,8 @@ def networks(draw) -> NetworkConfig:
 seeds = st.integers(0, 2**63 - 1)
 
 
-@njit(cache=True)
+# Not cached: numba would not see that the functions which it calls have changed.
+@njit
 def _exchange(p, state, packets, received, newest, fresh):
     for k in range(len(packets)):
         send(p, state, k, packets[k])
@@ -111,6 +112,7 @@ def oracle(config: NetworkConfig, seed: int) -> np.ndarray:
 @example(ROUGH, 0)
 @example(replace(ROUGH, playout=0.05), 1)
 @example(replace(ROUGH, playout=0.05, redundant=True, rate_hz=300.0), 2)
+@example(replace(ROUGH, delay=0.1, playout=0.05, redundant=True), 3)
 def test_the_step_form_says_what_the_vectorised_form_says(config, seed):
     packets = random_packets()
     received, newest, fresh = exchange(config, packets, seed)
@@ -130,6 +132,7 @@ def test_the_step_form_says_what_the_vectorised_form_says(config, seed):
 @example(ROUGH, 0)
 @example(replace(ROUGH, playout=0.05), 1)
 @example(replace(ROUGH, playout=0.05, redundant=True, rate_hz=300.0), 2)
+@example(replace(ROUGH, delay=0.1, playout=0.05, redundant=True), 3)
 def test_the_newest_is_the_last_sent_of_those_that_arrived(config, seed):
     np.testing.assert_array_equal(
         newest_packets(config, seed, FORWARD, STEPS, PERIOD), oracle(config, seed)
@@ -280,6 +283,12 @@ def test_loss_and_mean_length_of_its_bursts(loss, burst):
     assert runs.mean() == pytest.approx(1 / leave, abs=5 * std)
     if burst == 0.02 and loss < 0.5:  # twenty packets: the sampling no longer matters
         assert 1 / leave == pytest.approx(burst / PERIOD, rel=0.04)
+
+
+def test_a_network_is_as_bad_at_its_first_step_as_later():
+    config = NetworkConfig(loss=0.3, burst=10.0)
+    lost = [packet_delays(config, seed, FORWARD, 1, PERIOD)[0, 0] < 0 for seed in range(2000)]
+    assert np.mean(lost) == pytest.approx(0.3, abs=5 * math.sqrt(0.21 / 2000))
 
 
 def test_bursts_last_as_long_at_every_packet_rate():
