@@ -13,7 +13,9 @@ delay_s                how far the motion lags behind the wrench; it was moved f
 delay_source           "given", "estimated" (from this record), "load" (of the load file, because
                        this record does not determine it), "undetermined" (0 was used), or
                        "static" (poses at rest have none)
-notes                  what had to be assumed, in words
+notes                  what had to be assumed, and the findings, in words
+findings               list of name and message: suspected errors of the description; see
+                       `drake_teleop.logs.inspection`. Only looked for if the fit is poor
 ====================== ==========================================================================
 
 ====================== ==========================================================================
@@ -80,9 +82,9 @@ from drake_teleop.load.batch import DEFAULT_METHOD
 from drake_teleop.load.gripper import SIGNIFICANT, consistency_margin, identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.uncertainty import intervals
-from drake_teleop.logs.canonical import WRENCH, Log
+from drake_teleop.logs.canonical import WRENCH
 from drake_teleop.logs.contact import contacts_of, noise_floor
-from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
+from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog, eliminate_log, identify_log
 
 
 def identify_command(
@@ -112,7 +114,7 @@ def identify_command(
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
     alone = None if gripper_load is None else identified_object(result, gripper_load)
-    summary = _common(log, found.log, cutoff_hz, result.delay_s, found.delay_source) | {
+    summary = _common(log, found, cutoff_hz, result.delay_s) | {
         "samples": result.samples,
         **_load_figures(result),
         "offsets": result.offsets,
@@ -181,7 +183,7 @@ def eliminate_command(
         cutoff_hz=cutoff_hz,
         delay=delay,
     )
-    summary = _common(log, found.log, cutoff_hz, found.delay_s, found.delay_source) | {
+    summary = _common(log, found, cutoff_hz, found.delay_s) | {
         "load": str(load),
         "gripper": None if gripper is None else str(gripper),
         "sigma": sigma,
@@ -214,8 +216,10 @@ def eliminate_command(
 
 
 def _common(
-    path: Path, log: Log, cutoff_hz: float | None, delay_s: float, source: str
+    path: Path, found: IdentifiedLog | EliminatedLog, cutoff_hz: float | None, delay_s: float
 ) -> dict[str, Any]:
+    log = found.log
+    findings = [{"name": finding.name, "message": finding.message} for finding in found.findings]
     return {
         "log": str(path),
         "samples": len(log),
@@ -223,8 +227,9 @@ def _common(
         "rate_hz": 0.0 if log.static else 1 / log.dt,
         "cutoff_hz": None if log.static else cutoff_hz,
         "delay_s": delay_s,
-        "delay_source": source,
-        "notes": list(log.notes),
+        "delay_source": found.delay_source,
+        "notes": [*log.notes, *(f"{f['name']}: {f['message']}" for f in findings)],
+        "findings": findings,
     }
 
 

@@ -184,6 +184,56 @@ def check_log(path: Path) -> Conventions:
     return check_conventions(load_description(path), str(path))
 
 
+def question_fit(
+    path: Path, log: Log, load: Identification, predicted: NDArray[np.float64], delay: float | None
+) -> tuple[Finding, ...]:
+    """What `check_log` says of a log, if what was identified from it looks wrong; else nothing.
+
+    Args:
+        path: the log's file.
+        log: the samples that were used.
+        load: what was identified.
+        predicted: (N, 6) the wrench according to it.
+        delay: what was taken out [s]; None if it could not be estimated.
+
+    Returns:
+        the findings but for "lag", which identification takes out; "payload" in the figures of
+        this fit.
+
+    Raises:
+        DrakeTeleopError: if the log cannot be used as it is: the mass is negative, or a load
+            explains less than half of the wrench, or the accelerometer is in another unit, and a
+            finding says what to change.
+    """
+    unexplained = unexplained_share(log.wrench, log.wrench - predicted)
+    weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
+    clocks = log.static or (delay is not None and abs(delay) < CLOCK)
+    if load.mass > 0 and unexplained < EXPLAINED and clocks and 5.0 < weight < 20.0:
+        return ()
+    found = [finding for finding in check_log(path).findings if finding.name != "lag"]
+    if any(finding.name == "payload" for finding in found):
+        own = payload_finding(load, unexplained)
+        found = [own if own and f.name == "payload" else f for f in found]
+        if load.mass < 0 and load.identifiable[6]:
+            raise DrakeTeleopError(found[-1].message, where=log.source)
+        return tuple(found)
+    negative = load.mass < 0 and bool(load.identifiable[6])
+    worthless = negative or unexplained > 0.5 or any(f.name == "units" for f in found)
+    if found and worthless:
+        what = f"the fitted mass is {load.mass:.4g} kg"
+        if not negative:
+            what += f", and {100 * unexplained:.0f} % of the wrench's variance are left"
+        raise DrakeTeleopError(f"{what}: {found[0].message}", where=log.source)
+    if negative:
+        sensor = "static" if log.static else "wrench"
+        raise DrakeTeleopError(
+            f"the fitted mass is {load.mass:.4g} kg: the sign of the wrench is probably inverted",
+            where=f"{log.source}:{sensor}.sign",
+            remedy="set `sign: -1` in the log description (or remove it if it is there)",
+        )
+    return tuple(found)
+
+
 def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
 ) -> Conventions:

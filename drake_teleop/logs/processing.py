@@ -19,6 +19,7 @@ from drake_teleop.logs.alignment import low_pass, low_passed, measured, undelaye
 from drake_teleop.logs.canonical import Log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
 from drake_teleop.logs.contact import in_contact, noise_floor
+from drake_teleop.logs.conventions import Finding, check_log, question_fit
 from drake_teleop.logs.delay import estimate_delay
 from drake_teleop.logs.reading import read_log
 
@@ -33,6 +34,7 @@ class IdentifiedLog:
         predicted: (N, 6) offsets + V phi at the same instants.
         delay_source: as in the summary: "estimated", "given" ...
         rejected: (N,) samples that "robust" and "consistent" fits took for disturbed.
+        findings: suspected errors of the log's description; only looked for if the fit is poor.
     """
 
     log: Log
@@ -40,6 +42,7 @@ class IdentifiedLog:
     predicted: NDArray[np.float64]
     delay_source: str
     rejected: NDArray[np.bool_]
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,8 @@ class EliminatedLog:
         noise_floor: (6,) of `contact`, see `drake_teleop.logs.contact`.
         touched: (N,) where `contact` says that something is touched; nowhere in static poses.
         causal: the same wrenches as a loop would have had them, or None if not asked for.
+        findings: suspected errors of the log's description; only looked for if the load hardly
+            explains the wrench in half of the record.
     """
 
     log: Log
@@ -80,6 +85,7 @@ class EliminatedLog:
     noise_floor: NDArray[np.float64]
     touched: NDArray[np.bool_]
     causal: CausalWrench | None
+    findings: tuple[Finding, ...] = ()
 
 
 def identify_log(
@@ -100,8 +106,8 @@ def identify_log(
         delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
 
     Raises:
-        DrakeTeleopError: if the log cannot be used, the method is unknown, or the fitted mass is
-            negative.
+        DrakeTeleopError: if the log cannot be used, the method is unknown, or the result would be
+            worthless, see `drake_teleop.logs.conventions.question_fit`.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz)
     delay_s, source = _delay(log, cutoff_hz, delay)
@@ -111,16 +117,16 @@ def identify_log(
         log.wrench, *log.motion, method=method, shared_noise=log.static, delay_s=delay_s
     )
     result = fit.identification
-    if result.mass < 0 and result.identifiable[6]:
-        raise DrakeTeleopError(
-            f"the fitted mass is {result.mass:.4g} kg: the sign of the wrench is probably inverted",
-            where=f"{log.source}:wrench.sign",
-            remedy="set `sign: -1` in the log description (or remove it if it is there)",
-        )
     if fit.note:
         log = replace(log, notes=(*log.notes, fit.note))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
-    return IdentifiedLog(log, result, predicted, source, fit.rejected)
+    known_delay = None if source == "undetermined" else delay_s
+    findings = question_fit(Path(path), log, result, predicted, known_delay)
+    if any(finding.name == "payload" for finding in findings):
+        result = replace(
+            result, identifiable=np.repeat([True, False], [6, 10]) & result.identifiable
+        )
+    return IdentifiedLog(log, result, predicted, source, fit.rejected, findings)
 
 
 def eliminate_log(
@@ -227,6 +233,7 @@ def eliminate_log(
         noise_floor=floor,
         touched=touched,
         causal=late,
+        findings=_suspected(Path(path), log.wrench - offsets, contact),
     )
 
 
@@ -289,6 +296,17 @@ def _delay(
         )
     found = estimate_delay(log, cutoff_hz, phi)
     return (0.0, "undetermined") if found is None else (found, "estimated")
+
+
+def _suspected(
+    path: Path, wrench: NDArray[np.float64], contact: NDArray[np.float64]
+) -> tuple[Finding, ...]:
+    """Findings about a log whose load leaves most of the wrench, not only in a contact."""
+    before, after = (float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact))
+    if after < 0.3 * before:
+        return ()
+    found = check_log(path).findings
+    return tuple(finding for finding in found if finding.name not in ("lag", "payload"))
 
 
 def _hold(dt: float, cutoff_hz: float | None) -> int:

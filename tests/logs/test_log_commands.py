@@ -276,7 +276,9 @@ def test_ntnu_poses_give_mass_centre_and_offsets(
     np.testing.assert_allclose(summary["offsets"], -np.array(readings), atol=0.01)
     assert summary["not_identifiable"] == NAMES_OF_INERTIA
     assert summary["delay_source"] == "static"
-    with pytest.raises(DrakeTeleopError, match="sign of the wrench is probably inverted"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"sign of the wrench is inverted; set static\.sign: -1"
+    ):
         identify_log(describe_poses(tmp_path, ntnu, pose, sign=1))
 
 
