@@ -25,7 +25,7 @@ a sensor does not have them. Messages that hold `transforms` (TF) are taken apar
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from operator import attrgetter
@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
@@ -54,6 +55,19 @@ _GROUPS = {
     "position": "position",
     "translation": "position",
 }
+_TYPES = {
+    "wrench": ("WrenchStamped", "Wrench"),
+    "imu": ("Imu",),
+    "pose": (
+        "PoseStamped",
+        "PoseWithCovarianceStamped",
+        "TransformStamped",
+        "Odometry",
+        "Pose",
+        "TFMessage",
+    ),
+}
+"""The types that a stream may be, the likeliest first."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +161,35 @@ def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
     if is_bag(stream.file):
         raise topic_missing(stream.file)
     return read_table(stream.file, header=stream.header)
+
+
+def draft_of_bag(path: Path, topics: Sequence[Topic]) -> str:
+    """A draft of a log description: the topics whose types suit the streams.
+
+    Args:
+        path: the bag.
+        topics: what is in it.
+
+    Returns:
+        YAML text whose first lines say that it is a draft, and which other topics would do.
+    """
+    draft: dict[str, Any] = {}
+    others: list[str] = []
+    for stream, types in _TYPES.items():
+        kinds = {topic.name: topic.type.split("/")[-1] for topic in topics if topic.messages}
+        suited = [name for kind in types for name in kinds if kinds[name] == kind]
+        if suited or stream == "wrench":
+            draft[stream] = {"file": path.name, "topic": suited[0] if suited else "FILL IN"}
+        if suited and kinds[suited[0]] == "TFMessage":
+            draft[stream]["child_frame"] = "FILL IN"
+        others += [f"{name} ({stream})" for name in suited[1:]]
+    draft["wrench"]["sign"] = 1
+    head = [
+        "# DRAFT, guessed from the types of topics by `drake-teleop inspect`: check every line,",
+        "# above all wrench.sign and the frames, put it next to the bag, and inspect it.",
+        f"# Other topics that would do: {', '.join(others) or 'none'}.",
+    ]
+    return "\n".join(head) + "\n" + yaml.safe_dump(draft, sort_keys=False)
 
 
 def topic_missing(path: Path) -> DrakeTeleopError:

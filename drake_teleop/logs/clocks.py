@@ -136,11 +136,13 @@ def gaps(t: NDArray[np.float64], bandwidth_hz: float | None) -> NDArray[np.float
         bandwidth_hz: the cut-off; None for none.
     """
     steps = np.diff(t)
-    shortest = GAP * float(np.median(steps))
-    if bandwidth_hz is not None:
-        shortest = max(shortest, 0.5 / bandwidth_hz)
-    at = np.flatnonzero(steps > shortest)
+    at = np.flatnonzero(steps > shortest_gap(float(np.median(steps)), bandwidth_hz))
     return np.stack([t[at], t[at + 1]], axis=1)
+
+
+def shortest_gap(step: float, bandwidth_hz: float | None) -> float:
+    """Above which steps are gaps [s], see `gaps`; `step` is the median one [s]."""
+    return max(GAP * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
 
 
 def _evened(t: NDArray[np.float64], half: int, dt: float) -> NDArray[np.float64]:

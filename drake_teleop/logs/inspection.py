@@ -4,7 +4,8 @@ Names in the summary (and in summary.json):
 
 =============== =================================================================================
 log             the file that was read
-kind            "description", "canonical" or "unknown" (a table without known columns)
+kind            "description", "canonical", "unknown" (a table without known columns) or "bag"
+topics          of a bag: type, messages and rate_hz of each; otherwise empty
 streams         of each: rows, rate_hz, duration_s, longest_gap_s, gaps, clock_jumps (time stamps
                 that stand still or go back), repeated_rows, nan_rows, nan_longest (rows of the
                 longest block), and columns: of each min, max, mean, noise (standard deviation of
@@ -15,7 +16,7 @@ fit             of a load to the description as given: mass [kg] and unexplained
 mounting        of the IMU against the pose: R_SI, angle_deg, right_angled, lag_s (the best
                 constant), drift of the clock [s/s], unexplained; null without both
 delay_s         of the motion behind the wrench; null if the log does not determine it
-draft           the file with a draft description of an unknown table, or null
+draft           the file with a draft description of an unknown table or a bag, or null
 =============== =================================================================================
 """
 
@@ -32,14 +33,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.logs.bags import read_stream
+from drake_teleop.logs.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.canonical import describe_canonical
+from drake_teleop.logs.clocks import shortest_gap
 from drake_teleop.logs.conventions import Finding, check_conventions, white_noise
 from drake_teleop.logs.description import Description, load_description
 from drake_teleop.logs.tables import FORMATS, Table, read_table
 
-GAP = 10.0
-"""Steps longer than this many median steps are gaps."""
+BANDWIDTH = 30.0
+"""Gaps are those that matter below this frequency [Hz]."""
 REPEATED = 0.05
 """Repeated rows are mentioned from this share of all rows, or from a block of `BLOCK` rows."""
 BLOCK = 5
@@ -59,7 +61,7 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
     """Inspects a log and writes summary.json, and draft.yaml for an unknown table, into `out`.
 
     Args:
-        log: a canonical log, a description, or any table.
+        log: a canonical log, a description, any table, or a bag.
         out: folder for the results.
         quiet: print nothing.
 
@@ -72,6 +74,7 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
     summary: dict[str, Any] = {
         "log": str(log),
         "kind": "description",
+        "topics": {},
         "streams": {},
         "findings": [],
         "fit": None,
@@ -80,26 +83,37 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
         "draft": None,
     }
     out.mkdir(parents=True, exist_ok=True)
-    if log.suffix.lower() in FORMATS:
+    description: Description | None = None
+    draft = ""
+    if is_bag(log):
+        topics = topics_of(log)
+        draft = draft_of_bag(log, topics)
+        summary["kind"] = "bag"
+        summary["topics"] = {
+            topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
+            for topic in topics
+        }
+    elif log.suffix.lower() in FORMATS:
         table = read_table(log)
         try:
-            description: Description | None = describe_canonical(log, table)
+            description = describe_canonical(log, table)
             summary["kind"] = "canonical"
         except DrakeTeleopError:
-            description = None
             known = "f_x" in table.columns and "tau_x" in table.columns
             if known:
                 # A canonical log with NaN or a missing column: its own message is the best one.
                 description = describe_canonical(log, _finite(table, list(table.columns)))
                 summary["kind"] = "canonical"
         tables = {log: table}
+        if description is None:
+            draft = draft_description(table)
+            summary["kind"] = "unknown"
     else:
         description = load_description(log)
         tables = {}
     if description is None:
-        summary["kind"] = "unknown"
         summary["draft"] = str(out / "draft.yaml")
-        (out / "draft.yaml").write_text(draft_description(table), encoding="utf-8")
+        (out / "draft.yaml").write_text(draft, encoding="utf-8")
     else:
         _inspect(description, str(log), tables, summary)
     text = json.dumps(summary, indent=2, allow_nan=False)
@@ -260,7 +274,7 @@ def _clock(
             "the time stamps never increase", where=at, remedy="name another column, or time.rate"
         )
     median = float(np.median(forward))
-    gaps, back = int((steps > GAP * median).sum()), int((steps <= 0).sum())
+    gaps, back = int((steps > shortest_gap(median, BANDWIDTH)).sum()), int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,
         "duration_s": float(t[-1] - t[0]),
@@ -435,7 +449,13 @@ def _print(summary: dict[str, Any]) -> None:
         console.print(grid)
     for finding in summary["findings"]:
         console.print(f"[bold]{escape(finding['name'])}[/bold]: {escape(finding['message'])}")
+    if summary["topics"]:
+        grid = Grid("topic", "type", "messages", "rate [Hz]")
+        for name, topic in summary["topics"].items():
+            rate = f"{topic['rate_hz']:.4g}"
+            grid.add_row(name, topic["type"], str(topic["messages"]), rate)
+        console.print(grid)
     if summary["draft"]:
-        console.print(f"unknown columns; a draft description is in {escape(summary['draft'])}")
+        console.print(f"a draft description is in {escape(summary['draft'])}")
     elif not summary["findings"]:
         console.print("nothing suspicious")

@@ -19,6 +19,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.bags import is_bag, read_topic, topics_of
+from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.reading import read_log
 
@@ -240,6 +241,33 @@ def test_a_bag_of_ros_1(tmp_path: Path) -> None:
     found = table.numbers(["force.x", "force.y", "force.z"], 3, "here")
     np.testing.assert_array_equal(found, FORCES[:, :3])
     np.testing.assert_allclose(table.columns["stamp"], T, atol=1e-9)
+
+
+def test_inspecting_a_bag_lists_its_topics_and_drafts_a_description(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    topics = {
+        "/ft": wrenches(),
+        "/imu": imus(),
+        "/odometry": poses("Odometry"),
+        "/pose": poses("PoseStamped"),
+    }
+    bag = write_bag(tmp_path / "run1", {name: islice(x, 600) for name, x in topics.items()})
+    summary = inspect_command(bag, tmp_path / "out")
+    shown = capsys.readouterr().out
+    assert summary["kind"] == "bag"
+    assert summary["topics"]["/imu"]["type"] == "sensor_msgs/msg/Imu"
+    assert summary["topics"]["/imu"]["messages"] == 600
+    for word in ("/odometry", "geometry_msgs/msg/PoseStamped", "600"):
+        assert word in shown
+    draft = (tmp_path / "out" / "draft.yaml").read_text()
+    assert "DRAFT" in draft and "would do: /odometry (pose)" in draft
+    (tmp_path / "draft.yaml").write_text(draft)
+    # The draft is right as it stands: every stream is used, and nothing is suspicious.
+    found = inspect_command(tmp_path / "draft.yaml", tmp_path / "out", quiet=True)
+    assert set(found["streams"]) == {"wrench", "imu", "pose"}
+    assert found["findings"] == []
+    assert found["fit"]["mass"] == pytest.approx(1.7, rel=0.01)
 
 
 @pytest.mark.parametrize(
