@@ -32,7 +32,8 @@ noise and the three torques one; weights of their own would make mass and centre
 The covariance is that of `identification.NormalEquations` with the same weights of the rows, so
 coloured noise is accounted for. Errors in variables enlarge it: with G theta_LS = b and
 (G - lambda C) theta = b it is K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of
-`consistent` is of the same fit without the constraint, which is cautious.
+`consistent` is of the same fit without the constraint, which is cautious. A prior adds its
+information to that of the record, and parameters that it says most about are named.
 """
 
 from __future__ import annotations
@@ -58,6 +59,7 @@ from drake_teleop.load.moments import (
 )
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.total_least_squares import NormalForm, total_least_squares
+from drake_teleop.load.uncertainty import prior_dominated
 
 _CHUNK = 2**15
 # Least noise of a channel, relative to the wrench: what rounding leaves of a perfect record.
@@ -145,12 +147,15 @@ class BatchResult:
         noise: (6,) standard deviations of the wrench channels that gave the weights [N, N m].
         rejected: (N,) bools, samples that the fit did without.
         note: what a user has to know of the fit; mostly empty.
+        equations: of the samples that were used, with these weights: what
+            `uncertainty.base_parameters` asks for.
     """
 
     identification: Identification
     noise: Array
     rejected: NDArray[np.bool_]
     note: str
+    equations: NormalEquations
 
     @property
     def rejected_fraction(self) -> float:
@@ -299,16 +304,46 @@ def identify_batch(
     plain = equations.solve(delay_s)
     theta, Z = fit.form.theta, fit.moments.mean
     covariance = _covariance(plain.covariance, fit.form, offsets)
+    dominated = np.zeros(16, bool)
+    if prior is not None:
+        covariance, dominated = _with_prior(covariance, prior.information(plain.samples))
+    deviations = np.sqrt(np.diag(covariance))
     identification = replace(
         plain,
         phi=theta[6:],
         offsets=theta[:6],
         covariance=covariance,
-        identifiable=worth_stating(np.sqrt(np.diag(covariance)), theta[6:]),
+        identifiable=worth_stating(deviations, theta[6:]) & ~dominated,
+        prior_dominated=dominated,
         residual_rms=np.sqrt(np.diag(residual_covariance(Z, theta)).clip(0.0)),
         method=NAMES[method],
     )
-    return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note)
+    return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note, equations)
+
+
+def _with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Covariance (16, 16) of data and prior together, and which parameters are mostly the prior's.
+
+    With the information D of the data and P of the prior, (10, 10) of phi, the estimate is
+    (D + P)^-1 (D theta_data + P theta_prior): the diagonal of (D + P)^-1 D is the data's share. For
+    a single parameter it is 1 - (standard deviation over the prior's)^2.
+    """
+    known = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
+    used = known | (np.arange(16) >= 6)
+    # In units in which the entries are of one size.
+    scale = np.sqrt(np.where(known, np.diag(covariance), 1.0))
+    scale[6:] = np.diag(information) ** -0.5
+    data, total = np.zeros((2, 16, 16))
+    both, part = np.ix_(known, known), np.ix_(used, used)
+    data[both] = np.linalg.inv(covariance[both] / np.outer(scale, scale)[both])
+    total[6:, 6:] = information * np.outer(scale, scale)[6:, 6:]
+    total += data
+    posterior = np.where(np.diag(~used & np.isinf(np.diag(covariance))), np.inf, 0.0)
+    inverse = np.linalg.inv(total[part])
+    posterior[part] = inverse * np.outer(scale, scale)[part]
+    prior_share = np.zeros(16)
+    prior_share[used] = 1.0 - np.diag(inverse @ data[part])
+    return posterior, prior_dominated(np.sqrt(prior_share.clip(0.0)), np.ones(16))
 
 
 def _weighted(moments: Moments, options: Options, record: Record) -> Fit:

@@ -63,6 +63,15 @@ class Prior:
                 "has no extent in some direction, or is no body", where="prior.phi"
             )
 
+    def information(self, samples: int) -> Array:
+        """(10, 10) inverse covariance of phi that it stands for: the Hessian of either kind at phi.
+
+        Args:
+            samples: of the record, in units of which it has its weight.
+        """
+        parts = np.linalg.solve(pseudo_inertia(checked("prior.phi", self.phi, 10)), _UNITS)
+        return np.asarray(samples * self.weight * np.einsum("aij,bji->ab", parts, parts))
+
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid:

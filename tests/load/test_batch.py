@@ -172,6 +172,27 @@ def test_the_default_is_robust_consistent_and_knows_the_motions_noise():
     assert errors["consistent"] < 0.4 * min(errors["whitened"], errors["total"])
 
 
+@pytest.mark.parametrize("kind", ["entropic", "geodesic"])
+@pytest.mark.parametrize("offsets", [True, False])
+def test_what_only_the_prior_says_is_named(kind, offsets):
+    s = np.repeat(static_poses(), 10, axis=0)
+    F = OFFSETS * offsets + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
+    F = F + WRENCH_NOISE * np.random.default_rng(3).normal(size=F.shape)
+    thought = 1.05 * TOOL
+    prior = Prior(thought, 1.0, kind)
+    found = identify_batch(F, s, np.zeros(3), np.zeros(3), prior=prior, offsets=offsets)
+    load = found.identification
+    assert load.verdicts == ("identified",) * 10 + ("prior",) * 6
+    assert load.mass == pytest.approx(TOOL[0], rel=0.02)
+    np.testing.assert_allclose(load.phi[4:], thought[4:], atol=0.1 * thought[4])
+    # The data say nothing of the inertia but what mass and centre of mass imply: the prior's
+    # deviation where those are known.
+    expected = np.sqrt(np.diag(np.linalg.inv(prior.information(240)[4:, 4:])))
+    np.testing.assert_allclose(load.standard_deviations[10:], expected, rtol=0.02)
+    moved = identify_batch(*record(noise=1.0), prior=Prior(thought, 1e-4, kind)).identification
+    assert moved.verdicts == ("identified",) * 16
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_a_negative_mass_is_shown(method):
     F, *motion = record(noise=1.0)
