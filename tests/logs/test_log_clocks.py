@@ -1,0 +1,232 @@
+"""Time stamps as recorders write them: what is left out, what is repaired, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from known_motion import motion_at
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.canonical import ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
+from drake_teleop.logs.clocks import Clock, gaps, read_clock, spread
+from drake_teleop.logs.description import Time
+from drake_teleop.logs.processing import eliminate_log, identify_log
+from drake_teleop.logs.reading import read_log
+from drake_teleop.logs.tables import Table
+
+PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
+OFFSETS = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
+NAN = float("nan")
+
+
+def clock_of(stamps: object, values: object = None, **time: object) -> Clock:
+    t = np.array(stamps, float)
+    x = np.arange(float(len(t))) if values is None else np.array(values, float)
+    table = Table(Path("log.csv"), {"t": t, "x": x}, first_row=2)
+    return read_clock(Time.model_validate({"column": "t"} | time), table, ["x"], "here")
+
+
+def test_good_stamps_are_left_alone() -> None:
+    t = 1.7e9 + np.arange(50) * 0.01
+    clock = clock_of(t, offset=0.5)
+    np.testing.assert_array_equal(clock.t, t + 0.5)
+    np.testing.assert_array_equal(clock.rows, np.arange(50))
+    assert clock.notes == () and not len(gaps(clock.t, 30.0))
+    scaled = clock_of(t, scale=1.001, offset=0.5).t
+    np.testing.assert_allclose(scaled - t[0] - 0.5, 1.001 * (t - t[0]), atol=1e-6)
+
+
+def test_rows_without_a_stamp_are_left_out() -> None:
+    clock = clock_of([0.0, 0.1, NAN, NAN, 0.4, 0.5])
+    assert clock.rows.tolist() == [0, 1, 4, 5] and clock.total == 6
+    assert clock.notes == ("2 rows without a time stamp are left out",)
+
+
+def test_rows_that_are_repeated_with_their_stamp_are_left_out() -> None:
+    clock = clock_of([0.0, 0.1, 0.1, 0.1, 0.2, 0.3], [1, 2, 2, 2, NAN, 5])
+    assert clock.rows.tolist() == [0, 1, 4, 5]
+    assert "2 rows that repeat the one before" in clock.notes[0]
+    blank = clock_of([0.0, 0.1, 0.1, 0.2], [1, NAN, NAN, 2])
+    assert blank.rows.tolist() == [0, 1, 3]
+
+
+@pytest.mark.parametrize(
+    ("stamps", "time", "words"),
+    [
+        ([0, 0.1, 0.2, 0.15, 0.3], {}, "1 time stamps go back, the first is row 5 of log.csv, by"),
+        ([0.1] * 9, {}, "the time stamps of log.csv never increase; name another column"),
+        ([NAN] * 9, {}, "no finite number in 9 rows"),
+        (np.arange(9.0), {}, "a rate of 1 Hz; probably `unit: ms`"),
+        (np.arange(9.0) * 1e3, {}, "probably `unit: us`"),
+        (np.arange(9.0) * 1e6, {}, "probably `unit: ns`"),
+        (np.arange(9.0) * 1e-3, {"unit": "ms"}, "a rate of 1e+06 Hz; probably `unit: s`"),
+        (np.arange(9.0) * 0.5, {"unit": "s"}, "a rate of 2 Hz; probably `unit: ms`"),
+        (np.arange(9.0) * 20, {"unit": "s"}, "a rate of 0.05 Hz; probably `unit: ms`"),
+        ([0, 0.01, 0.02, 0.03, 99, 99.01], {}, "longest 99 s to row 6 of log.csv; cut the log"),
+        ([*np.arange(200) * 0.01, *[2.0] * 400, 2.01], {}, "stand still around row 2"),
+    ],
+)
+def test_stamps_that_nothing_can_be_made_of(stamps: object, time: dict, words: str) -> None:
+    with pytest.raises(DrakeTeleopError) as error:
+        clock_of(stamps, **time)
+    assert words in str(error.value)
+    assert str(error.value).startswith(("here", "log.csv"))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rate=st.floats(50, 3000),
+    burst=st.integers(2, 12),
+    start=st.sampled_from([0.0, 1.7e9]),
+    missing=st.lists(st.floats(0.1, 0.9), max_size=3),
+)
+def test_bursts_are_spread_to_what_they_were(
+    rate: float, burst: int, start: float, missing: list[float]
+) -> None:
+    """Rows come in bursts, each with the time of its last row; whole bursts may be missing."""
+    true = np.arange(300 * burst) / rate
+    kept = np.ones(len(true), bool)
+    for share in missing:
+        first = burst * int(share * 300)
+        kept[first : first + 5 * burst] = False
+    stamps = start + true[burst - 1 :: burst].repeat(burst)[kept]
+    found = spread(stamps) - start
+    assert (np.diff(found) > 0).all()
+    # Late by half a burst, the same everywhere; the rest is one burst among the 50 of a window.
+    late = (burst - 1) / 2 / rate
+    np.testing.assert_allclose(found - late, true[kept], atol=1e-6 + burst / 50 / rate)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rate=st.floats(300, 3000),
+    resolution=st.floats(2.0, 10.0),
+    jitter=st.floats(0, 0.3),
+    seed=st.integers(0, 2**31),
+)
+def test_coarse_stamps_are_spread_to_what_they_were(
+    rate: float, resolution: float, jitter: float, seed: int
+) -> None:
+    """Rounded down to a multiple of several periods, on top of jitter."""
+    rng = np.random.default_rng(seed)
+    true = np.arange(2000) / rate
+    step = resolution / rate
+    uneven = np.sort(true + rng.uniform(-jitter, jitter, len(true)) / rate)
+    stamps = np.floor(uneven / step) * step
+    found = spread(stamps)
+    assert (np.diff(found) > 0).all()
+    error = found + step / 2 - true
+    # The stamps are wrong by up to half a resolution, of a mean square of a twelfth.
+    raw = stamps + step / 2 - true
+    assert np.abs(error).max() < 0.6 * np.abs(raw).max()
+    assert error.std() < 0.3 * raw.std()
+
+
+def record(t: np.ndarray) -> np.ndarray:
+    motion = motion_at(t)
+    wrench = OFFSETS + non_contact_wrench(motion.specific_force, motion.omega, motion.alpha, PHI)
+    return np.hstack([wrench, motion.specific_force, motion.omega])
+
+
+def write_streams(folder: Path, wrench: pl.DataFrame, imu: pl.DataFrame, **imu_time: float) -> Path:
+    wrench.write_parquet(folder / "wrench.parquet")
+    imu.write_parquet(folder / "imu.parquet")
+    path = folder / "log.yaml"
+    path.write_text(
+        f"""
+wrench:
+  file: wrench.parquet
+  time: {{column: t, unit: ms}}
+  force: {{columns: [f_x, f_y, f_z]}}
+  torque: {{columns: [tau_x, tau_y, tau_z]}}
+imu:
+  file: imu.parquet
+  time: {{column: t, offset: {imu_time.get("offset", 0.0)}}}
+  specific_force: {{columns: [s_x, s_y, s_z]}}
+  angular_velocity: {{columns: [omega_x, omega_y, omega_z]}}
+"""
+    )
+    return path
+
+
+def frame(t: np.ndarray, names: tuple[str, ...], values: np.ndarray) -> pl.DataFrame:
+    return pl.DataFrame({"t": t} | dict(zip(names, values.T, strict=True)))
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    offset=st.floats(-50, 50),
+    jitter=st.floats(0, 0.3),
+    repeated=st.floats(0, 0.1),
+    blank=st.floats(0, 0.02),
+    gap=st.tuples(st.floats(0.15, 0.7), st.floats(0.05, 1.0)),
+    wrench_gap=st.booleans(),
+    seed=st.integers(0, 2**31),
+)
+def test_the_load_is_found_whatever_the_clocks(
+    tmp_path_factory: pytest.TempPathFactory,
+    offset: float,
+    jitter: float,
+    repeated: float,
+    blank: float,
+    gap: tuple[float, float],
+    wrench_gap: bool,
+    seed: int,
+) -> None:
+    """Two clocks with another zero and rate, jitter, repeated rows, lost stamps, and a gap."""
+    rng = np.random.default_rng(seed)
+    tables = []
+    for rate, zero, unit, columns, holed in (
+        (500.0, 0.0, 1e-3, slice(0, 6), wrench_gap),
+        (400.0, offset, 1.0, slice(6, 12), not wrench_gap),
+    ):
+        t = np.arange(0.0, 8.0, 1 / rate)
+        t = t + rng.uniform(-jitter, jitter, len(t)) / rate
+        values = record(t)[:, columns]
+        stamps = (t - zero) / unit
+        stamps[1:][rng.random(len(t) - 1) < blank] = NAN
+        rows = np.arange(len(t)).repeat(1 + (rng.random(len(t)) < repeated))
+        if holed:
+            start, length = 8.0 * gap[0], gap[1]
+            rows = rows[(t[rows] < start) | (t[rows] > start + length)]
+        names = WRENCH if unit == 1e-3 else (*SPECIFIC_FORCE, *ANGULAR_VELOCITY)
+        tables.append(frame(stamps[rows], names, values[rows]))
+    folder = tmp_path_factory.mktemp("clocks")
+    path = write_streams(folder, *tables, offset=offset)
+    found = identify_log(path, delay=0.0)
+    load = found.identification
+    np.testing.assert_allclose(load.phi, PHI, rtol=3e-3, atol=3e-4)
+    start, stop = 8.0 * gap[0], 8.0 * gap[0] + gap[1]
+    lost = (found.log.t > start) & (found.log.t < stop)
+    assert not lost.any()
+    assert any("1 gaps" in note for note in found.log.notes)
+
+
+def test_what_is_invented_in_a_gap_is_not_used(tmp_path: Path) -> None:
+    """One second of the wrench is missing; a straight line there would be 20 N off."""
+    t = np.arange(0.0, 8.0, 0.002)
+    x = record(t)
+    kept = (t < 3.0) | (t > 4.0)
+    wrench = frame(1e3 * t[kept], WRENCH, x[kept, :6])
+    imu = frame(t, (*SPECIFIC_FORCE, *ANGULAR_VELOCITY), x[:, 6:])
+    path = write_streams(tmp_path, wrench, imu)
+    bridged = read_log(path)
+    assert np.abs(bridged.wrench - record(bridged.t)[:, :6]).max() > 5
+    found = identify_log(path)
+    assert found.log.t[np.argmax(np.diff(found.log.t))] == pytest.approx(3 - 0.03 - 0.067, abs=0.01)
+    assert np.diff(found.log.t).max() == pytest.approx(1 + 2 * (0.03 + 0.067), abs=0.02)
+    assert 1 / found.log.dt == pytest.approx(500)
+    assert abs(found.identification.delay_s) < 1e-4
+    np.testing.assert_allclose(found.identification.phi, PHI, rtol=1e-3, atol=1e-4)
+    free = eliminate_log(path, found.identification, causal="delayed")
+    assert free.causal is not None
+    assert not free.touched.any()
+    assert len(free.log) == len(free.contact) == len(free.causal.contact) == len(free.scaled)
+    assert np.abs(free.contact).max() < 0.05
