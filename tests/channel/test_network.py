@@ -162,6 +162,19 @@ def test_duplicates_only_ever_bring_a_packet_sooner(config, seed):
         np.testing.assert_array_equal(twice, once)
 
 
+@given(networks(), seeds)
+@example(NetworkConfig(), 0)
+def test_no_packet_is_received_before_the_least_delay(config, seed):
+    packets, least = random_packets(200), 3
+    p = parameters(config, seed, FORWARD, PERIOD, least)
+    received, newest, fresh = np.empty_like(packets), np.empty(200, int), np.empty(200, bool)
+    _exchange(p, initial_state(p, np.zeros(PACKET_SIZE)), packets, received, newest, fresh)
+    assert (newest <= np.maximum(np.arange(200) - least, -1)).all()
+    np.testing.assert_array_equal(received[newest >= 0], packets[newest[newest >= 0]])
+    if config == NetworkConfig():
+        np.testing.assert_array_equal(newest, np.maximum(np.arange(200) - least, -1))
+
+
 def test_what_was_overtaken_is_never_received():
     delays = packet_delays(replace(ROUGH, duplicate=0.0), 0, FORWARD, STEPS, PERIOD)[:, 0]
     arrival = np.where(delays >= 0, np.arange(STEPS) + delays, 10 * STEPS)
