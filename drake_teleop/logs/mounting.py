@@ -12,7 +12,8 @@ the accelerometer looks like a shift of the centre of mass in the force alone, t
 centre of mass from the weight.
 
 Standard deviations are those of a jackknife that leaves out one of 20 blocks of time after the
-other, so that residuals may be coloured.
+other, so that residuals may be coloured. They contain noise, but not what interpolation between the
+samples of a pose does (about 0.1 % of p) nor the errors of scale of an accelerometer.
 """
 
 from __future__ import annotations
@@ -40,8 +41,9 @@ ROTATION_KNOWN_DEG = 1.0
 """A rotation is determined if its standard deviation about every axis is below this."""
 LEVER_KNOWN = 0.005
 """A coordinate of the accelerometer is determined if its standard deviation is below this [m]."""
-BELIEVABLE = 0.05
-"""A fit that leaves more of the variance than this tells nothing."""
+BELIEVABLE, BELIEVABLE_GRAVITY = 0.05, 0.005
+"""A fit that leaves more of the variance than this tells nothing; the second is for specific forces
+that are compared with gravity alone, as accelerations may look like a rotation."""
 CLOCK = 0.05
 """Clocks of IMU and pose that disagree by more are worth a note [s]."""
 _REACH = 1.0
@@ -88,6 +90,7 @@ class Mounting:
         middle_s: that instant, on the clock of the pose [s].
         drift: growth of the lag [s/s]; 0 if the record does not show one.
         unexplained: share of the variance of the specific force that this leaves.
+        unexplained_turning: the same of the angular velocity; None without a gyroscope.
         mirrored: a reflection fits decisively better, so R_SI means nothing.
         speed_ratio: rms angular speed of the gyroscope over that of the pose; None without one.
         deviations_deg: (3,) standard deviations of R_SI about the axes of S [deg]; inf about an
@@ -101,6 +104,7 @@ class Mounting:
     middle_s: float
     drift: float
     unexplained: float
+    unexplained_turning: float | None
     mirrored: bool
     speed_ratio: float | None
     deviations_deg: NDArray[np.float64]
@@ -126,9 +130,19 @@ class Mounting:
         return self.oblique_deg < RIGHT_ANGLED_DEG
 
     @property
+    def fits(self) -> bool:
+        """Whether IMU and pose agree, so that the rest means something."""
+        turning = self.unexplained_turning is None or self.unexplained_turning < BELIEVABLE
+        if self.lever is not None:
+            return not self.mirrored and turning and self.unexplained < BELIEVABLE
+        # Without a position the pose knows the angular velocity, but not the acceleration.
+        known = self.unexplained_turning is not None or self.unexplained < BELIEVABLE_GRAVITY
+        return not self.mirrored and turning and known
+
+    @property
     def determined(self) -> bool:
         """Whether the motion shows the rotation about every axis."""
-        return not self.mirrored and bool((self.deviations_deg < ROTATION_KNOWN_DEG).all())
+        return self.fits and bool((self.deviations_deg < ROTATION_KNOWN_DEG).all())
 
 
 def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | None:
@@ -155,7 +169,10 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     cutoff = min(_CUTOFF, 0.2 / imu.dt)
     measured, smooth = low_passed(imu, cutoff), low_passed(pose, cutoff)
     t = np.linspace(start + reach, stop - reach, _SAMPLES)
-    pairs = _pairs(t, measured, smooth)
+    # Without a gyroscope both readings have the angular velocity of the pose.
+    omega_imu, omega = (resample(t, log.t, log.angular_velocity) for log in (imu, pose))
+    gyroscope = not np.allclose(omega_imu, omega, atol=1e-9)
+    pairs = _pairs(t, measured, smooth, gyroscope)
     expected = pairs[0][0]
     if expected.var(axis=0).sum() < 0.25:
         return None
@@ -167,7 +184,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     # With the clock known, more of the record can be used.
     margin = min(reach, abs(middle) + 0.1)
     t = np.linspace(start + margin, stop - margin, _SAMPLES)
-    pairs = _pairs(t, measured, smooth)
+    pairs = _pairs(t, measured, smooth, gyroscope)
     turned = resample(t, pose.t, smooth.angular_velocity)
     K = _lever_matrix(turned, resample(t, pose.t, smooth.angular_acceleration))
 
@@ -184,6 +201,8 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     lever = None
     if position:
         lever = LeverArm(x[4:7], np.where(_shown(K, pose, cutoff), deviations[4:7], np.inf), "pose")
+    left = residual(x).reshape(_SAMPLES, -1, 3).var(axis=0).sum(axis=1)
+    shares = [float(part / y.var(axis=0).sum()) for part, (y, _) in zip(left, pairs, strict=True)]
     speeds = [float(np.linalg.norm(log.angular_velocity, axis=1).std()) for log in (imu, pose)]
     return Mounting(
         R_SI=_turned(R, x[:3]),
@@ -191,7 +210,8 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
         lag_middle_s=float(x[3]),
         middle_s=centre,
         drift=drift,
-        unexplained=float(residual(x)[:, :3].var(axis=0).sum() / pairs[0][0].var(axis=0).sum()),
+        unexplained=shares[0],
+        unexplained_turning=shares[1] if len(shares) > 1 else None,
         mirrored=mirrored,
         speed_ratio=speeds[0] / speeds[1] if speeds[1] > 0.05 else None,
         deviations_deg=np.degrees(deviations[:3]),
@@ -328,7 +348,7 @@ def describe_mounting(
         position = tuple(lever.p_SoIo_S.tolist())
         notes.append(
             f"imu.position found: {_millimetres(lever)} mm, from the {lever.source}; write it into"
-            f" the description as imu.position: {np.round(lever.p_SoIo_S, 4).tolist()}"
+            f" the description as imu.position: {_written(lever.p_SoIo_S)}"
         )
     return described(frame=frame, position=position), tuple(notes)
 
@@ -339,9 +359,9 @@ def _believed(mounting: Mounting | None, where: str) -> Mounting:
         what, remedy = "the specific force hardly changes", "turn the sensor about two axes"
     elif mounting.mirrored:
         what = "the axes of the IMU are those of the pose mirrored"
-        remedy = "exchange two columns of the IMU, or the sign of one"
-    elif mounting.unexplained > BELIEVABLE:
-        what = f"no rotation brings IMU and pose together ({mounting.unexplained:.0%} is left)"
+        remedy = "exchange two of its columns, or change imu.sign"
+    elif not mounting.fits:
+        what = f"no rotation brings IMU and pose together ({_left(mounting)})"
         remedy = "look for wrong units, signs or clocks by `drake-teleop inspect`"
     elif not mounting.determined:
         worst = float(mounting.deviations_deg.max())
@@ -356,13 +376,18 @@ def _believed(mounting: Mounting | None, where: str) -> Mounting:
     )
 
 
+def _left(found: Mounting) -> str:
+    shares = {"specific force": found.unexplained, "angular velocity": found.unexplained_turning}
+    return ", ".join(f"{v:.2g} of the {k}'s variance" for k, v in shares.items() if v is not None)
+
+
 def _rotation_notes(found: Mounting) -> list[str]:
     nearest = found.right_angled.astype(int).tolist()
     away = f"{found.oblique_deg:.1f} deg from the right-angled mounting {nearest}"
     sure = f"{float(found.deviations_deg.max()):.2g} deg"
     notes = [
         f"imu.frame found: {away}, standard deviation {sure}; write it into the description as"
-        f" imu.frame: {np.round(found.R_SI, 4).tolist()}"
+        f" imu.frame: {_written(found.R_SI)}"
     ]
     if not found.is_right_angled:
         notes.append(f"warning: the IMU is mounted obliquely, {away}: check that it is meant so")
@@ -377,7 +402,7 @@ def _rotation_notes(found: Mounting) -> list[str]:
 def _lever(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
     """The lever arm from the pose, or else from the wrench."""
     lever = None
-    if mounting is not None and not mounting.mirrored and mounting.unexplained < BELIEVABLE:
+    if mounting is not None and mounting.fits:
         lever = mounting.lever
     if lever is None or not lever.determined.all():
         other = lever_arm_from_wrench(at_Io)
@@ -401,6 +426,11 @@ def _lever(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
     return lever
 
 
+def _written(x: NDArray[np.float64]) -> list:
+    """To four digits, without -0.0."""
+    return list((np.round(x, 4) + 0.0).tolist())
+
+
 def _millimetres(lever: LeverArm) -> str:
     return ", ".join(
         f"{axis} {1e3 * value:.1f} +- {1e3 * deviation:.1f}" if deviation < 1 else f"{axis} unknown"
@@ -421,13 +451,11 @@ def right_angled_rotations() -> list[NDArray[np.float64]]:
 _Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
 
 
-def _pairs(t: NDArray[np.float64], imu: Log, pose: Log) -> _Pairs:
+def _pairs(t: NDArray[np.float64], imu: Log, pose: Log, gyroscope: bool) -> _Pairs:
     """Of each sensor, the signal (N, 3) of the pose at `t`, and that of the IMU on its clock."""
     pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
-    turned = resample(t, pose.t, pose.angular_velocity)
-    # Without a gyroscope both readings have the angular velocity of the pose.
-    if not np.allclose(resample(t, imu.t, imu.angular_velocity), turned, atol=1e-9):
-        pairs.append((turned, imu.angular_velocity))
+    if gyroscope:
+        pairs.append((resample(t, pose.t, pose.angular_velocity), imu.angular_velocity))
     return pairs
 
 
@@ -534,8 +562,9 @@ def _jackknife(
 def _unmapped(y: NDArray[np.float64], x: NDArray[np.float64]) -> float:
     """Share of the variance of y (N, 3) that no affine map of x (N, 3) explains."""
     y, x = y - y.mean(axis=0), x - x.mean(axis=0)
-    left_over = y - x @ np.linalg.lstsq(x, y, rcond=1e-6)[0]
-    return float(left_over.var(axis=0).sum() / (y.var(axis=0).sum() + 1e-12))
+    both, total = x.T @ y, float((y * y).sum()) + 1e-12 * len(y)
+    explained = (both * (np.linalg.pinv(x.T @ x, rcond=1e-12, hermitian=True) @ both)).sum()
+    return float((y * y).sum() - explained) / total
 
 
 def _angle_deg(R: NDArray[np.float64]) -> float:

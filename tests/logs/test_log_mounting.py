@@ -1,0 +1,335 @@
+"""Rotation and lever arm of an IMU, found without being told, against mountings that are known."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from known_motion import GRAVITY_W, Motion, motion_at, quaternions
+from scipy.spatial.transform import Rotation
+from test_log_commands import GRAVITY, describe_poses, describe_record
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.description import Description, load_description
+from drake_teleop.logs.inspection import inspect_command
+from drake_teleop.logs.mounting import Mounting, find_mounting, lever_arm_from_wrench
+from drake_teleop.logs.processing import eliminate_log, identify_log
+from drake_teleop.logs.reading import read_description, read_log
+from drake_teleop.logs.tables import Table
+
+PHI = phi_from_mass_com_inertia(3.13, [0.01, -0.02, 0.12], np.diag([0.02, 0.018, 0.006]))
+OFFSETS = np.array([3.0, -2.0, 7.0, 0.1, 0.2, -0.3])
+RIGHT_ANGLED = np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])
+LAG = 0.006
+
+
+def turning_about_y(t: np.ndarray, *, arm: float = 0.0) -> Motion:
+    """Swinging about the y axis of S, with So on an arc of this radius."""
+    angle, rate = 1.4 * np.sin(1.1 * t), 1.4 * 1.1 * np.cos(1.1 * t)
+    acceleration = -1.1 * 1.1 * angle
+    R_WS = Rotation.from_rotvec(np.outer(angle, [0.0, 1, 0])).as_matrix()
+    omega, alpha = np.outer(rate, [0.0, 1, 0]), np.outer(acceleration, [0.0, 1, 0])
+    r = np.array([0.0, 0, arm])
+    p_WS = R_WS @ r
+    s = np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
+    return Motion(t, R_WS, p_WS, s - np.einsum("nji,j->ni", R_WS, GRAVITY_W), omega, alpha)
+
+
+@dataclass(frozen=True)
+class Recorder:
+    """An IMU somewhere on the sensor, the wrench of a load, and a pose; each on its own clock."""
+
+    R_SI: np.ndarray
+    p_SoIo_S: np.ndarray
+    seed: int = 0
+    noise: float = 1.0
+    motion: Any = motion_at
+
+    def tables(self) -> dict[Path, Table]:
+        """6 s; noise and bias of a small MEMS IMU, of a wrist sensor, and of joint encoders."""
+        rng, p = np.random.default_rng(self.seed), self.p_SoIo_S
+
+        def noisy(x: np.ndarray, *sizes: float) -> np.ndarray:
+            return x + self.noise * rng.normal(size=x.shape) * np.repeat(sizes, 3)
+
+        t = np.arange(0, 6, 1 / 500)
+        m = self.motion(t)
+        wrench = non_contact_wrench(m.specific_force, m.omega, m.alpha, PHI)
+        wrench = noisy(wrench, 0.1, 0.005) + OFFSETS
+        columns = {"w": {"t": t, "f": wrench[:, :3], "m": wrench[:, 3:]}}
+        t = np.arange(0, 6, 1 / 250) + 0.0013
+        m = self.motion(t - LAG)
+        s = m.specific_force + np.cross(m.alpha, p) + np.cross(m.omega, np.cross(m.omega, p))
+        columns["i"] = {
+            "t": t,
+            "s": noisy(s @ self.R_SI, 0.06) + 0.3 * rng.normal(size=3),
+            "omega": noisy(m.omega @ self.R_SI, 2e-3) + 0.01 * rng.normal(size=3),
+        }
+        t = np.arange(0, 6, 1 / 125) + 0.0021
+        m = self.motion(t)
+        wobble = Rotation.from_rotvec(noisy(np.zeros((len(t), 3)), 1e-4)).as_matrix()
+        columns["p"] = {"t": t, "q": quaternions(m.R_WS @ wobble), "p": noisy(m.p_WS, 5e-5)}
+        return {Path(name): Table(Path(name), data) for name, data in columns.items()}
+
+
+def described(
+    *, gyroscope: bool = True, pose: bool = True, positioned: bool = True, **imu: Any
+) -> Description:
+    """The description of a `Recorder`'s tables."""
+
+    def stream(file: str, **fields: str) -> dict[str, Any]:
+        columns = {name: {"columns": [column]} for name, column in fields.items()}
+        return {"file": file, "time": {"column": "t"}} | columns
+
+    imus = {"specific_force": "s"} | ({"angular_velocity": "omega"} if gyroscope else {})
+    data = {"wrench": stream("w", force="f", torque="m"), "imu": stream("i", **imus) | imu}
+    if pose:
+        data["pose"] = stream("p", orientation="q") | (
+            {"position": {"columns": ["p"]}} if positioned else {}
+        )
+        data["pose"]["orientation"]["form"] = "quaternion_wxyz"
+    return Description.model_validate(data)
+
+
+def mounting(recorder: Recorder, **streams: bool) -> Mounting:
+    description, tables = described(**streams), recorder.tables()
+    imu = read_description(description, "log.yaml", tables=tables)
+    alone = description.model_copy(update={"imu": None})
+    pose = read_description(alone, "log.yaml", tables=tables)
+    found = find_mounting(imu, pose, position=streams.get("positioned", True))
+    assert found is not None
+    return found
+
+
+def a_rotation(seed: int) -> np.ndarray:
+    return Rotation.random(random_state=np.random.default_rng(seed)).as_matrix()
+
+
+def turn(R: np.ndarray) -> np.ndarray:
+    """Rotation vector [deg]."""
+    return np.degrees(Rotation.from_matrix(R).as_rotvec())
+
+
+rotations = st.integers(0, 10**6).map(a_rotation)
+places = st.tuples(*[st.floats(-0.2, 0.2)] * 3).map(np.array)
+
+
+@settings(max_examples=6, deadline=None)
+@given(rotations, places, st.integers(0, 10**6), st.booleans())
+def test_any_mounting_is_found_within_what_is_stated(
+    R_SI: np.ndarray, p_SoIo_S: np.ndarray, seed: int, gyroscope: bool
+) -> None:
+    found = mounting(Recorder(R_SI, p_SoIo_S, seed), gyroscope=gyroscope)
+    assert found.determined and found.lever is not None and found.lever.determined.all()
+    # 0.1 % of the lever arm, and as much of a rotation, is what interpolating the pose costs.
+    error = np.abs(turn(found.R_SI @ R_SI.T))
+    assert (error < 5 * found.deviations_deg + 0.02).all()
+    assert (np.abs(found.lever.p_SoIo_S - p_SoIo_S) < 5 * found.lever.deviations + 3e-4).all()
+    assert found.deviations_deg.max() < 0.1
+    assert found.lever.deviations.max() < 5e-4
+    assert found.lag_s == pytest.approx(LAG, abs=3e-4)
+
+
+def test_deviations_are_those_of_repeated_records() -> None:
+    truth = [(a_rotation(seed), np.array([0.05, -0.03, 0.08])) for seed in range(16)]
+    ratios = []
+    for seed, (R_SI, p) in enumerate(truth):
+        found = mounting(Recorder(R_SI, p, seed, noise=8.0), gyroscope=False)
+        assert found.lever is not None
+        ratios.append(turn(found.R_SI @ R_SI.T) / found.deviations_deg)
+        ratios.append((found.lever.p_SoIo_S - p) / found.lever.deviations)
+    ratios = np.array(ratios)
+    # 96 ratios, of which 95 % are to be within +-1.96: 86 or more in 99 of 100 such tests.
+    assert (np.abs(ratios) < 1.96).sum() >= 86
+    assert 0.7 < np.sqrt((ratios**2).mean()) < 1.3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_wrench_tells_the_lever_arm_without_a_pose(seed: int) -> None:
+    p = np.random.default_rng(seed).uniform(-0.1, 0.1, 3)
+    recorder = Recorder(a_rotation(seed), p, seed, noise=3.0)
+    description = described(pose=False, frame=recorder.R_SI.tolist())
+    tables = recorder.tables()
+    found = lever_arm_from_wrench(read_description(description, "log.yaml", tables=tables))
+    assert found is not None and found.determined.all()
+    assert (np.abs(found.p_SoIo_S - p) < 4 * found.deviations + 3e-4).all()
+    auto = read_description(
+        described(pose=False, frame=recorder.R_SI.tolist(), position="auto"),
+        "log.yaml",
+        tables=tables,
+    )
+    assert len(auto.notes) == 1 and "from the wrench" in auto.notes[0]
+
+
+def test_a_load_that_touches_something_tells_nothing() -> None:
+    tables = Recorder(np.eye(3), np.array([0.05, 0, 0])).tables()
+    touched = tables[Path("w")].columns["f"].copy()
+    touched[1000:1600] += 40.0
+    tables[Path("w")] = replace(
+        tables[Path("w")], columns=tables[Path("w")].columns | {"f": touched}
+    )
+    with pytest.raises(DrakeTeleopError, match="nothing tells the place of the accelerometer"):
+        read_description(described(pose=False, position="auto"), "log.yaml", tables=tables)
+
+
+@pytest.mark.parametrize("source", ["pose", "wrench"])
+def test_rotation_about_one_axis_tells_two_coordinates(source: str) -> None:
+    recorder = Recorder(np.eye(3), np.array([0.03, 0.04, -0.05]), motion=turning_about_y)
+    streams = {"pose": True} if source == "pose" else {"pose": False}
+    at_Io = read_description(described(**streams), "log.yaml", tables=recorder.tables())
+    lever = mounting(recorder).lever if source == "pose" else lever_arm_from_wrench(at_Io)
+    assert lever is not None and lever.source == source
+    assert lever.determined.tolist() == [True, False, True]
+    known = lever.determined
+    error = (lever.p_SoIo_S - recorder.p_SoIo_S)[known]
+    assert (np.abs(error) < 4 * lever.deviations[known] + 3e-4).all()
+    with pytest.raises(DrakeTeleopError, match=r"imu.position: .*determine y of"):
+        read_description(
+            described(**streams, position="auto"), "log.yaml", tables=recorder.tables()
+        )
+
+
+def test_an_orientation_alone_does_not_tell_the_lever_arm() -> None:
+    # So swings on an arc of 0.3 m, and the accelerometer is 0.3 m + p from the centre.
+    recorder = Recorder(
+        a_rotation(2),
+        np.array([0.02, 0.0, 0.05]),
+        motion=lambda t: turning_about_y(t, arm=0.3),
+    )
+    found = mounting(recorder, gyroscope=False, positioned=False)
+    assert found.lever is None
+    # The arc is allowed for: it does not turn the IMU.
+    assert found.determined
+    assert np.linalg.norm(turn(found.R_SI @ recorder.R_SI.T)) < 0.3
+
+
+def written(folder: Path, recorder: Recorder, **imu: Any) -> Path:
+    """The tables as NPZ files and their description."""
+    for name, table in recorder.tables().items():
+        np.savez(folder / f"{name}.npz", **table.columns)
+    data = described(**imu).model_dump(mode="json", exclude_none=True)
+    for name in ("wrench", "imu", "pose"):
+        data[name]["file"] += ".npz"
+    data["gravity"] = 9.80665
+    (folder / "log.yaml").write_text(yaml.safe_dump(data), encoding="utf-8")
+    return folder / "log.yaml"
+
+
+@pytest.mark.parametrize("oblique", [False, True])
+def test_what_was_found_can_be_written_down(tmp_path: Path, oblique: bool) -> None:
+    R_SI = Rotation.from_rotvec([0.1, -0.4, 0.2]).as_matrix() @ RIGHT_ANGLED
+    recorder = Recorder(R_SI if oblique else RIGHT_ANGLED, np.array([0.04, -0.06, 0.02]))
+    path = written(tmp_path, recorder, frame="auto", position="auto")
+    auto = read_log(path)
+    notes = "\n".join(auto.notes)
+    assert ("warning: the IMU is mounted obliquely, 26." in notes) == oblique
+    assert "warning" in notes or not oblique
+    assert "from the right-angled mounting [[0, -1, 0], [0, 0, 1], [-1, 0, 0]]" in notes
+    assert "mm, from the pose" in notes
+    data = yaml.safe_load(path.read_text())
+    for field in ("frame", "position"):
+        data["imu"][field] = yaml.safe_load(re.search(rf"imu.{field}: (\[.*\])", notes)[1])
+    path.write_text(yaml.safe_dump(data))
+    given_now = read_log(path)
+    assert given_now.notes == ()
+    # Four digits of the rotation and 0.1 mm make this difference.
+    np.testing.assert_allclose(auto.specific_force, given_now.specific_force, atol=0.01)
+    assert inspect_command(path, tmp_path / "out", quiet=True)["mounting"]["angle_deg"] < 0.1
+
+
+def test_a_position_that_is_given_is_that_of_the_found_frame(tmp_path: Path) -> None:
+    p = np.array([0.04, -0.06, 0.02])
+    recorder = Recorder(a_rotation(5), p, noise=0.1)
+    log = read_log(written(tmp_path, recorder, frame="auto", position="auto"))
+    half = read_log(written(tmp_path, recorder, frame="auto"))
+    data = yaml.safe_load((tmp_path / "log.yaml").read_text())
+    data["imu"]["position"] = p.tolist()
+    (tmp_path / "log.yaml").write_text(yaml.safe_dump(data))
+    given_place = read_log(tmp_path / "log.yaml")
+    assert np.abs(log.specific_force - half.specific_force).max() > 1.0
+    assert np.abs(log.specific_force - given_place.specific_force).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"rest": True}, ["the specific force hardly changes", "turn the sensor"]),
+        ({"mirror": True}, ["mirrored", "exchange two of its columns"]),
+        ({"sign": -1}, ["mirrored", "imu.sign"]),
+        ({"degrees": True}, ["no rotation brings", "angular velocity", "drake-teleop inspect"]),
+    ],
+)
+def test_a_rotation_that_the_data_do_not_determine_is_an_error(
+    changes: dict[str, Any], words: list[str]
+) -> None:
+    motion = (lambda t: motion_at(0 * t)) if changes.get("rest") else motion_at
+    tables = Recorder(RIGHT_ANGLED, np.zeros(3), motion=motion).tables()
+    columns = tables[Path("i")].columns
+    if changes.get("rest"):
+        still = {"s": motion(columns["t"]).specific_force, "omega": 0 * columns["omega"]}
+        columns |= still
+    if changes.get("mirror"):
+        columns |= {"s": columns["s"][:, [1, 0, 2]], "omega": columns["omega"][:, [1, 0, 2]]}
+    if changes.get("degrees"):
+        columns |= {"omega": np.degrees(columns["omega"])}
+    description = described(frame="auto", sign=changes.get("sign", 1))
+    with pytest.raises(DrakeTeleopError) as error:
+        read_description(description, "log.yaml", tables=tables)
+    message = str(error.value)
+    assert message.startswith("log.yaml:imu.frame: the data do not determine the rotation")
+    for word in words:
+        assert word in message
+
+
+def test_the_clock_of_the_imu_is_mentioned_and_left_alone() -> None:
+    tables = Recorder(RIGHT_ANGLED, np.zeros(3)).tables()
+    late = tables[Path("i")].columns["t"] + 0.2
+    tables[Path("i")] = replace(tables[Path("i")], columns=tables[Path("i")].columns | {"t": late})
+    log = read_description(described(frame="auto"), "log.yaml", tables=tables)
+    assert any("lags that of the pose by 0.206 s" in note for note in log.notes)
+    s = motion_at(log.t - LAG - 0.2).specific_force
+    assert np.abs(log.specific_force - s)[20:-20].mean() < 0.4
+
+
+# Real records
+
+
+@pytest.mark.parametrize(
+    ("record", "residual", "delay_s"),
+    [("1-baseline", 0.296, 0.00612), ("2-vibrations", 0.316, 0.00588)],
+)
+def test_ntnu_mounting_and_delay_without_being_told(
+    ntnu: Path, tmp_path: Path, record: str, residual: float, delay_s: float
+) -> None:
+    path = describe_record(tmp_path, ntnu, record)
+    known = load_description(path)
+    assert known.imu is not None
+    data = yaml.safe_load(path.read_text())
+    data["imu"]["frame"] = "auto"
+    path.write_text(yaml.safe_dump(data))
+    own = identify_log(path)
+    note = next(note for note in own.log.notes if note.startswith("imu.frame found"))
+    R_SI = np.array(yaml.safe_load(note.split("imu.frame: ")[1]))
+    assert np.linalg.norm(turn(R_SI @ np.array(known.imu.frame).T)) < 1.5
+    assert not any("warning" in note for note in own.log.notes)
+    assert own.identification.delay_s == pytest.approx(delay_s, abs=3e-4)
+    assert own.identification.mass == pytest.approx(0.9323, rel=0.01)
+    assert own.identification.com[2] == pytest.approx(0.0439, abs=3e-4)
+    # The load of the poses, which know nothing of the IMU, leaves less than with the axes exact.
+    poses = identify_log(describe_poses(tmp_path, ntnu, GRAVITY)).identification
+    contact = eliminate_log(path, poses).contact[:, :3]
+    assert np.sqrt(np.mean(np.sum(contact**2, axis=1))) < residual
+    data["imu"]["position"] = "auto"
+    path.write_text(yaml.safe_dump(data))
+    # 0.8 rad/s about one axis do not show a few centimetres.
+    with pytest.raises(DrakeTeleopError, match="determine x, y, z of"):
+        read_log(path)
