@@ -62,3 +62,34 @@ def normalized(a):
     """a / |a|."""
     scale = 1.0 / math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
     return (scale * a[0], scale * a[1], scale * a[2], scale * a[3])
+
+
+@njit(cache=True)
+def quaternion_of(R):
+    """The unit quaternion of a rotation matrix (3, 3) (Shepperd 1978: never divides by little)."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    largest = max(trace, R[0, 0], R[1, 1], R[2, 2])
+    if largest == trace:
+        a = (1.0 + trace, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
+    elif largest == R[0, 0]:
+        a = (
+            R[2, 1] - R[1, 2],
+            1.0 + 2.0 * R[0, 0] - trace,
+            R[0, 1] + R[1, 0],
+            R[0, 2] + R[2, 0],
+        )
+    elif largest == R[1, 1]:
+        a = (
+            R[0, 2] - R[2, 0],
+            R[0, 1] + R[1, 0],
+            1.0 + 2.0 * R[1, 1] - trace,
+            R[1, 2] + R[2, 1],
+        )
+    else:
+        a = (
+            R[1, 0] - R[0, 1],
+            R[0, 2] + R[2, 0],
+            R[1, 2] + R[2, 1],
+            1.0 + 2.0 * R[2, 2] - trace,
+        )
+    return normalized(a)

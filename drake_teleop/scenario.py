@@ -12,10 +12,12 @@ from pathlib import Path
 import yaml
 from pydrake.common.yaml import yaml_load, yaml_load_typed
 
+from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.master.device import JointFriction
 from drake_teleop.master.operator import OperatorConfig
+from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.quantities import check_ranges, check_structure, choice, quantity
 from drake_teleop.resources import scenarios_dir
 from drake_teleop.scaling.force_scaling import ForceScalingConfig
@@ -67,13 +69,6 @@ class Master:
 
 
 @dataclass
-class Channel:
-    """The line between master and slave."""
-
-    delay: float = quantity(0.0, "s", 0.0, 10.0, "one-way delay, the same in both directions")
-
-
-@dataclass
 class Slave:
     """Where the tool starts: S points down at this position."""
 
@@ -91,6 +86,7 @@ class Scenario:
     master: Master = field(default_factory=Master)
     kinematic_scaling: KinematicScalingConfig = field(default_factory=KinematicScalingConfig)
     channel: Channel = field(default_factory=Channel)
+    passivity: PassivityConfig = field(default_factory=PassivityConfig)
     slave: Slave = field(default_factory=Slave)
     joint_control: JointControlConfig = field(default_factory=JointControlConfig)
     wrist_sensor: WristSensorConfig = field(default_factory=WristSensorConfig)
@@ -107,6 +103,7 @@ class Scenario:
         check_ranges(self, where)
         self.force_scaling.scales(f"{where}:force_scaling")
         _check_rates(self, where)
+        _check_channel(self, where)
 
 
 def ScenarioNames() -> list[str]:
@@ -163,4 +160,23 @@ def _check_rates(scenario: Scenario, where: str) -> None:
             f"({rates.sensor_hz:g} Hz)",
             where=f"{where}:wrist_sensor.bandwidth_hz",
             remedy="lower the bandwidth below 0.45 of the sensor's rate",
+        )
+
+
+def _check_channel(scenario: Scenario, where: str) -> None:
+    for line in scenario.channel.lines(f"{where}:channel"):
+        line.check(f"{where}:channel")
+        if line.rate_hz is not None and scenario.channel.timeout < 2 / line.rate_hz:
+            raise DrakeTeleopError(
+                f"{scenario.channel.timeout:g} s are less than two packets of {line.rate_hz:g} Hz",
+                where=f"{where}:channel.timeout",
+                remedy="raise timeout or rate_hz, or the station is in its safe state all the time",
+            )
+    scaling = scenario.kinematic_scaling
+    scales = (scaling.translation_scale, scaling.rotation_scale)
+    if scenario.passivity.method != "none" and min(scales) == 0.0:
+        raise DrakeTeleopError(
+            "a motion that is scaled to zero carries no energy",
+            where=f"{where}:passivity.method",
+            remedy="set both scales of kinematic_scaling above 0, or method: none",
         )

@@ -47,6 +47,14 @@ SIGNALS = {
         _signal("hand_wrench_E", *_WRENCH, "hand on the stylus at Eo, in B"),
         _signal("force_to_master", *_WRENCH, "what the device displays, within its limits"),
         _signal("pose_command", *_POSE, "setpoint of the slave, X_WS"),
+        _signal("pose_received", *_POSE, "of the setpoint, what comes out of the channel, X_WS"),
+        _signal(
+            "ports",
+            "hand hand_rotation slave slave_rotation master_silent slave_silent",
+            "J,J,J,J,s,s",
+            "energy put into the channel at its ends, in the master's power units; how long each"
+            " end has heard nothing",
+        ),
         _signal("joint_command", _JOINTS, "rad", "from the inverse kinematics"),
         _signal("ik_status", "status", "1", "of the inverse kinematics, 0 = fine"),
         _signal("slave_state", _STATE, _STATE_UNITS, "true joint angles and velocities"),

@@ -13,7 +13,8 @@ from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
-from drake_teleop.channel.delay import AddChannel
+from drake_teleop.channel.channel import TeleopChannel
+from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.environment.contact import ToolContact
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.excitation import FourierTrajectory
@@ -59,9 +60,19 @@ _TELEOP_WIRES = (
     ("master_device.state", "force_display.master_state"),
     ("force_display.motor_torque", "master_device.motor_torque"),
 )
-# Through the channel.
-_FORWARD = ("forward_channel", "kinematic_scaling.pose_command", "inverse_kinematics.pose_command")
-_BACKWARD = ("backward_channel", "force_scaling.wrench_B", "force_display.wrench_command")
+# An ideal network without a method is nothing but wires.
+_DIRECT_WIRES = (
+    ("kinematic_scaling.pose_command", "inverse_kinematics.pose_command"),
+    ("force_scaling.wrench_B", "force_display.wrench_command"),
+)
+_CHANNEL_WIRES = (
+    ("kinematic_scaling.pose_command", "channel.pose_command"),
+    ("channel.pose_received", "inverse_kinematics.pose_command"),
+    ("force_scaling.wrench_B", "channel.wrench_B"),
+    ("operator.hand_wrench_E", "channel.hand_wrench_E"),
+    ("wrist_sensor.sample", "channel.sample"),
+    ("channel.wrench_received", "force_display.wrench_command"),
+)
 
 #: Signal -> port; `drake_teleop.signals` says what each one is.
 _SLAVE_SIGNALS = {
@@ -92,6 +103,7 @@ _TELEOP_SIGNALS = {
     "contact_wrench_S": "force_scaling.contact_wrench_S",
     "force_to_master": "force_display.force_to_master",
 }
+_CHANNEL_SIGNALS = {"pose_received": "channel.pose_received", "ports": "channel.ports"}
 
 
 #: How often the clutch and the monitor are looked at [s]; an event at 2 kHz would cost time.
@@ -135,6 +147,8 @@ def MakeTeleopStation(
         - scaled_wrench_S
         - contact_wrench_S
         - force_to_master
+        - pose_received (with a channel)
+        - ports (with a channel)
 
     Args:
         scenario: what the station is made of.
@@ -149,8 +163,7 @@ def MakeTeleopStation(
     scenario.check()
     _check_load_is_known(scenario, load_estimate)
     period = 1 / scenario.rates.hand_hz
-    hand, delay = scenario.operator.hand, scenario.channel.delay
-    scaling = scenario.kinematic_scaling
+    hand, scaling = scenario.operator.hand, scenario.kinematic_scaling
     start_B = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     start_W = np.array([*R_WS_HOME.ToQuaternion().wxyz(), *scenario.slave.position])
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix()
@@ -174,12 +187,31 @@ def MakeTeleopStation(
     for name, block in blocks.items():
         builder.AddNamedSystem(name, block)
     _connect(builder, _TELEOP_WIRES)
-    for wire, neutral in (_FORWARD, start_W), (_BACKWARD, np.zeros(6)):
-        name, sender, receiver = wire
-        received = AddChannel(builder, name, _output(builder, sender), delay, period, neutral)
-        builder.Connect(received, _input(builder, receiver))
+    signals = slave_signals | _TELEOP_SIGNALS
+    if _is_direct(scenario):
+        _connect(builder, _DIRECT_WIRES)
+    else:
+        channel = TeleopChannel(
+            scenario.channel,
+            scenario.passivity,
+            slave.arm,
+            R_WB.matrix(),
+            np.array([scaling.translation_scale, scaling.rotation_scale]),
+            scenario.force_scaling.force_scale,
+            start_W,
+            period,
+            scenario.simulation.seed,
+        )
+        builder.AddNamedSystem("channel", channel)
+        _connect(builder, _CHANNEL_WIRES)
+        signals |= _CHANNEL_SIGNALS
     builder.ExportInput(_input(builder, "kinematic_scaling.clutch"), "clutch")
-    return _finish(builder, "teleop_station", slave_signals | _TELEOP_SIGNALS, scenario)
+    return _finish(builder, "teleop_station", signals, scenario)
+
+
+def _is_direct(scenario: Scenario) -> bool:
+    lines = scenario.channel.lines()
+    return scenario.passivity.method == "none" and lines == (NetworkConfig(), NetworkConfig())
 
 
 def _check_load_is_known(scenario: Scenario, estimate: NDArray[np.float64] | None) -> None:

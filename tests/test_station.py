@@ -293,6 +293,7 @@ def test_scales_change_while_running_without_a_step_of_the_force(slave):
 
 def test_every_output_port_is_a_documented_signal():
     scenario = replace(LoadScenario("contact_transition"), simulation=Simulation(duration=0.01))
+    scenario = replace(scenario, channel__network="lan")
     station = MakeTeleopStation(scenario, load_estimate=np.zeros(16))
     names = {station.get_output_port(i).get_name() for i in range(station.num_output_ports())}
     assert names == set(SIGNALS)

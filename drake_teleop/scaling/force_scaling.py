@@ -82,9 +82,18 @@ def _scaled_into(sample, estimate, phi_gripper, scales, out):
 
 
 @njit(cache=True)
-def _felt_into(sample, estimate, phi_gripper, scales, arm, R_WB, out):
+def _scaled_now_into(sample, estimate, phi_gripper, change, time, out):
+    """F' of one sample with the scales of this time, see `scales_at`."""
+    scales = np.empty(4)
+    scales_at(change, time, scales)
+    _scaled_into(sample, estimate, phi_gripper, scales, out)
+
+
+@njit(cache=True)
+def _felt_into(sample, estimate, phi_gripper, change, time, arm, R_WB, out):
     """What the hand shall feel of F'; the orientation of S comes from the same sample."""
-    scaled_S, R_WS, p_WS = np.empty(6), np.empty((3, 3)), np.empty(3)
+    scales, scaled_S, R_WS, p_WS = np.empty(4), np.empty(6), np.empty((3, 3)), np.empty(3)
+    scales_at(change, time, scales)
     _scaled_into(sample, estimate, phi_gripper, scales, scaled_S)
     forward_kinematics(arm, sample[16:], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
@@ -124,7 +133,6 @@ class ForceScaling(LeafSystem):
         # Old and new scales, start and length of the change; see `scales_at`.
         scales = [*config.scales(), config.force_scale]
         self._change = self.DeclareNumericParameter(BasicVector([*scales, *scales, 0.0, 0.0]))
-        self._scales = np.empty(4)
         size = sum(sample_parts(arm.num_joints).values())
         self._sample = self.DeclareVectorInputPort("sample", size)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
@@ -161,18 +169,13 @@ class ForceScaling(LeafSystem):
             raise DrakeTeleopError(
                 "scales and duration are not finite or negative", where="SetScales"
             )
-        now = self._present_scales(context).copy()
-        change = np.concatenate([now, wanted[:4], [context.get_time(), wanted[4]]])
-        context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
-
-    def _present_scales(self, context: Context) -> NDArray[np.float64]:
-        change = context.get_numeric_parameter(self._change).value()
-        scales_at(change, context.get_time(), self._scales)
-        return self._scales
+        parameter = context.get_mutable_numeric_parameter(self._change)
+        now, start = np.empty(4), context.get_time()
+        scales_at(parameter.value(), start, now)
+        parameter.SetFromVector(np.concatenate([now, wanted[:4], [start, wanted[4]]]))
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
-        scales = self._present_scales(context)
-        _scaled_into(*self._inputs(context), scales, output.get_mutable_value())
+        _scaled_now_into(*self._inputs(context), *self._now(context), output.get_mutable_value())
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
         _scaled_into(*self._inputs(context), _ELIMINATION, output.get_mutable_value())
@@ -184,8 +187,11 @@ class ForceScaling(LeafSystem):
         )
 
     def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
-        inputs, scales = self._inputs(context), self._present_scales(context)
-        _felt_into(*inputs, scales, self._arm, self._R_WB, output.get_mutable_value())
+        inputs = (*self._inputs(context), *self._now(context))
+        _felt_into(*inputs, self._arm, self._R_WB, output.get_mutable_value())
+
+    def _now(self, context: Context) -> tuple[NDArray[np.float64], float]:
+        return context.get_numeric_parameter(self._change).value(), context.get_time()
 
     def _inputs(self, context: Context) -> tuple[NDArray[np.float64], ...]:
         """The sample, the estimate, and the gripper's part of it."""

@@ -1,0 +1,340 @@
+"""What lies between master and slave: a network, and a method that keeps the station passive.
+
+At every period both ends take one step of the method (`drake_teleop.passivity`), and what they send
+travels through one line of the network each (`drake_teleop.channel.network`). The block works in
+world axes and in the master's power units, see `drake_teleop.passivity.methods`.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    LeafSystem,
+    ValueProducer,
+)
+
+from drake_teleop.channel import network
+from drake_teleop.channel.network import PRESETS, NetworkConfig
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.passivity import methods
+from drake_teleop.passivity.memory import LIMIT, MEMORY
+from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, difference_into, dot
+from drake_teleop.passivity.safe_state import (
+    MASTER_WATCH,
+    SLAVE_WATCH,
+    initial_master_watch,
+    initial_slave_watch,
+    master_limits_into,
+    slave_command_into,
+)
+from drake_teleop.quantities import choice, quantity
+from drake_teleop.quaternions import quaternion_of
+from drake_teleop.slave.arm import ArmModel, forward_kinematics
+from drake_teleop.slave.wrist_sensor import sample_parts
+
+_NETWORKS = ("custom", *PRESETS)
+
+
+@dataclass
+class Channel(NetworkConfig):
+    """The network between master and slave; its own fields are those of `custom`."""
+
+    network: str = choice("custom", _NETWORKS, "a preset, or the network that these fields say")
+    backward: NetworkConfig | None = None
+    """From slave to master; null: as from master to slave."""
+    timeout: float = quantity(
+        0.1, "s", 1e-3, 0.2, "without a packet for so long, an end goes into its safe state"
+    )
+
+    def lines(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
+        """The two directions, forward (master to slave) and backward.
+
+        Raises:
+            DrakeTeleopError: if a preset is asked for and changed at the same time.
+        """
+        names = [entry.name for entry in dataclasses.fields(NetworkConfig)]
+        own = NetworkConfig(**{name: getattr(self, name) for name in names})
+        if self.network == "custom":
+            return own, own if self.backward is None else self.backward
+        if own != NetworkConfig() or self.backward is not None:
+            raise DrakeTeleopError(
+                f"'{self.network}' says all about the network",
+                where=f"{where}.network",
+                remedy="leave the other fields out, or set network: custom",
+            )
+        return PRESETS[self.network], PRESETS[self.network]
+
+
+# The state of both ends, one array: the step's number, then these.
+_STEP = 0
+_POSE_M = 1  # (7,) command at the master, a step ago
+_POSE_S = _POSE_M + 7  # (7,) slave, a step ago
+_WRENCH_M = _POSE_S + 7  # (6,) what the hand feels since then
+_WRENCH_S = _WRENCH_M + 6  # (6,) the slave's wrench then
+_WATCH_M = _WRENCH_S + 6
+_WATCH_S = _WATCH_M + MASTER_WATCH
+_MEMORY_M = _WATCH_S + SLAVE_WATCH
+_MEMORY_S = _MEMORY_M + MEMORY
+_SIZE = _MEMORY_S + MEMORY
+
+# Steps that a packet is on its way at least. Forward: the slave sees the command a step later.
+# Backward: the master has taken its step when the slave takes its own.
+_LEAST_DELAY = 1
+
+
+@njit(cache=True)
+def channel_step(
+    method,
+    pose_command,
+    wrench_B,
+    hand_B,
+    slave_pose,
+    saturated,
+    T,
+    timeout,
+    frame,
+    parameters,
+    forward_parameters,
+    backward_parameters,
+    forward,
+    backward,
+    ends,
+    pose_received,
+    ports,
+    wrench_received,
+):
+    """One step of both ends and of the lines between them.
+
+    Args:
+        method: index in `METHODS`.
+        pose_command: (7,) X_WS before the channel.
+        wrench_B: (6,) F_E_B, what the hand should feel of the slave's wrench [N, N m].
+        hand_B: (6,) of the hand on the stylus, in B [N, N m].
+        slave_pose: (7,) X_WS, actual.
+        saturated: whether the wrench is not to be trusted: the last one is kept.
+        T, timeout: [s].
+        frame: (11,) R_WB by rows, scale of translation and of rotation.
+        parameters: of the method.
+        forward_parameters, backward_parameters: of the lines.
+        forward, backward: their states, updated.
+        ends: of both ends, updated.
+        pose_received: (7,) X_WS that the slave shall follow, written.
+        ports: (6,) energy that hand and slave have put in, by group [J], updated; for how long
+            master and slave have heard nothing [s], written.
+        wrench_received: (6,) F_E_B that the hand shall feel, written.
+    """
+    k = int(ends[_STEP])
+    ends[_STEP] += 1.0
+    before_M, before_S = ends[_POSE_M : _POSE_M + 7], ends[_POSE_S : _POSE_S + 7]
+    held_M, held_S = ends[_WRENCH_M : _WRENCH_M + 6], ends[_WRENCH_S : _WRENCH_S + 6]
+    watch_M = ends[_WATCH_M : _WATCH_M + MASTER_WATCH]
+    watch_S = ends[_WATCH_S : _WATCH_S + SLAVE_WATCH]
+    memory_M = ends[_MEMORY_M : _MEMORY_M + MEMORY]
+    memory_S = ends[_MEMORY_S : _MEMORY_S + MEMORY]
+    dx, twist, hand, wrench = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
+    limits, command = np.empty(2), np.empty(13)
+    received, packet = np.empty(PACKET_SIZE), np.empty(PACKET_SIZE)
+
+    # The master's end.
+    difference_into(pose_command, before_M, dx)
+    before_M[:] = pose_command
+    for i in range(6):
+        twist[i] = dx[i] / T
+    for g in range(2):
+        ports[g] -= dot(held_M, dx, g)
+    _to_world(hand_B, frame, hand)
+    _, fresh = network.receive(backward_parameters, backward, k, received)
+    alive = fresh and received[HEALTHY] > 0.5
+    full = parameters[LIMIT : LIMIT + 2].copy()
+    master_limits_into(alive, T, timeout, full, held_M, watch_M, limits)
+    parameters[LIMIT : LIMIT + 2] = limits
+    methods.master_step(
+        method, received, fresh, pose_command, twist, dx, hand, T, parameters, memory_M, held_M,
+        packet,
+    )  # fmt: skip
+    parameters[LIMIT : LIMIT + 2] = full
+    network.send(forward_parameters, forward, k, packet)
+    _to_master(held_M, frame, wrench_received)
+
+    # The slave's end.
+    difference_into(slave_pose, before_S, dx)
+    before_S[:] = slave_pose
+    for i in range(6):
+        twist[i] = dx[i] / T
+    for g in range(2):
+        ports[2 + g] += dot(held_S, dx, g)
+    if not saturated:
+        _to_world(wrench_B, frame, held_S)
+    wrench[:] = held_S
+    _, fresh = network.receive(forward_parameters, forward, k + 1, received)
+    alive = fresh and received[HEALTHY] > 0.5
+    methods.slave_step(
+        method, received, fresh, slave_pose, twist, dx, wrench, T, parameters, memory_S, command,
+        packet,
+    )  # fmt: skip
+    network.send(backward_parameters, backward, k, packet)
+    slave_command_into(alive, T, timeout, command[:7], watch_S, pose_received)
+    ports[4], ports[5] = watch_M[0], watch_S[0]
+
+
+@njit(cache=True)
+def _to_world(wrench_B, frame, out):
+    """The wrench in W and in the master's power units."""
+    for g in range(2):
+        for i in range(3):
+            total = 0.0
+            for j in range(3):
+                total += frame[3 * i + j] * wrench_B[3 * g + j]
+            out[3 * g + i] = total / frame[9 + g]
+
+
+@njit(cache=True)
+def _to_master(wrench, frame, out):
+    """The inverse of `_to_world`."""
+    for g in range(2):
+        for i in range(3):
+            total = 0.0
+            for j in range(3):
+                total += frame[3 * j + i] * wrench[3 * g + j]
+            out[3 * g + i] = total * frame[9 + g]
+
+
+@njit(cache=True)
+def _slave_pose_into(arm, q, pose):
+    """X_WS (7,) of the arm at q."""
+    R, p = np.empty((3, 3)), np.empty(3)
+    forward_kinematics(arm, q, R, p)
+    orientation = quaternion_of(R)
+    for i in range(4):
+        pose[i] = orientation[i]
+    for i in range(3):
+        pose[4 + i] = p[i]
+
+
+class TeleopChannel(LeafSystem):
+    """The network, and at both of its ends the method that keeps the station passive.
+
+    A packet takes at least one period. Both ends have a safe state, see
+    `drake_teleop.passivity.safe_state`. While the wrist sensor is saturated its last good wrench is
+    sent.
+
+    The wrench that follows from a pose acts at once, while the device leaves that pose, so that
+    wrench times increment is exactly the work of the device's port. Hence it is an output that
+    depends on the inputs, and means something at the instants of the period only.
+
+    .. pydrake_system::
+
+        name: TeleopChannel
+        input_ports:
+        - pose_command: (7,) X_WS, after kinematic scaling
+        - wrench_B: (6,) F_E_B, what the hand should feel, from force scaling [N, N m]
+        - hand_wrench_E: (6,) of the hand on the stylus at E, in B [N, N m]
+        - sample: the wrist sensor's, see `drake_teleop.slave.wrist_sensor.sample_parts`
+        output_ports:
+        - pose_received: (7,) X_WS that the slave shall follow
+        - wrench_received: (6,) F_E_B that the hand shall feel [N, N m]
+        - ports: (6,) energy that the hand has put in by translation and by rotation, and what the
+          slave has [J]; for how long master and slave have heard nothing [s]
+
+    Args:
+        channel: the network.
+        passivity: the method.
+        arm: the slave's kinematics.
+        R_WB: (3, 3) alignment of the master's base with the world.
+        scales: (2,) slave over master, of translation and rotation.
+        force_scale: slave to master.
+        start: (7,) X_WS of the slave at the start.
+        period: between packets [s].
+        seed: of the network.
+    """
+
+    def __init__(
+        self,
+        channel: Channel,
+        passivity: PassivityConfig,
+        arm: ArmModel,
+        R_WB: NDArray[np.float64],
+        scales: NDArray[np.float64],
+        force_scale: float,
+        start: NDArray[np.float64],
+        period: float,
+        seed: int,
+    ) -> None:
+        super().__init__()
+        # Where motion is scaled to zero there is no energy, and any unit will do.
+        scales = np.where(scales > 0.0, scales, 1.0)
+        lines = [
+            network.parameters(line, seed, direction, period, least=_LEAST_DELAY)
+            for line, direction in zip(
+                channel.lines(), (network.FORWARD, network.BACKWARD), strict=True
+            )
+        ]
+        parameters = methods.parameters(passivity, list(force_scale / scales))
+        self._method, self._arm = METHODS.index(passivity.method), arm.table
+        self._constants = (
+            *(period, channel.timeout, np.concatenate([R_WB.ravel(), scales]), parameters),
+            *lines,
+        )
+        self._slave_pose = np.empty(7)
+        parts = sample_parts(arm.num_joints)
+        self._saturated = sum(list(parts.values())[: list(parts).index("saturated")])
+        self._pose = self.DeclareVectorInputPort("pose_command", 7)
+        self._wrench = self.DeclareVectorInputPort("wrench_B", 6)
+        self._hand = self.DeclareVectorInputPort("hand_wrench_E", 6)
+        self._sample = self.DeclareVectorInputPort("sample", sum(parts.values()))
+        ends = np.zeros(_SIZE)
+        ends[_POSE_M : _POSE_M + 7] = ends[_POSE_S : _POSE_S + 7] = start
+        ends[_WATCH_M : _WATCH_M + MASTER_WATCH] = initial_master_watch()
+        ends[_WATCH_S : _WATCH_S + SLAVE_WATCH] = initial_slave_watch(start)
+        memory = methods.initial_memory(passivity.method, parameters, start)
+        ends[_MEMORY_M : _MEMORY_M + MEMORY] = ends[_MEMORY_S:] = memory
+        state = [*(network.initial_state(p, np.zeros(PACKET_SIZE)) for p in lines), ends]
+        state += [np.array(start), np.zeros(6)]
+        self._groups = [self.DeclareDiscreteState(part) for part in state]
+        self.DeclareStateOutputPort("pose_received", self._groups[3])
+        self.DeclareStateOutputPort("ports", self._groups[4])
+        # The step is taken once, for the wrench that acts now and for the state after it.
+        self._step = self.DeclareCacheEntry(
+            "step",
+            ValueProducer(
+                allocate=lambda: AbstractValue.Make([*map(np.array, state), np.zeros(6)]),
+                calc=self._calc_step,
+            ),
+            {self.all_input_ports_ticket(), self.xd_ticket()},
+        )
+        self.DeclareVectorOutputPort("wrench_received", 6, self._calc_wrench, {self._step.ticket()})
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _calc_step(self, context: Context, step: AbstractValue) -> None:
+        *state, wrench = step.get_mutable_value()
+        for part, group in zip(state, self._groups, strict=True):
+            part[:] = context.get_discrete_state(group).value()
+        sample = self._sample.Eval(context)
+        _slave_pose_into(self._arm, sample[self._saturated + 1 :], self._slave_pose)
+        channel_step(
+            self._method,
+            self._pose.Eval(context),
+            self._wrench.Eval(context),
+            self._hand.Eval(context),
+            self._slave_pose,
+            sample[self._saturated] > 0.5,
+            *self._constants,
+            *state,
+            wrench,
+        )
+
+    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._step.Eval(context)[-1])
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        for part, group in zip(self._step.Eval(context), self._groups, strict=False):
+            discrete_state.set_value(group, part)

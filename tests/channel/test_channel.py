@@ -1,0 +1,100 @@
+"""The channel block in the station: a pure delay without a method, energy, safe state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.channel.channel import Channel
+from drake_teleop.channel.network import PRESETS, NetworkConfig
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.master.operator import OperatorConfig, Sine
+from drake_teleop.scenario import Scenario, replace
+from drake_teleop.simulation import simulate
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.station import MakeTeleopStation
+
+
+@pytest.fixture(scope="module")
+def load_estimate():
+    arm = AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm
+    return np.concatenate([np.zeros(6), arm.phi_load])
+
+
+def moving(**changes: object) -> Scenario:
+    """The hand swings up and down and turns a little, from 0.6 s on."""
+    sine = Sine(
+        t_start=0.6,
+        duration=10.0,
+        ramp=0.4,
+        frequency=2.0,
+        translation=[0.01, 0.0, 0.03],
+        rotation=[0.0, 0.2, 0.1],
+    )
+    base = replace(
+        Scenario(),
+        simulation__duration=0.8,
+        simulation__settle=0.6,
+        wrist_sensor__ideal=True,
+        operator=OperatorConfig(grip="firm", intent=[sine]),
+        rates__log_hz=2000.0,
+    )
+    return replace(base, **changes)
+
+
+def run(scenario: Scenario, load_estimate: np.ndarray):
+    return simulate(MakeTeleopStation(scenario, load_estimate=load_estimate), scenario.simulation)
+
+
+@pytest.mark.parametrize("steps", [1, 7, 40])
+def test_without_a_method_it_is_a_delay_in_both_directions(steps, load_estimate):
+    """At 2 kHz and logged at 2 kHz: what comes out went in so many samples ago, to rounding."""
+    result = run(moving(channel__delay=steps / 2000), load_estimate)
+    np.testing.assert_allclose(
+        result["pose_received"][steps:], result["pose_command"][:-steps], atol=1e-12
+    )
+    # What the hand should feel is -F' / 17.5, turned into B.
+    felt = np.linalg.norm(result["scaled_wrench_S"][:, :3], axis=1) / 17.5
+    shown = np.linalg.norm(result["force_to_master"][:, :3], axis=1)
+    np.testing.assert_allclose(shown[steps:], felt[:-steps], atol=1e-9)
+    assert felt.max() > 0.1
+
+
+def test_an_ideal_network_without_a_method_is_no_block(load_estimate):
+    station = MakeTeleopStation(moving(), load_estimate=load_estimate)
+    assert not station.HasSubsystemNamed("channel")
+    preset = MakeTeleopStation(
+        moving(channel=Channel(network="ideal")), load_estimate=load_estimate
+    )
+    assert not preset.HasSubsystemNamed("channel")
+
+
+def test_the_ports_count_the_work_of_the_hand(load_estimate):
+    """Against the same sum over the logged force and motion of the stylus itself."""
+    result = run(moving(channel__delay=0.01), load_estimate)
+    force, twist = result["force_to_master"], result["pose_command"][:, 4:]
+    work = np.cumsum(np.sum(force[:-1, :3] * np.diff(twist, axis=0), axis=1))
+    # What the block has counted at an instant of the log ends a step before.
+    counted = -(result["ports"][:, 0] - result["ports"][1, 0])
+    np.testing.assert_allclose(counted[2:], work[:-1], atol=1e-12)
+    assert np.abs(work).max() > 1e-4
+
+
+def test_directions_may_differ():
+    channel = Channel(delay=0.1, backward=NetworkConfig(delay=0.2))
+    assert [line.delay for line in channel.lines()] == [0.1, 0.2]
+    assert Channel(network="lunar").lines() == (PRESETS["lunar"], PRESETS["lunar"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"channel": Channel(network="lan", delay=0.1)}, r"channel\.network.*says all"),
+        ({"channel": Channel(rate_hz=10.0)}, r"channel\.timeout.*less than two packets"),
+        ({"channel": Channel(backward=NetworkConfig(loss=0.9, burst_loss=0.5))}, r"loss"),
+    ],
+)
+def test_a_channel_that_cannot_be_is_refused(changes, message, load_estimate):
+    with pytest.raises(DrakeTeleopError, match=message):
+        MakeTeleopStation(replace(Scenario(), **changes), load_estimate=load_estimate)
