@@ -218,7 +218,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         raise DrakeTeleopError(
             "bags are read by the library rosbags, which is not installed",
             where=str(path),
-            remedy="pip install 'drake_teleop[ros]'",
+            remedy="install the extra `ros`: pip install '.[ros]' in the clone of this project",
         ) from error
     try:
         standard = get_typestore(Stores.LATEST)
