@@ -32,6 +32,8 @@ verdicts               of each parameter: identified, weakly, not, prior; see
 identifiable           the names of what the record determines
 not_identifiable       the names of what it does not: do not use their values
 physically_consistent  whether phi belongs to a possible body
+determined             in words: how many independent combinations of offsets and load the record
+                       determines, which ones where single parameters are not, and what is weak
 method                 of the fit, in words
 rejected               share of the samples that a robust fit took for disturbed and left out
 condition_number       of the regression
@@ -119,6 +121,7 @@ def identify_command(
         **_load_figures(result),
         "offsets": result.offsets,
         "offsets_std": result.standard_deviations[:6],
+        "determined": found.base.lines(),
         "method": result.method,
         "rejected": found.rejected.mean(),
         "condition_number": result.condition_number,

@@ -15,6 +15,7 @@ from drake_teleop.load.gripper import identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.uncertainty import BaseParameters, base_parameters
 from drake_teleop.logs.alignment import low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.canonical import Log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
@@ -34,6 +35,7 @@ class IdentifiedLog:
         predicted: (N, 6) offsets + V phi at the same instants.
         delay_source: as in the summary: "estimated", "given" ...
         rejected: (N,) samples that "robust" and "consistent" fits took for disturbed.
+        base: which combinations of offsets and load the samples that were used determine.
         findings: suspected errors of the log's description; only looked for if the fit is poor.
     """
 
@@ -42,6 +44,7 @@ class IdentifiedLog:
     predicted: NDArray[np.float64]
     delay_source: str
     rejected: NDArray[np.bool_]
+    base: BaseParameters
     findings: tuple[Finding, ...] = ()
 
 
@@ -126,7 +129,8 @@ def identify_log(
         result = replace(
             result, identifiable=np.repeat([True, False], [6, 10]) & result.identifiable
         )
-    return IdentifiedLog(log, result, predicted, source, fit.rejected, findings)
+    base = base_parameters(fit.equations)
+    return IdentifiedLog(log, result, predicted, source, fit.rejected, base, findings)
 
 
 def eliminate_log(

@@ -114,6 +114,7 @@ def write_report(
         tiles=_tiles(result),
         notes=summary["notes"],
         tables=tables,
+        determined=found.base.lines(),
         figures=[
             (
                 "Fit",
@@ -121,7 +122,7 @@ def write_report(
                 "Measured wrench and V φ without the offsets, and what is left between them.",
             ),
             (
-                "What the record determines",
+                "Residual, intervals and identifiability",
                 embedded_png(path.parent / "knowledge.png"),
                 f"Top: the residual at {spectrum}. Below: each parameter with its interval, and "
                 "its standard deviation, as shares of what is natural for a load of this mass and "

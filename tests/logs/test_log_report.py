@@ -45,6 +45,7 @@ def test_the_page_stands_alone_and_has_the_numbers_of_the_summary(tmp_path: Path
     assert f"{summary['mass']:.4g}" in page
     assert page.count('"pill agrees"') == len(summary["identifiable"])
     assert "10 of 10" in page
+    assert summary["determined"] == ["16 of 16 combinations of offsets and load are determined"]
     assert summary["verdicts"] == dict.fromkeys(PARAMETERS, "identified")
     low, high = np.array(summary["phi_interval"]).T
     assert ((low < summary["phi"]) & (summary["phi"] < high)).all()
@@ -85,6 +86,8 @@ def test_static_poses_have_a_page_too(tmp_path: Path) -> None:
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "15 poses at rest" in page and "not identified" in page
     assert page.count("4 of 10") == 1
+    assert "10 of 16 combinations of offsets and load are determined" in page
+    assert "without influence on this record: I_xx, I_xy, I_xz, I_yy, I_yz, I_zz" in page
 
 
 def test_the_page_of_pictures_shows_all_channels_and_parameters(tmp_path: Path) -> None:
