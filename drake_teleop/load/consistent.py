@@ -28,11 +28,12 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array, checked
 from drake_teleop.load.inertia import (
     is_physically_consistent,
-    phi_from_pseudo_inertia,
     pseudo_inertia,
 )
 
 _UNITS = [pseudo_inertia(unit) for unit in np.eye(10)]
+_CONSTRAINT = [np.zeros((4, 4)), *_UNITS]
+_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_UNITS, (10, 16)).T)  # (10, 16)
 _SMALLEST_LENGTH = 1e-3  # of the unit of length [m]
 # Smallest eigenvalue over the largest that is information, and what the others are taken for.
 _RANK, _RIDGE = 1e-12, 1e-12
@@ -147,7 +148,7 @@ def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | No
 
     program = MathematicalProgram()
     x = program.NewContinuousVariables(10)
-    program.AddLinearMatrixInequalityConstraint([np.zeros((4, 4)), *_UNITS], x)
+    program.AddLinearMatrixInequalityConstraint(_CONSTRAINT, x)
     if row is not None:
         normalised = row * unit / np.abs(row * unit).max()
         program.AddLinearConstraint(normalised[None, :], [0.0], [np.inf], x)
@@ -175,7 +176,7 @@ def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | No
     # The solver's tolerance leaves eigenvalues of -1e-9 or so.
     values, vectors = np.linalg.eigh(pseudo_inertia(x))
     J = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return phi_from_pseudo_inertia(0.5 * (J + J.T))
+    return np.asarray(_FROM_PSEUDO_INERTIA @ J.ravel(), np.float64)
 
 
 def _add_distance(program: Any, x: Any, H: Array, b: Array) -> None:
