@@ -194,7 +194,7 @@ def _check_forward(
             f"{int((steps < 0).sum())} time stamps go back, the first is row"
             f" {rows[first + 1] + table.first_row} of {table.path.name}, by {-steps[first]:.3g} s",
             where=where,
-            remedy="cut the log there, sort the rows, or give time.rate instead of the stamps",
+            remedy="cut the log there, sort the rows, or use another clock: time.column, time.rate",
         )
     if len(t) > 1 and t[0] == t[-1]:
         raise DrakeTeleopError(

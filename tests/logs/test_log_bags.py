@@ -19,6 +19,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.bags import is_bag, read_topic, topics_of
+from drake_teleop.logs.description import load_description
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.reading import read_log
@@ -241,6 +242,34 @@ def test_a_bag_of_ros_1(tmp_path: Path) -> None:
     found = table.numbers(["force.x", "force.y", "force.z"], 3, "here")
     np.testing.assert_array_equal(found, FORCES[:, :3])
     np.testing.assert_allclose(table.columns["stamp"], T, atol=1e-9)
+
+
+def test_what_a_description_says_stands_beside_what_the_topic_gives(tmp_path: Path) -> None:
+    path = described(
+        tmp_path,
+        wrench={"file": "run1", "topic": "/ft", "force": {"unit": "lbf"}, "time": {"offset": 0.2}},
+        imu={"file": "run1", "topic": "/imu", "angular_velocity": None},
+        pose={
+            "file": "run1",
+            "topic": "/tf",
+            "child_frame": "tool0",
+            "orientation": {"inverse": True},
+            "position": {"columns": ["a", "b", "c"]},
+        },
+    )
+    found = load_description(path)
+    assert found.wrench and found.imu and found.pose
+    assert found.wrench.force.columns == ("force.x", "force.y", "force.z")
+    assert (found.wrench.force.unit, found.wrench.torque.unit) == ("lbf", "N m")
+    assert (found.wrench.time.column, found.wrench.time.offset) == ("stamp", 0.2)
+    assert found.imu.angular_velocity is None and found.imu.specific_force is not None
+    assert found.pose.orientation.inverse
+    assert found.pose.orientation.columns[0] == "orientation.w"
+    assert found.pose.position and found.pose.position.columns == ("a", "b", "c")
+    assert found.pose.source == tmp_path / "run1" / "tf" / "tool0"
+    for streams in ({"wrench": {"file": "x.csv"}}, {"static": {"file": "run1", "topic": "/ft"}}):
+        with pytest.raises(DrakeTeleopError, match=r"is missing; add|unknown field 'topic'"):
+            load_description(described(tmp_path, **streams))
 
 
 def test_inspecting_a_bag_lists_its_topics_and_drafts_a_description(
