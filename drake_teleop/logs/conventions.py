@@ -44,6 +44,8 @@ BELIEVABLE = 0.05
 """A hypothesis has to leave less than this share, besides the noise."""
 DECISIVE = 4.0
 """... and at least this factor less than the description as given."""
+HARDLY = 0.9
+"""A load that leaves more than this share of the wrench's variance drowns in the rest."""
 LAG = 0.002
 """Delays below this are not mentioned [s]."""
 CLOCK = 0.05
@@ -678,9 +680,15 @@ def _without_remedy(
 ) -> tuple[list[Finding], float | None]:
     """What is left to say of a wrench that no load explains and no edit mends."""
     smooth = low_passed(log, 30.0)
-    load = identify_batch(smooth.wrench, *smooth.motion, method="ordinary").identification
-    finding = payload_finding(load, given.unexplained - given.noise)
-    return ([finding], None) if finding else (_lag(description, delay), delay)
+    fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
+    finding = payload_finding(fit.identification, given.unexplained - given.noise)
+    if finding:
+        return [finding], None
+    if delay is not None and fit.rejected.any():
+        # A contact pulls at the delay.
+        lost = fit.rejected if log.bridged is None else fit.rejected | log.bridged
+        delay = estimate_delay(replace(log, bridged=lost), 30.0)
+    return _lag(description, delay), delay
 
 
 def payload_finding(load: Identification, unexplained: float) -> Finding | None:
@@ -688,11 +696,11 @@ def payload_finding(load: Identification, unexplained: float) -> Finding | None:
 
     Args:
         load: what was fitted.
-        unexplained: share of the wrench's variance that it leaves, besides noise. A load of which
-            the wrench is hardly made drowns in what else there is: contacts, cross-talk, drift;
-            a robust fit then believes the samples that suit it.
+        unexplained: share of the wrench's variance that it leaves, besides noise. With 0.9 the
+            rest (contacts, with the sensor's cross-talk and drift) is at least three times as large
+            as the load's part, and a robust fit believes the samples that suit it.
     """
-    if load.verdicts[6] != "not" and unexplained < 0.5:
+    if load.verdicts[6] != "not" and unexplained < HARDLY:
         return None
     deviation = float(load.standard_deviations[6])
     fitted = f"{load.mass:.2g} ± {deviation:.2g} kg in the fit"
