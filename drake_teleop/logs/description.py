@@ -248,7 +248,9 @@ class Imu(_Recorded):
         if not (self.specific_force or self.angular_velocity):
             raise ValueError("give specific_force, angular_velocity, or both")
         if self.automatic and not self.specific_force:
-            raise ValueError("frame and position are found from specific_force: give it, or them")
+            raise ValueError(
+                "auto: frame and position are found from specific_force; give it, or them"
+            )
         return self
 
     @property

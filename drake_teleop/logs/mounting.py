@@ -362,7 +362,7 @@ def _believed(mounting: Mounting | None, where: str) -> Mounting:
         remedy = "exchange two of its columns, or change imu.sign"
     elif not mounting.fits:
         what = f"no rotation brings IMU and pose together ({_left(mounting)})"
-        remedy = "look for wrong units, signs or clocks by `drake-teleop inspect`"
+        remedy = "find wrong units, signs or clocks by `drake-teleop inspect` with `frame: sensor`"
     elif not mounting.determined:
         worst = float(mounting.deviations_deg.max())
         what = f"one direction is known to {worst:.2g} deg only (standard deviation)"

@@ -54,6 +54,8 @@ BASE = yaml.safe_load(EXAMPLES[0])
         (("imu", "frame"), [[2, 0, 0], [0, 1, 0], [0, 0, 1]], ["imu.frame", "not a rotation"]),
         (("imu", "position"), [0.1, 0.2], ["imu.position"]),
         (("imu", "position"), [0.1, 0.2, float("nan")], ["imu.position", "finite"]),
+        (("imu", "position"), "somewhere", ["imu.position", "three numbers [m], or auto"]),
+        (("wrench", "frame"), "auto", ["wrench.frame", "3x3 rotation matrix"]),
         (("imu", "specific_force"), None, ["imu", "give specific_force"]),
         (("pose", "frame"), "base", ["pose", "must be sensor"]),
         (("pose", "orientation", "form"), "euler", ["pose.orientation.form", "'matrix'"]),
@@ -87,6 +89,21 @@ def test_errors_name_file_and_field(
 )
 def test_files_that_are_no_descriptions(tmp_path: Path, text: str, words: list[str]) -> None:
     _expect(tmp_path, text, words)
+
+
+def test_what_is_left_to_the_data_needs_data(tmp_path: Path) -> None:
+    data = yaml.safe_load(EXAMPLES[0])
+    omega = {"columns": ["wx", "wy", "wz"]}
+    data["imu"] |= {"frame": "auto", "position": "auto", "angular_velocity": omega}
+    path = tmp_path / "log.yaml"
+    path.write_text(yaml.safe_dump(data))
+    imu = load_description(path).imu
+    assert imu and imu.automatic and (imu.frame, imu.position) == ("auto", "auto")
+    del data["pose"]
+    _expect(tmp_path, yaml.safe_dump(data), ["imu.frame: auto", "add pose"])
+    data["imu"]["frame"] = "sensor"
+    del data["imu"]["specific_force"]
+    _expect(tmp_path, yaml.safe_dump(data), ["imu", "found from specific_force"])
 
 
 def test_missing_description(tmp_path: Path) -> None:
