@@ -289,7 +289,7 @@ def _clock(
             Finding(
                 "gap",
                 f"{at}: {gaps} gaps, the longest {forward.max():.3g} s at {where:.3g} s: rows are"
-                " missing or the clock jumped; cut the log there",
+                " missing or the clock jumped; what lies there is not used",
             )
         )
     if back:
@@ -298,7 +298,8 @@ def _clock(
             Finding(
                 "clock jump",
                 f"{at}: {back} time stamps stand still or go back, the first in row {row};"
-                " delete these rows, or give time.rate",
+                " rows that share one are left out or spread evenly; a log that goes back is"
+                " refused: cut it there, or give time.rate",
             )
         )
     return findings
