@@ -91,6 +91,25 @@ _SIZE = _MEMORY_S + MEMORY
 _LEAST_DELAY = 1
 
 
+def initial_ends(
+    method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The state of both ends before their first step.
+
+    Args:
+        method: one of `METHODS`.
+        parameters: of the method.
+        start: (7,) X_WS of command and slave.
+    """
+    ends = np.zeros(_SIZE)
+    ends[_POSE_M : _POSE_M + 7] = ends[_POSE_S : _POSE_S + 7] = start
+    ends[_WATCH_M : _WATCH_M + MASTER_WATCH] = initial_master_watch()
+    ends[_WATCH_S : _WATCH_S + SLAVE_WATCH] = initial_slave_watch(start)
+    memory = methods.initial_memory(method, parameters, start)
+    ends[_MEMORY_M : _MEMORY_M + MEMORY] = ends[_MEMORY_S:] = memory
+    return ends
+
+
 @njit(cache=True)
 def channel_step(
     method,
@@ -291,12 +310,7 @@ class TeleopChannel(LeafSystem):
         self._wrench = self.DeclareVectorInputPort("wrench_B", 6)
         self._hand = self.DeclareVectorInputPort("hand_wrench_E", 6)
         self._sample = self.DeclareVectorInputPort("sample", sum(parts.values()))
-        ends = np.zeros(_SIZE)
-        ends[_POSE_M : _POSE_M + 7] = ends[_POSE_S : _POSE_S + 7] = start
-        ends[_WATCH_M : _WATCH_M + MASTER_WATCH] = initial_master_watch()
-        ends[_WATCH_S : _WATCH_S + SLAVE_WATCH] = initial_slave_watch(start)
-        memory = methods.initial_memory(passivity.method, parameters, start)
-        ends[_MEMORY_M : _MEMORY_M + MEMORY] = ends[_MEMORY_S:] = memory
+        ends = initial_ends(passivity.method, parameters, start)
         state = [*(network.initial_state(p, np.zeros(PACKET_SIZE)) for p in lines), ends]
         state += [np.array(start), np.zeros(6)]
         self._groups = [self.DeclareDiscreteState(part) for part in state]

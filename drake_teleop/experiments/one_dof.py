@@ -1,0 +1,274 @@
+"""One degree of freedom of the station, fast enough for thousands of runs: where each method ends.
+
+Hand and device are one mass on the hand's spring and damper, the slave is a mass behind a position
+servo, the environment a stiff wall. Between them is the station's own channel,
+`drake_teleop.channel.channel.channel_step`, with motion along x alone:
+
+    (m_h + m_m) a = K_h (x_i - x) + B_h (v_i - v) - f_c tanh(v / v_c) + f    hand and device
+    m_s a_s = K (x_cmd - x_s) - D v_s + f_w                                  slave and its servo
+    f_w = -k_e max(x_s - x_w, 0)                                             wall
+    f_e = k_f (gamma f_w - sigma m_t a_s)                                    what is sent back
+
+The channel steps at 1 kHz; in between the forces of its ends are held and the masses take 20 steps
+of integration. The operator moves freely, rests, presses on the wall, holds, lets go and rests.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from drake_teleop.channel import network
+from drake_teleop.channel.channel import channel_step, initial_ends
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.passivity import methods
+from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.passivity.packet import PACKET_SIZE
+
+PERIOD = 1e-3  #: s, of the channel
+_SUBSTEPS = 20
+_FRICTION_SPEED = 5e-3  # m/s, below it Coulomb friction fades
+# These methods know the force of the slave's motor, which is therefore held over a period; for the
+# others the command is interpolated over it.
+_AT_THE_MOTOR = ("two_layer", "pspm")
+
+# When the operator does what [s]: swings to and fro, rests, presses, holds, lets go, rests.
+_SWING, _SWUNG, _PRESS, _PRESSED, _RELEASE, _RELEASED, END = 0.5, 3.0, 5.5, 6.5, 11.5, 12.5, 15.0
+_JUDGED = 1.9  # s, the length of the windows in which the station has to be at rest
+_FREE, _DEPTH = -0.04, 0.02  # m, from the wall: where the operator rests, and how deep he presses
+
+
+@dataclass(frozen=True)
+class OneDof:
+    """The two masses and what is around them; the defaults are those of the paper's station."""
+
+    hand_mass: float = 0.2  #: kg
+    hand_damping: float = 5.0  #: N s/m
+    hand_stiffness: float = 300.0  #: N/m
+    device_mass: float = 0.15  #: kg
+    device_friction: float = 0.05  #: N, Coulomb
+    slave_mass: float = 15.13  #: kg, arm and tool at the flange
+    servo_frequency: float = 117.0  #: rad/s, critically damped: -3 dB at 12 Hz, 17 ms late
+    ideal_servo: bool = False  #: the slave is where it is told to be
+    tool_mass: float = 3.13  #: kg, beyond the sensor
+    wall_stiffness: float = 5100.0  #: N/m
+    force_scale: float = 1 / 17.5  #: k_f
+    sigma: float = 0.0
+    gamma: float = 1.0
+
+
+@dataclass(frozen=True)
+class OneDofRun:
+    """What happened; arrays (N,), one entry for each period.
+
+    Args:
+        t: time [s].
+        master, slave: positions [m].
+        command: position that the slave was told [m].
+        felt: force on the hand [N].
+        wall: force of the wall on the slave [N].
+        energy: (N, 2) that hand and slave have put into the channel [J].
+    """
+
+    t: NDArray[np.float64]
+    master: NDArray[np.float64]
+    slave: NDArray[np.float64]
+    command: NDArray[np.float64]
+    felt: NDArray[np.float64]
+    wall: NDArray[np.float64]
+    energy: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """A run in numbers.
+
+    Args:
+        stable: whether it comes to rest, holding the wall and after it: within 0.5 mm peak to peak
+            about a parabola in the last 1.9 s.
+        hunting: that peak to peak, the larger of the two [m].
+        force_error: of the force felt against the scaled force of the wall, while holding [1].
+        drift: of the slave against the master, 2 s after contact [m].
+        free_force: felt in free motion, rms [N].
+        rise_delay: from half of the wall's force to half of the force felt [s].
+        least_energy: the least that both ends together have put into the channel [J]; negative if
+            it gave out more than it got.
+    """
+
+    stable: bool
+    hunting: float
+    force_error: float
+    drift: float
+    free_force: float
+    rise_delay: float
+    least_energy: float
+
+
+def run_one_dof(
+    model: OneDof,
+    passivity: PassivityConfig,
+    forward: NetworkConfig,
+    backward: NetworkConfig | None = None,
+    *,
+    seed: int = 0,
+    timeout: float = 0.2,
+    intent: NDArray[np.float64] | None = None,
+) -> OneDofRun:
+    """Simulates one run.
+
+    Args:
+        model: masses, hand, wall.
+        passivity: the method.
+        forward, backward: the network; backward None: as forward.
+        seed: of the network.
+        timeout: of the safe state [s].
+        intent: (N, 2) position [m] and velocity [m/s] that the operator intends, at the periods;
+            default `operators_intent`.
+
+    Raises:
+        DrakeTeleopError: for a network that cannot be.
+    """
+    scale, servo = model.force_scale, model.slave_mass * model.servo_frequency
+    passivity = dataclasses.replace(
+        passivity,
+        servo_stiffness=[servo * model.servo_frequency] * 2,
+        servo_damping=[2 * servo] * 2,
+    )
+    p = methods.parameters(passivity, [scale, scale])
+    intent = operators_intent() if intent is None else intent
+    start = np.array([1.0, 0.0, 0.0, 0.0, intent[0, 0], 0.0, 0.0])
+    # The block's command is that of the next step, here it is used at once.
+    forward_line = dataclasses.replace(forward, delay=forward.delay + PERIOD)
+    lines = [
+        network.parameters(line, seed, direction, PERIOD, least=1)
+        for line, direction in (
+            (forward_line, network.FORWARD),
+            (forward if backward is None else backward, network.BACKWARD),
+        )
+    ]
+    states = [network.initial_state(line, np.zeros(PACKET_SIZE)) for line in lines]
+    ends = initial_ends(passivity.method, p, start)
+    numbers = np.array([float(getattr(model, entry.name)) for entry in dataclasses.fields(model)])
+    held = passivity.method in _AT_THE_MOTOR and not model.ideal_servo
+    rows = _simulate(
+        METHODS.index(passivity.method), numbers, held, p, *lines, *states, ends, start, timeout,
+        np.ascontiguousarray(intent),
+    )  # fmt: skip
+    t = np.arange(len(intent)) * PERIOD
+    return OneDofRun(t, *(rows[:, i] for i in range(5)), rows[:, 5:7])
+
+
+def operators_intent() -> NDArray[np.float64]:
+    """(N, 2) position [m] and velocity [m/s] that the operator intends; the wall is at 0."""
+    t = np.arange(round(END / PERIOD)) * PERIOD
+    x = np.full_like(t, _FREE)
+    fade = np.minimum(_ramp(t, _SWING, 0.5), 1 - _ramp(t, _SWUNG - 0.5, 0.5))
+    x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - _SWING))
+    x += (_DEPTH - _FREE) * (
+        _ramp(t, _PRESS, _PRESSED - _PRESS) - _ramp(t, _RELEASE, _RELEASED - _RELEASE)
+    )
+    return np.stack([x, np.gradient(x, PERIOD)], axis=1)
+
+
+def figures(run: OneDofRun, model: OneDof) -> Figures:
+    """The run in numbers."""
+
+    def window(start: float, stop: float) -> slice:
+        return slice(round(start / PERIOD), round(stop / PERIOD))
+
+    hold, rest = window(_RELEASE - _JUDGED, _RELEASE), window(END - _JUDGED, END)
+    hunting = max(_hunting(x[part]) for x in (run.master, run.slave) for part in (hold, rest))
+    wall, felt = model.force_scale * model.gamma * run.wall, run.felt
+    pressed = float(wall[hold].mean())
+    steady = float(felt[hold].mean())
+    after = round((_RELEASED + 2.0) / PERIOD)
+    moving = window(_SWING, _SWUNG)
+    return Figures(
+        stable=bool(hunting < 0.5e-3),
+        hunting=hunting,
+        force_error=steady / pressed - 1 if pressed < 0 else np.nan,
+        drift=float(run.slave[after] - run.master[after]),
+        free_force=float(np.sqrt(np.mean(felt[moving] ** 2))),
+        rise_delay=_half(felt, steady) - _half(wall, pressed),
+        least_energy=float(run.energy.sum(axis=1).min()),
+    )
+
+
+def _ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.float64]:
+    u = np.clip((t - start) / length, 0.0, 1.0)
+    return u**3 * (10.0 + u * (6.0 * u - 15.0))
+
+
+def _hunting(x: NDArray[np.float64]) -> float:
+    if not np.isfinite(x).all():
+        return float("inf")
+    t = np.linspace(-1.0, 1.0, len(x))
+    return float(
+        np.ptp(x - np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyfit(t, x, 2)))
+    )
+
+
+def _half(force: NDArray[np.float64], steady: float) -> float:
+    """When the force first exceeds half of its steady value, from the press on."""
+    start = round(_PRESS / PERIOD)
+    beyond = np.abs(force[start:]) > 0.5 * abs(steady)
+    return (start + int(np.argmax(beyond))) * PERIOD if beyond.any() else float("nan")
+
+
+@njit(cache=True)
+def _simulate(
+    method, model, held, p, forward_line, backward_line, forward, backward, ends, start, timeout,
+    intent,
+):  # fmt: skip
+    """(N, 7) rows [master, slave, command, felt, wall, energy of hand, of slave]."""
+    mass, damping, stiffness = model[0] + model[3], model[1], model[2]
+    friction, slave_mass, frequency, ideal = model[4], model[5], model[6], model[7]
+    tool_mass, wall_stiffness, scale, sigma, gamma = model[8:13]
+    K, D = slave_mass * frequency * frequency, 2.0 * slave_mass * frequency
+    frame = np.zeros(11)
+    frame[0] = frame[4] = frame[8] = frame[9] = frame[10] = 1.0
+    pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
+    wrench, hand, felt, ports = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
+    rows = np.empty((intent.shape[0], 7))
+    x = x_s = start[4]
+    v = v_s = a_s = 0.0
+    dt = PERIOD / _SUBSTEPS
+    for k in range(intent.shape[0]):
+        wall = -wall_stiffness * max(x_s, 0.0)
+        wrench[0] = scale * (gamma * wall - sigma * tool_mass * a_s)
+        hand[0] = stiffness * (intent[k, 0] - x) + damping * (intent[k, 1] - v)
+        pose_m[4], pose_s[4] = x, x_s
+        before = received[4]
+        channel_step(
+            method, pose_m, wrench, hand, pose_s, False, PERIOD, timeout, frame, p, forward_line,
+            backward_line, forward, backward, ends, received, ports, felt,
+        )  # fmt: skip
+        command = received[4]
+        rows[k] = np.array([x, x_s, command, felt[0], wall, ports[0], ports[2]])
+        motor = K * (command - x_s) - D * v_s
+        following = min(k + 1, intent.shape[0] - 1)
+        for i in range(_SUBSTEPS):
+            share = (i + 0.5) / _SUBSTEPS
+            x_i = intent[k, 0] + share * (intent[following, 0] - intent[k, 0])
+            v_i = intent[k, 1] + share * (intent[following, 1] - intent[k, 1])
+            force = stiffness * (x_i - x) + damping * (v_i - v) + felt[0]
+            v += dt / mass * (force - friction * np.tanh(v / _FRICTION_SPEED))
+            x += dt * v
+            if ideal > 0.0:
+                x_s = before + (i + 1.0) / _SUBSTEPS * (command - before)
+                v_new = (command - before) / PERIOD
+                a_s, v_s = (v_new - v_s) / PERIOD if i == 0 else a_s, v_new
+            else:
+                if not held:
+                    motor = K * (before + share * (command - before) - x_s) - D * v_s
+                a_s = (motor - wall_stiffness * max(x_s, 0.0)) / slave_mass
+                v_s += dt * a_s
+                x_s += dt * v_s
+        if not abs(x) + abs(x_s) < 1e3:
+            rows[k + 1 :] = np.nan
+            break
+    return rows
