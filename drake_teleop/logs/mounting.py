@@ -18,7 +18,7 @@ samples of a pose does (about 0.1 % of p) nor the errors of scale of an accelero
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
 from typing import Any
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
-from drake_teleop.logs.alignment import low_pass, low_passed, resample, undelayed
+from drake_teleop.logs.alignment import low_pass, low_passed, measured, resample, undelayed
 from drake_teleop.logs.canonical import Log
 from drake_teleop.logs.delay import estimate_delay
 from drake_teleop.logs.description import Description
@@ -162,17 +162,20 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
             the place of the accelerometer from the centre of the rotation, and it is not told.
 
     Returns:
-        None if the specific force changes by less than 0.5 m/s^2 (rms), so nothing can be said.
+        None if the specific force changes by less than 0.5 m/s^2 (rms), or gaps leave less than a
+        tenth of the record, so that nothing can be said.
     """
     start, stop = max(imu.t[0], pose.t[0]), min(imu.t[-1], pose.t[-1])
     reach = min(_REACH, 0.2 * float(stop - start))
     cutoff = min(_CUTOFF, 0.2 / imu.dt)
-    measured, smooth = low_passed(imu, cutoff), low_passed(pose, cutoff)
-    t = np.linspace(start + reach, stop - reach, _SAMPLES)
+    sensed, smooth = low_passed(imu, cutoff), low_passed(pose, cutoff)
+    t = _times(start + reach, stop - reach, (imu, pose), cutoff)
+    if len(t) < _SAMPLES // 10:
+        return None
     # Without a gyroscope both readings have the angular velocity of the pose.
     omega_imu, omega = (resample(t, log.t, log.angular_velocity) for log in (imu, pose))
     gyroscope = not np.allclose(omega_imu, omega, atol=1e-9)
-    pairs = _pairs(t, measured, smooth, gyroscope)
+    pairs = _pairs(t, sensed, smooth, gyroscope)
     expected = pairs[0][0]
     if expected.var(axis=0).sum() < 0.25:
         return None
@@ -182,9 +185,9 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     R, mirrored = _kabsch(resample(t + middle + drift * (t - centre), imu.t, pairs[0][1]), expected)
 
     # With the clock known, more of the record can be used.
-    margin = min(reach, abs(middle) + 0.1)
-    t = np.linspace(start + margin, stop - margin, _SAMPLES)
-    pairs = _pairs(t, measured, smooth, gyroscope)
+    margin = min(reach, abs(middle) + 0.5 * abs(drift) * float(stop - start) + 0.1)
+    t = _times(start + margin, stop - margin, (imu, pose), cutoff)
+    pairs = _pairs(t, sensed, smooth, gyroscope)
     turned = resample(t, pose.t, smooth.angular_velocity)
     K = _lever_matrix(turned, resample(t, pose.t, smooth.angular_acceleration))
 
@@ -201,7 +204,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     lever = None
     if position:
         lever = LeverArm(x[4:7], np.where(_shown(K, pose, cutoff), deviations[4:7], np.inf), "pose")
-    left = residual(x).reshape(_SAMPLES, -1, 3).var(axis=0).sum(axis=1)
+    left = residual(x).reshape(len(t), -1, 3).var(axis=0).sum(axis=1)
     shares = [float(part / y.var(axis=0).sum()) for part, (y, _) in zip(left, pairs, strict=True)]
     speeds = [float(np.linalg.norm(log.angular_velocity, axis=1).std()) for log in (imu, pose)]
     return Mounting(
@@ -230,13 +233,16 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
         log: its specific force is that of the accelerometer, in the axes of S.
 
     Returns:
-        None if the load leaves more than 5 % of the wrench's variance: then something is touched.
+        None if the load leaves more than 5 % of the wrench's variance: then something is touched;
+        or if gaps leave less than a tenth of the record.
     """
     cutoff = min(_CUTOFF, 0.2 / log.dt)
     delay = estimate_delay(log, None) or 0.0
     smooth = low_passed(undelayed(log, delay), cutoff)
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
-    t = np.linspace(smooth.t[0] + margin, smooth.t[-1] - margin, _SAMPLES)
+    t = _times(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
+    if len(t) < _SAMPLES // 10:
+        return None
     wrench = resample(t, smooth.t, smooth.wrench)
 
     def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -356,7 +362,8 @@ def describe_mounting(
 def _believed(mounting: Mounting | None, where: str) -> Mounting:
     """The mounting, if the data determine its rotation."""
     if mounting is None:
-        what, remedy = "the specific force hardly changes", "turn the sensor about two axes"
+        what = "the specific force hardly changes, or gaps leave too little of it"
+        remedy = "turn the sensor about two axes"
     elif mounting.mirrored:
         what = "the axes of the IMU are those of the pose mirrored"
         remedy = "exchange two of its columns, or change imu.sign"
@@ -449,6 +456,13 @@ def right_angled_rotations() -> list[NDArray[np.float64]]:
 
 
 _Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
+
+
+def _times(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> NDArray[np.float64]:
+    """Evenly spaced times at which all logs have samples, and not bridges over gaps."""
+    t = np.linspace(start, stop, _SAMPLES)
+    known = [np.interp(t, log.t, measured(log, cutoff).astype(float)) > 0.99 for log in logs]
+    return t[np.all(known, axis=0)]
 
 
 def _pairs(t: NDArray[np.float64], imu: Log, pose: Log, gyroscope: bool) -> _Pairs:

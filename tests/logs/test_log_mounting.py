@@ -100,8 +100,10 @@ def described(
     return Description.model_validate(data)
 
 
-def mounting(recorder: Recorder, **streams: bool) -> Mounting:
-    description, tables = described(**streams), recorder.tables()
+def mounting(
+    recorder: Recorder, tables: dict[Path, Table] | None = None, **streams: bool
+) -> Mounting:
+    description, tables = described(**streams), tables or recorder.tables()
     imu = read_description(description, "log.yaml", tables=tables)
     alone = description.model_copy(update={"imu": None})
     pose = read_description(alone, "log.yaml", tables=tables)
@@ -298,6 +300,22 @@ def test_the_clock_of_the_imu_is_mentioned_and_left_alone() -> None:
     assert any("lags that of the pose by 0.206 s" in note for note in log.notes)
     s = motion_at(log.t - LAG - 0.2).specific_force
     assert np.abs(log.specific_force - s)[20:-20].mean() < 0.4
+
+
+def test_gaps_are_not_taken_for_motion() -> None:
+    p = np.array([0.05, -0.04, 0.06])
+    recorder = Recorder(a_rotation(3), p)
+    tables = recorder.tables()
+    for name in ("p", "i"):
+        columns = tables[Path(name)].columns
+        kept = (columns["t"] < 2.2) | (columns["t"] > 2.7)
+        tables[Path(name)] = replace(
+            tables[Path(name)], columns={k: x[kept] for k, x in columns.items()}
+        )
+    found = mounting(recorder, tables)
+    assert found.lever is not None and found.determined and found.unexplained < 1e-3
+    assert np.linalg.norm(turn(found.R_SI @ recorder.R_SI.T)) < 0.1
+    assert np.abs(found.lever.p_SoIo_S - p).max() < 1e-3
 
 
 # Real records
