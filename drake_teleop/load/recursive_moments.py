@@ -40,7 +40,7 @@ def terms() -> tuple[NDArray[np.uintp], Array]:
     T = coefficients()[:, :, _ORDER].swapaxes(1, 2)
     index = np.argwhere(T)
     # Unsigned, so that the compiled loops need not look for negative indices.
-    return index.astype(np.uintp), T[tuple(index.T)]
+    return np.ascontiguousarray(index, dtype=np.uintp), T[tuple(index.T)]
 
 
 @njit(cache=True)

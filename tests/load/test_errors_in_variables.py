@@ -30,14 +30,16 @@ def test_the_motion_is_that_of_a_body(benchmark):
 
 @pytest.mark.parametrize("level", ["JR3", "UTIAS High"])
 def test_total_least_squares_and_instruments_take_out_the_bias(benchmark, level):
-    figures = benchmark.summary(benchmark.study(level, 20))
+    figures = benchmark.summary(level, benchmark.study(level, 20))
     assert {"I_xx", "I_yy", "I_zz"} <= set(figures["biased"])
+    # Scatter of 20 records: its own is 16 %, and this is the largest of 16 parameters.
     for name in ("RIV", "RTLS"):
+        assert figures[name]["scatter_over_bound_max"] < 1.7
         # A fifth of the bias, or of its own scatter what 20 records cannot tell from none.
         ratio = np.array(figures[name]["bias_over_rls"])
         own = np.array(figures[name]["bias_over_own_standard_error"])
         assert ((ratio <= 0.2) | (own <= 3.0)).all()
         inertias = [figures["biased"].index(parameter) for parameter in ("I_xx", "I_yy", "I_zz")]
-        assert ratio[inertias].max() <= 0.2
+        assert ratio[inertias].max() <= 0.1
     assert figures["RTLS"]["mass_error_max_percent"] <= 2.0
     assert figures["RTLS"]["com_error_max_percent"] <= 5.0
