@@ -13,14 +13,14 @@ channel, the environment f . dx; what comes out of a passive channel never excee
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.passivity import none
+from drake_teleop.passivity import none, tdpa, wave
 from drake_teleop.passivity.memory import (
     COMMAND,
     DAMPING,
@@ -33,9 +33,13 @@ from drake_teleop.passivity.memory import (
     STIFFNESS,
 )
 from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, SEQUENCE, finite
+from drake_teleop.passivity.tdpa import TdpaConfig
+from drake_teleop.passivity.wave import WaveConfig
 from drake_teleop.quantities import choice, quantity
 
-METHODS = ("none",)
+METHODS = ("none", "wave", "tdpa")
+
+NONE, WAVE, TDPA = range(len(METHODS))
 
 
 @dataclass
@@ -55,6 +59,8 @@ class PassivityConfig:
     servo_damping: list[float] = quantity(
         [3.5e3, 117.0], "N s/m, N m s/rad", 0.0, 1e8, "D of the slave's servo, likewise (E)"
     )
+    wave: WaveConfig = field(default_factory=WaveConfig)
+    tdpa: TdpaConfig = field(default_factory=TdpaConfig)
 
 
 def parameters(
@@ -74,13 +80,9 @@ def parameters(
     p[LIMIT : LIMIT + 2] = config.force_limit, config.torque_limit
     p[STIFFNESS : STIFFNESS + 2] = np.multiply(config.servo_stiffness, power_scale)
     p[DAMPING : DAMPING + 2] = np.multiply(config.servo_damping, power_scale)
-    own = _own_parameters(config)
+    own = getattr(config, config.method).packed() if hasattr(config, config.method) else []
     p[METHOD : METHOD + len(own)] = own
     return p
-
-
-def _own_parameters(config: PassivityConfig) -> list[float]:
-    return []
 
 
 def initial_memory(
@@ -144,6 +146,10 @@ def master_step(method, received, fresh, pose, twist, dx, hand, T, p, memory, wr
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(hand)
     if not healthy:
         wrench[:] = 0.0
+    elif method == WAVE:
+        wave.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
+    elif method == TDPA:
+        tdpa.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
     else:
         none.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
     _finish(healthy, memory, packet)
@@ -167,6 +173,10 @@ def slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, c
     if not healthy:
         memory[COMMAND + 7 : COMMAND + 13] = 0.0
         command[:] = memory[COMMAND : COMMAND + 13]
+    elif method == WAVE:
+        wave.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
+    elif method == TDPA:
+        tdpa.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
     else:
         none.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
     _finish(healthy, memory, packet)

@@ -1,0 +1,307 @@
+"""Does any method give out energy that was not put in, over random networks and random ports?
+
+`python benchmarks/passivity.py [--json] [--networks N] [--seconds S]` runs both ends of every
+method over N (10 000) random networks of 10 s at 500 Hz: delay up to 300 ms, jitter up to 100 %,
+loss up to 50 % or in bursts with up to 95 %, reordering, duplicates, and a device that saturates
+in half of them. The motion of both ends is random in six degrees of freedom with bounded
+acceleration; the wrenches are random and often push with the motion, as active as it gets. It
+prints for each method the least energy of the channel at the pair f_k (x_k - x_(k-1)), which the
+laws can see, and at the true port of a held wrench, f_(k-1) (x_k - x_(k-1)). Baselines in the same
+run: no method, wave variables that hold the last sample, and the two-layer tank without its margin.
+What has no bound runs over every tenth network.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from drake_teleop.channel.network import NetworkConfig, newest_packets
+from drake_teleop.passivity import methods
+from drake_teleop.passivity.memory import COMMAND, DAMPING, LIMIT, METHOD, OWN, STIFFNESS
+from drake_teleop.passivity.methods import METHODS, PassivityConfig, initial_memory, parameters
+from drake_teleop.passivity.packet import (
+    INTEGRAL,
+    PACKET_SIZE,
+    WRENCH,
+    difference_into,
+    dot,
+    length,
+    limit,
+    moved_into,
+)
+
+Array = NDArray[np.float64]
+
+PERIOD = 2e-3
+ACCELERATION = np.array([20.0, 200.0])  # bounds of |x''| at both ends [m/s^2, rad/s^2]
+WRENCH_SIZE = np.array([6.0, 0.1])  # [N, N m]
+POSE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+# What `_run` finds for each group: least energy at either pair, how much stronger than f_e the hand
+# felt it.
+BACKWARD, TRUE, STRONGER, FIGURES = range(4)
+WAVE_HOLD = -1
+BOUNDED = ("wave", "tdpa", "two_layer", "pspm")
+
+
+def random_motion(rng: np.random.Generator, steps: int) -> tuple[Array, Array]:
+    """Increments (steps, 6) and poses (steps, 7) of a motion with bounded acceleration.
+
+    The acceleration changes at random about ten times a second, and a spring and a damper keep the
+    motion within about 0.5 m and 1 rad.
+    """
+    push = rng.normal(size=(steps, 6)) * np.repeat(ACCELERATION, 3)
+    changes = rng.random((steps, 6)) < 10.0 * PERIOD
+    changes[0] = True
+    last = np.maximum.accumulate(np.where(changes, np.arange(steps)[:, None], 0), axis=0)
+    dx, pose = np.zeros((steps, 6)), np.zeros((steps, 7))
+    _move(np.take_along_axis(push, last, axis=0), ACCELERATION, PERIOD, dx, pose)
+    return dx, pose
+
+
+@njit(cache=True)
+def _move(push, most, T, dx, pose):
+    x, v, a, now = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(7)
+    now[0] = 1.0
+    for k in range(len(push)):
+        for g in range(2):
+            rate = 6.0 if g == 0 else 14.0
+            for i in range(3 * g, 3 * g + 3):
+                a[i] = push[k, i] - rate * rate * x[i] - 2.0 * rate * v[i]
+            limit(a, g, 0.999 * most[g])
+        for i in range(6):
+            v[i] += a[i] * T
+            x[i] += v[i] * T
+            dx[k, i] = v[i] * T
+        moved_into(now, dx[k], now)
+        pose[k] = now
+
+
+def random_wrench(rng: np.random.Generator, steps: int) -> Array:
+    """(steps, 6) a wrench that changes about five times a second and is often zero."""
+    value = rng.normal(size=(steps, 6)) * np.repeat(WRENCH_SIZE, 3) * (rng.random((steps, 6)) < 0.7)
+    changes = rng.random((steps, 6)) < 5.0 * PERIOD
+    last = np.maximum.accumulate(np.where(changes, np.arange(steps)[:, None], 0), axis=0)
+    return np.take_along_axis(value, last, axis=0)
+
+
+@njit(cache=True)
+def _run(method, p, memories, newest, motion, poses, wrenches, active, T, sent, figures):
+    """Least energies of one method over one network; `figures` (2, FIGURES) is written.
+
+    `motion` (2, N, 6) and `poses` (2, N, 7) are those of both ends; the contact wrench is
+    `wrenches` (N, 6) plus `active` times a wrench that pushes the way the slave moves.
+    """
+    f_e, hand, felt = np.zeros(6), np.zeros(6), np.zeros(6)
+    wrench, before, motor, pull = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
+    command, old, moved, nothing = np.zeros(13), np.zeros(7), np.zeros(6), np.zeros(PACKET_SIZE)
+    twists, energy = np.zeros((2, 6)), np.zeros((2, 2))
+    old[0] = 1.0
+    figures[:] = 0.0
+    for k in range(newest.shape[1]):
+        for i in range(6):
+            twists[0, i], twists[1, i] = motion[0, k, i] / T, motion[1, k, i] / T
+            before[i] = wrench[i]
+        for g in range(2):
+            push = active * WRENCH_SIZE[g] / (length(motion[1, k], g) + 1e-9)
+            for i in range(3 * g, 3 * g + 3):
+                f_e[i] = wrenches[k, i] + push * motion[1, k, i]
+        for end in range(2):
+            now = newest[1 - end, k]
+            received = nothing if now < 0 else sent[1 - end, now]
+            fresh = now >= 0 and (k == 0 or now != newest[1 - end, k - 1])
+            if end == 0:
+                _master(method, received, fresh, poses[0, k], twists[0], motion[0, k], hand, T, p,
+                        memories[0], wrench, sent[0, k])  # fmt: skip
+                felt[:] = received[WRENCH : WRENCH + 6]
+            else:
+                _slave(method, received, fresh, poses[1, k], twists[1], motion[1, k], f_e, T, p,
+                       memories[1], command, sent[1, k])  # fmt: skip
+        difference_into(command, old, moved)
+        old[:] = command[:7]
+        # The pull of the slave's servo from now until the next step.
+        difference_into(command, poses[1, k], pull)
+        for g in range(2):
+            energy[0, g] += dot(f_e, moved, g) - dot(wrench, motion[0, k], g)
+            energy[1, g] -= dot(before, motion[0, k], g) + dot(motor, motion[1, k], g)
+            figures[g, BACKWARD] = min(figures[g, BACKWARD], energy[0, g])
+            figures[g, TRUE] = min(figures[g, TRUE], energy[1, g])
+            stronger = length(wrench, g) - length(felt, g)
+            figures[g, STRONGER] = max(figures[g, STRONGER], stronger)
+            for i in range(3 * g, 3 * g + 3):
+                motor[i] = p[STIFFNESS + g] * pull[i] - p[DAMPING + g] * twists[1, i]
+
+
+@njit(cache=True)
+def _master(method, received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+    if method != WAVE_HOLD:
+        methods.master_step(
+            method, received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet
+        )
+        return
+    for i in range(6):
+        b = p[METHOD + i // 3]  # the line's impedance
+        wrench[i] = math.sqrt(2.0 * b) * received[INTEGRAL + i] - b * dx[i] / T
+    for g in range(2):
+        limit(wrench, g, p[LIMIT + g])
+    for i in range(6):
+        b = p[METHOD + i // 3]
+        packet[INTEGRAL + i] = (b * dx[i] / T - wrench[i]) / math.sqrt(2.0 * b)
+
+
+@njit(cache=True)
+def _slave(method, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
+    if method != WAVE_HOLD:
+        methods.slave_step(
+            method, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
+        )
+        return
+    step = memory[OWN : OWN + 6]
+    for i in range(6):
+        b, u = p[METHOD + i // 3], received[INTEGRAL + i]
+        step[i] = T * (math.sqrt(2.0 * b) * u + wrench[i]) / b
+        packet[INTEGRAL + i] = u + math.sqrt(2.0 / b) * wrench[i]
+    moved_into(memory[COMMAND : COMMAND + 7], step, memory[COMMAND : COMMAND + 7])
+    command[:] = memory[COMMAND : COMMAND + 13]
+
+
+def cases() -> dict[str, tuple[int, Array]]:
+    """Name -> (method, its parameters with a device that does not saturate)."""
+    found = {}
+    for name in METHODS:
+        found[name] = METHODS.index(name), parameters(PassivityConfig(method=name))
+    found["wave_hold"] = WAVE_HOLD, parameters(PassivityConfig(method="wave"))
+    return found
+
+
+def random_network(rng: np.random.Generator) -> NetworkConfig:
+    """A network out of all that the study covers."""
+    bursts = rng.random() < 0.5
+    burst_loss = float(rng.uniform(0.5, 0.95))
+    return NetworkConfig(
+        delay=float(rng.uniform(0.0, 0.3)),
+        jitter=float(rng.uniform(0.0, 1.0)),
+        distribution=str(rng.choice(["uniform", "normal", "gamma"])),
+        loss=float(rng.uniform(0.0, 0.5 * (burst_loss if bursts else 1.0))),
+        burst=float(rng.uniform(0.01, 0.5)) if bursts else 0.0,
+        burst_loss=burst_loss if bursts else 1.0,
+        duplicate=float(rng.uniform(0.0, 0.5)),
+    )
+
+
+def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str, float]]:
+    """Least figures over the networks first..last-1, and CPU time [s], of each method."""
+    first, last, steps = job
+    every = cases()
+    least = {name: np.full((2, FIGURES), np.inf) for name in every}
+    seconds = dict.fromkeys(every, 0.0)
+    sent, figures = np.zeros((2, steps, PACKET_SIZE)), np.zeros((2, FIGURES))
+    # A few motions and wrenches in all combinations: drawing new ones would take most of the time.
+    rng = np.random.default_rng(0)
+    motions = [random_motion(rng, steps) for _ in range(32)]
+    wrenches = [random_wrench(rng, steps) for _ in range(32)]
+    for seed in range(first, last):
+        rng = np.random.default_rng(seed)
+        network = random_network(rng)
+        newest = np.stack([newest_packets(network, seed, way, steps, PERIOD) for way in range(2)])
+        # In a step the master's turn is before the slave's.
+        newest[1] = np.minimum(newest[1], np.arange(steps) - 1)
+        ends = [motions[rng.integers(32)] for _ in range(2)]
+        motion, poses = (np.stack(parts) for parts in zip(*ends, strict=True))
+        wrench, active = wrenches[rng.integers(32)], rng.uniform(-1.0, 1.0)
+        saturates = rng.random() < 0.5
+        for name, (method, p) in every.items():
+            if name not in BOUNDED and seed % 10:
+                continue  # what has no bound is found out sooner
+            p = p.copy()
+            if saturates:
+                p[LIMIT : LIMIT + 2] = 0.5, 0.01
+            start = initial_memory("none" if method == WAVE_HOLD else name, p, POSE)
+            memories = np.stack([start, start])
+            began = time.thread_time()
+            _run(method, p, memories, newest, motion, poses, wrench, active, PERIOD, sent, figures)
+            seconds[name] += time.thread_time() - began
+            figures[:, STRONGER] *= -1.0
+            least[name] = np.minimum(least[name], figures)
+    return least, seconds
+
+
+def study(networks: int, seconds: float = 10.0, processes: int = 2) -> dict[str, dict[str, float]]:
+    """Runs every method over the networks.
+
+    Returns:
+        Name -> "energy": least energy of the channel at the backward pair [J]; "true_energy": at
+        the true port of a held wrench, at the slave that of its servo [J]; "stronger": by how much
+        the hand felt more than was received [N, N m]; "us": CPU time of both ends, with the random
+        ports, a step [us]. Least (worst) over networks and over translation and rotation.
+    """
+    steps, share = round(seconds / PERIOD), max(1, -(-networks // (8 * processes)))
+    jobs = [(i, min(i + share, networks), steps) for i in range(0, networks, share)]
+    _some_networks((0, 1, 10))  # compiles, before the processes fork
+    if processes > 1:
+        with multiprocessing.get_context("fork").Pool(processes) as pool:
+            parts = pool.map(_some_networks, jobs, chunksize=1)
+    else:
+        parts = [_some_networks(job) for job in jobs]
+    result = {}
+    for name in parts[0][0]:
+        worst = np.min([least[name] for least, _ in parts], axis=(0, 1))
+        ran = networks if name in BOUNDED else -(-networks // 10)
+        spent = sum(seconds[name] for _, seconds in parts)
+        result[name] = {
+            "energy": float(worst[BACKWARD]),
+            "true_energy": float(worst[TRUE]),
+            "stronger": float(-worst[STRONGER]),
+            "us": 1e6 * spent / (ran * steps),
+        }
+    return result
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the study and prints it; returns 0 if the bounds hold and the baselines break them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument("--networks", type=int, default=10_000, help="how many networks")
+    parser.add_argument("--seconds", type=float, default=10.0, help="simulated time of each [s]")
+    options = parser.parse_args(arguments)
+    began = time.monotonic()
+    result = study(options.networks, options.seconds)
+    took = time.monotonic() - began
+    if options.json:
+        print(json.dumps({"networks": options.networks, "wall_s": took, "methods": result}))
+    else:
+        print(
+            f"Least energy over {options.networks} networks x {options.seconds:g} s, {took:.0f} s"
+        )
+        print(f"{'method':<22}{'backward [J]':>14}{'true port [J]':>15}{'us/step':>9}")
+        for name, figures in result.items():
+            print(
+                f"{name:<22}{figures['energy']:14.2e}{figures['true_energy']:15.2e}"
+                f"{figures['us']:9.2f}"
+            )
+    return 0 if holds(result) else 1
+
+
+def holds(result: dict[str, dict[str, float]]) -> bool:
+    """Whether the methods keep their bounds and the baselines do not."""
+    return (
+        result["tdpa"]["energy"] >= -1e-9
+        and result["wave"]["energy"] >= -1e-9
+        and result["tdpa"]["stronger"] <= 1e-12
+        and result["none"]["energy"] < -1.0
+        and result["wave_hold"]["energy"] < -1.0
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,154 @@
+"""Wave variables: what travels is u = (b v + F) / sqrt(2 b) and w = (b v - F) / sqrt(2 b).
+
+F = -f is the force that the hand puts into the port, and F v = (u^2 - w^2) / 2: an end gives out
+the energy of the wave that it received and nothing else, so a line of constant delay is passive
+(Anderson and Spong 1989; Niemeyer and Slotine 1991). With a step's increment v = dx / T this is
+exact for the backward pair f_k . (x_k - x_(k-1)).
+
+Over a network that is not constant an end sends the integral of its wave and the energy
+e = F dx + |wave received|^2 T / 2 that is its to pass on, both cumulative. The receiver plays out
+what has come of the integral through a filter of first order, and never more than has come of the
+energy (Yokokohji, Imaida, Yoshikawa 1999 and Niemeyer and Slotine 2004, joined). So nothing is
+created by jitter, loss or hold, nor by a wrench that the device cannot display, and a packet that
+is lost takes no motion with it. Uneven arrival costs energy all the same, and in a long contact the
+force: a playout buffer in the network avoids that.
+
+The slave's end is matched to the line by a damper m b that its command acts against: with m = 1
+nothing is reflected in free motion, and the hand feels b v; with m = 0 it feels the mass b T of the
+line's content. In contact the slave stays behind by f (T + filter) / b. Drift, of what was cut, is
+corrected through the wave too, out of what the filter left of its energy.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import math
+from dataclasses import dataclass
+
+from numba import njit
+
+from drake_teleop.passivity.memory import (
+    COMMAND,
+    HELD,
+    LEDGER,
+    LIMIT,
+    LOST,
+    METHOD,
+    OWN,
+    RECEIVED,
+    SENT,
+)
+from drake_teleop.passivity.packet import (
+    ENERGY,
+    INTEGRAL,
+    POSE,
+    arrived,
+    difference_into,
+    dot,
+    fill,
+    limit,
+    moved_into,
+    scale,
+)
+from drake_teleop.quantities import quantity
+
+# Parameters.
+_IMPEDANCE, _FILTER, _MATCHING, _DRIFT_RATE = METHOD, METHOD + 2, METHOD + 3, METHOD + 4
+# Memory: integral of the wave played out, integral of the wave sent, the wave of this step.
+_PLAYED, _INTEGRAL, _WAVE = OWN, OWN + 6, OWN + 12
+
+
+@dataclass
+class WaveConfig:
+    """Parameters of the wave variables."""
+
+    impedance: list[float] = quantity(
+        [10.0, 0.05], "N s/m, N m s/rad", 1e-6, 1e6, "b of the line, translation and rotation"
+    )
+    filter: float = quantity(0.003, "s", 0.0, 10.0, "time constant of the filter of either wave")
+    matching: float = quantity(
+        1.0, "1", 0.0, 100.0, "damper at the slave's end over b; 1 reflects nothing"
+    )
+    drift_rate: float = quantity(
+        2.0, "1/s", 0.0, 1e3, "rate at which the slave's lag behind the hand is corrected"
+    )
+
+    def packed(self) -> list[float]:
+        """The values in the order in which the steps read them."""
+        return [*self.impedance, self.filter, self.matching, self.drift_rate]
+
+
+@njit(cache=True)
+def _play(received, T, p, memory, wave):
+    """The wave (6,) of this step: what is played out, and `wave` (a correction) added to it.
+
+    Both are cut to the energy that has come. What is cut is given up: if it were kept, a line that
+    loses packets would pile it up during a long contact and play it out after that.
+    """
+    share = T / (T + p[_FILTER])
+    for g in range(2):
+        more = received[ENERGY + g] - memory[RECEIVED + g]
+        if more > 0.0:
+            memory[LEDGER + g] += more
+            memory[RECEIVED + g] += more
+        for i in range(3 * g, 3 * g + 3):
+            played = share * (received[INTEGRAL + i] - memory[_PLAYED + i])
+            memory[_PLAYED + i] += played
+            wave[i] += played / T
+        energy = 0.5 * T * dot(wave, wave, g)
+        if energy > memory[LEDGER + g]:
+            scale(wave, g, math.sqrt(memory[LEDGER + g] / energy))
+            energy = memory[LEDGER + g]
+        memory[LEDGER + g] -= energy
+
+
+@njit(cache=True)
+def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+    """One step of the master's end; see `methods.master_step`."""
+    wave = memory[_WAVE : _WAVE + 6]
+    wave[:] = 0.0
+    _play(received, T, p, memory, wave)
+    for g in range(2):
+        b = p[_IMPEDANCE + g]
+        for i in range(3 * g, 3 * g + 3):
+            wrench[i] = math.sqrt(2.0 * b) * wave[i] - b * dx[i] / T
+        limit(wrench, g, p[LIMIT + g])
+        # Not negative: of a wrench that was shortened even more is left than the wave going back.
+        left = 0.5 * T * dot(wave, wave, g) - dot(wrench, dx, g)
+        memory[SENT + g] += max(left, 0.0)
+        packet[ENERGY + g] = memory[SENT + g]
+        for i in range(3 * g, 3 * g + 3):
+            memory[_INTEGRAL + i] += (b * dx[i] - wrench[i] * T) / math.sqrt(2.0 * b)
+            packet[INTEGRAL + i] = memory[_INTEGRAL + i]
+    memory[HELD : HELD + 6] = wrench
+    fill(pose, twist, wrench, packet)
+
+
+@njit(cache=True)
+def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
+    """One step of the slave's end; see `methods.slave_step`."""
+    wave, now = memory[_WAVE : _WAVE + 6], memory[COMMAND : COMMAND + 7]
+    step = memory[COMMAND + 7 : COMMAND + 13]
+    wave[:] = 0.0
+    if arrived(received):
+        difference_into(received[POSE : POSE + 7], now, wave)
+        for i in range(6):
+            wave[i] *= p[_DRIFT_RATE] * math.sqrt(0.5 * p[_IMPEDANCE + i // 3])
+    _play(received, T, p, memory, wave)
+    for g in range(2):
+        b, damper = p[_IMPEDANCE + g], p[_MATCHING] * p[_IMPEDANCE + g]
+        for i in range(3 * g, 3 * g + 3):
+            step[i] = T * (math.sqrt(2.0 * b) * wave[i] + wrench[i]) / (b + damper)
+            memory[_INTEGRAL + i] += T * wave[i] + math.sqrt(2.0 / b) * (
+                T * wrench[i] - damper * step[i]
+            )
+            packet[INTEGRAL + i] = memory[_INTEGRAL + i]
+        damped = damper * dot(step, step, g) / T
+        left = 0.5 * T * dot(wave, wave, g) + dot(wrench, step, g) - damped
+        memory[LOST + g] += damped
+        memory[SENT + g] += max(left, 0.0)
+        packet[ENERGY + g] = memory[SENT + g]
+    moved_into(now, step, now)
+    for i in range(6):
+        step[i] /= T
+    command[:] = memory[COMMAND : COMMAND + 13]
+    memory[HELD : HELD + 6] = wrench
+    fill(pose, twist, wrench, packet)

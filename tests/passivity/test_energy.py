@@ -1,0 +1,45 @@
+"""No method gives out energy that was not put in, whatever the network and the ports do.
+
+Random motion at both ends, random wrenches, and random networks: delay up to 300 ms, jitter, loss,
+bursts, reordering, duplicates, and a device that saturates. `benchmarks/passivity.py` has the same
+in the large.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def bench() -> ModuleType:
+    path = Path(__file__).parents[2] / "benchmarks" / "passivity.py"
+    spec = importlib.util.spec_from_file_location("passivity_bench", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["passivity_bench"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def least(bench: ModuleType) -> dict[str, dict[str, float]]:
+    return bench.study(networks=24, seconds=4.0, processes=1)
+
+
+def test_tdpa_never_gives_out_more_than_was_put_in(least):
+    assert least["tdpa"]["energy"] >= -1e-9
+    assert least["tdpa"]["stronger"] <= 1e-12, "the wrench became stronger"
+
+
+def test_waves_give_out_the_energy_that_came_and_no_more(least):
+    assert least["wave"]["energy"] >= -1e-9
+    assert least["wave_hold"]["energy"] < -1e-3, "held waves should have created energy"
+
+
+def test_without_a_method_energy_is_created(least):
+    assert least["none"]["energy"] < -1.0

@@ -1,0 +1,88 @@
+"""The wave line against its closed forms (Niemeyer and Slotine 1991), with T half of the RTT."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.passivity.methods import (
+    METHODS,
+    PassivityConfig,
+    initial_memory,
+    master_step,
+    parameters,
+    slave_step,
+)
+from drake_teleop.passivity.packet import INTEGRAL, PACKET_SIZE
+from drake_teleop.passivity.wave import WaveConfig
+
+T, STEPS = 1e-3, 1200
+WAVE = METHODS.index("wave")
+
+
+def line(config, motion, contact, forward, backward):
+    """Wrench at the hand and motion of the slave's command (x alone), both (N,).
+
+    `contact(u, x)` is the force of the slave's end [N], for the wave u that arrives there and the
+    command x of the last step; packets travel for `forward` and `backward` steps.
+    """
+    p = parameters(PassivityConfig(method="wave", force_limit=1e3, wave=config))
+    start = np.array([1.0, 0, 0, 0, 0, 0, 0])
+    memory = [initial_memory("wave", p, start) for _ in range(2)]
+    sent, command = np.zeros((2, len(motion), PACKET_SIZE)), np.zeros((len(motion), 13))
+    nothing, zero, wrench = np.zeros(PACKET_SIZE), np.zeros(6), np.zeros((len(motion), 6))
+    u = np.zeros(len(motion))
+    for k, x in enumerate(motion):
+        pose, dx = start.copy(), zero.copy()
+        pose[4], dx[0] = x, x - motion[max(k - 1, 0)]
+        received = sent[1, k - backward] if k >= backward else nothing
+        master_step(
+            WAVE, received, True, pose, dx / T, dx, zero, T, p, memory[0], wrench[k], sent[0, k]
+        )
+        u[k] = (sent[0, k, INTEGRAL] - (sent[0, k - 1, INTEGRAL] if k else 0.0)) / T
+        received = sent[0, k - forward] if k >= forward else nothing
+        f_e = zero.copy()
+        f_e[0] = contact(u[k - forward] if k >= forward else 0.0, command[k - 1, 4])
+        slave_step(
+            WAVE, received, True, start, zero, zero, f_e, T, p, memory[1], command[k], sent[1, k]
+        )
+    return wrench[:, 0], command[:, 4]
+
+
+@pytest.fixture(scope="module")
+def motion():
+    rng = np.random.default_rng(0)
+    t = np.arange(STEPS) * T
+    return sum(0.02 * np.sin(w * t) for w in rng.uniform(2.0, 40.0, 5))
+
+
+@pytest.mark.parametrize("delay", [1, 30, 500])
+@pytest.mark.parametrize("end", ["matched", "free", "rigid"])
+def test_closed_forms_of_the_line(motion, end, delay):
+    """Z = b matched, b tanh(s T) free, b coth(s T) rigid: as exact recursions over the RTT."""
+    b, n = 10.0, 2 * delay
+    contact = {
+        "matched": lambda u, x: -np.sqrt(b / 2.0) * u,
+        "free": lambda u, x: 0.0,
+        "rigid": lambda u, x: -np.sqrt(2.0 * b) * u,
+    }[end]
+    config = WaveConfig(impedance=[b, 0.05], filter=0.0, matching=0.0, drift_rate=0.0)
+    f, _ = line(config, motion, contact, delay, delay)
+    F, v = -f, np.diff(motion, prepend=motion[0]) / T
+    if end == "matched":
+        np.testing.assert_allclose(F, b * v, atol=1e-12)
+    elif end == "free":  # b (1 - z^-n) / (1 + z^-n)
+        np.testing.assert_allclose(F[n:] + F[:-n], b * (v[n:] - v[:-n]), atol=1e-12)
+    else:  # b (1 + z^-n) / (1 - z^-n)
+        np.testing.assert_allclose(F[n:] - F[:-n], b * (v[n:] + v[:-n]), atol=1e-11)
+
+
+@pytest.mark.parametrize("delay", [10, 50, 150])
+def test_the_slave_stays_behind_by_the_momentum_on_the_line(delay):
+    """x_m - x_s = f (T + filter) / b in a steady contact."""
+    b, stiffness, filtering = 10.0, 291.0, 0.003
+    config = WaveConfig(impedance=[b, 0.05], filter=filtering, drift_rate=0.0)
+    pressed = 0.02 * np.minimum(np.arange(6000) * T / 0.5, 1.0)
+    f, x = line(config, pressed, lambda u, x: -stiffness * max(x, 0.0), delay, delay)
+    assert -f[-1] == pytest.approx(stiffness * x[-1], rel=0.01)
+    assert pressed[-1] - x[-1] == pytest.approx(-f[-1] * (delay * T + filtering) / b, rel=0.03)
