@@ -178,6 +178,13 @@ def identify(
     type=click.Choice(["delayed", "predicted"]),
     help="Also as a loop would have had it: with its low-pass's lag, or predicted over it.",
 )
+@click.option(
+    "--causal-tare",
+    "causal_tare_s",
+    type=_Number(min=0, min_open=True),
+    metavar="SECONDS",
+    help="With --causal: an untouched start that the offsets are of.  [default: the load file's]",
+)
 @_out("eliminate")
 @_cutoff
 @_delay
@@ -191,6 +198,7 @@ def eliminate(
     gamma: float,
     eta: float | None,
     causal: str | None,
+    causal_tare_s: float | None,
     out: Path,
     cutoff_hz: float,
     delay: float | str,
@@ -213,6 +221,7 @@ def eliminate(
         gamma=gamma,
         eta=eta,
         causal=causal,
+        causal_tare_s=causal_tare_s,
         cutoff_hz=cutoff_hz,
         delay=delay,
         quiet=quiet,

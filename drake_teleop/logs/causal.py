@@ -4,7 +4,8 @@ The zero-phase low-pass of `alignment` looks ahead. A loop cannot: its low-pass,
 filter of second order with the same cut-off, lags by sqrt(2) / (2 pi cut-off) at low frequencies
 (7.5 ms at 30 Hz), and a motion that comes later than the wrench has to be waited for. Wrench and
 motion are aligned first and the result is filtered, so that the elimination itself does not
-suffer from the lag; all that is late is the contact wrench.
+suffer from the lag; all that is late is the contact wrench. The sensor's offsets are those that a
+loop knows beforehand: the load file's, or of a start of the record in which nothing is touched.
 
 Prediction extrapolates the filter's output by its slope over the whole lag L: the filter becomes
 (1 + L s) H(s), whose delay is zero at low frequencies. The price is noise and overshoot: with no
@@ -14,7 +15,7 @@ motion to wait for the rms of white noise grows by sqrt(3).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +34,14 @@ class CausalWrench:
         lag_s: L, by how much a slow contact comes late, or would without the prediction [s].
         contact: (N, 6) Eq. (13).
         scaled: (N, 6) gamma F_c + sigma V phi.
+        offsets: (6,) of the sensor, known before: those of the load file or of the record's start.
     """
 
     mode: str
     lag_s: float
     contact: NDArray[np.float64]
     scaled: NDArray[np.float64]
+    offsets: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
 
 
 def causal_low_pass(

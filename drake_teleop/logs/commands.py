@@ -39,6 +39,8 @@ rejected               share of the samples that a robust fit took for disturbed
 condition_number       of the regression
 residual_rms           [f; tau], after the fit
 residual_rms_force     of |F|
+load_changes           list of t_s, mass_before, mass_after: where the load changes within the record,
+                       so that one load for all of it is wrong
 gripper                its file, if --gripper was given; otherwise this and the next are absent
 object                 of phi_total - phi_gr: mass, com, inertia_com, phi with their standard
                        deviations, identifiable, not_identifiable and physically_consistent as
@@ -61,12 +63,13 @@ residual_peak             largest |F_c|
 raw_torque_rms ...        the same four of the torque
 raw_rms_per_channel ...   the same four of each channel [f; tau]
 noise_floor               [f; tau], standard deviation of the contact wrench where it is quiet
-contacts                  list of start_s, stop_s, peak_N, peak_Nm: from where a channel exceeds 8
+contacts                  list of start_s, stop_s, peak_N, peak_Nm: from where a channel exceeds 5.5
                           noise floors until all are below 4; null for static poses
 in_contact                share of the samples in `contacts`; null for static poses
 causal                    null, or, if --causal was given: mode, lag_s (by how much the output is
-                          late, or would be without prediction), residual_rms, noise_floor as
-                          above, and difference_rms, of |F_causal - F_c|
+                          late, or would be without prediction), offsets, tare_s (length of the
+                          start that they are of; null if of the load file), residual_rms,
+                          noise_floor as above, and difference_rms, of |F_causal - F_c|
 ========================= =======================================================================
 """
 
@@ -74,6 +77,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -127,6 +131,14 @@ def identify_command(
         "condition_number": result.condition_number,
         "residual_rms": result.residual_rms,
         "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
+        "load_changes": [
+            {
+                "t_s": found.log.t[after.start],
+                "mass_before": before.load.mass,
+                "mass_after": after.load.mass,
+            }
+            for before, after in pairwise(found.loads)
+        ],
     }
     if alone is not None:
         summary |= {"gripper": str(gripper), "object": _object_figures(alone)}
@@ -160,6 +172,7 @@ def eliminate_command(
     gamma: float = 1.0,
     eta: float | None = None,
     causal: str | None = None,
+    causal_tare_s: float | None = None,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     quiet: bool = False,
@@ -183,6 +196,7 @@ def eliminate_command(
         gamma=gamma,
         eta=eta,
         causal=causal,
+        causal_tare_s=causal_tare_s,
         cutoff_hz=cutoff_hz,
         delay=delay,
     )
@@ -206,7 +220,7 @@ def eliminate_command(
             "less than half of the record agrees on the sensor's offsets: if it is in contact most"
             " of the time, the contact wrench may be off by a constant"
         )
-    summary = _plain(summary | _rms_figures(found) | _contact_figures(found))
+    summary = _plain(summary | _rms_figures(found) | _contact_figures(found, causal_tare_s))
     from drake_teleop.logs.pictures import draw_elimination
 
     out.mkdir(parents=True, exist_ok=True)
@@ -301,7 +315,7 @@ def _rms_figures(found: EliminatedLog) -> dict[str, Any]:
     )
 
 
-def _contact_figures(found: EliminatedLog) -> dict[str, Any]:
+def _contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[str, Any]:
     figures: dict[str, Any] = {
         "noise_floor": found.noise_floor,
         "contacts": None,
@@ -329,6 +343,8 @@ def _contact_figures(found: EliminatedLog) -> dict[str, Any]:
         figures["causal"] = {
             "mode": found.causal.mode,
             "lag_s": found.causal.lag_s,
+            "tare_s": causal_tare_s,
+            "offsets": found.causal.offsets,
             "residual_rms": force_rms(late),
             "noise_floor": noise_floor(late),
             "difference_rms": force_rms(late - found.contact),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from drake_teleop.load.gripper import identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.segments import Segment, segments
 from drake_teleop.load.uncertainty import BaseParameters, base_parameters
 from drake_teleop.logs.alignment import low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.canonical import Log
@@ -23,6 +25,8 @@ from drake_teleop.logs.contact import in_contact, noise_floor
 from drake_teleop.logs.conventions import Finding, check_log, question_fit
 from drake_teleop.logs.delay import estimate_delay
 from drake_teleop.logs.reading import read_log
+
+_FEWEST_TO_TARE = 10
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,7 @@ class IdentifiedLog:
         rejected: (N,) samples that "robust" and "consistent" fits took for disturbed.
         base: which combinations of offsets and load the samples that were used determine.
         findings: suspected errors of the log's description; only looked for if the fit is poor.
+        loads: the parts with a load each, if the load changes within the record.
     """
 
     log: Log
@@ -46,6 +51,7 @@ class IdentifiedLog:
     rejected: NDArray[np.bool_]
     base: BaseParameters
     findings: tuple[Finding, ...] = ()
+    loads: tuple[Segment, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -120,8 +126,9 @@ def identify_log(
         log.wrench, *log.motion, method=method, shared_noise=log.static, delay_s=delay_s
     )
     result = fit.identification
-    if fit.note:
-        log = replace(log, notes=(*log.notes, fit.note))
+    loads = () if log.static else tuple(segments(log.wrench, *log.motion, log.dt))
+    notes = [*_load_notes(log, loads), *([fit.note] if fit.note else [])]
+    log = replace(log, notes=(*log.notes, *notes))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
     findings = question_fit(Path(path), log, result, predicted, known_delay)
@@ -130,7 +137,15 @@ def identify_log(
             result, identifiable=np.repeat([True, False], [6, 10]) & result.identifiable
         )
     base = base_parameters(fit.equations)
-    return IdentifiedLog(log, result, predicted, source, fit.rejected, base, findings)
+    return IdentifiedLog(log, result, predicted, source, fit.rejected, base, findings, loads)
+
+
+def _load_notes(log: Log, loads: tuple[Segment, ...]) -> list[str]:
+    return [
+        f"the load changes at t = {log.t[after.start]:.2f} s, from {before.load.mass:.4g} kg to"
+        f" {after.load.mass:.4g} kg: one load for the whole record is wrong, cut it there"
+        for before, after in pairwise(loads)
+    ]
 
 
 def eliminate_log(
@@ -146,6 +161,7 @@ def eliminate_log(
     delay: str | float = "auto",
     tare: bool = True,
     causal: str | None = None,
+    causal_tare_s: float | None = None,
 ) -> EliminatedLog:
     """Removes (or scales) the non-contact wrench of a known load in a log.
 
@@ -165,10 +181,12 @@ def eliminate_log(
         delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
         tare: take the sensor's offsets from this record (they drift between records), not from
             `load`: the constant that most of the record agrees on, see `robust_offsets`.
-        causal: "delayed" or "predicted" gives `EliminatedLog.causal` as well. The offsets are
-            those of the zero-phase result, as if the sensor had been tared before; accelerations
-            that were differentiated from poses have seen half a smoother's window ahead, which a
-            loop would have to wait for in addition.
+        causal: "delayed" or "predicted" gives `EliminatedLog.causal` as well. Accelerations that
+            were differentiated from poses have seen half a smoother's window ahead, which a loop
+            would have to wait for in addition.
+        causal_tare_s: length of the start of the record, with nothing touched, that the offsets of
+            the causal wrench are taken from [s]; None takes those of `load`. Either way they come
+            from the past alone.
 
     Raises:
         DrakeTeleopError: if the log or a load file cannot be used, eta is given together with
@@ -177,6 +195,10 @@ def eliminate_log(
     identification = load if isinstance(load, Identification) else Identification.load(load)
     scales = _scales(sigma, sigma_object, gamma, eta, gripper is not None)
     log = read_log(path, bandwidth_hz=cutoff_hz)
+    if causal is None and causal_tare_s is not None:
+        raise DrakeTeleopError(
+            "is for the causal wrench only", where="causal_tare_s", remedy="give causal as well"
+        )
     if log.static and causal is not None:
         raise DrakeTeleopError(
             "poses at rest have no order in time", where="causal", remedy="leave it out"
@@ -213,10 +235,19 @@ def eliminate_log(
     scaled = scaled_wrench(log.wrench, offsets, *motion, phi_gripper, phi_object, **scales)
     late = None
     if causal is not None:
+        before = identification.offsets
+        if causal_tare_s is not None:
+            untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
+            before = _start(log, causal_tare_s, untouched).mean(axis=0)
         late = causal_wrenches(
-            contact, scaled, log.dt, cutoff_hz=cutoff_hz, delay_s=delay_s, mode=causal
+            contact_wrench(log.wrench, before, *motion, phi),
+            scaled_wrench(log.wrench, before, *motion, phi_gripper, phi_object, **scales),
+            log.dt,
+            cutoff_hz=cutoff_hz,
+            delay_s=delay_s,
+            mode=causal,
         )
-        late = replace(late, contact=late.contact[known], scaled=late.scaled[known])
+        late = replace(late, offsets=before, contact=late.contact[known], scaled=late.scaled[known])
     contact = smooth(contact)
     floor, touched = noise_floor(contact), np.zeros(len(contact), bool)
     if not log.static:
@@ -239,6 +270,18 @@ def eliminate_log(
         causal=late,
         findings=_suspected(Path(path), log.wrench - offsets, contact),
     )
+
+
+def _start(log: Log, length_s: float, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The samples of `wrench` within `length_s` of the start."""
+    rows = log.t - log.t[0] < length_s
+    if rows.all() or rows.sum() < _FEWEST_TO_TARE:
+        raise DrakeTeleopError(
+            f"the first {length_s:g} s are {rows.sum()} of {len(log)} samples",
+            where="causal_tare_s",
+            remedy=f"give a start of {_FEWEST_TO_TARE} samples or more, less than the record",
+        )
+    return wrench[rows]
 
 
 def usable_phi(identification: Identification) -> tuple[NDArray[np.float64], tuple[str, ...]]:

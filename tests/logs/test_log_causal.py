@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.alignment import low_pass
 from drake_teleop.logs.causal import causal_low_pass, causal_wrenches, filter_lag
 from drake_teleop.logs.contact import contacts_of, in_contact, noise_floor
 
@@ -98,9 +100,25 @@ def test_contacts_have_their_times_and_peaks_and_noise_has_none() -> None:
     assert found[1].start_s == found[1].stop_s == pytest.approx(14.0)
 
 
+@pytest.mark.parametrize("memory", [0.0, 0.2])
+def test_noise_is_a_contact_less_than_once_an_hour(memory: float) -> None:
+    """An hour in records of a minute, each with its own noise floor."""
+    rate, n = 200.0, 12_000
+    rng, count = np.random.default_rng(7), 0
+    decay = np.exp(-1 / (rate * memory)) if memory else 0.0
+    for _ in range(60):
+        noise = lfilter([1.0], [1.0, -decay], rng.normal(size=(n + 400, 6)), axis=0)[400:]
+        contact = low_pass(STD * noise, 1 / rate, 30.0)
+        contact = contact - contact.mean(axis=0)
+        count += len(
+            contacts_of(np.arange(n) / rate, contact, in_contact(contact, noise_floor(contact), 7))
+        )
+    assert count <= 1
+
+
 def test_hysteresis_lasts_until_the_lower_threshold() -> None:
     contact = np.zeros((300, 6))
-    contact[:, 0] = np.concatenate([np.full(50, 5.0), [9.0], np.full(149, 5.0), np.full(100, 3.0)])
+    contact[:, 0] = np.concatenate([np.full(50, 5.0), [6.0], np.full(149, 5.0), np.full(100, 3.0)])
     touched = in_contact(contact, np.ones(6), 10)
     assert np.flatnonzero(touched).tolist() == list(range(50, 200))
     assert not in_contact(contact[:50], np.ones(6), 10).any()

@@ -126,6 +126,42 @@ def test_eliminate_leaves_the_contact(tmp_path: Path, load: Path) -> None:
     assert np.sqrt(np.mean(np.sum(contact[free, :3] ** 2, axis=1))) < 0.1
 
 
+@pytest.mark.parametrize("tare", [None, 0.5])
+def test_the_causal_wrench_knows_nothing_of_what_comes(
+    tmp_path: Path, load: Path, tare: float | None
+) -> None:
+    t = np.arange(0, 4, 1e-3)
+    late = push(t)
+    late[t > 3.5] += [5.0, 0, 0, 0, 0, 1]
+    before, after = (
+        eliminate_log(
+            simulated(tmp_path / f"{name}.parquet", contact=contact, noise=0.1),
+            *(load,),
+            delay=0.0,
+            causal="delayed",
+            causal_tare_s=tare,
+        ).causal
+        for name, contact in (("a", None), ("b", late))
+    )
+    assert before is not None and after is not None
+    past = t < 2.8
+    np.testing.assert_array_equal(before.contact[past], after.contact[past])
+    np.testing.assert_array_equal(before.scaled[past], after.scaled[past])
+    expected = Identification.load(load).offsets if tare is None else OFFSETS
+    np.testing.assert_allclose(after.offsets, expected, atol=0.02)
+    # Late by the filter's lag, and otherwise the push.
+    np.testing.assert_allclose(after.contact[3200:3400], push(t - after.lag_s)[3200:3400], atol=0.3)
+
+
+def test_a_start_to_tare_with_has_samples(tmp_path: Path, load: Path) -> None:
+    log = simulated(tmp_path / "log.parquet")
+    for seconds in (1e-3, 9.0):
+        with pytest.raises(DrakeTeleopError, match=r"causal_tare_s: the first .* of 4000 samples"):
+            eliminate_log(log, load, delay=0.0, causal="delayed", causal_tare_s=seconds)
+    with pytest.raises(DrakeTeleopError, match="give causal as well"):
+        eliminate_log(log, load, delay=0.0, causal_tare_s=0.5)
+
+
 def test_eliminate_writes_its_files(
     tmp_path: Path, load: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -297,6 +333,10 @@ def test_ntnu_records_without_their_non_contact_force(
     assert summary["residual_rms"] <= residual
     assert summary["gravity_only_rms"] == pytest.approx(gravity_only, abs=0.02)
     assert np.abs(summary["tare"][:3]).max() < 0.5
+    # The hammer taps four times in the second record.
+    assert [round(c["start_s"], 1) for c in summary["contacts"]] == (
+        [0.8, 2.3, 3.3, 4.2] if record == "2-vibrations" else []
+    )
 
     own = identify_command(log, tmp_path / "own", quiet=True)
     assert own["not_identifiable"] == NAMES_OF_INERTIA
