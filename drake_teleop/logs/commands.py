@@ -39,7 +39,7 @@ rejected               share of the samples that a robust fit took for disturbed
 condition_number       of the regression
 residual_rms           [f; tau], after the fit
 residual_rms_force     of |F|
-load_changes           list of t_s, mass_before, mass_after: where the load changes within the record,
+load_changes           list of t_s, mass_before, mass_after: where the load changes in the record,
                        so that one load for all of it is wrong
 gripper                its file, if --gripper was given; otherwise this and the next are absent
 object                 of phi_total - phi_gr: mass, com, inertia_com, phi with their standard

@@ -1,0 +1,118 @@
+"""`identify` says so when the load changes in a record, and only then."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from known_motion import motion_at
+from test_log_commands import describe_record
+
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.segments import segments
+from drake_teleop.logs.alignment import low_passed
+from drake_teleop.logs.canonical import Log, write_log
+from drake_teleop.logs.commands import identify_command
+from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.reading import read_log
+
+TOOL = phi_from_mass_com_inertia(3.13, [0.01, -0.02, 0.12], np.diag([0.02, 0.018, 0.006]))
+OBJECT = phi_from_mass_com_inertia(0.8, [0.04, 0.0, 0.2], np.diag([8e-4, 8e-4, 4e-4]))
+OFFSETS = np.array([3.0, -2.0, 7.0, 0.1, 0.2, -0.3])
+LEVELS = {"none": (0, 0, 0, 0), "High": (0.1, 1.0, 0.2, 0.01)}
+
+
+def simulated(path: Path, grasped_at: float, clock: float = 0.0) -> Path:
+    """A canonical log, 12 s at 500 Hz."""
+    t = np.arange(0.0, 12.0, 2e-3)
+    motion = motion_at(t)
+    parts = motion.specific_force, motion.omega, motion.alpha
+    share = np.clip((t - grasped_at) / 0.05, 0.0, 1.0)[:, None]
+    wrench = OFFSETS + non_contact_wrench(*parts, TOOL) + share * non_contact_wrench(*parts, OBJECT)
+    wrench += np.repeat([0.2, 0.01], 3) * np.random.default_rng(3).normal(size=wrench.shape)
+    write_log(Log(t + clock, wrench, *parts), path)
+    return path
+
+
+def test_identify_says_when_the_load_changes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the log's own time."""
+    summary = identify_command(simulated(tmp_path / "log.parquet", 4.0, clock=100.0), tmp_path)
+    (change,) = summary["load_changes"]
+    assert change["t_s"] == pytest.approx(104.0, abs=0.1)
+    assert change["mass_before"] == pytest.approx(3.13, rel=0.01)
+    assert change["mass_after"] == pytest.approx(3.93, rel=0.01)
+    (note,) = [note for note in summary["notes"] if "the load changes" in note]
+    assert "t = 104.0" in note and "cut it there" in note
+    assert "the load changes at t = 104.0" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_identify_says_nothing_if_it_does_not(tmp_path: Path) -> None:
+    summary = identify_command(simulated(tmp_path / "log.parquet", 20.0), tmp_path, quiet=True)
+    assert summary["load_changes"] == []
+    assert not any("the load changes" in note for note in summary["notes"])
+
+
+@pytest.mark.parametrize("record", ["1-baseline", "2-vibrations"])
+@pytest.mark.parametrize("cutoff_hz", [30.0, None])
+def test_ntnu_records_have_one_load(
+    ntnu: Path, tmp_path: Path, record: str, cutoff_hz: float | None
+) -> None:
+    """Turning about one axis, free and with a hammer tapping on the robot."""
+    assert identify_log(describe_record(tmp_path, ntnu, record), cutoff_hz=cutoff_hz).loads == ()
+
+
+def test_ur5_pushes_are_no_load(ur5: Path, tmp_path: Path) -> None:
+    """Eight pushes of up to 50 N on a handle of 0.1 kg."""
+    record = f"{ur5}/No9_Singularity_Free_ForceSensor__"
+    description: dict[str, Any] = {
+        "wrench": {
+            "file": record + "log_force_sensor.csv",
+            "header": False,
+            "time": {"column": 0},
+            "force": {"columns": [1, 2, 3]},
+            "torque": {"columns": [4, 5, 6]},
+        },
+        "pose": {
+            "file": record + "log_tool_vector.csv",
+            "header": False,
+            "time": {"column": 0},
+            "orientation": {"columns": [4, 5, 6], "form": "rotation_vector"},
+            "position": {"columns": [1, 2, 3]},
+        },
+    }
+    path = tmp_path / "log.yaml"
+    path.write_text(yaml.safe_dump(description), encoding="utf-8")
+    log = low_passed(read_log(path, bandwidth_hz=30.0), 30.0)
+    assert segments(log.wrench, *log.motion, log.dt) == []
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_utias_records_have_one_load(level: str, utias: Path) -> None:
+    """Ten tools from 9 g to 1 kg, stop and go."""
+    s_std, alpha_std, f_std, tau_std = LEVELS[level]
+    for file in sorted(utias.glob("*.npz")):
+        with np.load(file) as data:
+            # These records have gravity upwards (their README).
+            s = data["a_S"] - 9.81 * data["R_WS"][:, 2]
+            wrench = np.hstack([data["f_S"], data["tau_S"]])
+            omega, alpha = data["omega_S"], data["alpha_S"]
+        rng = np.random.default_rng(0)
+        wrench = wrench + np.repeat([f_std, tau_std], 3) * rng.normal(size=wrench.shape)
+        s, alpha = (
+            x + std * rng.normal(size=x.shape) for x, std in ((s, s_std), (alpha, alpha_std))
+        )
+        assert segments(wrench, s, omega, alpha, 0.01) == [], file.stem
+
+
+@pytest.fixture
+def utias(ntnu: Path) -> Path:
+    folder = ntnu.parent / "utias_workshop_tools"
+    if not folder.is_dir():
+        pytest.skip("needs the records utias_workshop_tools, which the project does not ship")
+    return folder
