@@ -62,7 +62,7 @@ def riv_normal_equations(memory, theta, noise_std, information, index, factors, 
         information: (16,) of the prior.
         index, factors: from `terms`, space: from `scratch`, MRg: (16, 33) scratch.
     """
-    E, row, L, LZ, inverse, S, W = space
+    E, g, L, LZ, inverse, S, W = space
     measured, mixed, instruments = memory[:19], memory[19:38], memory[38:57]
     residual_products(measured, theta, index, factors, L, LZ, S)
     for c in range(6):
@@ -70,11 +70,11 @@ def riv_normal_equations(memory, theta, noise_std, information, index, factors, 
         for d in range(6):
             S[c, d] /= measured[0, 0] + _STATED
     invert(S, inverse, W)
-    weighted_gram(instruments, W, index, factors, E, row, MRg)
-    weighted_gram(mixed, W, index, factors, E, row, MRg[:, 16:])
-    weighted_right(mixed[:, 13:].T, W, index, factors, row)
+    weighted_gram(instruments, W, index, factors, E, MRg, 0)
+    weighted_gram(mixed, W, index, factors, E, MRg, 16)
+    weighted_right(mixed[:, 13:].T, W, index, factors, g)
     for i in range(16):
-        MRg[i, 32] = row[i]
+        MRg[i, 32] = g[i]
         MRg[i, i] += _RIDGE * MRg[i, i] + information[i]
         for j in range(17):
             A[i, j] = 0.0

@@ -33,10 +33,7 @@ _ORDER = [0, *range(7, 19), *range(1, 7)]
 
 @cache
 def terms() -> tuple[NDArray[np.uintp], Array]:
-    """The map from z to [E V]: (n, 3) [channel, element of z, parameter], and n factors.
-
-    In the order of channel and element, which `weighted_gram` relies upon.
-    """
+    """The map from z to [E V]: (n, 3) [channel, element of z, parameter], and n factors."""
     T = coefficients()[:, :, _ORDER].swapaxes(1, 2)
     index = np.argwhere(T)
     # Unsigned, so that the compiled loops need not look for negative indices.
@@ -101,7 +98,6 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
     """
     L[:] = 0.0
     LZ[:] = 0.0
-    S[:] = 0.0
     for c in range(6):
         L[c, _WRENCH + c] = 1.0
     for t in range(len(factors)):
@@ -113,11 +109,11 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
                 for j in range(19):
                     LZ[c, j] += a * Z[i, j]
     for c in range(6):
-        for d in range(6):
+        for d in range(c + 1):
             total = 0.0
             for j in range(19):
                 total += LZ[c, j] * L[d, j]
-            S[c, d] = total
+            S[c, d] = S[d, c] = total
 
 
 @njit(cache=True)
@@ -143,37 +139,32 @@ def noise_products(Z, noise_std, motion_std, Q):
 
 
 @njit(cache=True)
-def weighted_gram(Z, W, index, factors, E, row, G):
+def weighted_gram(Z, W, index, factors, E, G, first):
     """Writes the sum of X^T W Y into G, from the sum Z of y z^T: X, Y are [E V] of y, z.
 
     Args:
         Z: (19, 19).
         W: (6, 6).
         index, factors: from `terms`.
-        E: (13, 6, 16), row: (16,) scratch.
-        G: (16, m >= 16), its first 16 columns written.
+        E: (13, 6, 16) scratch.
+        G: (16, m), 16 columns of it from `first` on are written.
     """
     E[:] = 0.0
     for t in range(len(factors)):
         c, b, k, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
         for a in range(13):
             E[a, c, k] += factor * Z[a, b]
-    G[:, :16] = 0.0
-    t = 0
-    while t < len(factors):
-        c, a = index[t, 0], index[t, 1]
-        w0, w1, w2, w3, w4, w5 = W[c, 0], W[c, 1], W[c, 2], W[c, 3], W[c, 4], W[c, 5]
+    G[:, first : first + 16] = 0.0
+    for t in range(len(factors)):
+        c, a, j, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
+        w0, w1, w2 = factor * W[c, 0], factor * W[c, 1], factor * W[c, 2]
+        w3, w4, w5 = factor * W[c, 3], factor * W[c, 4], factor * W[c, 5]
         for k in range(16):
-            row[k] = (
+            G[j, first + k] += (
                 (w0 * E[a, 0, k] + w1 * E[a, 1, k])
                 + (w2 * E[a, 2, k] + w3 * E[a, 3, k])
                 + (w4 * E[a, 4, k] + w5 * E[a, 5, k])
             )
-        while t < len(factors) and index[t, 0] == c and index[t, 1] == a:
-            j, factor = index[t, 2], factors[t]
-            for k in range(16):
-                G[j, k] += factor * row[k]
-            t += 1
 
 
 @njit(cache=True)

@@ -109,7 +109,7 @@ def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space
         motion_std: (9,) of [s, omega, alpha].
         index, factors: from `terms`, space: from `scratch`, Q: (19, 19) scratch.
     """
-    E, row, L, LZ, inverse, S, W = space
+    E, g, L, LZ, inverse, S, W = space
     noise_products(Z, noise_std, motion_std, Q)
     residual_products(Q, theta, index, factors, L, LZ, S)
     for c in range(6):
@@ -121,11 +121,11 @@ def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space
     for c in range(6):
         for d in range(6):
             scale += W[c, d] * S[c, d]
-    weighted_gram(Z, W, index, factors, E, row, G)
-    weighted_gram(Q, W, index, factors, E, row, N)
-    weighted_right(Z[:, 13:].T, W, index, factors, row)
+    weighted_gram(Z, W, index, factors, E, G, 0)
+    weighted_gram(Q, W, index, factors, E, N, 0)
+    weighted_right(Z[:, 13:].T, W, index, factors, g)
     for i in range(16):
-        G[i, 16] = row[i]
+        G[i, 16] = g[i]
     return max(0.0, scale) / (6.0 * Z[0, 0])
 
 
