@@ -19,6 +19,8 @@ E = [[-A, A c], [c^T A, 1 - c^T A c]] (Wensing, Kim, Slotine 2018).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -143,60 +145,82 @@ def _units(phi: Array) -> Array:
 
 def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | None) -> Array:
     """(10,) phi / unit that minimises phi^T H phi / 2 - b^T phi + prior, J(phi) >= 0."""
-    # Drake is imported here: all else of the load core does without, and starts ten times faster.
-    from pydrake.solvers import ClarabelSolver, MathematicalProgram
-
-    program = MathematicalProgram()
-    x = program.NewContinuousVariables(10)
-    program.AddLinearMatrixInequalityConstraint(_CONSTRAINT, x)
-    if row is not None:
-        normalised = row * unit / np.abs(row * unit).max()
-        program.AddLinearConstraint(normalised[None, :], [0.0], [np.inf], x)
+    entropic = prior is not None and prior.kind == "entropic"
     if prior is not None:
         J0_inverse = np.linalg.inv(pseudo_inertia(checked("prior.phi", prior.phi, 10) / unit))
         scaled = [J0_inverse @ part for part in _UNITS]
         pull = prior.weight * np.array([np.trace(part) for part in scaled])
         if prior.kind == "geodesic":
             H = H + prior.weight * np.einsum("aij,bji->ab", scaled, scaled)
-        b = b + (pull if prior.kind == "geodesic" else -pull)
-    if prior is not None and prior.kind == "entropic":
+        b = b + (-pull if entropic else pull)
+    if not entropic and row is None:
+        prepared = _distance_program(get_ident())
+    else:
+        prepared = _new_program(distance=not entropic)
+    program, x, cone, solver = prepared
+    if row is not None:
+        normalised = row * unit / np.abs(row * unit).max()
+        program.AddLinearConstraint(normalised[None, :], [0.0], [np.inf], x)
+    if entropic:
+        assert prior is not None
         scale = 10.0 / np.trace(H)
         program.AddQuadraticCost(scale * H, -scale * b, x, is_convex=True)
         _add_log_det(program, x, prior.weight * scale)
     else:
-        _add_distance(program, x, H, b)
-    result = ClarabelSolver().Solve(program)
+        cone.UpdateCoefficients(*_distance(H, b))
+    result = solver.Solve(program)
     if not result.is_success():
         raise DrakeTeleopError(
             f"the semidefinite program has no solution ({result.get_solution_result().name})",
             where="consistent",
             remedy="check the sign of the wrench, and that the load moves",
         )
-    x = result.GetSolution(x)
     # The solver's tolerance leaves eigenvalues of -1e-9 or so.
-    values, vectors = np.linalg.eigh(pseudo_inertia(x))
+    values, vectors = np.linalg.eigh(np.tensordot(result.GetSolution(x), _UNITS, 1))
     J = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return np.asarray(_FROM_PSEUDO_INERTIA @ J.ravel(), np.float64)
 
 
-def _add_distance(program: Any, x: Any, H: Array, b: Array) -> None:
-    """Minimises |R x - d|, R^T R = H, R^T d = b: where x^T H x / 2 - b^T x is smallest.
+def _new_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
+    """(program, phi / unit, cone of the distance or None, solver) with J(phi) >= 0."""
+    # Drake is imported here: all else of the load core does without, and starts ten times faster.
+    from pydrake.solvers import ClarabelSolver, MathematicalProgram
+
+    program, cone = MathematicalProgram(), None
+    x = program.NewContinuousVariables(10)
+    program.AddLinearMatrixInequalityConstraint(_CONSTRAINT, x)
+    if distance:
+        t = program.NewContinuousVariables(1)
+        program.AddLinearCost([1.0], t)
+        A, b = np.eye(11, 11, 10), np.zeros(11)
+        cone = program.AddLorentzConeConstraint(A, b, np.append(x, t)).evaluator()
+    return program, x, cone, ClarabelSolver()
+
+
+@cache
+def _distance_program(thread: int) -> tuple[Any, Any, Any, Any]:
+    """Building the program takes as long as solving it: each thread has one, whose data change."""
+    return _new_program(distance=True)
+
+
+def _distance(H: Array, b: Array) -> tuple[Array, Array]:
+    """Cone t >= |R x - d|, R^T R = H, R^T d = b: where x^T H x / 2 - b^T x is smallest.
 
     The distance and not its square: the solver stops at 1e-8 of either, and the square root of
     that would be the error of a load at the edge of consistency. What the record does not determine
     is kept small.
+
+    Returns:
+        (11, 11) and (11,), the coefficients of [x; t] and the constants.
     """
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]
     values = values / scale
     root = np.sqrt(np.maximum(values, _RIDGE))
-    R = root[:, None] * vectors.T
-    d = np.where(values > _RANK, vectors.T @ b / root, 0.0) / scale
-    t = program.NewContinuousVariables(1)
-    cone = np.zeros((11, 11))
-    cone[0, 10], cone[1:, :10] = 1.0, R
-    program.AddLorentzConeConstraint(cone, np.append(0.0, -d), np.append(x, t))
-    program.AddLinearCost([1.0], t)
+    cone, constants = np.zeros((11, 11)), np.zeros(11)
+    cone[0, 10], cone[1:, :10] = 1.0, root[:, None] * vectors.T
+    constants[1:] = -np.where(values > _RANK, vectors.T @ b / root, 0.0) / scale
+    return cone, constants
 
 
 def _add_log_det(program: Any, x: Any, weight: float) -> None:

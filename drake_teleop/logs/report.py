@@ -105,6 +105,8 @@ def write_report(
             f" {summary['rate_hz']:.4g} Hz; motion {1e3 * summary['delay_s']:.2f} ms behind the"
             f" wrench ({summary['delay_source']})"
         )
+    if summary["rejected"] > 0:
+        samples += f"; {summary['rejected']:.1%} of them rejected as disturbed, shaded below"
     spectrum = "each pose" if log.static else "each frequency"
     page = render(
         "drake_teleop.logs",
