@@ -140,11 +140,13 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
     received = np.array([time for time, _ in pairs]) * 1e-9
     columns = _columns([part for _, part in pairs])
+    absent = _take_absent(columns)
+    columns |= _short(columns)
     columns["received"] = received
     if "header.stamp" in columns and not columns["header.stamp"].any():
         del columns["header.stamp"]
     columns["stamp"] = columns.get("header.stamp", received)
-    return Table(path / topic.lstrip("/"), columns)
+    return Table(path / topic.lstrip("/"), columns, absent=absent)
 
 
 def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
@@ -270,7 +272,7 @@ def _columns(messages: list[Any]) -> dict[str, NDArray]:
         elif all(len(v) == len(sample) for v in values):
             columns[path] = np.stack(values)
             columns |= {f"{path}.{i}": columns[path][:, i] for i in range(len(sample))}
-    return columns | _short(_provided(columns))
+    return columns
 
 
 def _leaves(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
@@ -285,14 +287,16 @@ def _leaves(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
             yield from _leaves(value, f"{path}.")
 
 
-def _provided(columns: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Takes out of `columns`, and returns, without what their covariance calls not provided."""
-    for path in [name for name in columns if name.endswith("_covariance")]:
-        if (columns[path][:, 0] == -1).all():
-            group = path.removesuffix("_covariance")
-            for name in [name for name in columns if name.startswith(f"{group}.")]:
-                del columns[name]
-    return columns
+def _take_absent(columns: dict[str, NDArray]) -> tuple[str, ...]:
+    """The groups that their covariance calls not provided; they are taken out of `columns`."""
+    absent = tuple(
+        name.removesuffix("_covariance")
+        for name, values in columns.items()
+        if name.endswith("_covariance") and (values[:, 0] == -1).all()
+    )
+    for name in [name for name in columns if name.rpartition(".")[0] in absent]:
+        del columns[name]
+    return absent
 
 
 def _short(columns: dict[str, NDArray]) -> dict[str, NDArray]:

@@ -1,4 +1,7 @@
-"""Tables of numbers from CSV, Parquet and NPZ files, with messages that name file, column, row."""
+"""Tables of numbers from CSV, Parquet and NPZ files, with messages that name file, column, row.
+
+Topics of bags become the same kind of table in `drake_teleop.logs.bags`.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +30,13 @@ class Table:
         path: the file, for messages.
         columns: name to array (N,) or, from an NPZ file, (N, ...); of any type as yet.
         first_row: number of the first data row in the file as a reader counts, for messages.
+        absent: groups of columns, such as "orientation", that the file says it does not have.
     """
 
     path: Path
     columns: dict[str, NDArray]
     first_row: int = 1
+    absent: tuple[str, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -93,6 +98,12 @@ class Table:
 
     def _column(self, name: str, where: str) -> NDArray[np.float64]:
         if name not in self.columns:
+            if name.rpartition(".")[0] in self.absent:
+                raise DrakeTeleopError(
+                    f"{self.path.name} says that it does not provide {name!r} (covariance -1)",
+                    where=where,
+                    remedy="name another column, or leave this out",
+                )
             near = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
             hint = "did you mean" if near else "its columns are"
             raise DrakeTeleopError(

@@ -314,11 +314,15 @@ def test_inspecting_a_bag_lists_its_topics_and_drafts_a_description(
         ("wrench", {"file": "broken.mcap"}, ["broken.mcap", "cannot be read"]),
         ("wrench", {"file": "broken.bag"}, ["broken.bag", "cannot be read"]),
         ("wrench", {"file": "broken"}, ["cannot be read"]),
-        ("imu", {"topic": "/blind"}, ["no column 'linear_acceleration.x'"]),
+        ("imu", {"topic": "/blind"}, ["not provide 'linear_acceleration.x'"]),
         ("pose", {}, ["/tf", "several child frames", "camera, tool0"]),
         ("pose", {"topic": "/tf", "child_frame": "hand"}, ["no child frame 'hand'", "tool0"]),
         ("pose", {"topic": "/imu", "child_frame": "x"}, ["no child frame 'x'", "leave it out"]),
-        ("pose", {"topic": "/imu", "position": None}, ["no column 'orientation.w'"]),
+        (
+            "pose",
+            {"topic": "/imu", "position": None},
+            ["not provide 'orientation.w' (covariance -1)"],
+        ),
     ],
 )
 def test_bad_bags(tmp_path: Path, stream: str, change: dict[str, Any], words: list[str]) -> None:
