@@ -26,6 +26,7 @@ from scipy.special import fdtri
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.batch import identify_batch
+from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.alignment import low_passed, measured, resample, undelayed
@@ -681,10 +682,16 @@ def _without_remedy(
     """What is left to say of a wrench that no load explains and no edit mends."""
     smooth = low_passed(log, 30.0)
     fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
-    finding = payload_finding(fit.identification, given.unexplained - given.noise)
+    load = fit.identification
+    finding = payload_finding(load, given.unexplained - given.noise)
     if finding:
         return [finding], None
-    if delay is not None and fit.rejected.any():
+    kept = ~fit.rejected
+    wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
+    residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
+    if delay is None or unexplained_share(wrench, residual) > BELIEVABLE + given.noise:
+        return [], None
+    if fit.rejected.any():
         # A contact pulls at the delay.
         lost = fit.rejected if log.bridged is None else fit.rejected | log.bridged
         delay = estimate_delay(replace(log, bridged=lost), 30.0)

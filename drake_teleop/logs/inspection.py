@@ -230,15 +230,15 @@ def _repeated(
 ) -> list[Finding]:
     """Whether rows were held by the recorder, and at what rate new ones came.
 
-    A coarse sensor at rest repeats rows by itself; but then rows in which all channels but one
-    repeat are as common, whereas held rows repeat in all channels at once.
+    A coarse sensor at rest repeats rows by itself; but then the row after a repeated one differs in
+    a channel or two, whereas after a row that was held most channels are new at once.
     """
     held = int(same.sum())
+    news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
-    equal = (changing[1:] == changing[:-1]).sum(axis=1)
-    nearly = int((equal == changing.shape[1] - 1).sum())
+    differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
     enough = same.mean() > REPEATED or _longest(same) >= BLOCK
-    if not enough or (changing.shape[1] > 1 and held < 3 * nearly):
+    if not enough or (len(differ) and np.median(differ) <= 0.5):
         return []
     longest = _longest(same)
     fresh = np.flatnonzero(~same)
