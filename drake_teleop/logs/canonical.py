@@ -179,6 +179,12 @@ def describe_canonical(path: Path, table: Table) -> Description:
             table.numbers(names, len(names), str(path))
         return bool(found)
 
+    if not {"t", *WRENCH} & set(table.columns):
+        raise DrakeTeleopError(
+            "is no canonical log: it has none of the columns t, f_x ... tau_z",
+            where=str(path),
+            remedy="describe it in a YAML file (docs/logs.md); `drake-teleop inspect` drafts one",
+        )
     table.raw("t", str(path))
     table.numbers(WRENCH, 6, str(path))
     time = Time(column="t")
