@@ -23,10 +23,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike
 
 from drake_teleop.load.arrays import Array
-from drake_teleop.load.recursive import PRIOR_STD, SETTLED
 from drake_teleop.load.recursive_moments import (
     MomentEstimator,
     add_product,
@@ -132,15 +130,6 @@ class RecursiveInstrumentalVariables(MomentEstimator):
     method = "recursive instrumental variables"
     sample_size = 24
     _sums = 3
-
-    def __init__(
-        self,
-        noise_std: ArrayLike,
-        forgetting: float = 1.0,
-        prior_std: ArrayLike = PRIOR_STD,
-        bound: float = SETTLED,
-    ) -> None:
-        super().__init__(noise_std, forgetting, prior_std, bound)
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
         """(16, 16) (R^T M^-1 R + prior)^-1: W is the inverse of the errors' covariance."""

@@ -123,7 +123,11 @@ class RecursiveEstimator(ABC):
     sample_size = 15
 
     def __init__(
-        self, noise_std: ArrayLike, forgetting: float, prior_std: ArrayLike, bound: float
+        self,
+        noise_std: ArrayLike,
+        forgetting: float = 1.0,
+        prior_std: ArrayLike = PRIOR_STD,
+        bound: float = SETTLED,
     ) -> None:
         if not 0.0 < forgetting <= 1.0:
             raise DrakeTeleopError(f"{forgetting} is not within (0, 1]", where="forgetting")
