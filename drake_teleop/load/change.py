@@ -78,8 +78,8 @@ _IMPOSSIBLE = 4.0
 
 # Parts of the memory: status; squared residuals of the known and the new load; sums of a block;
 # then beliefs [theta (16); P (256)]: the known load, the filter that watches it, and the new one.
-_STATE, _BASE, _IN_BLOCK, _SAMPLES, _SUM, _BACK_SUM, _AGE, _START, _LEARNT = range(9)
-_RESIDUAL, _SQUARES, _WRENCH, _MOTION, _V, _KNOWN = 9, 15, 21, 27, 36, 96
+_STATE, _BASE, _IN_BLOCK, _SAMPLES, _SUM, _BACK_SUM, _AGE, _START, _LEARNT, _POWER = range(10)
+_RESIDUAL, _SQUARES, _WRENCH, _MOTION, _V, _KNOWN = 10, 16, 22, 28, 37, 97
 _WATCH, _NEW, _SIZE = _KNOWN + 272, _KNOWN + 544, _KNOWN + 816
 
 
@@ -179,7 +179,7 @@ def _restart(memory, belief):
         for j in range(10):
             memory[belief + 16 + 17 * (6 + j)] += WIDE[j] ** 2
         memory[_START] = memory[_SAMPLES]
-        memory[_SQUARES:_WRENCH] = 0.0
+        memory[_SQUARES:_WRENCH] = memory[_POWER] = 0.0
     memory[_SUM] = memory[_AGE] = 0.0
 
 
@@ -195,21 +195,18 @@ def _settled(memory, bound):
 
 
 @njit(cache=True)
-def _possible(memory):
-    """Whether a body may have the new load's mass and, along each axis, extent."""
+def _doubt_inertias(memory, noise, block):
+    """Adds what noise of alpha may have taken from the new load's inertias to their variances.
+
+    Least squares shrinks them by the share of noise in the power of alpha.
+    """
     theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : _SIZE].reshape(16, 16)
-    if theta[6] <= 0.0:
-        return theta[6] > -_IMPOSSIBLE * math.sqrt(P[6, 6])
-    spread = math.sqrt(P[10, 10]) + math.sqrt(P[13, 13]) + math.sqrt(P[15, 15])
-    trace = theta[10] + theta[13] + theta[15]
-    for k in range(3):
-        h, moment = theta[7 + k], theta[10 + (0, 3, 5)[k]]
-        # Twice the second moment about the centre of mass along this axis.
-        twice = trace - 2.0 * moment - 2.0 * h * h / theta[6]
-        doubt = spread + 4.0 * abs(h) / theta[6] * math.sqrt(P[7 + k, 7 + k])
-        if twice < -_IMPOSSIBLE * doubt:
-            return False
-    return True
+    expected = memory[_AGE] * (noise[12] + noise[13] + noise[14]) / block
+    share = min(1.0, expected / max(memory[_POWER], 1e-300))
+    moment = theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2
+    scale = abs(theta[10]) + abs(theta[13]) + abs(theta[15]) + 2.0 * moment / abs(theta[6])
+    for i in range(10, 16):
+        P[i, i] += (share * scale) ** 2
 
 
 @njit(cache=True)
@@ -267,19 +264,24 @@ def _judge(memory, block, noise, window, hold, bound):
     # Does a new one explain it together with those before?
     chi = _explain(memory, _NEW, block, noise)
     memory[_AGE] += 1.0
+    for k in range(3):
+        memory[_POWER] += memory[_MOTION + 6 + k] ** 2
     for c in range(6):
         residual = memory[_WRENCH + c] - memory[_NEW + c]
         for j in range(10):
             residual -= memory[_V + 10 * c + j] * memory[_NEW + 6 + j]
         memory[_SQUARES + c] += residual * residual
     memory[_SUM] = max(0.0, memory[_SUM] + chi - _SLACK)
-    if memory[_SUM] > _ALARM or not _possible(memory):
+    # A body has mass.
+    mass, deviation = memory[_NEW + 6], math.sqrt(memory[_NEW + 16 + 17 * 6])
+    if memory[_SUM] > _ALARM or mass < -_IMPOSSIBLE * deviation:
         memory[_STATE] = DISTURBED
         _restart(memory, _NEW)
     elif memory[_STATE] == DISTURBED and memory[_AGE] >= hold:
         memory[_STATE] = CHANGED
     elif memory[_STATE] == CHANGED and _settled(memory, bound):
         memory[_STATE] = memory[_BASE] = IDENTIFIED
+        _doubt_inertias(memory, noise, block)
         memory[_KNOWN:_WATCH] = memory[_NEW:_SIZE]
         memory[_LEARNT] = memory[_AGE] * block
         memory[_RESIDUAL:_SQUARES] = memory[_SQUARES:_WRENCH] * (block / memory[_AGE])

@@ -134,6 +134,52 @@ def test_a_vertical_push_at_rest_is_a_weight_until_the_tool_moves(bench, tool):
         assert np.bincount(states[1000:]).argmax() == expected
 
 
+def test_grasped_at_rest_and_lifted(bench, tool):
+    """Another load at once; known only when it moves.
+
+    Noise of alpha shrinks the inertias at rest. When it moves they do not fit: all starts anew.
+    """
+    t, moving, up = bench.motion(6)
+    still = [np.tile(x[:1], (len(t), 1)) for x in (9.81 * up, 0 * up, 0 * up)]
+    rng, monitor = np.random.default_rng(6), bench.monitor("JR3", tool)
+    wrench_std, motion_std = bench.SENSORS["JR3"]
+    for clean, phi, last in (
+        (still, bench.TOOL, KNOWN),
+        (still, bench.TOOL + bench.OBJECT, CHANGED),
+        (moving, bench.TOOL + bench.OBJECT, IDENTIFIED),
+    ):
+        F = bench.OFFSETS + non_contact_wrench(*clean, phi)
+        F += np.repeat(wrench_std, 3) * rng.normal(size=F.shape)
+        noisy = [x + n * rng.normal(size=x.shape) for x, n in zip(clean, motion_std, strict=True)]
+        states = monitor.watch(F, *noisy)
+        assert states[-1] == last
+        assert (states[500:] >= min(last, CHANGED)).all()
+    assert monitor.changed_at == pytest.approx(20.0, abs=0.5)
+    assert monitor.load.mass - tool.mass == pytest.approx(0.8, rel=0.01)
+
+
+def test_inertias_that_noise_has_shrunk_are_doubted(bench, tool):
+    """In a slow motion alpha is mostly noise: the deviations say that inertias are too small."""
+    t, clean, up = bench.motion(8)
+    turn = 0.6 * np.sin(0.8 * t)
+    rate, change = 0.48 * np.cos(0.8 * t), -0.384 * np.sin(0.8 * t)
+    axis = np.array([0.6, 0.8, 0.0])
+    s = 9.81 * np.stack([-0.8 * np.sin(turn), 0.6 * np.sin(turn), np.cos(turn)], axis=1)
+    s += clean[0] - 9.81 * up
+    motion = [s, np.outer(rate, axis), np.outer(change, axis)]
+    rng, monitor = np.random.default_rng(8), bench.monitor("JR3", tool)
+    wrench_std, motion_std = bench.SENSORS["JR3"]
+    for phi in (bench.TOOL, bench.TOOL + bench.OBJECT):
+        F = bench.OFFSETS + non_contact_wrench(*motion, phi)
+        F += np.repeat(wrench_std, 3) * rng.normal(size=F.shape)
+        noisy = [x + n * rng.normal(size=x.shape) for x, n in zip(motion, motion_std, strict=True)]
+        monitor.watch(F, *noisy)
+    assert monitor.state == "identified"
+    error = monitor.load.phi - bench.TOOL - bench.OBJECT
+    assert (np.abs(error[4:]) < 3.0 * monitor.load.standard_deviations[10:]).all()
+    assert error[4] < -0.005 and not monitor.load.identifiable[10]
+
+
 def test_coloured_noise_of_the_stated_long_run_variance_is_no_change(bench, tool):
     """AR(1) noise with a memory of 2 ms, much louder in the long run than from sample to sample."""
     pole = 0.6
