@@ -219,8 +219,8 @@ def _sharpened(rows: list[Array], noise: Array, loads: list[Segment]) -> list[Se
     """Parts that meet do so where the one load stops to explain the wrench and the next begins."""
 
     def misfit(part: Segment, samples: slice) -> Array:
-        F, *motion = (table[samples] for table in rows)
-        left = F - part.load.offsets - non_contact_wrench(*motion, part.load.phi)
+        F, s, omega, alpha = (table[samples] for table in rows)
+        left: Array = F - part.load.offsets - non_contact_wrench(s, omega, alpha, part.load.phi)
         return np.sum((left / noise) ** 2, axis=1)
 
     found = [loads[0]]
