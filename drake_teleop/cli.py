@@ -243,6 +243,51 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
     inspect_command(log, out, quiet=quiet)
 
 
+class _Names(click.ParamType):
+    """Names with commas between them."""
+
+    name = "NAME,..."
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
+        return value if isinstance(value, tuple) else tuple(value.split(","))
+
+
+@cli.command("compare-passivity")
+@click.option("--networks", type=_Names(), help="Presets.  [default: lan to lunar]")
+@click.option("--methods", type=_Names(), help="Methods.  [default: all]")
+@click.option(
+    "--jobs", type=click.IntRange(min=1), help="Processes at once.  [default: one for each core]"
+)
+@_out("compare-passivity")
+@_seed
+@_quiet
+def compare_passivity(
+    networks: tuple[str, ...] | None,
+    methods: tuple[str, ...] | None,
+    jobs: int | None,
+    out: Path,
+    seed: int | None,
+    quiet: bool,
+) -> None:
+    """Compare passivity methods over networks with delay.
+
+    The whole station swings freely and presses on a leaf, soft and stiff; a one-degree-of-freedom
+    reference says how long a round trip each method bears. Writes tables, pictures, report.html.
+    """
+    from drake_teleop.experiments import compare_passivity as study
+
+    study.compare_command(
+        out,
+        networks=networks or study.NETWORKS,
+        methods=methods or study.METHODS,
+        seed=seed or 0,
+        jobs=jobs or -1,
+        quiet=quiet,
+    )
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command line and exits: 0, 2 for unusable input, 130 for Ctrl-C."""
     try:

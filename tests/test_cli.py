@@ -57,7 +57,7 @@ def test_no_command_shows_the_help(capsys):
     assert status == 2
     status, out, _ = run_main(capsys, "--help")
     assert status == 0
-    for command in ("reproduce", "run", "identify", "eliminate", "inspect"):
+    for command in ("reproduce", "run", "identify", "eliminate", "inspect", "compare-passivity"):
         assert f"  {command} " in out
     assert "..." not in out.split("Commands:")[1]  # every summary fits its line
 

@@ -36,10 +36,21 @@ _FRICTION_SPEED = 5e-3  # m/s, below it Coulomb friction fades
 # others the command is interpolated over it.
 _AT_THE_MOTOR = ("two_layer", "pspm")
 
-# When the operator does what [s]: swings to and fro, rests, presses, holds, lets go, rests.
-_SWING, _SWUNG, _PRESS, _PRESSED, _RELEASE, _RELEASED, END = 0.5, 3.0, 5.5, 6.5, 11.5, 12.5, 15.0
-_JUDGED = 1.9  # s, the length of the windows in which the station has to be at rest
 _FREE, _DEPTH = -0.04, 0.02  # m, from the wall: where the operator rests, and how deep he presses
+
+
+@dataclass(frozen=True)
+class Task:
+    """When the operator does what [s]: swings, rests, presses, holds, lets go, rests."""
+
+    swing: float = 0.5
+    swung: float = 3.0
+    press: float = 5.5
+    pressed: float = 6.5
+    release: float = 11.5
+    released: float = 12.5
+    end: float = 17.0
+    judged: float = 1.9  #: length of the windows in which the station has to be at rest
 
 
 @dataclass(frozen=True)
@@ -158,44 +169,21 @@ def run_one_dof(
         METHODS.index(passivity.method), numbers, held, p, *lines, *states, ends, start, timeout,
         np.ascontiguousarray(intent),
     )  # fmt: skip
-    t = np.arange(len(intent)) * PERIOD
-    return OneDofRun(t, *(rows[:, i] for i in range(5)), rows[:, 5:7])
+    t = np.arange(len(intent), dtype=np.float64) * PERIOD
+    master, slave, command, felt, wall = rows.T[:5]
+    return OneDofRun(t, master, slave, command, felt, wall, rows[:, 5:7])
 
 
-def operators_intent() -> NDArray[np.float64]:
+def operators_intent(task: Task = Task()) -> NDArray[np.float64]:
     """(N, 2) position [m] and velocity [m/s] that the operator intends; the wall is at 0."""
-    t = np.arange(round(END / PERIOD)) * PERIOD
+    t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
     x = np.full_like(t, _FREE)
-    fade = np.minimum(_ramp(t, _SWING, 0.5), 1 - _ramp(t, _SWUNG - 0.5, 0.5))
-    x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - _SWING))
-    x += (_DEPTH - _FREE) * (
-        _ramp(t, _PRESS, _PRESSED - _PRESS) - _ramp(t, _RELEASE, _RELEASED - _RELEASE)
-    )
+    fade = np.minimum(_ramp(t, task.swing, 0.5), 1 - _ramp(t, task.swung - 0.5, 0.5))
+    x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - task.swing))
+    pressing = _ramp(t, task.press, task.pressed - task.press)
+    releasing = _ramp(t, task.release, task.released - task.release)
+    x += (_DEPTH - _FREE) * (pressing - releasing)
     return np.stack([x, np.gradient(x, PERIOD)], axis=1)
-
-
-def figures(run: OneDofRun, model: OneDof) -> Figures:
-    """The run in numbers."""
-
-    def window(start: float, stop: float) -> slice:
-        return slice(round(start / PERIOD), round(stop / PERIOD))
-
-    hold, rest = window(_RELEASE - _JUDGED, _RELEASE), window(END - _JUDGED, END)
-    hunting = max(_hunting(x[part]) for x in (run.master, run.slave) for part in (hold, rest))
-    wall, felt = model.force_scale * model.gamma * run.wall, run.felt
-    pressed = float(wall[hold].mean())
-    steady = float(felt[hold].mean())
-    after = round((_RELEASED + 2.0) / PERIOD)
-    moving = window(_SWING, _SWUNG)
-    return Figures(
-        stable=bool(hunting < 0.5e-3),
-        hunting=hunting,
-        force_error=steady / pressed - 1 if pressed < 0 else np.nan,
-        drift=float(run.slave[after] - run.master[after]),
-        free_force=float(np.sqrt(np.mean(felt[moving] ** 2))),
-        rise_delay=_half(felt, steady) - _half(wall, pressed),
-        least_energy=float(run.energy.sum(axis=1).min()),
-    )
 
 
 def _ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.float64]:
@@ -203,20 +191,73 @@ def _ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.flo
     return u**3 * (10.0 + u * (6.0 * u - 15.0))
 
 
-def _hunting(x: NDArray[np.float64]) -> float:
-    if not np.isfinite(x).all():
-        return float("inf")
-    t = np.linspace(-1.0, 1.0, len(x))
-    return float(
-        np.ptp(x - np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyfit(t, x, 2)))
+def figures(run: OneDofRun, model: OneDof, task: Task = Task()) -> Figures:
+    """The run in numbers."""
+    return figures_of(
+        t=run.t,
+        master=run.master,
+        slave=run.slave,
+        felt=run.felt,
+        pressed=model.force_scale * model.gamma * run.wall,
+        energy=run.energy.sum(axis=1),
+        task=task,
     )
 
 
+def figures_of(
+    *,
+    t: NDArray[np.float64],
+    master: NDArray[np.float64],
+    slave: NDArray[np.float64],
+    felt: NDArray[np.float64],
+    pressed: NDArray[np.float64],
+    energy: NDArray[np.float64],
+    task: Task,
+) -> Figures:
+    """A run of the task in numbers; all arrays (N,), equidistant.
+
+    Args:
+        t: time [s].
+        master, slave: positions in the direction in which is pressed [m].
+        felt: force on the hand [N].
+        pressed: force of the environment, scaled to the hand [N].
+        energy: that both ends have put into the channel [J].
+        task: when what happened.
+    """
+    dt = float(t[1] - t[0])
+
+    def window(start: float, stop: float) -> slice:
+        return slice(round(start / dt), round(stop / dt))
+
+    hold = window(task.release - task.judged, task.release)
+    rest = window(task.end - task.judged, task.end)
+    hunting = max(_hunting(x[part]) for x in (master, slave) for part in (hold, rest))
+    steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
+    after = min(round((task.released + 2.0) / dt), len(t) - 1)
+    start = round(task.press / dt)
+    return Figures(
+        stable=bool(hunting < 0.5e-3),
+        hunting=hunting,
+        force_error=steady / goal - 1 if goal != 0 else float("nan"),
+        drift=float(slave[after] - master[after]),
+        free_force=float(np.sqrt(np.mean(felt[window(task.swing, task.swung)] ** 2))),
+        rise_delay=(_half(felt[start:], steady) - _half(pressed[start:], goal)) * dt,
+        least_energy=float(energy.min()),
+    )
+
+
+def _hunting(x: NDArray[np.float64]) -> float:
+    """Peak to peak about the parabola that fits best; infinite if it is not finite."""
+    if not np.isfinite(x).all():
+        return float("inf")
+    t = np.linspace(-1.0, 1.0, len(x))
+    return float(np.ptp(x - np.polyval(np.polyfit(t, x, 2), t)))
+
+
 def _half(force: NDArray[np.float64], steady: float) -> float:
-    """When the force first exceeds half of its steady value, from the press on."""
-    start = round(_PRESS / PERIOD)
-    beyond = np.abs(force[start:]) > 0.5 * abs(steady)
-    return (start + int(np.argmax(beyond))) * PERIOD if beyond.any() else float("nan")
+    """Index at which the force first exceeds half of its steady value."""
+    beyond = np.abs(force) > 0.5 * abs(steady)
+    return float(np.argmax(beyond)) if beyond.any() else float("nan")
 
 
 @njit(cache=True)

@@ -1,0 +1,126 @@
+"""One task for every method and network: swing freely, rest, press on the leaf, hold, let go, rest.
+
+The whole 6-DoF station does it; the times follow the network's round trip, so that a station over
+the moon has as many round trips to come to rest as one in a building.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from drake_teleop.channel.channel import Channel
+from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.experiments.identification import slave_arm
+from drake_teleop.experiments.one_dof import Figures, Task, figures_of
+from drake_teleop.master.operator import MinimumJerk, OperatorConfig, Sine
+from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import Scenario, replace
+from drake_teleop.slave.arm import forward_kinematics
+
+#: m, from the ball's tip to the origin of S (models/tool.sdf).
+_TIP = 0.2
+_GAP, _DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; how deep the operator presses
+#: Leaves by name: thickness [m] of a leaf of 120 mm x 50 mm, which is light enough not to rattle.
+LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
+
+
+def task_over(round_trip: float) -> Task:
+    """The task with three more round trips [s] for each rest and hold."""
+    wait = 3 * round_trip
+    return Task(
+        press=3.5 + wait,
+        pressed=4.5 + wait,
+        release=7.5 + 2 * wait,
+        released=8.5 + 2 * wait,
+        end=11.0 + 3 * wait,
+        judged=1.0,
+    )
+
+
+def delayed_contact(
+    base: Scenario, channel: Channel, passivity: PassivityConfig, leaf: str
+) -> tuple[Scenario, Task]:
+    """The scenario of the task.
+
+    Args:
+        base: rates, sensor, scales, grip of the operator.
+        channel: the network.
+        passivity: the method.
+        leaf: one of `LEAVES`.
+    """
+    task = task_over(sum(line.delay for line in channel.lines()))
+    settle = 0.5
+    swing = Sine(
+        t_start=settle + task.swing,
+        duration=2.0,
+        ramp=0.5,
+        frequency=1.5,
+        translation=[0.005, 0.0, 0.02],
+        rotation=[0.0, 0.05, 0.0],
+    )
+    reach = [0.0, 0.0, -(_GAP + _DEPTH)]
+    press = MinimumJerk(t_start=settle + task.press, duration=1.0, translation=reach)
+    back = MinimumJerk(t_start=settle + task.release, duration=1.0, translation=[-x for x in reach])
+    x, y, z = base.slave.position
+    sheet = SheetSpring(
+        position=[x, y, z - _TIP - _GAP], length=0.12, width=0.05, thickness=LEAVES[leaf]
+    )
+    return (
+        replace(
+            base,
+            simulation=dataclasses.replace(base.simulation, settle=settle, duration=task.end),
+            operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, back]),
+            channel=channel,
+            passivity=passivity,
+            sheet_spring=sheet,
+        ),
+        task,
+    )
+
+
+def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> Figures:
+    """The run in numbers: vertical motion and force, which the task is about."""
+    scaling = scenario.force_scaling
+    slave = _heights(slave_arm(scenario).table, np.ascontiguousarray(result["slave_state"][:, :6]))
+    lasting = result.t <= task.end
+    energy = (
+        result["ports"][:, :4].sum(axis=1) if "ports" in result else np.full(len(slave), np.nan)
+    )
+    return figures_of(
+        t=result.t[lasting],
+        master=result["pose_command"][lasting, 6],
+        slave=slave[lasting],
+        felt=result["force_to_master"][lasting, 2],
+        pressed=scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][lasting, 2],
+        energy=energy[lasting],
+        task=task,
+    )
+
+
+@njit(cache=True)
+def _heights(arm, q):
+    """(N,) height of So at each row of q."""
+    R, p, heights = np.empty((3, 3)), np.empty(3), np.empty(q.shape[0])
+    for k in range(q.shape[0]):
+        forward_kinematics(arm, q[k], R, p)
+        heights[k] = p[2]
+    return heights
+
+
+def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, NDArray[np.float64]]:
+    """What a picture of the task shows: t, heights [m] and vertical forces [N], master's units."""
+    slave = _heights(slave_arm(scenario).table, np.ascontiguousarray(result["slave_state"][:, :6]))
+    scaling = scenario.force_scaling
+    return {
+        "t": result.t,
+        "master": result["pose_command"][:, 6] - scenario.slave.position[2],
+        "slave": slave - scenario.slave.position[2],
+        "felt": result["force_to_master"][:, 2],
+        "pressed": scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
+        "energy": result["ports"][:, :4].sum(axis=1),
+    }
