@@ -14,7 +14,7 @@ station   list of runs: method, network, leaf, and the figures of `one_dof.Figur
 one_dof   list: method, wall_N_per_m, jitter, loss, longest_s: the longest round trip of the grid up
           to which every one was stable (0: none was), and grid_s, the round trips tried
 covering  list: sigma, round_trip_s, wall_N_per_m, injected_J: energy that a loop without a method
-          has created in one run of the task; damping_Ns_per_m: what the device needs so that it creates none
+          has created in one run; damping_Ns_per_m: what the device needs so that it creates none
 networks, methods, seed  as asked for
 ========= ======================================================================================
 """
