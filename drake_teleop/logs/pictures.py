@@ -211,7 +211,7 @@ def draw_elimination(found: EliminatedLog) -> Figure:
         norms = [(n, np.linalg.norm(w[:, :3], axis=1), c) for n, w, c in curves]
         _draw(magnitude, t, norms, static)
         magnitude.set_ylim(bottom=0)
-        magnitude.set_title("$|F|$, rms: " + ", ".join(_rms_words(norms)))
+        magnitude.set_title("$|F|$, rms in N: " + ", ".join(_rms_words(norms)))
         magnitude.set_ylabel("force [N]")
         shade_contact(magnitude, t, found.touched)
         axes = _channel_axes(below)
@@ -224,7 +224,7 @@ def draw_elimination(found: EliminatedLog) -> Figure:
 
 
 def _rms_words(norms: Sequence[tuple[str, NDArray[np.float64], str]]) -> list[str]:
-    return [f"{name} {np.sqrt(np.mean(values**2)):.3g} N" for name, values, _ in norms]
+    return [f"{name} {np.sqrt(np.mean(values**2)):.3g}" for name, values, _ in norms]
 
 
 def _channel_axes(figure: Any) -> list[Axes]:
