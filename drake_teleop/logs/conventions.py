@@ -638,7 +638,7 @@ def _against_load(description: Description, data: _Data) -> tuple[list[Finding],
 
     def fitted(edited: Description) -> LoadFit:
         # A delay that was estimated under a wrong description may be wrong too.
-        log = data.thin(edited)
+        log = _rewrenched(thin, description, edited) or data.thin(edited)
         fits = [load_fit(undelayed(log, shift)) for shift in {0.0, delay or 0.0}]
         return min(fits, key=lambda fit: fit.unexplained)
 
@@ -674,6 +674,27 @@ def _against_load(description: Description, data: _Data) -> tuple[list[Finding],
     others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
     message = "; just as possible: ".join([finding.message, *others.values()])
     return [Finding(finding.name, message), *_lag(description, delay)], delay
+
+
+def _rewrenched(log: Log, old: Description, new: Description) -> Log | None:
+    """The log of another description of the wrench, without reading it again; None if it must."""
+    a, b = old.wrench, new.wrench
+    if a is None or b is None or "base" in (a.frame, b.frame):
+        return None
+    changes = {"sign": a.sign, "frame": a.frame, "force": a.force, "torque": a.torque}
+    if new.model_copy(update={"wrench": b.model_copy(update=changes)}) != old:
+        return None
+    R_old, R_new = (np.array(w.frame) if w.frame != "sensor" else np.eye(3) for w in (a, b))
+    parts = []
+    for x, force, again in (
+        (log.wrench[:, :3], a.force.columns, b.force.columns),
+        (log.wrench[:, 3:], a.torque.columns, b.torque.columns),
+    ):
+        if set(force) != set(again) or len(force) != 3:
+            return None
+        given = x @ R_old  # In the axes of the file.
+        parts.append(given[:, [force.index(column) for column in again]] @ R_new.T)
+    return replace(log, wrench=a.sign * b.sign * np.hstack(parts))
 
 
 def _without_remedy(

@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.logs.commands import eliminate_command, identify_command
+from drake_teleop.logs.commands import identify_command
 from drake_teleop.logs.inspection import inspect_command
+from drake_teleop.logs.processing import eliminate_log, identify_log
 
 Tables = dict[str, pl.DataFrame]
 Data = dict[str, Any]
@@ -119,15 +120,18 @@ REAL: list[tuple[Callable[[Data, Tables], None], str, str]] = [
 ]
 
 
-@pytest.mark.parametrize("record", ["1-baseline", "2-vibrations"])
-@pytest.mark.parametrize(("plant", "name", "says"), REAL, ids=[p[0].__name__ for p in REAL])
+@pytest.mark.parametrize(
+    ("plant", "name", "says", "record"),
+    [(*p, ("1-baseline", "2-vibrations")[i % 2]) for i, p in enumerate(REAL)],
+    ids=[p[0].__name__ for p in REAL],
+)
 def test_an_error_in_a_real_record_is_named(
     ntnu: Path,
     tmp_path: Path,
-    record: str,
     plant: Callable[[Data, Tables], None],
     name: str,
     says: str,
+    record: str,
 ) -> None:
     path = ntnu_log(ntnu, tmp_path, record, frame=NTNU_FRAME)
     data = yaml.safe_load(path.read_text())
@@ -220,10 +224,10 @@ def test_identify_refuses_a_worthless_result_and_says_why(
 
 def test_identify_and_eliminate_pass_findings_on(tmp_path: Path) -> None:
     path = written(tmp_path, good())
-    summary = identify_command(path, tmp_path / "good", quiet=True)
-    assert summary["findings"] == []
-    load = tmp_path / "good" / "identification.json"
-    assert eliminate_command(path, load, tmp_path / "out", quiet=True)["findings"] == []
+    found = identify_log(path)
+    assert found.findings == ()
+    load = found.identification
+    assert eliminate_log(path, load).findings == ()
     columns = good()
     columns["imu_t"] = columns["t"] + 0.08
     summary = identify_command(written(tmp_path, columns), tmp_path / "late", quiet=True)
@@ -231,8 +235,8 @@ def test_identify_and_eliminate_pass_findings_on(tmp_path: Path) -> None:
     assert any("imu.time.offset: -0.080" in note for note in summary["notes"])
     columns = good()
     planted.sign(columns)
-    summary = eliminate_command(written(tmp_path, columns), load, tmp_path / "out", quiet=True)
-    assert [entry["name"] for entry in summary["findings"]] == ["sign"]
+    suspected = eliminate_log(written(tmp_path, columns), load).findings
+    assert [finding.name for finding in suspected] == ["sign"]
 
 
 @pytest.mark.parametrize(
@@ -269,6 +273,6 @@ def test_the_clock_of_a_ur5_imu(
     if force:
         assert "payload not identifiable" in found["payload"]
         assert "new values come at 20" in found["repeated rows"]
-        summary = identify_command(tmp_path / "log.yaml", tmp_path / "out", quiet=True)
-        assert any(entry["name"] == "payload" for entry in summary["findings"])
-        assert "m" in summary["not_identifiable"]
+        identified = identify_log(tmp_path / "log.yaml")
+        assert any(finding.name == "payload" for finding in identified.findings)
+        assert not identified.identification.identifiable[6:].any()
