@@ -179,7 +179,12 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     expected = pairs[0][0]
     if expected.var(axis=0).sum() < 0.25:
         return None
-    lag = _best_shift(t, pairs, imu.t, reach)
+    # A gyroscope tells the clock. Without one, a long lever arm must not be taken for a late clock.
+    arm = np.zeros((len(t), 1))
+    if not gyroscope:
+        omega, alpha = (resample(t, pose.t, x) for x in smooth.motion[1:])
+        arm = _lever_matrix(omega, alpha).reshape(-1, 9)
+    lag = _best_shift(t, pairs, imu.t, reach, arm)
     centre = float(t.mean())
     middle, drift = _drift(t, pairs, imu.t, lag, 2 * cutoff * float(t[-1] - t[0]))
     R, mirrored = _kabsch(resample(t + middle + drift * (t - centre), imu.t, pairs[0][1]), expected)
@@ -474,10 +479,21 @@ def _pairs(t: NDArray[np.float64], imu: Log, pose: Log, gyroscope: bool) -> _Pai
 
 
 def _best_shift(
-    t: NDArray[np.float64], pairs: _Pairs, t_imu: NDArray[np.float64], reach: float
+    t: NDArray[np.float64],
+    pairs: _Pairs,
+    t_imu: NDArray[np.float64],
+    reach: float,
+    arm: NDArray[np.float64],
 ) -> float:
+    """The shift at which free maps leave least, beyond what is linear in `arm` (N, k)."""
+    U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
+    U = U[:, singular > 1e-3 * singular[0]]
+
+    def beyond(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return x - U @ (U.T @ x)
+
     def cost(shift: float) -> float:
-        return sum(_unmapped(y, resample(t + shift, t_imu, x)) for y, x in pairs)
+        return sum(_unmapped(beyond(y), beyond(resample(t + shift, t_imu, x))) for y, x in pairs)
 
     step = 0.01
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)

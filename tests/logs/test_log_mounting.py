@@ -122,7 +122,7 @@ def turn(R: np.ndarray) -> np.ndarray:
 
 
 rotations = st.integers(0, 10**6).map(a_rotation)
-places = st.tuples(*[st.floats(-0.2, 0.2)] * 3).map(np.array)
+places = st.tuples(*[st.floats(-0.1, 0.1)] * 3).map(np.array)
 
 
 @settings(max_examples=6, deadline=None)
