@@ -26,8 +26,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from drake_teleop.channel.network import NetworkConfig, newest_packets
-from drake_teleop.passivity import methods
-from drake_teleop.passivity.memory import COMMAND, DAMPING, LIMIT, METHOD, OWN, STIFFNESS
+from drake_teleop.passivity import methods, two_layer
+from drake_teleop.passivity.memory import (
+    COMMAND,
+    DAMPING,
+    LEDGER,
+    LIMIT,
+    METHOD,
+    OWN,
+    STIFFNESS,
+)
 from drake_teleop.passivity.methods import METHODS, PassivityConfig, initial_memory, parameters
 from drake_teleop.passivity.packet import (
     INTEGRAL,
@@ -69,7 +77,7 @@ def random_motion(rng: np.random.Generator, steps: int) -> tuple[Array, Array]:
     return dx, pose
 
 
-@njit(cache=True)
+@njit
 def _move(push, most, T, dx, pose):
     x, v, a, now = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(7)
     now[0] = 1.0
@@ -95,12 +103,12 @@ def random_wrench(rng: np.random.Generator, steps: int) -> Array:
     return np.take_along_axis(value, last, axis=0)
 
 
-@njit(cache=True)
-def _run(method, p, memories, newest, motion, poses, wrenches, active, T, sent, figures):
+@njit
+def _run(method, p, memories, newest, motion, poses, wrenches, active, pushed, T, sent, figures):
     """Least energies of one method over one network; `figures` (2, FIGURES) is written.
 
     `motion` (2, N, 6) and `poses` (2, N, 7) are those of both ends; the contact wrench is
-    `wrenches` (N, 6) plus `active` times a wrench that pushes the way the slave moves.
+    `wrenches` (N, 6) plus `active` times a wrench that pushes the way the end `pushed` moves.
     """
     f_e, hand, felt = np.zeros(6), np.zeros(6), np.zeros(6)
     wrench, before, motor, pull = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
@@ -113,9 +121,9 @@ def _run(method, p, memories, newest, motion, poses, wrenches, active, T, sent, 
             twists[0, i], twists[1, i] = motion[0, k, i] / T, motion[1, k, i] / T
             before[i] = wrench[i]
         for g in range(2):
-            push = active * WRENCH_SIZE[g] / (length(motion[1, k], g) + 1e-9)
+            push = active * WRENCH_SIZE[g] / (length(motion[pushed, k], g) + 1e-9)
             for i in range(3 * g, 3 * g + 3):
-                f_e[i] = wrenches[k, i] + push * motion[1, k, i]
+                f_e[i] = wrenches[k, i] + push * motion[pushed, k, i]
         for end in range(2):
             now = newest[1 - end, k]
             received = nothing if now < 0 else sent[1 - end, now]
@@ -142,7 +150,7 @@ def _run(method, p, memories, newest, motion, poses, wrenches, active, T, sent, 
                 motor[i] = p[STIFFNESS + g] * pull[i] - p[DAMPING + g] * twists[1, i]
 
 
-@njit(cache=True)
+@njit
 def _master(method, received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
     if method != WAVE_HOLD:
         methods.master_step(
@@ -159,7 +167,7 @@ def _master(method, received, fresh, pose, twist, dx, hand, T, p, memory, wrench
         packet[INTEGRAL + i] = (b * dx[i] / T - wrench[i]) / math.sqrt(2.0 * b)
 
 
-@njit(cache=True)
+@njit
 def _slave(method, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     if method != WAVE_HOLD:
         methods.slave_step(
@@ -177,9 +185,20 @@ def _slave(method, received, fresh, pose, twist, dx, wrench, T, p, memory, comma
 
 def cases() -> dict[str, tuple[int, Array]]:
     """Name -> (method, its parameters with a device that does not saturate)."""
+    # A soft servo, no damper that fills the tanks and no limit but theirs: energy is short.
+    soft: dict[str, Any] = {
+        "servo_stiffness": [300.0, 5.0],
+        "servo_damping": [0.0, 0.0],
+        "two_layer": two_layer.TwoLayerConfig(
+            damper=[0.0, 0.0], drain_rate=1e6, initial=[0.0, 0.0]
+        ),
+    }
     found = {}
     for name in METHODS:
-        found[name] = METHODS.index(name), parameters(PassivityConfig(method=name))
+        found[name] = METHODS.index(name), parameters(PassivityConfig(method=name, **soft))
+    tank = PassivityConfig(method="two_layer", **soft)
+    found["two_layer_no_margin"] = METHODS.index("two_layer"), parameters(tank)
+    found["two_layer_no_margin"][1][two_layer.ACCELERATION : two_layer.ACCELERATION + 2] = 0.0
     found["wave_hold"] = WAVE_HOLD, parameters(PassivityConfig(method="wave"))
     return found
 
@@ -219,6 +238,7 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
         ends = [motions[rng.integers(32)] for _ in range(2)]
         motion, poses = (np.stack(parts) for parts in zip(*ends, strict=True))
         wrench, active = wrenches[rng.integers(32)], rng.uniform(-1.0, 1.0)
+        pushed = int(rng.integers(2))
         saturates = rng.random() < 0.5
         for name, (method, p) in every.items():
             if name not in BOUNDED and seed % 10:
@@ -226,12 +246,27 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
             p = p.copy()
             if saturates:
                 p[LIMIT : LIMIT + 2] = 0.5, 0.01
-            start = initial_memory("none" if method == WAVE_HOLD else name, p, POSE)
+            start = initial_memory("none" if method == WAVE_HOLD else METHODS[method], p, POSE)
+            initial = start[LEDGER : LEDGER + 2]
             memories = np.stack([start, start])
             began = time.thread_time()
-            _run(method, p, memories, newest, motion, poses, wrench, active, PERIOD, sent, figures)
+            _run(
+                method,
+                p,
+                memories,
+                newest,
+                motion,
+                poses,
+                wrench,
+                active,
+                pushed,
+                PERIOD,
+                sent,
+                figures,
+            )
             seconds[name] += time.thread_time() - began
             figures[:, STRONGER] *= -1.0
+            figures[:, TRUE] += 2.0 * initial  # a tank at each end
             least[name] = np.minimum(least[name], figures)
     return least, seconds
 
@@ -241,7 +276,8 @@ def study(networks: int, seconds: float = 10.0, processes: int = 2) -> dict[str,
 
     Returns:
         Name -> "energy": least energy of the channel at the backward pair [J]; "true_energy": at
-        the true port of a held wrench, at the slave that of its servo [J]; "stronger": by how much
+        the true port of a held wrench, at the slave that of its servo, with what the tanks held at
+        the start [J]; "stronger": by how much
         the hand felt more than was received [N, N m]; "us": CPU time of both ends, with the random
         ports, a step [us]. Least (worst) over networks and over translation and rotation.
     """
@@ -298,6 +334,8 @@ def holds(result: dict[str, dict[str, float]]) -> bool:
         result["tdpa"]["energy"] >= -1e-9
         and result["wave"]["energy"] >= -1e-9
         and result["tdpa"]["stronger"] <= 1e-12
+        and result["two_layer"]["true_energy"] >= -1e-9
+        and result["two_layer_no_margin"]["true_energy"] < -1e-6
         and result["none"]["energy"] < -1.0
         and result["wave_hold"]["energy"] < -1.0
     )

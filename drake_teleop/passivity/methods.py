@@ -14,13 +14,24 @@ channel, the environment f . dx; what comes out of a passive channel never excee
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.passivity import none, tdpa, wave
+from drake_teleop.passivity import (
+    force_limit,
+    four_channel,
+    none,
+    pspm,
+    tdpa,
+    two_layer,
+    wave,
+)
+from drake_teleop.passivity.force_limit import ForceLimitConfig
+from drake_teleop.passivity.four_channel import FourChannelConfig
 from drake_teleop.passivity.memory import (
     COMMAND,
     DAMPING,
@@ -32,14 +43,16 @@ from drake_teleop.passivity.memory import (
     STEPS,
     STIFFNESS,
 )
-from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, SEQUENCE, finite
+from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, POSE, SEQUENCE, finite
+from drake_teleop.passivity.pspm import PspmConfig
 from drake_teleop.passivity.tdpa import TdpaConfig
+from drake_teleop.passivity.two_layer import TwoLayerConfig
 from drake_teleop.passivity.wave import WaveConfig
 from drake_teleop.quantities import choice, quantity
 
-METHODS = ("none", "wave", "tdpa")
+METHODS = ("none", "wave", "tdpa", "two_layer", "pspm", "four_channel", "force_limit")
 
-NONE, WAVE, TDPA = range(len(METHODS))
+NONE, WAVE, TDPA, TWO_LAYER, PSPM, FOUR_CHANNEL, FORCE_LIMIT = range(len(METHODS))
 
 
 @dataclass
@@ -61,6 +74,10 @@ class PassivityConfig:
     )
     wave: WaveConfig = field(default_factory=WaveConfig)
     tdpa: TdpaConfig = field(default_factory=TdpaConfig)
+    two_layer: TwoLayerConfig = field(default_factory=TwoLayerConfig)
+    pspm: PspmConfig = field(default_factory=PspmConfig)
+    four_channel: FourChannelConfig = field(default_factory=FourChannelConfig)
+    local_force_limit: ForceLimitConfig = field(default_factory=ForceLimitConfig)
 
 
 def parameters(
@@ -80,8 +97,17 @@ def parameters(
     p[LIMIT : LIMIT + 2] = config.force_limit, config.torque_limit
     p[STIFFNESS : STIFFNESS + 2] = np.multiply(config.servo_stiffness, power_scale)
     p[DAMPING : DAMPING + 2] = np.multiply(config.servo_damping, power_scale)
-    own = getattr(config, config.method).packed() if hasattr(config, config.method) else []
-    p[METHOD : METHOD + len(own)] = own
+    own: dict[str, Any] = {
+        "wave": config.wave,
+        "tdpa": config.tdpa,
+        "two_layer": config.two_layer,
+        "pspm": config.pspm,
+        "four_channel": config.four_channel,
+        "force_limit": config.local_force_limit,
+    }
+    if config.method in own:
+        packed = own[config.method].packed()
+        p[METHOD : METHOD + len(packed)] = packed
     return p
 
 
@@ -106,7 +132,11 @@ def initial_memory(
         )
     memory = np.zeros(MEMORY)
     memory[COMMAND : COMMAND + 7] = pose
-    memory[PACKET + 2 : PACKET + 9] = pose
+    memory[PACKET + POSE : PACKET + POSE + 7] = pose
+    if method == "two_layer":
+        two_layer.initialize(parameters, memory)
+    elif method == "pspm":
+        pspm.initialize(parameters, memory)
     return memory
 
 
@@ -150,6 +180,18 @@ def master_step(method, received, fresh, pose, twist, dx, hand, T, p, memory, wr
         wave.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
     elif method == TDPA:
         tdpa.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
+    elif method == TWO_LAYER:
+        two_layer.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
+    elif method == PSPM:
+        pspm.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
+    elif method == FOUR_CHANNEL:
+        four_channel.master_step(
+            received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet
+        )
+    elif method == FORCE_LIMIT:
+        force_limit.master_step(
+            received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet
+        )
     else:
         none.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
     _finish(healthy, memory, packet)
@@ -177,6 +219,20 @@ def slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, c
         wave.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
     elif method == TDPA:
         tdpa.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
+    elif method == TWO_LAYER:
+        two_layer.slave_step(
+            received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
+        )
+    elif method == PSPM:
+        pspm.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
+    elif method == FOUR_CHANNEL:
+        four_channel.slave_step(
+            received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
+        )
+    elif method == FORCE_LIMIT:
+        force_limit.slave_step(
+            received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
+        )
     else:
         none.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
     _finish(healthy, memory, packet)

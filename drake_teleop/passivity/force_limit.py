@@ -1,0 +1,44 @@
+"""Local force limit: what is felt never exceeds a force that the hand can hold by itself.
+
+It keeps no account of energy. A loop that is unstable stays so, but its limit cycle is no stronger
+than the limit, and it ends where the hand and the device's friction take more than the limited
+wrench can give. This is the ceiling that safety standards ask for, whatever the other end says.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+
+from numba import njit
+
+from drake_teleop.passivity import none
+from drake_teleop.passivity.memory import HELD, METHOD
+from drake_teleop.passivity.packet import WRENCH, limit
+from drake_teleop.quantities import quantity
+
+
+@dataclass
+class ForceLimitConfig:
+    """Parameters of the local force limit."""
+
+    force: float = quantity(1.0, "N", 0.0, 1e4, "largest force at the hand")
+    torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")
+
+    def packed(self) -> list[float]:
+        """The values in the order in which the steps read them."""
+        return [self.force, self.torque]
+
+
+@njit(cache=True)
+def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+    """One step of the master's end; see `methods.master_step`."""
+    none.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
+    for g in range(2):
+        limit(wrench, g, p[METHOD + g])
+    memory[HELD : HELD + 6] = wrench
+    packet[WRENCH : WRENCH + 6] = wrench
+
+
+@njit(cache=True)
+def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
+    """One step of the slave's end; see `methods.slave_step`."""
+    none.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)

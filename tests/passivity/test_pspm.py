@@ -1,0 +1,90 @@
+"""Passive set-position modulation: its ledger is the energy of the true port, to rounding."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.passivity.memory import LEDGER, RECEIVED, SENT
+from drake_teleop.passivity.methods import (
+    METHODS,
+    PassivityConfig,
+    initial_memory,
+    master_step,
+    parameters,
+    slave_step,
+)
+from drake_teleop.passivity.packet import PACKET_SIZE, difference_into, moved_into
+
+T, STEPS, START = 1e-3, 1500, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+K, D = np.repeat([300.0, 5.0], 3), np.repeat([2.0, 0.02], 3)
+
+
+def motion(rng):
+    t = np.arange(STEPS) * T
+    return 0.05 * sum(
+        np.sin(np.outer(t, rng.uniform(2, 15, 6))) * rng.uniform(-1, 1, 6) for _ in range(3)
+    )
+
+
+def groups(values):
+    return np.array([values[:3].sum(), values[3:].sum()])
+
+
+@pytest.mark.parametrize("end", ["master", "slave"])
+def test_stored_energy_is_what_was_put_in(end):
+    """E + spring = E_0 + received - sent - work of the held wrench, of both groups, at every step.
+
+    Wrench and spring are found from what the end puts out, not from its memory.
+    """
+    rng = np.random.default_rng(4)
+    config = PassivityConfig(method="pspm", servo_stiffness=[300.0, 5.0], servo_damping=[2.0, 0.02])
+    p, m = parameters(config), METHODS.index("pspm")
+    memory = initial_memory("pspm", p, START)
+    first, work = memory[LEDGER : LEDGER + 2].copy(), np.zeros(2)
+    other = initial_memory("pspm", p, START)
+    held, before, e = np.zeros(6), START.copy(), np.zeros(6)
+    ours, theirs = motion(rng), motion(rng)
+    dx, dx_other, pose, target = np.zeros(6), np.zeros(6), START.copy(), START.copy()
+    packet, received, output = np.zeros(PACKET_SIZE), np.zeros(PACKET_SIZE), np.zeros(13)
+    wrench, spare = np.zeros(6), np.zeros(PACKET_SIZE)
+    K_h = np.repeat(config.pspm.stiffness, 3)
+    B = np.repeat(config.pspm.damping, 3)
+    largest = 0.0
+    for k in range(STEPS):
+        moved_into(START, ours[k], pose)
+        difference_into(pose, before, dx)
+        before[:] = pose
+        moved_into(START, theirs[k], target)
+        dx_other[:] = theirs[k] - theirs[max(k - 1, 0)]
+        f_e = np.repeat([4.0, 0.05], 3) * np.sin(k * T * np.arange(3, 9))
+        twist = dx / T
+        work += groups(held * dx)
+        fresh = k % 3 == 0  # two packets of three are lost
+        if end == "master":
+            if fresh:
+                slave_step(
+                    m, spare, True, target, dx_other / T, dx_other, f_e, T, p, other, output,
+                    received,
+                )  # fmt: skip
+            master_step(
+                m, received, fresh, pose, twist, dx, np.zeros(6), T, p, memory, wrench, packet
+            )
+            held = wrench.copy()
+            e = (wrench + B * twist) / K_h
+            spring = 0.5 * K_h * e**2
+        else:
+            if fresh:
+                master_step(
+                    m, spare, True, target, dx_other / T, dx_other, np.zeros(6), T, p, other,
+                    wrench, received,
+                )  # fmt: skip
+            slave_step(m, received, fresh, pose, twist, dx, f_e, T, p, memory, output, packet)
+            difference_into(output[:7], pose, e)
+            held = K * e - D * twist
+            spring = 0.5 * K * e**2
+        left = memory[LEDGER : LEDGER + 2] + groups(spring)
+        put_in = first + memory[RECEIVED : RECEIVED + 2] - memory[SENT : SENT + 2] - work
+        np.testing.assert_allclose(left, put_in, rtol=0, atol=1e-9)
+        largest = max(largest, np.abs(work).max())
+    assert largest > 0.01, "nothing happened"
