@@ -660,7 +660,7 @@ def _against_load(description: Description, data: _Data) -> tuple[list[Finding],
     limit = min(limit, BELIEVABLE + given.noise)
     found = [entry for entry in found if entry[0].unexplained < limit]
     if not found and given.good:
-        return _lag(description, delay), delay
+        return _lag(description, delay) if _shows(thin, delay) else [], delay
     if not found:
         return _without_remedy(description, log, given, delay)
     least = 1.2 * min(fit.unexplained for fit, *_ in found) + 1e-9
@@ -674,6 +674,15 @@ def _against_load(description: Description, data: _Data) -> tuple[list[Finding],
     others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
     message = "; just as possible: ".join([finding.message, *others.values()])
     return [Finding(finding.name, message), *_lag(description, delay)], delay
+
+
+def _shows(log: Log, delay: float | None) -> bool:
+    """Whether the delay is five standard errors from none: twice a log likelihood ratio of 25."""
+    if delay is None:
+        return False
+    none, aligned = load_fit(log), load_fit(undelayed(log, delay))
+    gain = none.independent * np.log(none.unexplained / (aligned.unexplained + 1e-30))
+    return bool(gain > 25.0)
 
 
 def _rewrenched(log: Log, old: Description, new: Description) -> Log | None:
