@@ -1,0 +1,64 @@
+"""The observers of energy against closed forms and against the methods' own ledgers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_methods import line, poses, run, wrenches
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.passivity.energy import created, in_flight, ledger, port_work
+from drake_teleop.passivity.memory import MEMORY
+from drake_teleop.passivity.methods import PassivityConfig
+
+
+def test_work_of_a_held_wrench_is_exact_however_coarse_the_samples():
+    """A constant force over a path, a constant torque over a turn about its axis."""
+    angle = np.linspace(0.0, 2.5, 6)
+    pose = np.zeros((6, 7))
+    pose[:, 0], pose[:, 3] = np.cos(angle / 2), np.sin(angle / 2)
+    pose[:, 4:] = np.outer(np.linspace(0.0, 1.0, 6) ** 3, [0.3, -0.2, 0.1])
+    wrench = np.tile([2.0, 1.0, 5.0, 0.0, 0.0, 0.4], (6, 1))
+    for pair in ("held", "backward", "mean"):
+        work = port_work(wrench, pose, pair)
+        np.testing.assert_allclose(work[-1], [0.6 - 0.2 + 0.5, 0.4 * 2.5], rtol=1e-12)
+
+
+def test_the_pairs_differ_by_what_a_step_is_worth():
+    """A spring that is sampled: `mean` is its energy exactly, the others are off by k dx^2 / 2."""
+    x, k = np.array([0.0, 0.1, 0.15, 0.4]), 7.0
+    pose, wrench = np.zeros((4, 7)), np.zeros((4, 6))
+    pose[:, 0], pose[:, 4], wrench[:, 0] = 1.0, x, -k * x
+    stored, step = 0.5 * k * x[-1] ** 2, 0.5 * k * np.sum(np.diff(x) ** 2)
+    work = {pair: -port_work(wrench, pose, pair)[-1, 0] for pair in ("held", "mean", "backward")}
+    np.testing.assert_allclose(work["mean"], stored)
+    np.testing.assert_allclose(work["held"], stored - step)
+    np.testing.assert_allclose(work["backward"], stored + step)
+
+
+def test_what_tdpa_has_on_its_books_is_the_work_at_the_hand():
+    rng = np.random.default_rng(5)
+    master, f_e = poses(rng, 1200), wrenches(rng, 1200)
+    wrench, _, _, _, memory = run(
+        "tdpa", PassivityConfig(method="tdpa"), master, poses(rng, 1200), f_e, line(rng, 1200)
+    )
+    hand, slave = ledger(memory[0]), ledger(memory[1])
+    put_in = -port_work(wrench, master, "backward")[-1]
+    # What was put in is sent, kept, or was balanced by what came from the slave.
+    kept = put_in - hand.sent + hand.received - hand.stored
+    assert (kept >= -1e-12).all() and (kept <= [2e-3 + 1e-12, 1e-4 + 1e-12]).all()
+    assert (in_flight(hand, slave) >= 0.0).all() and (hand.lost > 0.0).any()
+
+
+def test_created_energy_never_falls():
+    energy = np.array([0.0, 1.0, -2.0, 3.0, -1.0])
+    np.testing.assert_array_equal(created(energy), [0.0, 0.0, 2.0, 2.0, 2.0])
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(DrakeTeleopError, match="there is no pair 'forward'"):
+        port_work(np.zeros((3, 6)), np.zeros((3, 7)), "forward")
+    with pytest.raises(DrakeTeleopError, match="do not fit"):
+        port_work(np.zeros((3, 6)), np.zeros((2, 7)))
+    with pytest.raises(DrakeTeleopError, match="is not one"):
+        ledger(np.zeros(MEMORY + 1))
