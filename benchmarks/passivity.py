@@ -62,6 +62,7 @@ POSE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 # felt it, least energy in the tank of an end.
 BACKWARD, TRUE, STRONGER, TANK, FIGURES = range(5)
 WAVE_HOLD = -1
+AT_MOTOR = ("two_layer", "pspm")
 BOUNDED = ("wave", "tdpa", "two_layer", "pspm")
 
 
@@ -107,11 +108,14 @@ def random_wrench(rng: np.random.Generator, steps: int) -> Array:
 
 
 @njit
-def _run(method, p, memories, newest, motion, poses, wrenches, active, pushed, T, sent, figures):
+def _run(
+    method, at_motor, p, memories, newest, motion, poses, wrenches, active, pushed, T, sent, figures
+):
     """Least energies of one method over one network; `figures` (2, FIGURES) is written.
 
     `motion` (2, N, 6) and `poses` (2, N, 7) are those of both ends; the contact wrench is
-    `wrenches` (N, 6) plus `active` times a wrench that pushes the way the end `pushed` moves.
+    `wrenches` (N, 6) plus `active` times a wrench that pushes the way the end `pushed` moves. The
+    slave's port is that of wrench and command, or (`at_motor`) that of its servo.
     """
     f_e, hand, felt = np.zeros(6), np.zeros(6), np.zeros(6)
     wrench, before, motor, pull = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
@@ -139,14 +143,23 @@ def _run(method, p, memories, newest, motion, poses, wrenches, active, pushed, T
             else:
                 _slave(method, received, fresh, poses[1, k], twists[1], motion[1, k], f_e, T, p,
                        memories[1], command, sent[1, k])  # fmt: skip
-        difference_into(command, old, moved)
-        old[:] = command[:7]
-        # The pull of the slave's servo from now until the next step.
-        difference_into(command, poses[1, k], pull)
         for g in range(2):
-            energy[0, g] += dot(f_e, moved, g) - dot(wrench, motion[0, k], g)
             work[0, g] += dot(before, motion[0, k], g)
-            work[1, g] += dot(motor, motion[1, k], g)
+        if at_motor:
+            for g in range(2):
+                work[1, g] += dot(motor, motion[1, k], g)
+            # The pull of the slave's servo from now until the next step.
+            difference_into(command, poses[1, k], pull)
+            for i in range(6):
+                motor[i] = p[STIFFNESS + i // 3] * pull[i] - p[DAMPING + i // 3] * twists[1, i]
+        else:
+            difference_into(command, old, moved)
+            old[:] = command[:7]
+            for g in range(2):
+                energy[0, g] += dot(f_e, moved, g) - dot(wrench, motion[0, k], g)
+                work[1, g] -= dot(motor, moved, g)
+            motor[:] = f_e
+        for g in range(2):
             energy[1, g] = -work[0, g] - work[1, g]
             for end in range(2):
                 books = memories[end, RECEIVED + g] - memories[end, SENT + g]
@@ -156,8 +169,6 @@ def _run(method, p, memories, newest, motion, poses, wrenches, active, pushed, T
             figures[g, TRUE] = min(figures[g, TRUE], energy[1, g])
             stronger = length(wrench, g) - length(felt, g)
             figures[g, STRONGER] = max(figures[g, STRONGER], stronger)
-            for i in range(3 * g, 3 * g + 3):
-                motor[i] = p[STIFFNESS + g] * pull[i] - p[DAMPING + g] * twists[1, i]
 
 
 @njit
@@ -254,24 +265,15 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
             p = p.copy()
             if saturates:
                 p[LIMIT : LIMIT + 2] = 0.5, 0.01
+            at_motor = METHODS[method] in AT_MOTOR and method != WAVE_HOLD
             start = initial_memory("none" if method == WAVE_HOLD else METHODS[method], p, POSE)
             initial = start[LEDGER : LEDGER + 2]
             memories = np.stack([start, start])
             began = time.thread_time()
             _run(
-                method,
-                p,
-                memories,
-                newest,
-                motion,
-                poses,
-                wrench,
-                active,
-                pushed,
-                PERIOD,
-                sent,
-                figures,
-            )
+                method, at_motor, p, memories, newest, motion, poses, wrench, active, pushed,
+                PERIOD, sent, figures,
+            )  # fmt: skip
             seconds[name] += time.thread_time() - began
             figures[:, STRONGER] *= -1.0
             figures[:, TRUE] += 2.0 * initial  # a tank at each end
@@ -283,9 +285,10 @@ def study(networks: int, seconds: float = 10.0, processes: int = 2) -> dict[str,
     """Runs every method over the networks.
 
     Returns:
-        Name -> "energy": least energy of the channel at the backward pair [J]; "true_energy": at
-        the true port of a held wrench, at the slave that of its servo, with what the tanks held at
-        the start [J]; "tank": least that the tank of an end held, by the work at its port [J];
+        Name -> "energy": least energy of the channel at the backward pair [J] (methods at the
+        motor's port are not made for it and get 0); "true_energy": at the true port of held
+        wrenches, with what the tanks held at the start [J]; "tank": least that the tank of an end
+        held, by the work at its port, of methods that have one [J];
         "stronger": by how much the hand felt more than was received [N, N m]; "us": CPU time of
         both ends, with the random ports, a step [us]. Least (worst) over networks and over
         translation and rotation.

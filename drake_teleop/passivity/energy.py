@@ -88,8 +88,7 @@ class Ledger:
         received: of the other end's counter.
         sent: its own counter, for the other end.
         lost: it took out of the loop. `tdpa`: work that was withheld, a measure of its activity.
-            `two_layer`: what overflowed a tank. `wave`: what the matching damper took. `pspm`: what
-            the dampers took.
+            `two_layer`, `pspm`: what overflowed a store. `wave`: what the matching damper took.
     """
 
     stored: Array

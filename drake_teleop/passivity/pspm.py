@@ -6,8 +6,9 @@ end can pay. An end stores the energy E; its account is
     E_k = E_(k-1) + received - sent + d_k - (K / 2) (|x_k - y_k|^2 - |x_k - y_(k-1)|^2)
 
 where d_k is what its damper took since the last step, and y_k is the set position nearest to the
-wanted one with E_k >= 0. Energy above a ceiling is sent to the other end (energy shuffling).
-Neither the delay nor a bound of the acceleration has to be known.
+wanted one with E_k >= 0. Energy above a ceiling is sent from the hand to the slave (energy
+shuffling) and lost at the slave: if it went round, a limit cycle could live on it for long. Neither
+the delay nor a bound of the acceleration has to be known.
 
 Lee and Huang take d_k >= B |dx|^2 / T of a damper in continuous time. Here a wrench is held over
 a step, which makes a spring active; so d_k is what was put into the port, -f_(k-1) . dx_k, less
@@ -64,13 +65,13 @@ class PspmConfig:
 
     initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "E at the start")
     ceiling: list[float] = quantity(
-        [0.02, 4e-4], "J", 0.0, 1e6, "of E; what is above goes to the other end"
+        [0.015, 3e-4], "J", 0.0, 1e6, "of E; what is above is sent to the slave, there lost"
     )
     stiffness: list[float] = quantity(
         [1000.0, 10.0], "N/m, N m/rad", 1e-6, 1e9, "K_h, through which the hand feels"
     )
     damping: list[float] = quantity(
-        [1.0, 0.01], "N s/m, N m s/rad", 0.0, 1e6, "B, shown to the hand"
+        [0.5, 0.005], "N s/m, N m s/rad", 0.0, 1e6, "B, shown to the hand"
     )
 
     def packed(self) -> list[float]:
@@ -86,11 +87,12 @@ def initialize(p, memory):
 
 
 @njit(cache=True)
-def _modulate(received, g, stiffness, dx, before, p, memory, packet):
+def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
     """Moves the set position of group g as far towards the wanted one as can be paid for.
 
     In memory the wrench held since the last step and the set position less the position, now;
-    `before` is the square of the latter at the last step.
+    `before` is the square of the latter at the last step. What is above the ceiling is sent, or
+    (not `shuffle`) lost.
     """
     offset, wanted = memory[OFFSET : OFFSET + 6], memory[_WANTED : _WANTED + 6]
     stored, needed = dot(offset, offset, g), dot(wanted, wanted, g)
@@ -101,14 +103,13 @@ def _modulate(received, g, stiffness, dx, before, p, memory, packet):
         energy += more
         memory[RECEIVED + g] += more
     most = stored + 2.0 * energy / stiffness
-    share = 1.0 if needed <= most else math.sqrt(max(most, 0.0) / needed)
+    share = 1.0 if needed <= max(most, 0.0) else math.sqrt(max(most, 0.0) / needed)
     for i in range(3 * g, 3 * g + 3):
         offset[i] = share * wanted[i]
     energy -= 0.5 * stiffness * (dot(offset, offset, g) - stored)
-    sent = max(energy - p[_CEILING + g], 0.0)
-    memory[LOST + g] += damped
-    memory[SENT + g] += sent
-    memory[LEDGER + g] = energy - sent
+    surplus = max(energy - p[_CEILING + g], 0.0)
+    memory[SENT + g if shuffle else LOST + g] += surplus
+    memory[LEDGER + g] = energy - surplus
     packet[ENERGY + g] = memory[SENT + g]
 
 
@@ -124,7 +125,7 @@ def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, pa
         limit(wrench, g, p[LIMIT + g])
         for i in range(3 * g, 3 * g + 3):
             wanted[i] = wrench[i] / p[_SPRING + g]
-        _modulate(received, g, p[_SPRING + g], dx, before, p, memory, packet)
+        _modulate(received, g, p[_SPRING + g], dx, before, True, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = p[_SPRING + g] * offset[i] - p[_DAMPER + g] * twist[i]
         limit(wrench, g, p[LIMIT + g])
@@ -144,7 +145,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         difference_into(received[POSE : POSE + 7], pose, wanted)
         memory[COMMAND + 7 : COMMAND + 13] = received[VELOCITY : VELOCITY + 6]
     for g in range(2):
-        _modulate(received, g, p[STIFFNESS + g], dx, before[g], p, memory, packet)
+        _modulate(received, g, p[STIFFNESS + g], dx, before[g], False, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             memory[HELD + i] = p[STIFFNESS + g] * offset[i] - p[DAMPING + g] * twist[i]
     moved_into(pose, offset, now)

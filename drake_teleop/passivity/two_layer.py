@@ -62,7 +62,7 @@ _SPRING, _BRAKE = OWN, OWN + 6
 class TwoLayerConfig:
     """Parameters of the energy tanks."""
 
-    send_rate: float = quantity(10.0, "1/s", 0.0, 1e6, "share of a tank that is sent in a second")
+    send_rate: float = quantity(5.0, "1/s", 0.0, 1e6, "share of a tank that is sent in a second")
     drain_rate: float = quantity(
         10.0, "1/s", 0.0, 1e6, "share of the master's tank that the wrench may drain in a second"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.passivity.memory import LEDGER, RECEIVED, SENT
+from drake_teleop.passivity.memory import LEDGER, LOST, RECEIVED, SENT
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -33,7 +33,7 @@ def groups(values):
 
 @pytest.mark.parametrize("end", ["master", "slave"])
 def test_stored_energy_is_what_was_put_in(end):
-    """E + spring = E_0 + received - sent - work of the held wrench, of both groups, at every step.
+    """E + spring = E_0 + received - sent - lost - work of the held wrench, at every step.
 
     Wrench and spring are found from what the end puts out, not from its memory.
     """
@@ -84,7 +84,8 @@ def test_stored_energy_is_what_was_put_in(end):
             held = K * e - D * twist
             spring = 0.5 * K * e**2
         left = memory[LEDGER : LEDGER + 2] + groups(spring)
-        put_in = first + memory[RECEIVED : RECEIVED + 2] - memory[SENT : SENT + 2] - work
+        put_in = first + memory[RECEIVED : RECEIVED + 2] - work
+        put_in -= memory[SENT : SENT + 2] + memory[LOST : LOST + 2]
         np.testing.assert_allclose(left, put_in, rtol=0, atol=1e-9)
         largest = max(largest, np.abs(work).max())
     assert largest > 0.01, "nothing happened"
