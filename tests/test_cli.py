@@ -141,7 +141,7 @@ def test_options_reach_the_commands(capsys, install):
             (Path("a.yaml"), Path("out/identify")),
             {
                 "gripper": None,
-                "method": "ordinary",
+                "method": "consistent",
                 "cutoff_hz": 30.0,
                 "delay": 0.006,
                 "quiet": False,
@@ -166,7 +166,7 @@ def test_eliminate_hands_on_the_scaling_law(capsys, install):
             (Path("a.csv"), Path("i.json"), Path("out/eliminate")),
             {
                 "gripper": None, "sigma": 0.5, "sigma_object": None, "gamma": 2.0, "eta": 0.25,
-                "causal": None, "cutoff_hz": 20.0, "delay": "auto",
+                "causal": None, "causal_tare_s": None, "cutoff_hz": 20.0, "delay": "auto",
                 "quiet": False,
             },
         )

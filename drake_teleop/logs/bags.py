@@ -25,6 +25,7 @@ a sensor does not have them. Messages that hold `transforms` (TF) are taken apar
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -165,30 +166,32 @@ def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
     return read_table(stream.file, header=stream.header)
 
 
-def draft_of_bag(path: Path, topics: Sequence[Topic]) -> str:
+def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
     """A draft of a log description: the topics whose types suit the streams.
 
     Args:
         path: the bag.
         topics: what is in it.
+        folder: where the draft will be, which its path to the bag starts from.
 
     Returns:
         YAML text whose first lines say that it is a draft, and which other topics would do.
     """
     draft: dict[str, Any] = {}
     others: list[str] = []
+    file = os.path.relpath(path, folder)
     for stream, types in _TYPES.items():
         kinds = {topic.name: topic.type.split("/")[-1] for topic in topics if topic.messages}
         suited = [name for kind in types for name in kinds if kinds[name] == kind]
         if suited or stream == "wrench":
-            draft[stream] = {"file": path.name, "topic": suited[0] if suited else "FILL IN"}
+            draft[stream] = {"file": file, "topic": suited[0] if suited else "FILL IN"}
         if suited and kinds[suited[0]] == "TFMessage":
             draft[stream]["child_frame"] = "FILL IN"
         others += [f"{name} ({stream})" for name in suited[1:]]
     draft["wrench"]["sign"] = 1
     head = [
         "# DRAFT, guessed from the types of topics by `drake-teleop inspect`: check every line,",
-        "# above all wrench.sign and the frames, put it next to the bag, and inspect it.",
+        "# above all wrench.sign and the frames, and inspect it.",
         f"# Other topics that would do: {', '.join(others) or 'none'}.",
     ]
     return "\n".join(head) + "\n" + yaml.safe_dump(draft, sort_keys=False)

@@ -58,6 +58,9 @@ _RATE = 100.0
 _STAMPS = "time stamps of a stream without"
 
 
+_NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
+
+
 @dataclass(frozen=True)
 class Finding:
     """Something suspicious in a log.
@@ -250,7 +253,15 @@ def check_conventions(
     Raises:
         DrakeTeleopError: if the log cannot be read as it is described.
     """
-    data = _Data(description, source, dict(tables or {}))
+    found = _check(_Data(description, source, dict(tables or {})), description)
+    if Path(source).suffix.lower() not in FORMATS:
+        return found
+    # A canonical table has no lines that could be changed.
+    findings = (replace(f, message=f"{f.message} ({_NO_YAML})") for f in found.findings)
+    return replace(found, findings=tuple(findings))
+
+
+def _check(data: _Data, description: Description) -> Conventions:
     log = data.read(description)
     findings = list(_units(description, log))
     if findings:
@@ -415,7 +426,7 @@ def _pose_edits(description: Description) -> Iterator[_Edit]:
     if orientation is None:
         return
     if imu is None or imu.specific_force is None:
-        turned = tuple(-x for x in description.gravity)
+        turned = tuple(0.0 - x for x in description.gravity)
         yield (
             Finding(
                 "reversed gravity",

@@ -23,6 +23,7 @@ draft           the file with a draft description of an unknown table or a bag, 
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -87,7 +88,7 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
     draft = ""
     if is_bag(log):
         topics = topics_of(log)
-        draft = draft_of_bag(log, topics)
+        draft = draft_of_bag(log, topics, out)
         summary["kind"] = "bag"
         summary["topics"] = {
             topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
@@ -106,7 +107,7 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
                 summary["kind"] = "canonical"
         tables = {log: table}
         if description is None:
-            draft = draft_description(table)
+            draft = draft_description(table, out)
             summary["kind"] = "unknown"
     else:
         description = load_description(log)
@@ -363,11 +364,12 @@ _NAMES = {
 }
 
 
-def draft_description(table: Table) -> str:
+def draft_description(table: Table, folder: Path) -> str:
     """A draft of a log description, guessed from names and magnitudes of a table's columns.
 
     Args:
         table: any table.
+        folder: where the draft will be, which its path to the table starts from.
 
     Returns:
         YAML text whose first line says that it is a draft, and what was not found.
@@ -378,7 +380,7 @@ def draft_description(table: Table) -> str:
         key: [name for name in table.columns if re.match(pattern, name, re.IGNORECASE)]
         for key, pattern in _NAMES.items()
     }
-    file = table.path.name
+    file = os.path.relpath(table.path, folder)
     time: dict[str, Any] = {"column": "FILL IN"}
     if columns["time"]:
         time = {"column": columns["time"][0], "unit": _time_unit(table, columns["time"][0])}
@@ -413,7 +415,7 @@ def draft_description(table: Table) -> str:
     unused = [n for n in table.columns if not any(n in found for found in columns.values())]
     head = [
         "# DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
-        "# above all wrench.sign, units and frames, put it next to the table, and inspect it.",
+        "# above all wrench.sign, units and frames, and inspect it.",
         f"# Columns without a guess: {', '.join(unused) or 'none'}.",
     ]
     return "\n".join(head) + "\n" + yaml.safe_dump(draft, sort_keys=False)

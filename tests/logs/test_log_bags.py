@@ -291,9 +291,8 @@ def test_inspecting_a_bag_lists_its_topics_and_drafts_a_description(
         assert word in shown
     draft = (tmp_path / "out" / "draft.yaml").read_text()
     assert "DRAFT" in draft and "would do: /odometry (pose)" in draft
-    (tmp_path / "draft.yaml").write_text(draft)
     # The draft is right as it stands: every stream is used, and nothing is suspicious.
-    found = inspect_command(tmp_path / "draft.yaml", tmp_path / "out", quiet=True)
+    found = inspect_command(tmp_path / "out" / "draft.yaml", tmp_path / "again", quiet=True)
     assert set(found["streams"]) == {"wrench", "imu", "pose"}
     assert found["findings"] == []
     assert found["fit"]["mass"] == pytest.approx(1.7, rel=0.01)
