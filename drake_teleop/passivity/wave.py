@@ -9,14 +9,15 @@ Over a network that is not constant an end sends the integral of its wave and th
 e = F dx + |wave received|^2 T / 2 that is its to pass on, both cumulative. The receiver plays out
 what has come of the integral through a filter of first order, and never more than has come of the
 energy (Yokokohji, Imaida, Yoshikawa 1999 and Niemeyer and Slotine 2004, joined). So nothing is
-created by jitter, loss or hold, nor by a wrench that the device cannot display, and a packet that
-is lost takes no motion with it. Uneven arrival costs energy all the same, and in a long contact the
-force: a playout buffer in the network avoids that.
+created by jitter, loss or hold, nor by a wrench that the device cannot display; and nothing of the
+integral is ever missing for good, which is the correction of drift. Uneven arrival costs energy:
+the filter then becomes as slow as it must be to play all that has come out of what is in store. A
+playout buffer in the network keeps it fast.
 
 The slave's end is matched to the line by a damper m b that its command acts against: with m = 1
 nothing is reflected in free motion, and the hand feels b v; with m = 0 it feels the mass b T of the
-line's content. In contact the slave stays behind by f (T + filter) / b. Drift, of what was cut, is
-corrected through the wave too, out of what the filter left of its energy.
+line's content. In contact the slave stays behind by f (T + filter) / b. Without any wave a wall
+would push the slave away; in a silence it stays instead, and the contact comes back after it.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -39,21 +40,17 @@ from drake_teleop.passivity.memory import (
 from drake_teleop.passivity.packet import (
     ENERGY,
     INTEGRAL,
-    POSE,
-    arrived,
-    difference_into,
     dot,
     fill,
     limit,
     moved_into,
-    scale,
 )
 from drake_teleop.quantities import quantity
 
 # Parameters.
-_IMPEDANCE, _FILTER, _MATCHING, _DRIFT_RATE = METHOD, METHOD + 2, METHOD + 3, METHOD + 4
-# Memory: integral of the wave played out, integral of the wave sent, the wave of this step.
-_PLAYED, _INTEGRAL, _WAVE = OWN, OWN + 6, OWN + 12
+_IMPEDANCE, _FILTER, _MATCHING, _PATIENCE = METHOD, METHOD + 2, METHOD + 3, METHOD + 4
+# Memory: integral of the wave played out, of the wave sent, the wave of this step; silence [s].
+_PLAYED, _INTEGRAL, _WAVE, _SILENT = OWN, OWN + 6, OWN + 12, OWN + 18
 
 
 @dataclass
@@ -67,44 +64,43 @@ class WaveConfig:
     matching: float = quantity(
         1.0, "1", 0.0, 100.0, "damper at the slave's end over b; 1 reflects nothing"
     )
-    drift_rate: float = quantity(
-        2.0, "1/s", 0.0, 1e3, "rate at which the slave's lag behind the hand is corrected"
+    patience: float = quantity(
+        0.05, "s", 0.0, 10.0, "silence after which the slave stays where it is, until it ends"
     )
 
     def packed(self) -> list[float]:
         """The values in the order in which the steps read them."""
-        return [*self.impedance, self.filter, self.matching, self.drift_rate]
+        return [*self.impedance, self.filter, self.matching, self.patience]
 
 
 @njit(cache=True)
 def _play(received, T, p, memory, wave):
-    """The wave (6,) of this step: what is played out, and `wave` (a correction) added to it.
+    """Writes the wave (6,) of this step: what is played out of the integral that has come.
 
-    Both are cut to the energy that has come. What is cut is given up: if it were kept, a line that
-    loses packets would pile it up during a long contact and play it out after that.
+    If a share a of what is left, d, is played in each step, that costs a |d|^2 / (2 T (2 - a)) in
+    all: a is the filter's, or so small that the energy in store pays for that.
     """
-    share = T / (T + p[_FILTER])
     for g in range(2):
         more = received[ENERGY + g] - memory[RECEIVED + g]
         if more > 0.0:
             memory[LEDGER + g] += more
             memory[RECEIVED + g] += more
         for i in range(3 * g, 3 * g + 3):
-            played = share * (received[INTEGRAL + i] - memory[_PLAYED + i])
-            memory[_PLAYED + i] += played
-            wave[i] += played / T
-        energy = 0.5 * T * dot(wave, wave, g)
-        if energy > memory[LEDGER + g]:
-            scale(wave, g, math.sqrt(memory[LEDGER + g] / energy))
-            energy = memory[LEDGER + g]
-        memory[LEDGER + g] -= energy
+            wave[i] = received[INTEGRAL + i] - memory[_PLAYED + i]
+        left, store = dot(wave, wave, g), 2.0 * T * memory[LEDGER + g]
+        share = T / (T + p[_FILTER])
+        if share * left > (2.0 - share) * store:
+            share = 2.0 * store / (left + store)
+        for i in range(3 * g, 3 * g + 3):
+            memory[_PLAYED + i] += share * wave[i]
+            wave[i] *= share / T
+        memory[LEDGER + g] = max(memory[LEDGER + g] - 0.5 * T * dot(wave, wave, g), 0.0)
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
     """One step of the master's end; see `methods.master_step`."""
     wave = memory[_WAVE : _WAVE + 6]
-    wave[:] = 0.0
     _play(received, T, p, memory, wave)
     for g in range(2):
         b = p[_IMPEDANCE + g]
@@ -125,13 +121,26 @@ def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, pa
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """One step of the slave's end; see `methods.slave_step`."""
-    wave, now = memory[_WAVE : _WAVE + 6], memory[COMMAND : COMMAND + 7]
-    step = memory[COMMAND + 7 : COMMAND + 13]
-    wave[:] = 0.0
-    if arrived(received):
-        difference_into(received[POSE : POSE + 7], now, wave)
+    now, step = memory[COMMAND : COMMAND + 7], memory[COMMAND + 7 : COMMAND + 13]
+    memory[_SILENT] = 0.0 if fresh else memory[_SILENT] + T
+    if memory[_SILENT] <= p[_PATIENCE]:
+        _reflect(received, wrench, T, p, memory)
+        moved_into(now, step, now)
         for i in range(6):
-            wave[i] *= p[_DRIFT_RATE] * math.sqrt(0.5 * p[_IMPEDANCE + i // 3])
+            step[i] /= T
+    else:
+        step[:] = 0.0
+    packet[INTEGRAL : INTEGRAL + 6] = memory[_INTEGRAL : _INTEGRAL + 6]
+    packet[ENERGY : ENERGY + 2] = memory[SENT : SENT + 2]
+    command[:] = memory[COMMAND : COMMAND + 13]
+    memory[HELD : HELD + 6] = wrench
+    fill(pose, twist, wrench, packet)
+
+
+@njit(cache=True)
+def _reflect(received, wrench, T, p, memory):
+    """Step of the command under the wave and the contact wrench, and the wave that goes back."""
+    wave, step = memory[_WAVE : _WAVE + 6], memory[COMMAND + 7 : COMMAND + 13]
     _play(received, T, p, memory, wave)
     for g in range(2):
         b, damper = p[_IMPEDANCE + g], p[_MATCHING] * p[_IMPEDANCE + g]
@@ -140,15 +149,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             memory[_INTEGRAL + i] += T * wave[i] + math.sqrt(2.0 / b) * (
                 T * wrench[i] - damper * step[i]
             )
-            packet[INTEGRAL + i] = memory[_INTEGRAL + i]
         damped = damper * dot(step, step, g) / T
         left = 0.5 * T * dot(wave, wave, g) + dot(wrench, step, g) - damped
         memory[LOST + g] += damped
         memory[SENT + g] += max(left, 0.0)
-        packet[ENERGY + g] = memory[SENT + g]
-    moved_into(now, step, now)
-    for i in range(6):
-        step[i] /= T
-    command[:] = memory[COMMAND : COMMAND + 13]
-    memory[HELD : HELD + 6] = wrench
-    fill(pose, twist, wrench, packet)

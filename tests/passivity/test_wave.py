@@ -66,7 +66,7 @@ def test_closed_forms_of_the_line(motion, end, delay):
         "free": lambda u, x: 0.0,
         "rigid": lambda u, x: -np.sqrt(2.0 * b) * u,
     }[end]
-    config = WaveConfig(impedance=[b, 0.05], filter=0.0, matching=0.0, drift_rate=0.0)
+    config = WaveConfig(impedance=[b, 0.05], filter=0.0, matching=0.0)
     f, _ = line(config, motion, contact, delay, delay)
     F, v = -f, np.diff(motion, prepend=motion[0]) / T
     if end == "matched":
@@ -81,7 +81,7 @@ def test_closed_forms_of_the_line(motion, end, delay):
 def test_the_slave_stays_behind_by_the_momentum_on_the_line(delay):
     """x_m - x_s = f (T + filter) / b in a steady contact."""
     b, stiffness, filtering = 10.0, 291.0, 0.003
-    config = WaveConfig(impedance=[b, 0.05], filter=filtering, drift_rate=0.0)
+    config = WaveConfig(impedance=[b, 0.05], filter=filtering)
     pressed = 0.02 * np.minimum(np.arange(6000) * T / 0.5, 1.0)
     f, x = line(config, pressed, lambda u, x: -stiffness * max(x, 0.0), delay, delay)
     assert -f[-1] == pytest.approx(stiffness * x[-1], rel=0.01)
