@@ -51,6 +51,9 @@ from drake_teleop.passivity.packet import (
 )
 from drake_teleop.quantities import quantity
 
+# Of what the hand puts in, until the reserve is full: all of it would leave a soft wall too little.
+_SHARE_KEPT = 0.5
+
 # Parameters.
 _RELEASE, _DRAIN, _DRIFT_RATE, _RESERVE = METHOD, METHOD + 1, METHOD + 2, METHOD + 3
 # Memory of the master: share of the wrench that is withheld, energy kept.
@@ -73,7 +76,7 @@ class TdpaConfig:
         20.0, "1/s", 0.0, 1e3, "rate at which a withheld command is made up for, if it is paid for"
     )
     reserve: list[float] = quantity(
-        [2e-3, 1e-4], "J", 0.0, 1e3, "that the master keeps of what the hand puts in, per group"
+        [2e-3, 1e-4], "J", 0.0, 1e3, "that the master keeps of what the hand puts in"
     )
 
     def packed(self) -> list[float]:
@@ -121,7 +124,7 @@ def _account(g, drained, p, memory):
         kept = min(memory[LEDGER + g] - drained, 0.0)
         memory[LEDGER + g] = max(memory[LEDGER + g] - drained, 0.0)
     else:
-        kept = min(-drained, max(p[_RESERVE + g] - memory[_KEPT + g], 0.0))
+        kept = min(-_SHARE_KEPT * drained, max(p[_RESERVE + g] - memory[_KEPT + g], 0.0))
         memory[SENT + g] -= drained + kept
     memory[_KEPT + g] = max(memory[_KEPT + g] + kept, 0.0)
 
