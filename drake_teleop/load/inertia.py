@@ -22,6 +22,8 @@ from drake_teleop.load.arrays import Array, checked
 
 # Rounding of phi and of the eigenvalues, so that rods, plates and points count as consistent.
 _ROUNDING = 1e-12
+# Square of a radius of gyration [m^2] below which a body is a point.
+_LEAST_SPREAD = 1e-290
 
 
 def _second_moment(about: Array, mass: float) -> Array:
@@ -119,7 +121,8 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     mass, spread = J[3, 3], np.trace(J[:3, :3])
     if mass <= 0.0 or spread < 0.0:
         return False
-    length = np.sqrt(spread / mass) if spread > 0.0 else 1.0
+    # Next to the smallest numbers there are, quotients are no longer precise: that is a point.
+    length = np.sqrt(spread / mass) if spread > _LEAST_SPREAD * mass else 1.0
     unit = np.array([length, length, length, 1.0])
     eigenvalues = np.linalg.eigvalsh(J / np.outer(unit, unit) / mass)
     return bool(eigenvalues[0] >= -(tolerance + _ROUNDING))

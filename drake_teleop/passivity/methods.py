@@ -173,6 +173,7 @@ def master_step(method, received, fresh, pose, twist, dx, hand, T, p, memory, wr
             not finite.
         packet: (PACKET_SIZE,) written: what is sent.
     """
+    packet[:] = 0.0  # a method writes only what it uses
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(hand)
     if not healthy:
         wrench[:] = 0.0
@@ -211,6 +212,7 @@ def slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, c
         command: (13,) written: pose (7,) and twist (6,) that the slave shall follow. The last one,
             at rest, if an input is not finite.
     """
+    packet[:] = 0.0  # a method writes only what it uses
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(wrench)
     if not healthy:
         memory[COMMAND + 7 : COMMAND + 13] = 0.0
