@@ -10,9 +10,10 @@ e = F dx + |wave received|^2 T / 2 that is its to pass on, both cumulative. The 
 what has come of the integral through a filter of first order, and never more than has come of the
 energy (Yokokohji, Imaida, Yoshikawa 1999 and Niemeyer and Slotine 2004, joined). So nothing is
 created by jitter, loss or hold, nor by a wrench that the device cannot display; and nothing of the
-integral is ever missing for good, which is the correction of drift. Uneven arrival costs energy:
-the filter then becomes as slow as it must be to play all that has come out of what is in store. A
-playout buffer in the network keeps it fast.
+integral is ever missing for good, so lost packets cause no drift. What a limited wrench or silence
+leaves of it is corrected in free motion, where that takes no work. Uneven arrival costs energy:
+the filter then becomes as slow as it must be to play all that has come out of what is in store.
+A playout buffer in the network keeps it fast.
 
 The slave's end is matched to the line by a damper m b that its command acts against: with m = 1
 nothing is reflected in free motion, and the hand feels b v; with m = 0 it feels the mass b T of the
@@ -40,6 +41,9 @@ from drake_teleop.passivity.memory import (
 from drake_teleop.passivity.packet import (
     ENERGY,
     INTEGRAL,
+    POSE,
+    arrived,
+    difference_into,
     dot,
     fill,
     limit,
@@ -48,9 +52,15 @@ from drake_teleop.passivity.packet import (
 from drake_teleop.quantities import quantity
 
 # Parameters.
-_IMPEDANCE, _FILTER, _MATCHING, _PATIENCE = METHOD, METHOD + 2, METHOD + 3, METHOD + 4
+_IMPEDANCE, _FILTER, _MATCHING, _PATIENCE, _DRIFT_RATE = (
+    METHOD,
+    METHOD + 2,
+    METHOD + 3,
+    METHOD + 4,
+    METHOD + 5,
+)
 # Memory: integral of the wave played out, of the wave sent, the wave of this step; silence [s].
-_PLAYED, _INTEGRAL, _WAVE, _SILENT = OWN, OWN + 6, OWN + 12, OWN + 18
+_PLAYED, _INTEGRAL, _WAVE, _SILENT, _DRIFT = OWN, OWN + 6, OWN + 12, OWN + 18, OWN + 19
 
 
 @dataclass
@@ -67,10 +77,13 @@ class WaveConfig:
     patience: float = quantity(
         0.05, "s", 0.0, 10.0, "silence after which the slave stays where it is, until it ends"
     )
+    drift_rate: float = quantity(
+        2.0, "1/s", 0.0, 1e3, "rate at which drift is corrected where that takes no work"
+    )
 
     def packed(self) -> list[float]:
         """The values in the order in which the steps read them."""
-        return [*self.impedance, self.filter, self.matching, self.patience]
+        return [*self.impedance, self.filter, self.matching, self.patience, self.drift_rate]
 
 
 @njit(cache=True)
@@ -125,6 +138,8 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     memory[_SILENT] = 0.0 if fresh else memory[_SILENT] + T
     if memory[_SILENT] <= p[_PATIENCE]:
         _reflect(received, wrench, T, p, memory)
+        if arrived(received):
+            _correct(received, wrench, T, p, memory)
         moved_into(now, step, now)
         for i in range(6):
             step[i] /= T
@@ -153,3 +168,14 @@ def _reflect(received, wrench, T, p, memory):
         left = 0.5 * T * dot(wave, wave, g) + dot(wrench, step, g) - damped
         memory[LOST + g] += damped
         memory[SENT + g] += max(left, 0.0)
+
+
+@njit(cache=True)
+def _correct(received, wrench, T, p, memory):
+    """Adds a step towards the received pose where it does not press on what the slave touches."""
+    drift, step = memory[_DRIFT : _DRIFT + 6], memory[COMMAND + 7 : COMMAND + 13]
+    difference_into(received[POSE : POSE + 7], memory[COMMAND : COMMAND + 7], drift)
+    for g in range(2):
+        if dot(wrench, drift, g) >= 0.0:
+            for i in range(3 * g, 3 * g + 3):
+                step[i] += min(T * p[_DRIFT_RATE], 1.0) * drift[i]
