@@ -63,7 +63,7 @@ POSE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 BACKWARD, TRUE, STRONGER, TANK, FIGURES = range(5)
 WAVE_HOLD = -1
 AT_MOTOR = ("two_layer", "pspm")
-BOUNDED = ("wave", "tdpa", "two_layer", "pspm")
+BOUNDED = ("wave", "tdpa", "charged_tdpa", "two_layer", "pspm")
 
 
 def random_motion(rng: np.random.Generator, steps: int) -> tuple[Array, Array]:
@@ -345,6 +345,7 @@ def holds(result: dict[str, dict[str, float]]) -> bool:
     """Whether the methods keep their bounds and the baselines do not."""
     return (
         result["tdpa"]["energy"] >= -1e-9
+        and result["charged_tdpa"]["energy"] >= -1e-9
         and result["wave"]["energy"] >= -1e-9
         and result["tdpa"]["stronger"] <= 1e-12
         and result["two_layer"]["true_energy"] >= -1e-9

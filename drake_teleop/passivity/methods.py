@@ -45,14 +45,23 @@ from drake_teleop.passivity.memory import (
 )
 from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, POSE, SEQUENCE, finite
 from drake_teleop.passivity.pspm import PspmConfig
-from drake_teleop.passivity.tdpa import TdpaConfig
+from drake_teleop.passivity.tdpa import TdpaConfig, charged
 from drake_teleop.passivity.two_layer import TwoLayerConfig
 from drake_teleop.passivity.wave import WaveConfig
 from drake_teleop.quantities import choice, quantity
 
-METHODS = ("none", "wave", "tdpa", "two_layer", "pspm", "four_channel", "force_limit")
+METHODS = (
+    "none",
+    "wave",
+    "tdpa",
+    "charged_tdpa",
+    "two_layer",
+    "pspm",
+    "four_channel",
+    "force_limit",
+)
 
-NONE, WAVE, TDPA, TWO_LAYER, PSPM, FOUR_CHANNEL, FORCE_LIMIT = range(len(METHODS))
+NONE, WAVE, TDPA, CHARGED_TDPA, TWO_LAYER, PSPM, FOUR_CHANNEL, FORCE_LIMIT = range(len(METHODS))
 
 
 @dataclass
@@ -74,6 +83,7 @@ class PassivityConfig:
     )
     wave: WaveConfig = field(default_factory=WaveConfig)
     tdpa: TdpaConfig = field(default_factory=TdpaConfig)
+    charged_tdpa: TdpaConfig = field(default_factory=charged)
     two_layer: TwoLayerConfig = field(default_factory=TwoLayerConfig)
     pspm: PspmConfig = field(default_factory=PspmConfig)
     four_channel: FourChannelConfig = field(default_factory=FourChannelConfig)
@@ -100,6 +110,7 @@ def parameters(
     own: dict[str, Any] = {
         "wave": config.wave,
         "tdpa": config.tdpa,
+        "charged_tdpa": config.charged_tdpa,
         "two_layer": config.two_layer,
         "pspm": config.pspm,
         "four_channel": config.four_channel,
@@ -179,7 +190,7 @@ def master_step(method, received, fresh, pose, twist, dx, hand, T, p, memory, wr
         wrench[:] = 0.0
     elif method == WAVE:
         wave.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
-    elif method == TDPA:
+    elif method in (TDPA, CHARGED_TDPA):
         tdpa.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
     elif method == TWO_LAYER:
         two_layer.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
@@ -219,7 +230,7 @@ def slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, c
         command[:] = memory[COMMAND : COMMAND + 13]
     elif method == WAVE:
         wave.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
-    elif method == TDPA:
+    elif method in (TDPA, CHARGED_TDPA):
         tdpa.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
     elif method == TWO_LAYER:
         two_layer.slave_step(

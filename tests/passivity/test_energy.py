@@ -36,6 +36,12 @@ def test_tdpa_never_gives_out_more_than_was_put_in(least):
     assert least["tdpa"]["stronger"] <= 1e-12, "the wrench became stronger"
 
 
+def test_what_is_charged_by_drag_is_not_given_out_twice(least):
+    assert least["charged_tdpa"]["energy"] >= -1e-9
+    assert least["charged_tdpa"]["stronger"] <= 0.28 + 1e-12, "stronger by more than the drag"
+    assert least["charged_tdpa"]["stronger"] > 0.2, "there should have been drag"
+
+
 def test_waves_give_out_the_energy_that_came_and_no_more(least):
     assert least["wave"]["energy"] >= -1e-9
     assert least["wave_hold"]["energy"] < -1e-3, "held waves should have created energy"
