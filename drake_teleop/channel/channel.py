@@ -27,10 +27,11 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.passivity import methods
 from drake_teleop.passivity.memory import LIMIT, MEMORY
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
-from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, difference_into, dot
+from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, difference_into, dot, finite
 from drake_teleop.passivity.safe_state import (
     MASTER_WATCH,
     SLAVE_WATCH,
+    STOP,
     initial_master_watch,
     initial_slave_watch,
     master_limits_into,
@@ -76,11 +77,12 @@ class Channel(NetworkConfig):
 
 # The state of both ends, one array: the step's number, then these.
 _STEP = 0
-_POSE_M = 1  # (7,) command at the master, a step ago
-_POSE_S = _POSE_M + 7  # (7,) slave, a step ago
-_WRENCH_M = _POSE_S + 7  # (6,) what the hand feels since then
+_POSE_M = 1  # (8,) command at the master, a step ago; 1 if it was unknown, then the one before
+_POSE_S = _POSE_M + 8  # (8,) slave, likewise
+_WRENCH_M = _POSE_S + 8  # (6,) what the hand feels since then
 _WRENCH_S = _WRENCH_M + 6  # (6,) the slave's wrench then
-_WATCH_M = _WRENCH_S + 6
+_TRUSTED = _WRENCH_S + 6  # for how long the wrench was good without a break [s]
+_WATCH_M = _TRUSTED + 1
 _WATCH_S = _WATCH_M + MASTER_WATCH
 _MEMORY_M = _WATCH_S + SLAVE_WATCH
 _MEMORY_S = _MEMORY_M + MEMORY
@@ -103,6 +105,7 @@ def initial_ends(
     """
     ends = np.zeros(_SIZE)
     ends[_POSE_M : _POSE_M + 7] = ends[_POSE_S : _POSE_S + 7] = start
+    ends[_TRUSTED] = STOP
     ends[_WATCH_M : _WATCH_M + MASTER_WATCH] = initial_master_watch()
     ends[_WATCH_S : _WATCH_S + SLAVE_WATCH] = initial_slave_watch(start)
     memory = methods.initial_memory(method, parameters, start)
@@ -139,7 +142,7 @@ def channel_step(
         wrench_B: (6,) F_E_B, what the hand should feel of the slave's wrench [N, N m].
         hand_B: (6,) of the hand on the stylus, in B [N, N m].
         slave_pose: (7,) X_WS, actual.
-        saturated: whether the wrench is not to be trusted: the last one is kept.
+        saturated: whether the wrench is not to be trusted: the last good one is kept.
         T, timeout: [s].
         frame: (11,) R_WB by rows, scale of translation and of rotation.
         parameters: of the method.
@@ -153,7 +156,7 @@ def channel_step(
     """
     k = int(ends[_STEP])
     ends[_STEP] += 1.0
-    before_M, before_S = ends[_POSE_M : _POSE_M + 7], ends[_POSE_S : _POSE_S + 7]
+    before_M, before_S = ends[_POSE_M : _POSE_M + 8], ends[_POSE_S : _POSE_S + 8]
     held_M, held_S = ends[_WRENCH_M : _WRENCH_M + 6], ends[_WRENCH_S : _WRENCH_S + 6]
     watch_M = ends[_WATCH_M : _WATCH_M + MASTER_WATCH]
     watch_S = ends[_WATCH_S : _WATCH_S + SLAVE_WATCH]
@@ -164,45 +167,87 @@ def channel_step(
     received, packet = np.empty(PACKET_SIZE), np.empty(PACKET_SIZE)
 
     # The master's end.
-    difference_into(pose_command, before_M, dx)
-    before_M[:] = pose_command
+    good = _moved(pose_command, before_M, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
         ports[g] -= dot(held_M, dx, g)
-    _to_world(hand_B, frame, hand)
+    hand[:] = 0.0
+    if finite(hand_B):
+        _to_world(hand_B, frame, hand)
+    else:
+        good = False
     _, fresh = network.receive(backward_parameters, backward, k, received)
     alive = fresh and received[HEALTHY] > 0.5
     full = parameters[LIMIT : LIMIT + 2].copy()
-    master_limits_into(alive, T, timeout, full, held_M, watch_M, limits)
+    master_limits_into(
+        alive, (fresh and not alive) or not good, T, timeout, full, held_M, watch_M, limits
+    )
     parameters[LIMIT : LIMIT + 2] = limits
     methods.master_step(
-        method, received, fresh, pose_command, twist, dx, hand, T, parameters, memory_M, held_M,
+        method, received, fresh, before_M[:7], twist, dx, hand, T, parameters, memory_M, held_M,
         packet,
     )  # fmt: skip
     parameters[LIMIT : LIMIT + 2] = full
+    if not good:
+        packet[HEALTHY] = 0.0
     network.send(forward_parameters, forward, k, packet)
     _to_master(held_M, frame, wrench_received)
 
     # The slave's end.
-    difference_into(slave_pose, before_S, dx)
-    before_S[:] = slave_pose
+    good = _moved(slave_pose, before_S, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
         ports[2 + g] += dot(held_S, dx, g)
-    if not saturated:
-        _to_world(wrench_B, frame, held_S)
+    if not finite(wrench_B):
+        good = False
+        ends[_TRUSTED] = 0.0
+    elif saturated:
+        ends[_TRUSTED] = 0.0
+    else:
+        # From a wrench that was kept to the measured one, all of the way at last.
+        _to_world(wrench_B, frame, wrench)
+        share = T / max(STOP - ends[_TRUSTED], T)
+        for i in range(6):
+            held_S[i] = (1.0 - share) * held_S[i] + share * wrench[i]
+        ends[_TRUSTED] += T
     wrench[:] = held_S
     _, fresh = network.receive(forward_parameters, forward, k + 1, received)
     alive = fresh and received[HEALTHY] > 0.5
     methods.slave_step(
-        method, received, fresh, slave_pose, twist, dx, wrench, T, parameters, memory_S, command,
+        method, received, fresh, before_S[:7], twist, dx, wrench, T, parameters, memory_S, command,
         packet,
     )  # fmt: skip
+    if not good:
+        packet[HEALTHY] = 0.0
     network.send(backward_parameters, backward, k, packet)
-    slave_command_into(alive, T, timeout, command[:7], watch_S, pose_received)
+    slave_command_into(
+        alive, (fresh and not alive) or not good, T, timeout, command[:7], watch_S, pose_received
+    )
     ports[4], ports[5] = watch_M[0], watch_S[0]
+
+
+@njit(cache=True)
+def _moved(pose, before, dx):
+    """Writes the increment since the last step, none from or to a pose that is not finite.
+
+    Args:
+        pose: (7,) now.
+        before: (8,) the last pose that was finite; 1 if the last pose was not. Updated.
+        dx: (6,) written.
+
+    Returns:
+        Whether the pose is finite.
+    """
+    good = finite(pose)
+    if good:
+        difference_into(pose, before, dx)
+        before[:7] = pose
+    if not good or before[7] > 0.0:
+        dx[:] = 0.0
+    before[7] = 0.0 if good else 1.0
+    return good
 
 
 @njit(cache=True)
@@ -242,9 +287,9 @@ def _slave_pose_into(arm, q, pose):
 class TeleopChannel(LeafSystem):
     """The network, and at both of its ends the method that keeps the station passive.
 
-    A packet takes at least one period. Both ends have a safe state, see
-    `drake_teleop.passivity.safe_state`. While the wrist sensor is saturated its last good wrench is
-    sent.
+    A packet takes at least one period. Both ends have a safe state for silence and for data that
+    are not finite, see `drake_teleop.passivity.safe_state`. While the wrist sensor is saturated its
+    last good wrench is kept.
 
     The wrench that follows from a pose acts at once, while the device leaves that pose, so that
     wrench times increment is exactly the work of the device's port. Hence it is an output that

@@ -1,6 +1,7 @@
-"""The watchdogs of both ends: what happens when the other end falls silent, and when it is back.
+"""The safe state of both ends: what happens in silence and with faulty data, and when it is over.
 
-An end is *silent* when no new packet of a healthy sender has come for the time `timeout`.
+An end is *silent* when no new packet of a healthy sender has come for the time `timeout`. It is so
+at once when its own data are not finite, or when the newest packet says so of the sender's.
 
 * Master. The wrench that the hand feels fades to zero, in 50 ms from where it was. When packets
   come again, the limit of the wrench rises from zero to the device's limit within 0.5 s, so that
@@ -10,6 +11,26 @@ An end is *silent* when no new packet of a healthy sender has come for the time 
   made up for.
 
 Both begin as if the other end had been silent before.
+
+==============================  ==============================  ==============================
+cause                           master                          slave
+==============================  ==============================  ==============================
+nothing comes from the slave    fades after `timeout`           goes on
+nothing comes from the master   goes on                         stops after `timeout`
+pose or wrench of the hand      fades at once; the hand is      stops as soon as it is told
+not finite                      taken to rest where it was
+pose or wrench of the slave     fades as soon as it is told     stops at once; the last good
+not finite                                                      pose and wrench are kept
+wrist sensor saturated          goes on                         goes on; the last good wrench
+                                                                is kept
+a tank is empty                 the wrench is shortened to      the servo's spring is
+                                what can be paid for            shortened likewise
+wrench beyond the device        shortened to its limit          goes on
+==============================  ==============================  ==============================
+
+A saturated sensor stops nothing, because only the hand can lead the slave out of it, and what the
+hand feels meanwhile pushes it that way. A wrench that was kept goes over to the measured one within
+50 ms. While a pose is unknown no work is counted at its port.
 """
 
 from __future__ import annotations
@@ -26,10 +47,9 @@ RESUME = 0.5  #: s, in which it goes over to normal again
 # Watch of the master: time without packets, present limits (2,), what they fall by per second (2,).
 _SILENT, _LIMIT, _FALL = 0, 1, 3
 MASTER_WATCH = 5
-# Watch of the slave: likewise; phase; time in it; command (7,) at its start; velocity (6,) there;
-# the last command (7,), the one before (7,).
-_PHASE, _TIME, _FROM, _VELOCITY, _LAST, _BEFORE = 1, 2, 3, 10, 16, 23
-_FOLLOWING, _STOPPING, _RESUMING = 0.0, 1.0, 2.0
+# Watch of the slave: likewise; time since it began to stop, and to resume; command (7,) when it
+# began to stop; velocity (6,) there; the last command (7,), the one before (7,).
+_STOPPING, _RESUMING, _FROM, _VELOCITY, _LAST, _BEFORE = 1, 2, 3, 10, 16, 23
 SLAVE_WATCH = 30
 
 
@@ -43,18 +63,28 @@ def initial_master_watch() -> NDArray[np.float64]:
 def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """(SLAVE_WATCH,) before the first packet: the command rests at `pose` (7,), X_WS."""
     watch = np.zeros(SLAVE_WATCH)
-    watch[_SILENT], watch[_PHASE] = np.inf, _STOPPING
+    watch[_SILENT] = np.inf
     for part in (_FROM, _LAST, _BEFORE):
         watch[part : part + 7] = pose
     return watch
 
 
 @njit(cache=True)
-def master_limits_into(alive, T, timeout, full, held, watch, limits):
+def _listen(alive, fault, T, watch):
+    """Counts for how long nothing was heard."""
+    if fault:
+        watch[_SILENT] = np.inf
+    else:
+        watch[_SILENT] = 0.0 if alive else watch[_SILENT] + T
+
+
+@njit(cache=True)
+def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
     """What the wrench at the hand has to keep at this step.
 
     Args:
         alive: whether a new packet of a healthy slave came at this step.
+        fault: whether the hand's data are not finite, or a new packet says so of the slave's.
         T: time between steps [s].
         timeout: [s].
         full: (2,) the device's limits [N, N m].
@@ -62,7 +92,7 @@ def master_limits_into(alive, T, timeout, full, held, watch, limits):
         watch: (MASTER_WATCH,) updated.
         limits: (2,) written [N, N m].
     """
-    watch[_SILENT] = 0.0 if alive else watch[_SILENT] + T
+    _listen(alive, fault, T, watch)
     for g in range(2):
         if watch[_SILENT] <= timeout:
             watch[_FALL + g] = 0.0
@@ -76,43 +106,44 @@ def master_limits_into(alive, T, timeout, full, held, watch, limits):
 
 
 @njit(cache=True)
-def slave_command_into(alive, T, timeout, wanted, watch, command):
+def slave_command_into(alive, fault, T, timeout, wanted, watch, command):
     """The command that leaves for the slave at this step.
 
     Args:
         alive: whether a new packet of a healthy master came at this step.
+        fault: whether the slave's data are not finite, or a new packet says so of the hand's.
         T, timeout: [s].
         wanted: (7,) X_WS that the method asks for.
         watch: (SLAVE_WATCH,) updated.
         command: (7,) written, X_WS.
     """
-    watch[_SILENT] = 0.0 if alive else watch[_SILENT] + T
+    _listen(alive, fault, T, watch)
     last, before = watch[_LAST : _LAST + 7], watch[_BEFORE : _BEFORE + 7]
     start, velocity = watch[_FROM : _FROM + 7], watch[_VELOCITY : _VELOCITY + 6]
     step = np.empty(6)
-    silent = watch[_SILENT] > timeout
-    if silent != (watch[_PHASE] == _STOPPING):
-        watch[_PHASE] = _STOPPING if silent else _RESUMING
-        watch[_TIME] = 0.0
-        difference_into(last, before, step)
+    if watch[_SILENT] <= timeout:
+        watch[_RESUMING] = min(watch[_RESUMING] + T, RESUME)
+    elif watch[_RESUMING] > 0.0:
+        difference_into(last, before, velocity)
+        for i in range(6):
+            velocity[i] /= T
         start[:] = last
-        velocity[:] = step / T
-    watch[_TIME] += T
-    if watch[_PHASE] == _STOPPING:
-        u = min(watch[_TIME] / STOP, 1.0)
+        watch[_STOPPING] = watch[_RESUMING] = 0.0
+    if watch[_RESUMING] == RESUME:
+        command[:] = wanted
+    else:
+        # Where it stops or has stopped; and from there, with a share that rises smoothly from 0 to
+        # 1, to what is wanted. So velocity is continuous even if it resumes before it has stopped.
+        watch[_STOPPING] += T
+        u = min(watch[_STOPPING] / STOP, 1.0)
         for i in range(6):  # velocity falls as 1 - 3 u^2 + 2 u^3
             step[i] = velocity[i] * STOP * u * (1.0 - u * u * (1.0 - 0.5 * u))
         moved_into(start, step, command)
-    elif watch[_PHASE] == _RESUMING:
-        u = min(watch[_TIME] / RESUME, 1.0)
-        share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
-        difference_into(wanted, start, step)
-        for i in range(6):
-            step[i] *= share
-        moved_into(start, step, command)
-        if u == 1.0:
-            watch[_PHASE] = _FOLLOWING
-    else:
-        command[:] = wanted
+        u = watch[_RESUMING] / RESUME
+        if u > 0.0:
+            difference_into(wanted, command, step)
+            for i in range(6):
+                step[i] *= u * u * u * (10.0 + u * (6.0 * u - 15.0))
+            moved_into(command, step, command)
     before[:] = last
     last[:] = command

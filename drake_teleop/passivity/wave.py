@@ -10,15 +10,20 @@ e = F dx + |wave received|^2 T / 2 that is its to pass on, both cumulative. The 
 what has come of the integral through a filter of first order, and never more than has come of the
 energy (Yokokohji, Imaida, Yoshikawa 1999 and Niemeyer and Slotine 2004, joined). So nothing is
 created by jitter, loss or hold, nor by a wrench that the device cannot display; and nothing of the
-integral is ever missing for good, so lost packets cause no drift. What a limited wrench or silence
-leaves of it is corrected in free motion, where that takes no work. Uneven arrival costs energy:
-the filter then becomes as slow as it must be to play all that has come out of what is in store.
-A playout buffer in the network keeps it fast.
+integral is ever missing for good, so neither lost packets nor a limited wrench cause drift. What
+long silence leaves is corrected in free motion, where that takes no work. Uneven arrival costs
+energy: the filter then becomes as slow as it must be to play all that has come out of what is in
+store. A playout buffer in the network keeps it fast.
 
 The slave's end is matched to the line by a damper m b that its command acts against: with m = 1
 nothing is reflected in free motion, and the hand feels b v; with m = 0 it feels the mass b T of the
-line's content. In contact the slave stays behind by f (T + filter) / b. Without any wave a wall
-would push the slave away; in a silence it stays instead, and the contact comes back after it.
+line's content. In contact the slave stays behind by f (T + filter) / b. Neither a wall nor the
+spring of a hand takes much of a slow wave: at a round trip of 0.5 s what is left of a contact's
+beginning fades with a time constant of 1.5 s, at 1 s with one of 9 s.
+
+Without any wave a wall would push the slave away; in a silence it stays instead, and reflects. The
+contact comes back after it, but not quite as deep: the hand went on while it felt nothing, and to
+push it back takes energy that nobody has paid for. Pressed anew it is as deep as before.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -75,7 +80,7 @@ class WaveConfig:
         1.0, "1", 0.0, 100.0, "damper at the slave's end over b; 1 reflects nothing"
     )
     patience: float = quantity(
-        0.05, "s", 0.0, 10.0, "silence after which the slave stays where it is, until it ends"
+        0.03, "s", 0.0, 10.0, "silence after which the slave stays where it is, until it ends"
     )
     drift_rate: float = quantity(
         2.0, "1/s", 0.0, 1e3, "rate at which drift is corrected where that takes no work"
@@ -119,14 +124,14 @@ def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, pa
         b = p[_IMPEDANCE + g]
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = math.sqrt(2.0 * b) * wave[i] - b * dx[i] / T
+            # As if it could all be displayed, so that no momentum is missing on the line.
+            memory[_INTEGRAL + i] += (b * dx[i] - wrench[i] * T) / math.sqrt(2.0 * b)
+            packet[INTEGRAL + i] = memory[_INTEGRAL + i]
         limit(wrench, g, p[LIMIT + g])
         # Not negative: of a wrench that was shortened even more is left than the wave going back.
         left = 0.5 * T * dot(wave, wave, g) - dot(wrench, dx, g)
         memory[SENT + g] += max(left, 0.0)
         packet[ENERGY + g] = memory[SENT + g]
-        for i in range(3 * g, 3 * g + 3):
-            memory[_INTEGRAL + i] += (b * dx[i] - wrench[i] * T) / math.sqrt(2.0 * b)
-            packet[INTEGRAL + i] = memory[_INTEGRAL + i]
     memory[HELD : HELD + 6] = wrench
     fill(pose, twist, wrench, packet)
 
@@ -145,6 +150,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             step[i] /= T
     else:
         step[:] = 0.0
+        _rest(wrench, T, p, memory)
     packet[INTEGRAL : INTEGRAL + 6] = memory[_INTEGRAL : _INTEGRAL + 6]
     packet[ENERGY : ENERGY + 2] = memory[SENT : SENT + 2]
     command[:] = memory[COMMAND : COMMAND + 13]
@@ -168,6 +174,25 @@ def _reflect(received, wrench, T, p, memory):
         left = 0.5 * T * dot(wave, wave, g) + dot(wrench, step, g) - damped
         memory[LOST + g] += damped
         memory[SENT + g] += max(left, 0.0)
+
+
+@njit(cache=True)
+def _rest(wrench, T, p, memory):
+    """Plays the wave that keeps the slave where it is, as long as the energy in store pays for it.
+
+    It is reflected as by a rigid wall. What comes later has only to make up for the rest.
+    """
+    wave = memory[_WAVE : _WAVE + 6]
+    for g in range(2):
+        for i in range(3 * g, 3 * g + 3):
+            wave[i] = -wrench[i] / math.sqrt(2.0 * p[_IMPEDANCE + g])
+        energy = 0.5 * T * dot(wave, wave, g)
+        if energy <= memory[LEDGER + g]:
+            memory[LEDGER + g] -= energy
+            memory[SENT + g] += energy
+            for i in range(3 * g, 3 * g + 3):
+                memory[_PLAYED + i] += T * wave[i]
+                memory[_INTEGRAL + i] -= T * wave[i]
 
 
 @njit(cache=True)
