@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.experiments.one_dof import (
+    OneDof,
+    Task,
+    figures,
+    operators_intent,
+    run_one_dof,
+)
 from drake_teleop.passivity.memory import MEMORY
 from drake_teleop.passivity.methods import (
     METHODS,
@@ -178,3 +186,20 @@ def test_a_method_that_does_not_exist_is_refused():
     with pytest.raises(DrakeTeleopError, match="method"):
         check_ranges(PassivityConfig(method="waves"), "passivity")
     assert initial_memory("none", np.zeros(1), START).shape == (MEMORY,)
+
+
+@pytest.mark.parametrize(("wall", "round_trip"), [(5100.0, 1.0), (20000.0, 0.3), (20000.0, 0.02)])
+def test_charged_tdpa_holds_a_wall_over_a_long_delay_with_the_right_force(wall, round_trip):
+    model, task = OneDof(wall_stiffness=wall), Task(release=15.5, released=16.5, end=21.0)
+    network = NetworkConfig(delay=round_trip / 2, jitter=0.25, loss=0.1)
+
+    def found(method):
+        passivity = PassivityConfig(method=method)
+        run = run_one_dof(model, passivity, network, intent=operators_intent(task))
+        return figures(run, model, task)
+
+    charged, strict = found("charged_tdpa"), found("tdpa")
+    assert charged.stable and abs(charged.force_error) < 0.01
+    assert abs(charged.drift) < 0.5e-3 and charged.free_force < 0.3
+    assert charged.rise_delay < 0.5 * round_trip + 0.25, "the quick onset should have come"
+    assert abs(strict.force_error) > 0.3, "energy earned beforehand should have mattered"
