@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.channel.channel import Channel
+from drake_teleop.channel import channel
+from drake_teleop.channel.channel import Channel, channel_step
 from drake_teleop.channel.network import PRESETS, NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.master.operator import OperatorConfig, Sine
+from drake_teleop.passivity.safe_state import STOP
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.plant import AddSlavePlant
@@ -98,3 +100,37 @@ def test_directions_may_differ():
 def test_a_channel_that_cannot_be_is_refused(changes, message, load_estimate):
     with pytest.raises(DrakeTeleopError, match=message):
         MakeTeleopStation(replace(Scenario(), **changes), load_estimate=load_estimate)
+
+
+def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
+    monkeypatch, load_estimate
+):
+    """From 0.2 to 0.4 s its wrench is not a number; the hand moves all the time."""
+    scenario = moving(
+        channel__delay=0.01,
+        simulation__duration=1.2,
+        rates__log_hz=1000.0,
+    )
+    sound = run(scenario, load_estimate)
+
+    def failing(method, pose, wrench_B, *rest):
+        ends = rest[-4]
+        failed = 2 * 800 <= ends[0] < 2 * 1000  # at 2 kHz, after 0.6 s of settling
+        channel_step(method, pose, np.full(6, np.nan) if failed else wrench_B, *rest)
+
+    monkeypatch.setattr(channel, "channel_step", failing)
+    result = run(scenario, load_estimate)
+    for name in result:
+        values = result[name][:, :4] if name == "ports" else result[name]  # then come ages
+        assert np.isfinite(values).all(), name
+    t, force = result.t, np.linalg.norm(result["force_to_master"][:, :3], axis=1)
+    position = result["pose_received"][:, 4:]
+    safe = (t > 0.2 + 0.01 + STOP + 0.005) & (t < 0.4)
+    assert force[safe].max() < 1e-12
+    assert np.ptp(position[safe], axis=0).max() < 1e-12
+    assert np.abs(np.diff(result["force_to_master"][:, :3], axis=0)).max() < 0.5
+    fastest = np.abs(np.diff(sound["pose_received"][:, 4:], axis=0)).max()
+    assert np.abs(np.diff(position, axis=0)).max() < 2.0 * fastest
+    again = t > 1.1
+    np.testing.assert_allclose(position[again], sound["pose_received"][again, 4:], atol=2e-3)
+    assert force[again].max() > 0.1

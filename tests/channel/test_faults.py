@@ -1,0 +1,129 @@
+"""Data that are not finite, and a saturated sensor, at either end: smooth, bounded, and over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from drake_teleop.channel import network
+from drake_teleop.channel.channel import channel_step, initial_ends
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.passivity.methods import METHODS, PassivityConfig, parameters
+from drake_teleop.passivity.packet import PACKET_SIZE
+from drake_teleop.passivity.safe_state import RESUME, STOP
+
+T, STEPS, DELAY = 1e-3, 4000, 0.01
+LIMIT = 5.0
+TIMEOUT = 0.1
+FAULT = (1.0, 1.4)  # s, in contact
+FAULTS = ("hand_pose", "hand_wrench", "slave_pose", "slave_wrench", "saturated")
+
+
+@dataclass
+class Run:
+    """Arrays over the steps; x along the axis of motion, wrenches (N, 6), ports (N, 6)."""
+
+    t: np.ndarray
+    hand: np.ndarray
+    command: np.ndarray
+    felt: np.ndarray
+    ports: np.ndarray
+
+
+def hand_position() -> np.ndarray:
+    """Along x [m]: from free space into the wall at 0, 5 mm deep, and from 2.5 s on out again."""
+    t = np.arange(STEPS) * T
+    u = np.clip(np.stack([t - 0.3, t - 2.5]) / 0.5, 0.0, 1.0)
+    ramp = u**3 * (10.0 + u * (6.0 * u - 15.0))
+    return -0.015 + 0.02 * (ramp[0] - ramp[1]) + 5e-4 * np.sin(12.0 * t)
+
+
+def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=np.nan) -> Run:
+    """Both ends with a hand that moves as prescribed and a slave behind a servo."""
+    p = parameters(PassivityConfig(method=method, force_limit=LIMIT), [1 / 17.5] * 2)
+    line = NetworkConfig(delay=DELAY)
+    lines = [network.parameters(line, 0, way, T, least=1) for way in range(2)]
+    states = [network.initial_state(each, np.zeros(PACKET_SIZE)) for each in lines]
+    frame = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 1, 1])
+    hand = hand_position()
+    start = np.array([1.0, 0, 0, 0, hand[0], 0, 0])
+    ends, received, slave = initial_ends(method, p, start), start.copy(), start.copy()
+    ports, felt, velocity = np.zeros(6), np.zeros(6), 0.0
+    found = Run(np.arange(STEPS) * T, hand, *(np.zeros((STEPS, n)) for n in (7, 6, 6)))
+    for k, x in enumerate(hand):
+        wall = -7000.0 * max(slave[4], 0.0)
+        velocity += T * (117.0**2 * (received[4] - slave[4]) - 234.0 * velocity + wall / 15.13)
+        slave[4] += T * velocity
+        now = span[0] <= k * T < span[1]
+        inputs = {
+            "hand_pose": np.array([1.0, 0, 0, 0, x, 0, 0]),
+            "slave_wrench": np.array([wall / 17.5, 0, 0, 0, 0, 0]),
+            "hand_wrench": np.zeros(6),
+            "slave_pose": slave.copy(),
+        }
+        if now and fault in inputs:
+            inputs[fault][:] = bad
+        if now and fault == "saturated":
+            inputs["slave_wrench"][:] = 1e3
+        channel_step(
+            METHODS.index(method), *inputs.values(), now and fault == "saturated", T, TIMEOUT,
+            frame, p, *lines, *states, ends, received, ports, felt,
+        )  # fmt: skip
+        found.command[k], found.felt[k], found.ports[k] = received, felt, ports
+    return found
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_smooth_bounded_and_recovered_from(method, fault):
+    sound, faulty = run(method, None), run(method, fault, bad=np.inf)
+    t, x, f = faulty.t, faulty.command[:, 4], faulty.felt[:, 0]
+    assert np.isfinite(faulty.command).all() and np.isfinite(faulty.felt).all()
+    assert np.isfinite(faulty.ports[:, :4]).all()
+    assert np.linalg.norm(faulty.felt[:, :3], axis=1).max() <= LIMIT + 1e-12
+    before = (t > 0.9) & (t < FAULT[0])
+    assert np.abs(f[before]).max() > 0.1, "nothing was felt that could fade"
+    # No step, of force or of the command, that the sound run does not have.
+    assert np.abs(np.diff(f)).max() < 0.5
+    missed = np.ptp(faulty.hand[(t > FAULT[0]) & (t < FAULT[1])])
+    fastest = np.abs(np.diff(sound.command[:, 4])).max() + 2.0 * missed * T / RESUME
+    assert np.abs(np.diff(x)).max() < 1.5 * fastest
+    # The safe state of both ends.
+    safe = (t > FAULT[0] + DELAY + STOP + 0.005) & (t < FAULT[1])
+    if fault != "saturated":
+        assert np.abs(f[safe]).max() < 1e-12
+        assert np.ptp(x[safe]) < 1e-12
+    # In free motion it is as if nothing had been.
+    after = t > 3.5
+    assert np.abs(x - sound.command[:, 4])[after].max() < 1e-3
+    assert np.abs(f - sound.felt[:, 0])[after].max() < 0.1
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("fault", ["hand_pose", "slave_wrench"])
+def test_one_bad_sample_is_hardly_felt(method, fault):
+    sound, faulty = run(method, None), run(method, fault, span=(1.2, 1.2 + T / 2))
+    assert np.abs(faulty.command[:, 4] - sound.command[:, 4]).max() < 1e-3
+    assert np.abs(np.diff(faulty.felt[:, 0])).max() < 0.5
+
+
+def test_the_hand_fades_in_50_ms_and_not_at_once():
+    """The pose of the hand is known: it is the slave that has lost its wrench."""
+    found = run("none", "slave_wrench")
+    f = found.felt[:, 0]
+    told = round((FAULT[0] + DELAY) / T) + 2
+    fade = np.abs(f[told : told + round(STOP / T) + 2])
+    assert (np.diff(fade) <= 0.0).all()
+    assert np.abs(np.diff(fade)).max() < 2.5 * fade[0] * T / STOP
+    assert fade[-1] < 1e-12
+
+
+def test_while_the_sensor_is_saturated_the_last_good_wrench_is_felt():
+    found = run("none", "saturated")
+    t, f = found.t, found.felt[:, 0]
+    held = f[(t > FAULT[0] + 2 * DELAY) & (t < FAULT[1])]
+    assert np.ptp(held) < 1e-12
+    back = f[(t > FAULT[1]) & (t < 2.0)]
+    assert np.abs(np.diff(back)).max() < 0.1
