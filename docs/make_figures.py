@@ -41,12 +41,13 @@ def station_figure() -> Picture:
         _block(axes, operator, MOTION, "operator")
         _block(axes, master, MOTION, "master\ndevice")
         _block(axes, scaling, MOTION, "kinematic\nscaling")
-        _block(axes, channel, MOTION, "delay")
+        middle, tall = (MOTION + FORCE) / 2, MOTION - FORCE + HEIGHT
+        text = "network\n\nat both ends:\npassivity\nmethod,\nsafe state"
+        _block(axes, channel, middle, text, height=tall)
         _block(axes, ik, MOTION, "inverse\nkinematics")
         _block(axes, control, MOTION, "joint\ncontrol")
         _block(axes, slave, MOTION, "slave arm")
         _block(axes, master, FORCE, "force display\n" r"$J_M^{\,T}$, limits")
-        _block(axes, channel, FORCE, "delay")
         _block(axes, ik, FORCE, "to the master\n" r"$\times\ 1/17.5$")
         _block(axes, control, FORCE, "elimination,\nscaling " r"$\sigma,\gamma,\eta$", heavy=True)
         _block(axes, slave, FORCE, "wrist sensor")
@@ -97,11 +98,18 @@ def _side(axes: Axes, left: float, right: float, name: str, colour: str) -> None
 
 
 def _block(
-    axes: Axes, x: float, y: float, text: str, *, heavy: bool = False, colour: str = BLACK
+    axes: Axes,
+    x: float,
+    y: float,
+    text: str,
+    *,
+    height: float = HEIGHT,
+    heavy: bool = False,
+    colour: str = BLACK,
 ) -> None:
     axes.add_patch(
         FancyBboxPatch(
-            (x - WIDTH / 2, y - HEIGHT / 2), WIDTH, HEIGHT,
+            (x - WIDTH / 2, y - height / 2), WIDTH, height,
             boxstyle="round,pad=0,rounding_size=0.07",
             facecolor="white",
             edgecolor=VERMILION if heavy else colour,
