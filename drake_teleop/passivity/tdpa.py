@@ -22,7 +22,8 @@ deep. `charged_tdpa` is the same law with two additions, off in `tdpa`:
 
 - A little drag on the hand earns the energy beforehand, wherever either end holds less than the
   reserve (the tank's level controller of Franken et al. 2011, here with a bounded force). The hand
-  feels it in free motion; then |f_out| <= |f_in| + drag, and the energy's bound is the same.
+  feels it in free motion; then |f_out| <= |f_in| + drag, and the energy's bound is the same. What
+  the master's end holds beyond the reserve goes back to the slave's.
 - The slave sends its wrench filtered. Hand, delay and a wall that is g times as stiff as the hand
   are the loop 1 + tau s + g e^(-s R) with the round trip R. Its fastest answer without an overshoot
   has ln(g R / tau) + R / tau + 1 = 0, which tau = (1 + e g) R meets within 4 % from g = 1 on; for
@@ -171,6 +172,8 @@ def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, pa
         scale(wrench, g, share)
         _drag(g, received[_SLAVES_LEDGER + g], dx, T, p, memory, wrench)
         _account(g, dot(wrench, dx, g), p, memory)
+        if p[_DRAG + g] > 0.0:
+            _pass_on(g, p, memory)
         packet[ENERGY + g] = memory[SENT + g]
     memory[HELD : HELD + 6] = wrench
     fill(pose, twist, wrench, packet)
@@ -186,6 +189,15 @@ def _drag(g, slaves_ledger, dx, T, p, memory, wrench):
         for i in range(3 * g, 3 * g + 3):
             wrench[i] -= damping * dx[i]
         limit(wrench, g, p[LIMIT + g])
+
+
+@njit(cache=True)
+def _pass_on(g, p, memory):
+    """Sends back what the master's end has beyond the reserve: the slave's end may need it."""
+    surplus = memory[LEDGER + g] + memory[_KEPT + g] - p[_RESERVE + g]
+    surplus = min(max(surplus, 0.0), memory[LEDGER + g])
+    memory[LEDGER + g] -= surplus
+    memory[SENT + g] += surplus
 
 
 @njit(cache=True)

@@ -203,3 +203,13 @@ def test_charged_tdpa_holds_a_wall_over_a_long_delay_with_the_right_force(wall, 
     assert abs(charged.drift) < 0.5e-3 and charged.free_force < 0.3
     assert charged.rise_delay < 0.5 * round_trip + 0.25, "the quick onset should have come"
     assert abs(strict.force_error) > 0.3, "energy earned beforehand should have mattered"
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.0])
+def test_a_slave_whose_inertia_is_felt_is_not_left_behind(sigma):
+    """Accelerating costs energy there; what the master's end has too much of comes back."""
+    model = OneDof(sigma=sigma)
+    network = NetworkConfig(delay=0.3, jitter=0.25, loss=0.1)
+    run = run_one_dof(model, PassivityConfig(method="charged_tdpa"), network)
+    assert np.abs(run.slave[-1000:] - run.master[-1000:]).max() < 10e-3
+    assert run.wall.min() < -10.0, "the wall should have been pressed"
