@@ -25,9 +25,18 @@ from drake_teleop.channel import network
 from drake_teleop.channel.network import PRESETS, NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.passivity import methods
-from drake_teleop.passivity.memory import LIMIT, MEMORY
+from drake_teleop.passivity.memory import (
+    COMMAND,
+    DAMPING,
+    HELD,
+    LEDGER,
+    LIMIT,
+    MEMORY,
+    STIFFNESS,
+)
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, difference_into, dot, finite
+from drake_teleop.passivity.pspm import OFFSET
 from drake_teleop.passivity.safe_state import (
     MASTER_WATCH,
     SLAVE_WATCH,
@@ -225,7 +234,27 @@ def channel_step(
     slave_command_into(
         alive, (fresh and not alive) or not good, T, timeout, command[:7], watch_S, pose_received
     )
+    if method == methods.TWO_LAYER or method == methods.PSPM:
+        _pull_into(method, command[:7], pose_received, before_S[:7], twist, parameters, memory_S)
     ports[4], ports[5] = watch_M[0], watch_S[0]
+
+
+@njit(cache=True)
+def _pull_into(method, wanted, command, pose, twist, p, memory):
+    """Tells a method at the motor's port how the servo pulls at the command that really left.
+
+    PSPM counts the spring's energy, and pays for what there is more of it than it had wanted.
+    """
+    offset, other = memory[OFFSET : OFFSET + 6], np.empty(6)
+    difference_into(command, pose, offset)
+    difference_into(wanted, pose, other)
+    for i in range(6):
+        memory[HELD + i] = p[STIFFNESS + i // 3] * offset[i] - p[DAMPING + i // 3] * twist[i]
+    if method == methods.PSPM:
+        memory[COMMAND : COMMAND + 7] = command
+        for g in range(2):
+            more = dot(offset, offset, g) - dot(other, other, g)
+            memory[LEDGER + g] -= 0.5 * p[STIFFNESS + g] * more
 
 
 @njit(cache=True)

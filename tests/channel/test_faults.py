@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from drake_teleop.channel import network
-from drake_teleop.channel.channel import channel_step, initial_ends
+from drake_teleop.channel.channel import _MEMORY_S, channel_step, initial_ends
 from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.passivity.memory import DAMPING, HELD, STIFFNESS
 from drake_teleop.passivity.methods import METHODS, PassivityConfig, parameters
 from drake_teleop.passivity.packet import PACKET_SIZE
 from drake_teleop.passivity.safe_state import RESUME, STOP
@@ -30,6 +31,7 @@ class Run:
     command: np.ndarray
     felt: np.ndarray
     ports: np.ndarray
+    servo: np.ndarray  # what its servo pulls with, and what the method at its port believes
 
 
 def hand_position() -> np.ndarray:
@@ -51,7 +53,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
     start = np.array([1.0, 0, 0, 0, hand[0], 0, 0])
     ends, received, slave = initial_ends(method, p, start), start.copy(), start.copy()
     ports, felt, velocity = np.zeros(6), np.zeros(6), 0.0
-    found = Run(np.arange(STEPS) * T, hand, *(np.zeros((STEPS, n)) for n in (7, 6, 6)))
+    found = Run(np.arange(STEPS) * T, hand, *(np.zeros((STEPS, n)) for n in (7, 6, 6, 2)))
     for k, x in enumerate(hand):
         wall = -7000.0 * max(slave[4], 0.0)
         velocity += T * (117.0**2 * (received[4] - slave[4]) - 234.0 * velocity + wall / 15.13)
@@ -72,6 +74,8 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
             frame, p, *lines, *states, ends, received, ports, felt,
         )  # fmt: skip
         found.command[k], found.felt[k], found.ports[k] = received, felt, ports
+        pull = p[STIFFNESS] * (received[4] - slave[4]) - p[DAMPING] * velocity
+        found.servo[k] = pull, ends[_MEMORY_S + HELD]
     return found
 
 
@@ -127,3 +131,13 @@ def test_while_the_sensor_is_saturated_the_last_good_wrench_is_felt():
     assert np.ptp(held) < 1e-12
     back = f[(t > FAULT[1]) & (t < 2.0)]
     assert np.abs(np.diff(back)).max() < 0.1
+
+
+@pytest.mark.parametrize("method", ["two_layer", "pspm"])
+def test_the_ledger_of_the_motor_sees_the_command_that_really_leaves(method):
+    """In the safe state, and on the way out of it, that is not the one the method asked for."""
+    found = run(method, "hand_wrench")
+    t = found.t
+    changed = (t > FAULT[0] + DELAY + 0.01) & (t < FAULT[1] + RESUME)
+    assert np.abs(found.servo[changed, 0]).max() > 0.1
+    np.testing.assert_allclose(found.servo[:, 1], found.servo[:, 0], atol=1e-6)
