@@ -8,7 +8,7 @@ acceleration; the wrenches are random and often push with the motion, as active 
 prints for each method the least energy of the channel at the pair f_k (x_k - x_(k-1)), which the
 laws can see, and at the true port of a held wrench, f_(k-1) (x_k - x_(k-1)). Baselines in the same
 run: no method, wave variables that hold the last sample, and the two-layer tank without its margin.
-What has no bound runs over every tenth network.
+What has no bound, and `charged_tdpa`, runs over every tenth network.
 """
 
 from __future__ import annotations
@@ -46,7 +46,6 @@ from drake_teleop.passivity.packet import (
     WRENCH,
     difference_into,
     dot,
-    length,
     limit,
     moved_into,
 )
@@ -63,7 +62,9 @@ POSE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 BACKWARD, TRUE, STRONGER, TANK, FIGURES = range(5)
 WAVE_HOLD = -1
 AT_MOTOR = ("two_layer", "pspm")
-BOUNDED = ("wave", "tdpa", "charged_tdpa", "two_layer", "pspm")
+# These run over every network, the rest over every tenth: what has no bound is found out sooner,
+# and `charged_tdpa` has the ledger of `tdpa`.
+EVERY = ("wave", "tdpa", "two_layer", "pspm")
 
 
 def random_motion(rng: np.random.Generator, steps: int) -> tuple[Array, Array]:
@@ -108,41 +109,50 @@ def random_wrench(rng: np.random.Generator, steps: int) -> Array:
 
 
 @njit
-def _run(
-    method, at_motor, p, memories, newest, motion, poses, wrenches, active, pushed, T, sent, figures
-):
+def _push(wrenches, motion, active, out):
+    """out (N, 6) = wrenches plus `active` times a wrench that pushes along the motion (N, 6)."""
+    for k in range(len(out)):
+        for g in range(2):
+            push = active * WRENCH_SIZE[g] / (_size(motion[k], g) + 1e-9)
+            for i in range(3 * g, 3 * g + 3):
+                out[k, i] = wrenches[k, i] + push * motion[k, i]
+
+
+@njit
+def _size(a, g):
+    return math.sqrt(dot(a, a, g))
+
+
+@njit
+def _run(method, at_motor, p, memories, newest, motion, poses, wrenches, T, sent, figures):
     """Least energies of one method over one network; `figures` (2, FIGURES) is written.
 
-    `motion` (2, N, 6) and `poses` (2, N, 7) are those of both ends; the contact wrench is
-    `wrenches` (N, 6) plus `active` times a wrench that pushes the way the end `pushed` moves. The
-    slave's port is that of wrench and command, or (`at_motor`) that of its servo.
+    `motion` (2, N, 6) and `poses` (2, N, 7) are those of both ends, `wrenches` (N, 6) are the
+    contact's. The slave's port is that of wrench and command, or (`at_motor`) that of its servo.
     """
-    f_e, hand, felt = np.zeros(6), np.zeros(6), np.zeros(6)
+    hand, felt = np.zeros(6), np.zeros(6)
     wrench, before, motor, pull = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
     command, old, moved, nothing = np.zeros(13), np.zeros(7), np.zeros(6), np.zeros(PACKET_SIZE)
     twists, energy, work = np.zeros((2, 6)), np.zeros((2, 2)), np.zeros((2, 2))
     start = memories[:, LEDGER : LEDGER + 2].copy()
-    old[0] = 1.0
+    old[0], rate, slots = 1.0, 1.0 / T, sent.shape[1]
     figures[:] = 0.0
     for k in range(newest.shape[1]):
         for i in range(6):
-            twists[0, i], twists[1, i] = motion[0, k, i] / T, motion[1, k, i] / T
+            twists[0, i], twists[1, i] = motion[0, k, i] * rate, motion[1, k, i] * rate
             before[i] = wrench[i]
-        for g in range(2):
-            push = active * WRENCH_SIZE[g] / (length(motion[pushed, k], g) + 1e-9)
-            for i in range(3 * g, 3 * g + 3):
-                f_e[i] = wrenches[k, i] + push * motion[pushed, k, i]
+        f_e = wrenches[k]
         for end in range(2):
             now = newest[1 - end, k]
-            received = nothing if now < 0 else sent[1 - end, now]
+            received = nothing if now < 0 else sent[1 - end, now % slots]
             fresh = now >= 0 and (k == 0 or now != newest[1 - end, k - 1])
             if end == 0:
                 _master(method, received, fresh, poses[0, k], twists[0], motion[0, k], hand, T, p,
-                        memories[0], wrench, sent[0, k])  # fmt: skip
+                        memories[0], wrench, sent[0, k % slots])  # fmt: skip
                 felt[:] = received[WRENCH : WRENCH + 6]
             else:
                 _slave(method, received, fresh, poses[1, k], twists[1], motion[1, k], f_e, T, p,
-                       memories[1], command, sent[1, k])  # fmt: skip
+                       memories[1], command, sent[1, k % slots])  # fmt: skip
         for g in range(2):
             work[0, g] += dot(before, motion[0, k], g)
         if at_motor:
@@ -167,7 +177,7 @@ def _run(
                 figures[g, TANK] = min(figures[g, TANK], tank)
             figures[g, BACKWARD] = min(figures[g, BACKWARD], energy[0, g])
             figures[g, TRUE] = min(figures[g, TRUE], energy[1, g])
-            stronger = length(wrench, g) - length(felt, g)
+            stronger = _size(wrench, g) - _size(felt, g)
             figures[g, STRONGER] = max(figures[g, STRONGER], stronger)
 
 
@@ -243,25 +253,28 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
     every = cases()
     least = {name: np.full((2, FIGURES), np.inf) for name in every}
     seconds = dict.fromkeys(every, 0.0)
-    sent, figures = np.zeros((2, steps, PACKET_SIZE)), np.zeros((2, FIGURES))
+    figures = np.zeros((2, FIGURES))
     # A few motions and wrenches in all combinations: drawing new ones would take most of the time.
     rng = np.random.default_rng(0)
     motions = [random_motion(rng, steps) for _ in range(32)]
     wrenches = [random_wrench(rng, steps) for _ in range(32)]
+    wrench = np.zeros((steps, 6))
     for seed in range(first, last):
         rng = np.random.default_rng(seed)
         network = random_network(rng)
         newest = np.stack([newest_packets(network, seed, way, steps, PERIOD) for way in range(2)])
         # In a step the master's turn is before the slave's.
         newest[1] = np.minimum(newest[1], np.arange(steps) - 1)
+        # No more packets than are still of use: they stay in the cache.
+        sent = np.zeros((2, int((np.arange(steps) - newest).max()) + 1, PACKET_SIZE))
         ends = [motions[rng.integers(32)] for _ in range(2)]
         motion, poses = (np.stack(parts) for parts in zip(*ends, strict=True))
-        wrench, active = wrenches[rng.integers(32)], rng.uniform(-1.0, 1.0)
-        pushed = int(rng.integers(2))
+        passive, active = wrenches[rng.integers(32)], rng.uniform(-1.0, 1.0)
+        _push(passive, motion[rng.integers(2)], active, wrench)
         saturates = rng.random() < 0.5
         for name, (method, p) in every.items():
-            if name not in BOUNDED and seed % 10:
-                continue  # what has no bound is found out sooner
+            if name not in EVERY and seed % 10:
+                continue
             p = p.copy()
             if saturates:
                 p[LIMIT : LIMIT + 2] = 0.5, 0.01
@@ -271,8 +284,7 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
             memories = np.stack([start, start])
             began = time.thread_time()
             _run(
-                method, at_motor, p, memories, newest, motion, poses, wrench, active, pushed,
-                PERIOD, sent, figures,
+                method, at_motor, p, memories, newest, motion, poses, wrench, PERIOD, sent, figures
             )  # fmt: skip
             seconds[name] += time.thread_time() - began
             figures[:, STRONGER] *= -1.0
@@ -304,7 +316,7 @@ def study(networks: int, seconds: float = 10.0, processes: int = 2) -> dict[str,
     result = {}
     for name in parts[0][0]:
         worst = np.min([least[name] for least, _ in parts], axis=(0, 1))
-        ran = networks if name in BOUNDED else -(-networks // 10)
+        ran = networks if name in EVERY else -(-networks // 10)
         spent = sum(seconds[name] for _, seconds in parts)
         result[name] = {
             "energy": float(worst[BACKWARD]),
