@@ -251,7 +251,9 @@ class _Names(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, ...]:
-        return value if isinstance(value, tuple) else tuple(value.split(","))
+        if isinstance(value, tuple):
+            return value
+        return tuple(name.strip() for name in value.split(","))
 
 
 @cli.command("compare-passivity")
@@ -261,14 +263,14 @@ class _Names(click.ParamType):
     "--jobs", type=click.IntRange(min=1), help="Processes at once.  [default: one for each core]"
 )
 @_out("compare-passivity")
-@_seed
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @_quiet
 def compare_passivity(
     networks: tuple[str, ...] | None,
     methods: tuple[str, ...] | None,
     jobs: int | None,
     out: Path,
-    seed: int | None,
+    seed: int,
     quiet: bool,
 ) -> None:
     """Compare passivity methods over networks with delay.
@@ -282,7 +284,7 @@ def compare_passivity(
         out,
         networks=networks or study.NETWORKS,
         methods=methods or study.METHODS,
-        seed=seed or 0,
+        seed=seed,
         jobs=jobs or -1,
         quiet=quiet,
     )

@@ -88,6 +88,7 @@ def compare_command(
     """
     _check("network", networks, tuple(PRESETS))
     _check("method", methods, METHODS)
+    out.mkdir(parents=True, exist_ok=True)  # before the work: a bad path costs no time
     with progress_bars(quiet) as stage:
         limits = _one_dof_study(methods, seed, jobs, stage)
         runs, traces = _station_study(networks, methods, seed, jobs, stage)
@@ -102,7 +103,6 @@ def compare_command(
     }
     from drake_teleop.experiments.passivity_report import print_tables, write_report
 
-    out.mkdir(parents=True, exist_ok=True)
     _write_table(runs, out / "runs.parquet")
     (out / "summary.json").write_text(
         json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8"

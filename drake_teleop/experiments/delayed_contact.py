@@ -11,6 +11,7 @@ import dataclasses
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
@@ -18,6 +19,7 @@ from drake_teleop.experiments.identification import slave_arm
 from drake_teleop.experiments.one_dof import Figures, Task, figures_of
 from drake_teleop.master.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.quaternions import quaternion_of
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.slave.arm import forward_kinematics
@@ -84,43 +86,50 @@ def delayed_contact(
 
 
 def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> Figures:
-    """The run in numbers: vertical motion and force, which the task is about."""
+    """The run in numbers: vertical motion and force, which the task is about, and the turning."""
+    heights, turned = _slave_motion(result, scenario)
     scaling = scenario.force_scaling
-    slave = _heights(slave_arm(scenario).table, np.ascontiguousarray(result["slave_state"][:, :6]))
-    lasting = result.t <= task.end
-    energy = (
-        result["ports"][:, :4].sum(axis=1) if "ports" in result else np.full(len(slave), np.nan)
-    )
     return figures_of(
-        t=result.t[lasting],
-        master=result["pose_command"][lasting, 6],
-        slave=slave[lasting],
-        felt=result["force_to_master"][lasting, 2],
-        pressed=scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][lasting, 2],
-        energy=energy[lasting],
+        t=result.t,
+        master=result["pose_command"][:, 6],
+        slave=heights,
+        felt=result["force_to_master"][:, 2],
+        pressed=scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
+        energy=result["ports"][:, :4].sum(axis=1),
         task=task,
+        turned=turned,
     )
-
-
-@njit(cache=True)
-def _heights(arm, q):
-    """(N,) height of So at each row of q."""
-    R, p, heights = np.empty((3, 3)), np.empty(3), np.empty(q.shape[0])
-    for k in range(q.shape[0]):
-        forward_kinematics(arm, q[k], R, p)
-        heights[k] = p[2]
-    return heights
 
 
 def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, NDArray[np.float64]]:
-    """What a picture of the task shows: t, heights [m] and vertical forces [N], master's units."""
-    slave = _heights(slave_arm(scenario).table, np.ascontiguousarray(result["slave_state"][:, :6]))
+    """What a picture of the task shows: t [s], forces in the master's units [N], energy [J]."""
     scaling = scenario.force_scaling
     return {
         "t": result.t,
-        "master": result["pose_command"][:, 6] - scenario.slave.position[2],
-        "slave": slave - scenario.slave.position[2],
         "felt": result["force_to_master"][:, 2],
         "pressed": scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
         "energy": result["ports"][:, :4].sum(axis=1),
     }
+
+
+def _slave_motion(
+    result: SimulationResult, scenario: Scenario
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N,) height of So [m] and (N, 3) rotation vector since the start of the log [rad]."""
+    table, q = slave_arm(scenario).table, np.ascontiguousarray(result["slave_state"][:, :6])
+    poses = _poses(table, q)
+    rotations = Rotation.from_quat(poses[:, [1, 2, 3, 0]])
+    return poses[:, 6], (rotations * rotations[0].inv()).as_rotvec()
+
+
+@njit(cache=True)
+def _poses(arm, q):
+    """(N, 7) X_WS at each row of q."""
+    R, p, poses = np.empty((3, 3)), np.empty(3), np.empty((q.shape[0], 7))
+    for k in range(q.shape[0]):
+        forward_kinematics(arm, q[k], R, p)
+        orientation = quaternion_of(R)
+        for i in range(4):
+            poses[k, i] = orientation[i]
+        poses[k, 4:] = p
+    return poses

@@ -36,6 +36,7 @@ _FRICTION_SPEED = 5e-3  # m/s, below it Coulomb friction fades
 # others the command is interpolated over it.
 _AT_THE_MOTOR = ("two_layer", "pspm")
 
+_QUIET, _TIP = 0.5e-3, 0.2  # m, peak to peak at rest; from the wrist to the tool's tip
 _FREE, _DEPTH = -0.04, 0.02  # m, from the wall: where the operator rests, and how deep he presses
 
 
@@ -100,9 +101,14 @@ class Figures:
 
     Args:
         stable: whether it comes to rest, holding the wall and after it: within 0.5 mm peak to peak
-            about a parabola in the last 1.9 s.
+            about a parabola at the end of either. Of the whole station the orientation has to be at
+            rest as well, within what moves the tool's tip by as much.
         hunting: that peak to peak, the larger of the two [m].
-        force_error: of the force felt against the scaled force of the wall, while holding [1].
+        turning: likewise of the orientation [rad]; 0 in one degree of freedom.
+        felt_force: on the hand while holding, mean [N].
+        chatter: its standard deviation [N].
+        force_error: of the force felt against the scaled force of the wall, while holding [1]. It
+            says nothing of how hard the slave presses.
         drift: of the slave against the master, 2 s after contact [m].
         free_force: felt in free motion, rms [N].
         rise_delay: from half of the wall's force to half of the force felt [s].
@@ -112,6 +118,9 @@ class Figures:
 
     stable: bool
     hunting: float
+    turning: float
+    felt_force: float
+    chatter: float
     force_error: float
     drift: float
     free_force: float
@@ -153,7 +162,8 @@ def run_one_dof(
     intent = operators_intent() if intent is None else intent
     start = np.array([1.0, 0.0, 0.0, 0.0, intent[0, 0], 0.0, 0.0])
     # The block's command is that of the next step, here it is used at once.
-    forward_line = dataclasses.replace(forward, delay=forward.delay + PERIOD)
+    playout = forward.playout + PERIOD if forward.playout > 0 else 0.0
+    forward_line = dataclasses.replace(forward, delay=forward.delay + PERIOD, playout=playout)
     lines = [
         network.parameters(line, seed, direction, PERIOD, least=1)
         for line, direction in (
@@ -213,6 +223,7 @@ def figures_of(
     pressed: NDArray[np.float64],
     energy: NDArray[np.float64],
     task: Task,
+    turned: NDArray[np.float64] | None = None,
 ) -> Figures:
     """A run of the task in numbers; all arrays (N,), equidistant.
 
@@ -223,6 +234,7 @@ def figures_of(
         pressed: force of the environment, scaled to the hand [N].
         energy: that both ends have put into the channel [J].
         task: when what happened.
+        turned: (N, 3) rotation vector of the slave's tool since the start [rad], if it can turn.
     """
     dt = float(t[1] - t[0])
 
@@ -232,12 +244,17 @@ def figures_of(
     hold = window(task.release - task.judged, task.release)
     rest = window(task.end - task.judged, task.end)
     hunting = max(_hunting(x[part]) for x in (master, slave) for part in (hold, rest))
+    angles = () if turned is None else turned.T
+    turning = max((_hunting(x[part]) for x in angles for part in (hold, rest)), default=0.0)
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.released + 2.0) / dt), len(t) - 1)
     start = round(task.press / dt)
     return Figures(
-        stable=bool(hunting < 0.5e-3),
+        stable=bool(hunting < _QUIET and turning < _QUIET / _TIP),
         hunting=hunting,
+        turning=turning,
+        felt_force=abs(steady),
+        chatter=float(felt[hold].std()),
         force_error=steady / goal - 1 if goal != 0 else float("nan"),
         drift=float(slave[after] - master[after]),
         free_force=float(np.sqrt(np.mean(felt[window(task.swing, task.swung)] ** 2))),

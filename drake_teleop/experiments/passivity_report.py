@@ -14,14 +14,17 @@ from drake_teleop.channel.network import PRESETS
 from drake_teleop.html import embedded, render
 from drake_teleop.style import COLOURS, GREY, Picture, house_style
 
-#: Columns of the station's table: key of the row, heading, factor, format.
+#: Columns of the station's table: key of the row, heading, factor, decimals.
 COLUMNS = (
-    ("hunting", "hunting [mm]", 1e3, "{:.2f}"),
-    ("force_error", "force error [%]", 1e2, "{:.1f}"),
-    ("drift", "drift [mm]", 1e3, "{:.2f}"),
-    ("free_force", "free force [N rms]", 1.0, "{:.2f}"),
-    ("rise_delay", "rise delay [ms]", 1e3, "{:.0f}"),
-    ("least_energy", "least energy [J]", 1.0, "{:.3f}"),
+    ("hunting", "Hunting [mm]", 1e3, 2),
+    ("turning", "Turning [deg]", 180 / np.pi, 2),
+    ("felt_force", "Felt [N]", 1.0, 2),
+    ("chatter", "Chatter [N]", 1.0, 2),
+    ("force_error", "Force error [%]", 1e2, 1),
+    ("drift", "Drift [mm]", 1e3, 2),
+    ("free_force", "Free force [N]", 1.0, 2),
+    ("rise_delay", "Rise delay [ms]", 1e3, 0),
+    ("least_energy", "Least energy [J]", 1.0, 3),
 )
 
 Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
@@ -51,8 +54,9 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
 def cells(row: Mapping[str, Any]) -> list[str]:
     """The figures of one run of the station, as printed; a run that ended early has none."""
     return [
-        "–" if row[key] is None else form.format(factor * row[key])
-        for key, _, factor, form in COLUMNS
+        # Adding 0 to what is rounded takes the sign from -0.
+        "–" if row[key] is None else f"{round(factor * row[key], decimals) + 0.0:.{decimals}f}"
+        for key, _, factor, decimals in COLUMNS
     ]
 
 
@@ -63,7 +67,7 @@ def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
         axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
         axes.plot(shown["t"], shown["felt"], color=COLOURS[0], linewidth=0.9)
 
-    figure = _grid(summary, traces, draw, "force on the hand [N]")
+    figure = _grid(summary, traces, draw, "force [N]")
     figure.suptitle("Felt force (blue) and scaled contact force (grey)", x=0.01, ha="left")
     return figure
 
@@ -87,7 +91,7 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
 def _grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> Figure:
     methods, networks = summary["methods"], summary["networks"]
     with house_style():
-        figure = Picture(figsize=(3.0 * len(networks), 1.35 * len(methods) + 0.6))
+        figure = Picture(figsize=(max(3.0 * len(networks), 7.5), 1.5 * len(methods) + 0.8))
         grid = figure.subplots(len(methods), len(networks), squeeze=False, sharex="col")
         for i, method in enumerate(methods):
             for j, network in enumerate(networks):
@@ -95,7 +99,7 @@ def _grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> F
                 if i == 0:
                     axes.set_title(f"{network}, RTT {2e3 * PRESETS[network].delay:g} ms")
                 if j == 0:
-                    axes.set_ylabel(f"{method}\n{unit}")
+                    axes.set_ylabel(f"{method}\n{unit}", fontsize=8)
                 if shown is None:
                     axes.text(0.5, 0.5, "ended early", transform=axes.transAxes, ha="center")
                 else:
@@ -136,6 +140,7 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     """The tables on the terminal."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     console = Console()
     for network in summary["networks"]:
@@ -144,11 +149,12 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
                 title=f"{network}, RTT {2e3 * PRESETS[network].delay:g} ms: {leaf}",
                 title_justify="left",
             )
-            for heading in ("method", "stable", *(heading for _, heading, _, _ in COLUMNS)):
-                table.add_column(heading, justify="left" if heading == "method" else "right")
+            for heading in ("Method", "Stable", *(heading for _, heading, _, _ in COLUMNS)):
+                left = heading == "Method"
+                table.add_column(Text(heading), justify="left" if left else "right")
             for row in summary["station"]:
                 if (row["network"], row["leaf"]) == (network, leaf):
                     verdict = "[green]yes" if row["stable"] else "[red]no"
                     table.add_row(row["method"], verdict, *cells(row))
             console.print(table)
-    console.print(f"written to {out}", highlight=False, markup=False)
+    console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

@@ -1,0 +1,41 @@
+"""What does a method cost the station, over the same network without one?
+
+The contact scenario over `internet`; all stations interleaved in this process, thread CPU time.
+
+    python benchmarks/channel.py [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from drake_teleop.channel.channel import Channel
+from drake_teleop.experiments.speed import MakeMovingStation, cpu_seconds
+from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.scenario import LoadScenario, replace
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    arguments = parser.parse_args()
+    direct = LoadScenario("contact_transition")
+    stations = {"direct": MakeMovingStation(direct)}
+    for method in METHODS:
+        over = replace(
+            direct, channel=Channel(network="internet"), passivity=PassivityConfig(method=method)
+        )
+        stations[method] = MakeMovingStation(over)
+    cost = cpu_seconds(stations)
+    figures = {name: cost[name] / cost["none"] for name in cost}
+    print("cost of the whole station over that without a method on the same network")
+    for name, figure in figures.items():
+        print(f"{name:20s} {figure:6.3f}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
