@@ -84,6 +84,7 @@ class OneDofRun:
         felt: force on the hand [N].
         wall: force of the wall on the slave [N].
         energy: (N, 2) that hand and slave have put into the channel [J].
+        silent: (N, 2) for how long hand and slave have heard nothing [s].
     """
 
     t: NDArray[np.float64]
@@ -93,6 +94,7 @@ class OneDofRun:
     felt: NDArray[np.float64]
     wall: NDArray[np.float64]
     energy: NDArray[np.float64]
+    silent: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -181,7 +183,7 @@ def run_one_dof(
     )  # fmt: skip
     t = np.arange(len(intent), dtype=np.float64) * PERIOD
     master, slave, command, felt, wall = rows.T[:5]
-    return OneDofRun(t, master, slave, command, felt, wall, rows[:, 5:7])
+    return OneDofRun(t, master, slave, command, felt, wall, rows[:, 5:7], rows[:, 7:])
 
 
 def operators_intent(task: Task = Task()) -> NDArray[np.float64]:
@@ -282,7 +284,7 @@ def _simulate(
     method, model, held, p, forward_line, backward_line, forward, backward, ends, start, timeout,
     intent,
 ):  # fmt: skip
-    """(N, 7) rows [master, slave, command, felt, wall, energy of hand, of slave]."""
+    """(N, 9) rows [master, slave, command, felt, wall, energy (hand, slave), silence (both)]."""
     mass, damping, stiffness = model[0] + model[3], model[1], model[2]
     friction, slave_mass, frequency, ideal = model[4], model[5], model[6], model[7]
     tool_mass, wall_stiffness, scale, sigma, gamma = model[8:13]
@@ -291,7 +293,7 @@ def _simulate(
     frame[0] = frame[4] = frame[8] = frame[9] = frame[10] = 1.0
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
     wrench, hand, felt, ports = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
-    rows = np.empty((intent.shape[0], 7))
+    rows = np.empty((intent.shape[0], 9))
     x = x_s = start[4]
     v = v_s = a_s = 0.0
     dt = PERIOD / _SUBSTEPS
@@ -306,7 +308,8 @@ def _simulate(
             backward_line, forward, backward, ends, received, ports, felt,
         )  # fmt: skip
         command = received[4]
-        rows[k] = np.array([x, x_s, command, felt[0], wall, ports[0], ports[2]])
+        rows[k, :7] = np.array([x, x_s, command, felt[0], wall, ports[0], ports[2]])
+        rows[k, 7:] = ports[4:]
         motor = K * (command - x_s) - D * v_s
         following = min(k + 1, intent.shape[0] - 1)
         for i in range(_SUBSTEPS):

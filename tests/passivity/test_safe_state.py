@@ -157,6 +157,24 @@ def test_every_rough_network_is_recovered_from(rough_networks, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_nothing_steps_up_while_it_resumes_in_rough_networks(rough_networks, method):
+    """Before the paper's wall, where several methods chatter: not in the 0.5 s after a silence."""
+    resumptions = 0
+    for forward, backward in rough_networks:
+        config = PassivityConfig(method=method)
+        result = run_one_dof(OneDof(), config, forward, backward, timeout=TIMEOUT)
+        silent = result.silent[:, 0] > TIMEOUT
+        since = np.arange(len(silent)) - np.maximum.accumulate(
+            np.where(silent, np.arange(len(silent)), 0)
+        )
+        resuming = (since > 0) & (since < round(RESUME / PERIOD)) & (result.t > 1.0)
+        resumptions += int((np.diff(silent.astype(int)) < 0).sum())
+        growth = np.diff(np.abs(result.felt), prepend=0.0)
+        assert growth[resuming].max(initial=0.0) < 0.5
+    assert resumptions >= 5
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_a_packet_holds_nothing_that_was_in_its_memory_before(method):
     """What is sent is finite whatever lay where the packet is written."""
     p = parameters(PassivityConfig(method=method))
