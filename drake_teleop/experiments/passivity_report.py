@@ -27,6 +27,9 @@ COLUMNS = (
     ("least_energy", "Least energy [J]", 1.0, 3),
 )
 
+# What fits on a terminal of 80 columns; the page has all of them.
+_TERMINAL = ("hunting", "felt_force", "force_error", "drift", "free_force", "rise_delay")
+
 Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
 
 
@@ -138,6 +141,7 @@ def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     """The tables on the terminal."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -148,13 +152,19 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
             table = Table(
                 title=f"{network}, RTT {2e3 * PRESETS[network].delay:g} ms: {leaf}",
                 title_justify="left",
+                box=SIMPLE_HEAD,
             )
-            for heading in ("Method", "Stable", *(heading for _, heading, _, _ in COLUMNS)):
-                left = heading == "Method"
-                table.add_column(Text(heading), justify="left" if left else "right")
+            table.add_column("Method", no_wrap=True)
+            table.add_column("Stable", justify="right")
+            for key, heading, _, _ in COLUMNS:
+                if key in _TERMINAL:
+                    word = max(map(len, heading.split()))
+                    table.add_column(Text(heading), justify="right", min_width=word)
             for row in summary["station"]:
                 if (row["network"], row["leaf"]) == (network, leaf):
                     verdict = "[green]yes" if row["stable"] else "[red]no"
-                    table.add_row(row["method"], verdict, *cells(row))
+                    named = zip(COLUMNS, cells(row), strict=True)
+                    shown = [cell for (key, *_), cell in named if key in _TERMINAL]
+                    table.add_row(row["method"], verdict, *shown)
             console.print(table)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)
