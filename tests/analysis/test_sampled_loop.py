@@ -1,0 +1,254 @@
+"""The sampled one axis: against a simulation, the continuous limit, and its own eigenvalues."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drake_teleop.analysis.one_axis import OneAxis
+from drake_teleop.analysis.sampled_loop import (
+    Sampling,
+    cut_loop,
+    delay_margin,
+    growth_rate,
+    loop_response,
+    multipliers,
+    sampled_loop,
+    sampled_response,
+    sampled_two_port,
+    unstable_multipliers,
+)
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.master.operator import GRIPS
+
+STATION = Sampling()
+JR3 = Sampling(low_pass_hz=500.0)
+
+
+@pytest.fixture(scope="module")
+def bench() -> ModuleType:
+    """The benchmark, for its simulation, which knows nothing of the analysis."""
+    path = Path(__file__).parents[2] / "benchmarks/analysis.py"
+    spec = importlib.util.spec_from_file_location("bench_analysis", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["bench_analysis"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def held(grip: str, **fields: float) -> OneAxis:
+    hand = GRIPS[grip]
+    axis = OneAxis(hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness)
+    return replace(axis, **fields)
+
+
+axes = st.builds(
+    OneAxis,
+    hand_mass=st.floats(0.05, 0.6),
+    hand_damping=st.floats(1.0, 25.0),
+    hand_stiffness=st.floats(0.0, 900.0),
+    sigma=st.floats(0.0, 2.0),
+    gamma=st.floats(0.0, 2.0),
+    mass_error=st.floats(-1.0, 1.0),
+    wall_stiffness=st.sampled_from([0.0, 1e3, 5.1e3, 2e4, 1e5]),
+    wall_damping=st.floats(0.0, 100.0),
+    force_scale=st.sampled_from([1 / 17.5, 0.3]),
+)
+
+
+@pytest.mark.parametrize("steps", [0, 1, 2, 7])
+@pytest.mark.parametrize(
+    "sampling",
+    [
+        STATION,
+        JR3,
+        Sampling(joint_control_hz=10e3, low_pass_hz=500.0),
+        Sampling(joint_control_hz=1e3, sensor_hz=500.0),
+        Sampling(1e3, 1.5e3, 3e3, 300.0),
+    ],
+)
+def test_a_simulation_with_small_steps_takes_the_same_path(
+    bench: ModuleType, sampling: Sampling, steps: int
+) -> None:
+    axis = OneAxis(
+        sigma=0.7, mass_error=0.4, wall_damping=30.0, position_scale=1.3,
+        delay=steps / sampling.hand_hz,
+    )  # fmt: skip
+    start = np.array([1e-3, 0.1, 2e-3, -0.05])
+    simulated = bench.simulate(axis, sampling, start, 0.1, 20)
+    loop = sampled_loop(axis, sampling)
+    state = np.zeros(len(loop.states))
+    state[[loop.states.index(name) for name in ("x_m", "v_m", "x_s", "v_s")]] = start
+    simulated = simulated[:: round(loop.period * sampling.hand_hz)]
+    outputs = np.empty_like(simulated)
+    for row in outputs:
+        row[:] = loop.C @ state
+        state = loop.A @ state
+    np.testing.assert_allclose(
+        outputs / np.abs(simulated).max(axis=0),
+        simulated / np.abs(simulated).max(axis=0),
+        atol=1e-12,
+    )
+
+
+def _rates(factor: float) -> Sampling:
+    return Sampling(*(factor * rate for rate in (2e3, 2e3, 8e3)))
+
+
+def _without_first_order(at_rate, factor: float):
+    """The limit of short periods, from two of them."""
+    return 2 * at_rate(_rates(2 * factor)) - at_rate(_rates(factor))
+
+
+@pytest.mark.parametrize("stiffness", [0.0, 5.1e3])
+def test_short_periods_give_the_continuous_loop(stiffness: float) -> None:
+    axis = OneAxis(sigma=0.6, mass_error=0.3, wall_stiffness=stiffness, position_scale=1.2)
+    w = 2 * np.pi * np.geomspace(0.1, 50.0, 30)
+    s = 1j * w
+    # m x'' = m k_v (k_p (l_p x_m - x) - x') - k_e x, and what the elimination leaves of it.
+    gain = axis.velocity_gain * axis.position_gain
+    slave = axis.slave_mass * (s**2 + axis.velocity_gain * s + gain) + stiffness
+    position = axis.slave_mass * gain * axis.position_scale / slave
+    true, estimate = axis.tool_mass * s**2, (axis.tool_mass + axis.mass_error) * s**2
+    felt = axis.gamma * (stiffness + true - estimate) + axis.sigma * estimate
+    hand = (axis.hand_mass + axis.device_mass) * s**2 + axis.hand_stiffness
+    hand += (axis.hand_damping + axis.device_damping) * s
+    expected = -axis.force_scale * felt * position / hand
+
+    def at_rate(sampling: Sampling):
+        return loop_response(cut_loop(axis, sampling), w)
+
+    coarse = np.abs(at_rate(_rates(4.0)) / expected - 1).max()
+    fine = np.abs(at_rate(_rates(8.0)) / expected - 1).max()
+    assert 0.45 < fine / coarse < 0.55  # of first order: holds are half a period late
+    np.testing.assert_allclose(_without_first_order(at_rate, 8.0) / expected, 1.0, atol=2e-4)
+
+
+def test_short_periods_give_the_continuous_two_port() -> None:
+    axis = OneAxis(sigma=0.6, mass_error=0.3, delay=5e-3)
+    w = 2 * np.pi * np.geomspace(0.1, 30.0, 20)
+    s, kv = 1j * w, axis.velocity_gain
+    spring, slave = axis.slave_mass * kv * axis.position_gain / s, axis.slave_mass * (s + kv)
+    M = axis.sigma * axis.tool_mass + (axis.sigma - axis.gamma) * axis.mass_error
+    late, kf = np.exp(-s * axis.delay), axis.force_scale
+    expected = np.empty((20, 2, 2), complex)
+    expected[:, 0, 0] = axis.device_mass * s + axis.device_damping
+    expected[:, 0, 0] += kf * M * s * spring / (slave + spring) * late**2
+    expected[:, 0, 1] = kf * late * (axis.gamma - M * s / (slave + spring))
+    expected[:, 1, 0] = -spring / (slave + spring) * late
+    expected[:, 1, 1] = 1 / (slave + spring)
+    limit = _without_first_order(lambda rates: sampled_two_port(axis, rates, w), 8.0)
+    np.testing.assert_allclose(limit / expected, 1.0, atol=1e-4)
+
+
+@settings(max_examples=60, deadline=None)
+@given(axis=axes, steps=st.integers(0, 30), low_pass=st.booleans())
+def test_the_argument_principle_counts_what_eigenvalues_say(
+    axis: OneAxis, steps: int, low_pass: bool
+) -> None:
+    sampling = JR3 if low_pass else STATION
+    delay = steps / sampling.hand_hz
+    size = np.abs(multipliers(sampled_loop(replace(axis, delay=delay), sampling)))
+    if np.abs(size - 1).min() > 1e-9:  # on the circle itself there is nothing to count
+        count = unstable_multipliers(cut_loop(axis, sampling), delay)
+        assert count == (size > 1).sum()
+
+
+@pytest.mark.parametrize("sampling", [STATION, JR3])
+@pytest.mark.parametrize(
+    "axis",
+    [
+        held("light", sigma=1.0, wall_stiffness=0.0),
+        held("medium"),
+        held("medium", sigma=1.0),
+        held("firm", wall_stiffness=2e4),
+    ],
+)
+def test_the_first_multiplier_leaves_the_circle_at_the_margin(
+    axis: OneAxis, sampling: Sampling
+) -> None:
+    margin = float(delay_margin(cut_loop(axis, sampling)))
+    steps = int(margin / 2 * sampling.hand_hz)
+    assert 5 < steps < 250
+    before, after = (
+        growth_rate(sampled_loop(replace(axis, delay=n / sampling.hand_hz), sampling))
+        for n in (steps, steps + 1)
+    )
+    assert before < 0 < after
+
+
+def test_unstable_without_delay_and_stable_for_any() -> None:
+    assert delay_margin(cut_loop(held("light", wall_stiffness=5.1e3), STATION)) == 0.0
+    firm = cut_loop(held("firm", wall_stiffness=5.1e3), STATION)
+    assert delay_margin(firm) == np.inf
+    assert (unstable_multipliers(firm, np.geomspace(5e-4, 100.0, 1000)) == 0).all()
+
+
+@pytest.mark.parametrize(
+    "axis", [held("medium", wall_stiffness=2.5e3), held("firm", wall_stiffness=2e4)]
+)
+def test_a_simulation_becomes_unstable_at_the_margin(bench: ModuleType, axis: OneAxis) -> None:
+    simulated = bench.simulated_margin(axis, JR3)
+    assert float(delay_margin(cut_loop(axis, JR3))) == pytest.approx(simulated, abs=2e-3)
+
+
+@pytest.mark.parametrize("delay", [0.0, 5e-3, 20e-3, 40e-3])
+def test_multipliers_predict_how_a_perturbation_grows(bench: ModuleType, delay: float) -> None:
+    axis = held("medium", delay=delay)
+    simulated = bench.simulated_growth(axis, STATION)
+    assert growth_rate(sampled_loop(axis, STATION)) == pytest.approx(simulated, rel=0.02)
+
+
+def test_control_state_spaces_in_and_out() -> None:
+    loop = sampled_loop(OneAxis(delay=2e-3, wall_damping=5.0), STATION)
+    system = loop.to_control()
+    assert isinstance(system, control.StateSpace) and system.dt == 5e-4
+    assert system.output_labels == list(loop.outputs)
+    np.testing.assert_array_equal(multipliers(system), multipliers(loop))
+    assert growth_rate(system) == growth_rate(loop)
+    w = np.array([1.0, 30.0, 500.0])
+    np.testing.assert_allclose(
+        np.moveaxis(system.frequency_response(w).frdata, 2, 0),
+        sampled_response(loop, w),
+        rtol=1e-9,
+    )
+    np.testing.assert_array_equal(sampled_response(system, w), sampled_response(loop, w))
+
+
+def test_arrays_of_parameters_give_what_each_gives() -> None:
+    k, sigma = np.array([[0.0], [5.1e3], [2e4]]), np.array([0.0, 1.0])
+    both = cut_loop(replace(OneAxis(), wall_stiffness=k, sigma=sigma), JR3)
+    assert both.open.shape == (3, 2, 10)
+    margins = delay_margin(both)
+    w = np.array([1.0, 20.0])
+    responses = loop_response(both, w, 0.01)
+    for i in range(3):
+        for j in range(2):
+            one = cut_loop(OneAxis(wall_stiffness=k[i, 0], sigma=sigma[j]), JR3)
+            assert margins[i, j] == pytest.approx(float(delay_margin(one)), rel=1e-9)
+            np.testing.assert_allclose(
+                responses[:, i, j], loop_response(one, w, 0.01), rtol=1e-8, atol=1e-12
+            )
+
+
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda: sampled_loop(OneAxis(ideal_servo=True), STATION), "ideal servo"),
+        (lambda: sampled_loop(OneAxis(), Sampling(joint_control_hz=1999.0)), "joint_control_hz"),
+        (lambda: cut_loop(OneAxis(), Sampling(joint_control_hz=1e3)), "whole number of times"),
+    ],
+)
+def test_what_has_no_such_form_is_said(call, words: str) -> None:
+    with pytest.raises(DrakeTeleopError, match=words):
+        call()
