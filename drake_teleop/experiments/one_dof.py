@@ -34,7 +34,7 @@ _SUBSTEPS = 20
 _FRICTION_SPEED = 5e-3  # m/s, below it Coulomb friction fades
 # These methods know the force of the slave's motor, which is therefore held over a period; for the
 # others the command is interpolated over it.
-_AT_THE_MOTOR = ("two_layer", "pspm")
+AT_THE_MOTOR = ("two_layer", "pspm")
 
 _QUIET, _TIP = 0.5e-3, 0.2  # m, peak to peak at rest; from the wrist to the tool's tip
 _FREE, _DEPTH = -0.04, 0.02  # m, from the wall: where the operator rests, and how deep he presses
@@ -176,7 +176,7 @@ def run_one_dof(
     states = [network.initial_state(line, np.zeros(PACKET_SIZE)) for line in lines]
     ends = initial_ends(passivity.method, p, start)
     numbers = np.array([float(getattr(model, entry.name)) for entry in dataclasses.fields(model)])
-    held = passivity.method in _AT_THE_MOTOR and not model.ideal_servo
+    held = passivity.method in AT_THE_MOTOR and not model.ideal_servo
     rows = _simulate(
         METHODS.index(passivity.method), numbers, held, p, *lines, *states, ends, start, timeout,
         np.ascontiguousarray(intent),

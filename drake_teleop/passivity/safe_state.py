@@ -4,8 +4,9 @@ An end is *silent* when no new packet of a healthy sender has come for the time 
 at once when its own data are not finite, or when the newest packet says so of the sender's.
 
 * Master. The wrench that the hand feels fades to zero, in 50 ms from where it was. When packets
-  come again, the limit of the wrench rises from zero to the device's limit within 0.5 s, so that
-  nothing steps.
+  come again, for 0.5 s the wrench grows at most at the rate that would take it to the device's
+  limit in 0.5 s, so that nothing steps even if packets are missing again; from then on its limit
+  rises at that rate, whatever the wrench does.
 * Slave. The command comes to rest within 50 ms, and stays. When packets come again, it goes over
   from there to what the newest packet asks for within 0.5 s; what was asked for in between is not
   made up for.
@@ -44,9 +45,10 @@ from drake_teleop.passivity.packet import difference_into, length, moved_into
 STOP = 0.05  #: s, in which a silent end comes to rest
 RESUME = 0.5  #: s, in which it goes over to normal again
 
-# Watch of the master: time without packets, present limits (2,), what they fall by per second (2,).
-_SILENT, _LIMIT, _FALL = 0, 1, 3
-MASTER_WATCH = 5
+# Watch of the master: time without packets, present limits (2,), what they fall by per second (2,),
+# time since the last silence.
+_SILENT, _LIMIT, _FALL, _HEARD = 0, 1, 3, 5
+MASTER_WATCH = 6
 # Watch of the slave: likewise; time since it began to stop, and to resume; command (7,) when it
 # began to stop; velocity (6,) there; the last command (7,), the one before (7,).
 _STOPPING, _RESUMING, _FROM, _VELOCITY, _LAST, _BEFORE = 1, 2, 3, 10, 16, 23
@@ -93,16 +95,20 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
         limits: (2,) written [N, N m].
     """
     _listen(alive, fault, T, watch)
+    heard = watch[_SILENT] <= timeout
+    watch[_HEARD] = min(watch[_HEARD] + T, RESUME) if heard else 0.0
     for g in range(2):
-        if watch[_SILENT] <= timeout:
+        size, limit = length(held, g), watch[_LIMIT + g]
+        if heard:
             watch[_FALL + g] = 0.0
-            watch[_LIMIT + g] = min(full[g], watch[_LIMIT + g] + full[g] * T / RESUME)
+            start = size if watch[_HEARD] < RESUME else limit
+            limit = min(full[g], start + full[g] * T / RESUME)
         else:
             if watch[_FALL + g] == 0.0:
-                watch[_LIMIT + g] = min(watch[_LIMIT + g], length(held, g))
-                watch[_FALL + g] = watch[_LIMIT + g] / STOP
-            watch[_LIMIT + g] = max(0.0, watch[_LIMIT + g] - watch[_FALL + g] * T)
-        limits[g] = watch[_LIMIT + g]
+                limit = min(limit, size)
+                watch[_FALL + g] = limit / STOP
+            limit = max(0.0, limit - watch[_FALL + g] * T)
+        watch[_LIMIT + g] = limits[g] = limit
 
 
 @njit(cache=True)

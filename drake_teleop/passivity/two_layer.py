@@ -12,6 +12,10 @@ cost f . dx + |f| a_max T^2 at most; this is what the tank must hold (Franken's 
 forbid even a wrench that brakes). What is sent leaves the tank *before* that is asked. So the tanks
 are never overdrawn, whatever the network does, as long as |x''| <= a_max at both ends.
 
+A slave that is slower than a_max T might pay even for its brake: with an empty tank it would coast
+on for ever. So the slave keeps a reserve that is neither sent nor spent on the spring; only the
+brake may use it.
+
 Where the tank of the master is below its level, a damper on the hand fills it. Of what the tank
 holds the wrench may drain only a share in a step, which takes the edge off an empty tank; small
 tanks end a limit cycle soon, because it lives on what they hold.
@@ -54,6 +58,7 @@ from drake_teleop.quantities import quantity
 # Parameters; those of two numbers are for translation and rotation.
 _SEND, _INITIAL, _LEVEL = METHOD, METHOD + 1, METHOD + 3
 _CAPACITY, _DAMPER, ACCELERATION, _DRAIN = METHOD + 5, METHOD + 7, METHOD + 9, METHOD + 11
+_RESERVE = 0.01  # share of the capacity
 # Memory of the slave: pull of the spring, pull of the damper.
 _SPRING, _BRAKE = OWN, OWN + 6
 
@@ -102,7 +107,7 @@ def _exchange(received, dx, T, p, memory, packet):
         if more > 0.0:
             level += more
             memory[RECEIVED + g] += more
-        sent = min(T * p[_SEND], 1.0) * max(level, 0.0)
+        sent = min(T * p[_SEND], 1.0) * max(level - _RESERVE * p[_CAPACITY + g], 0.0)
         level -= sent
         lost = max(level - p[_CAPACITY + g], 0.0)
         memory[SENT + g] += sent
@@ -158,9 +163,10 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             spring[i] *= p[STIFFNESS + g]
             brake[i] = -p[DAMPING + g] * twist[i]
             pull[i] = spring[i] + brake[i]
-        # The spring is shortened first, so that an empty tank brakes.
-        room = max(memory[LEDGER + g], 0.0) - _cost(brake, dx, g, T, p)
-        if _cost(pull, dx, g, T, p) > max(memory[LEDGER + g], 0.0):
+        # The spring is shortened first and leaves the reserve, so that an empty tank brakes.
+        room = max(memory[LEDGER + g] - _RESERVE * p[_CAPACITY + g], 0.0)
+        if _cost(pull, dx, g, T, p) > room:
+            room -= _cost(brake, dx, g, T, p)
             cost = _cost(spring, dx, g, T, p)
             share = min(max(room / cost, 0.0), 1.0) if cost > 0.0 else 0.0
             for i in range(3 * g, 3 * g + 3):

@@ -9,6 +9,7 @@ import pytest
 
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.experiments.one_dof import (
+    AT_THE_MOTOR,
     PERIOD,
     OneDof,
     Task,
@@ -16,6 +17,7 @@ from drake_teleop.experiments.one_dof import (
     operators_intent,
     run_one_dof,
 )
+from drake_teleop.master.device import FORCE_LIMIT
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -99,15 +101,16 @@ def test_pressing_anew_after_a_silence_is_as_without_it(tmp_path, method):
 def test_motion_that_happened_in_silence_is_not_replayed(tmp_path, method):
     """The hand swings from 0.5 to 3 s; nothing arrives from 1 to 2.5 s, while it swings."""
     result = run(silent(tmp_path, [(1.0, 2.5)]), method, OneDof())
-    t, command = result.t, result.command
-    fast = np.abs(np.diff(result.master)).max()
-    back = (t > 2.5) & (t < 2.5 + 0.1 + RESUME)
-    # Never faster than the hand itself and the way that was missed, spread over the resumption.
+    t = result.t
+    # Never faster than the hand itself and the way that was missed, on the ramp of the resumption,
+    # whose steepest rate is 15/8.
     missed = np.ptp(result.master)
-    assert np.abs(np.diff(command[back[:-1].nonzero()[0]])).max() < 2 * fast + (
-        2 * missed / RESUME * PERIOD
-    )
-    assert np.abs(np.diff(command)).max() < 5e-3
+    fast = np.abs(np.diff(result.master)).max() + 15 / 8 * missed / RESUME * PERIOD
+    back = ((t > 2.5) & (t < 2.5 + 0.1 + RESUME))[:-1]
+    assert np.abs(np.diff(result.slave))[back].max() < fast
+    if method not in AT_THE_MOTOR:  # there the command is a pull, written as a pose
+        assert np.abs(np.diff(result.command))[back].max() < fast
+    assert np.abs(np.diff(result.command)).max() < 5e-3
 
 
 def rough(path: Path, rng: np.random.Generator, until: float = 9.0) -> NetworkConfig:
@@ -163,14 +166,12 @@ def test_nothing_steps_up_while_it_resumes_in_rough_networks(rough_networks, met
     for forward, backward in rough_networks:
         config = PassivityConfig(method=method)
         result = run_one_dof(OneDof(), config, forward, backward, timeout=TIMEOUT)
-        silent = result.silent[:, 0] > TIMEOUT
-        since = np.arange(len(silent)) - np.maximum.accumulate(
-            np.where(silent, np.arange(len(silent)), 0)
-        )
-        resuming = (since > 0) & (since < round(RESUME / PERIOD)) & (result.t > 1.0)
+        silent, steps = result.silent[:, 0] > TIMEOUT, np.arange(len(result.t))
+        since = steps - np.maximum.accumulate(np.where(silent, steps, -len(steps)))
+        resuming = (since > 0) & (since < round(RESUME / PERIOD))
         resumptions += int((np.diff(silent.astype(int)) < 0).sum())
-        growth = np.diff(np.abs(result.felt), prepend=0.0)
-        assert growth[resuming].max(initial=0.0) < 0.5
+        growth = np.diff(np.abs(result.felt), prepend=0.0)[resuming]
+        assert growth.max(initial=0.0) < 1.001 * FORCE_LIMIT * PERIOD / RESUME
     assert resumptions >= 5
 
 

@@ -1,0 +1,177 @@
+"""Does every method recover from every random network, and never push harder than it may?
+
+`python benchmarks/recovery.py [--json] [--networks N]` presses on a wall of 0.1 to 5 kN/m with
+`drake_teleop.experiments.one_dof` over N (10 000) pairs of random lines: delay up to 300 ms, jitter
+up to 100 %, loss up to 50 %, bursts that lose 50 to 100 % and often last longer than the watchdog's
+0.1 s. At 4.5 s, in contact, the lines become good: 10 ms and no loss. The hand lets go and rests. A
+method has recovered if at the end the slave is within 2 mm of the hand, which is at rest within
+0.5 mm and feels less than 0.1 N. The force may never be above 5 N, and may never step up by more
+than 0.5 N in the first 0.5 s after a silence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import multiprocessing
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.experiments.one_dof import (
+    PERIOD,
+    OneDof,
+    OneDofRun,
+    Task,
+    operators_intent,
+    run_one_dof,
+)
+from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.passivity.safe_state import RESUME
+
+TASK = Task(swing=0.3, swung=1.5, press=2.0, pressed=2.6, release=6.5, released=7.1, end=10.0)
+GOOD_FROM, TIMEOUT, LIMIT = 4.5, 0.1, 5.0  # s, s, N
+
+
+@dataclasses.dataclass
+class Row:
+    """What a method did over all networks; of the figures the worst."""
+
+    method: str
+    runs: int = 0
+    recovered: int = 0
+    silences: int = 0
+    beside: float = 0.0  #: slave beside the hand, last half second [m]
+    at_rest: float = 0.0  #: force that the hand feels then [N]
+    largest: float = 0.0  #: force ever felt [N]
+    step: float = 0.0  #: by how much it grew from step to step just after a silence [N]
+
+    def add(self, run: OneDofRun) -> None:
+        """Counts one run."""
+        end, felt = slice(-round(0.5 / PERIOD), None), np.abs(run.felt)
+        beside = float(np.abs(run.slave - run.master)[end].max())
+        at_rest = float(felt[end].max())
+        still = np.ptp(run.master[end]) < 0.5e-3
+        self.runs += 1
+        self.recovered += bool(beside < 2e-3 and at_rest < 0.1 and still)  # never if not finite
+        silent = run.silent[:, 0] > TIMEOUT
+        grown = np.diff(felt, prepend=0.0)[_resuming(silent)]
+        self.silences += int((np.diff(silent.astype(int)) < 0).sum())
+        worst = dict(
+            beside=beside, at_rest=at_rest, largest=felt.max(), step=grown.max(initial=0.0)
+        )
+        self._raise(worst)
+
+    def join(self, other: Row) -> None:
+        """Adds what another process has counted."""
+        for name in ("runs", "recovered", "silences"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self._raise(dataclasses.asdict(other))
+
+    def _raise(self, found: dict[str, float]) -> None:
+        for name in ("beside", "at_rest", "largest", "step"):
+            # The order matters: what is not a number stays.
+            setattr(self, name, float(np.maximum(found[name], getattr(self, name))))
+
+
+def _resuming(silent: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The steps up to RESUME after a silence."""
+    steps = np.arange(len(silent))
+    since = steps - np.maximum.accumulate(np.where(silent, steps, -len(silent)))
+    return (since > 0) & (since < round(RESUME / PERIOD))
+
+
+def rough_line(path: Path, rng: np.random.Generator) -> NetworkConfig:
+    """A line that is as bad as can be until GOOD_FROM; written as a trace of every millisecond."""
+    steps = round(GOOD_FROM / PERIOD)
+    mean, jitter = rng.uniform(0.0, 0.3), rng.uniform()
+    delay = mean * (1.0 + jitter * rng.uniform(-1.0, 1.0, steps))
+    lost = rng.uniform(size=steps) < rng.uniform(0.0, 0.5)
+    start = 0.0
+    while start < GOOD_FROM:
+        stop = start + rng.exponential(0.15)
+        burst = slice(round(start / PERIOD), round(stop / PERIOD))
+        lost[burst] |= rng.uniform(size=len(lost[burst])) < rng.uniform(0.5, 1.0)
+        start = stop + rng.exponential(0.5)
+    cells = np.char.mod("%.6f", delay)
+    cells[lost] = ""
+    times = np.char.mod("%.3f", PERIOD * np.arange(steps))
+    rows = np.char.add(np.char.add(times, ","), cells)
+    text = "\n".join(["time,delay", *rows, f"{GOOD_FROM},0.01", "60,0.01"])
+    path.write_text(text + "\n", encoding="utf-8")
+    return NetworkConfig(trace=str(path))
+
+
+def _some_networks(job: tuple[int, int]) -> list[Row]:
+    """Every method over the networks first..last-1."""
+    rows, intent = [Row(method) for method in METHODS], operators_intent(TASK)
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / f"{way}.csv" for way in range(2)]
+        for seed in range(*job):
+            rng = np.random.default_rng(seed)
+            lines = [rough_line(path, rng) for path in paths]
+            model = OneDof(wall_stiffness=float(np.exp(rng.uniform(np.log(100), np.log(5000)))))
+            for row in rows:
+                config = PassivityConfig(method=row.method, force_limit=LIMIT)
+                row.add(run_one_dof(model, config, *lines, timeout=TIMEOUT, intent=intent))
+    return rows
+
+
+def study(networks: int, processes: int = 2) -> list[Row]:
+    """Runs every method over the networks."""
+    share = max(1, -(-networks // (16 * processes)))
+    jobs = [(first, min(first + share, networks)) for first in range(0, networks, share)]
+    run_one_dof(OneDof(), PassivityConfig(), NetworkConfig())  # compiles, before processes fork
+    if processes > 1:
+        with multiprocessing.get_context("fork").Pool(processes) as pool:
+            parts = pool.map(_some_networks, jobs, chunksize=1)
+    else:
+        parts = [_some_networks(job) for job in jobs]
+    total = parts[0]
+    for part in parts[1:]:
+        for row, other in zip(total, part, strict=True):
+            row.join(other)
+    return total
+
+
+def holds(rows: list[Row]) -> bool:
+    """Whether every method recovered every time and kept within its limits."""
+    return all(
+        row.recovered == row.runs and row.largest <= LIMIT + 1e-12 and row.step < 0.5
+        for row in rows
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the study and prints it; returns 0 if `holds`."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument("--networks", type=int, default=10_000, help="how many networks")
+    options = parser.parse_args(arguments)
+    began = time.monotonic()
+    rows = study(options.networks)
+    took = time.monotonic() - began
+    if options.json:
+        print(json.dumps({"wall_s": took, "rows": [dataclasses.asdict(row) for row in rows]}))
+    else:
+        print(f"{options.networks} networks, {took:.0f} s")
+        print(
+            "method        recovered of     runs  silences  beside mm  at rest N  largest N  step N"
+        )
+        for row in rows:
+            print(
+                f"{row.method:<14}{row.recovered:>9} of {row.runs:>8}{row.silences:>10}"
+                f"{1e3 * row.beside:>11.3f}{row.at_rest:>11.3f}{row.largest:>11.3f}"
+                f"{row.step:>8.3f}"
+            )
+    return 0 if holds(rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
