@@ -181,17 +181,18 @@ def hybrid_of_chain(A: Complex) -> Complex:
     return two_port(a12 / a22, a11 - a12 * a21 / a22, -1 / a22, a21 / a22)
 
 
-def scattering(H: Complex, reference: tuple[float, float] = (1.0, 1.0)) -> Complex:
+def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) -> Complex:
     """S from the waves F + b V to the waves F - b V of the ports, with -V_s at the slave's.
 
     Args:
         H: (..., 2, 2).
-        reference: impedances b of the two ports [N s/m]. Passivity does not depend on them, the
-            norm of S does.
+        reference: impedances b of the two ports [N s/m], which broadcast with the entries. Whether
+            the norm of S exceeds 1 does not depend on them, by how much does.
     """
     h11, h12, h21, h22 = entries(H)
-    ratio = np.sqrt(reference[1] / reference[0])
-    h11, h12, h21, h22 = h11 / reference[0], h12 * ratio, h21 * ratio, h22 * reference[1]
+    b1, b2 = np.asarray(reference[0]), np.asarray(reference[1])
+    ratio = np.sqrt(b2 / b1)
+    h11, h12, h21, h22 = h11 / b1, h12 * ratio, h21 * ratio, h22 * b2
     determinant = (1 + h11) * (1 + h22) - h12 * h21
     return (
         two_port(
@@ -237,7 +238,8 @@ def absorb(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> C
     h11, h12, h21, h22 = entries(H)
     z = np.asarray(environment)
     give = 1 / (1 + h22 * z)
-    return two_port(h11 + hand - h12 * h21 * z * give, h12 * give, h21 * give, h22 * give)
+    felt = h11 + np.asarray(hand) - h12 * h21 * z * give
+    return two_port(felt, h12 * give, h21 * give, h22 * give)
 
 
 def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:

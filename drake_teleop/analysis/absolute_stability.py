@@ -1,0 +1,335 @@
+"""For which hands and environments a station is stable: any passive ones, or those within ranges.
+
+Everything here takes two-ports (..., 2, 2) on the imaginary axis, see `two_port`, and answers for
+each frequency. Whoever concludes from it that a station is stable says at the same time that h11
+and h22 have no poles to the right of the axis; the servo of a station takes care of that.
+
+A hand and an environment that may be anything passive are a hard test: a position-force station
+fails it with any delay and, behind a servo that gives way, without one. What is asked beside it is
+therefore whether the station is stable for those that there are: for every hand and environment
+whose mass, damping and stiffness lie within `ImpedanceRange`s.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_teleop.analysis.one_axis import Complex
+from drake_teleop.analysis.two_port import absorb, entries, transmitted_impedance
+from drake_teleop.errors import DrakeTeleopError
+
+if TYPE_CHECKING:
+    import control
+
+Real = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_ROUNDING = 1e-12  # relative to the terms that cancel in a criterion
+
+
+def llewellyn(H: Complex) -> Real:
+    """2 Re h11 Re h22 - Re(h12 h21) - |h12 h21|, not negative where absolutely stable.
+
+    It depends on the product of the scales only. Llewellyn, Proc. IRE 40 (1952).
+    """
+    h11, h12, h21, h22 = entries(H)
+    product = h12 * h21
+    return 2 * h11.real * h22.real - product.real - np.abs(product)
+
+
+def absolutely_stable(H: Complex) -> Flags:
+    """Whether no passive hand and environment can make the station oscillate at the frequency."""
+    h11, h12, h21, h22 = entries(H)
+    size = np.abs(h12 * h21) + np.abs(h11 * h22)
+    return (
+        (h11.real >= -_ROUNDING * np.abs(h11))
+        & (h22.real >= -_ROUNDING * np.abs(h22))
+        & (llewellyn(H) >= -_ROUNDING * size)
+    )
+
+
+def required_damping(H: Complex) -> Real:
+    """Damping to add to the device, or at least to be had of the hand, for absolute stability.
+
+    The largest over all frequencies is what the station lacks; negative is to spare. Infinite where
+    no damping helps. [N s/m]
+    """
+    h11, h12, h21, h22 = entries(H)
+    product = h12 * h21
+    loss = product.real + np.abs(product)
+    loss = np.where(loss <= _ROUNDING * np.abs(product), 0.0, loss)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        through = np.where(loss > 0, loss / (2 * h22.real), 0.0)
+    return np.where(h22.real < 0, np.inf, through) - h11.real
+
+
+def raisbeck(H: Complex) -> Real:
+    """4 Re h11 Re h22 - |h12 + conj(h21)|^2, not negative where passive.
+
+    Of a station with scales take it on `power_scaled` ports: else their ratio alone is what it
+    sees. Raisbeck, J. Appl. Phys. 25 (1954).
+    """
+    h11, h12, h21, h22 = entries(H)
+    return 4 * h11.real * h22.real - np.abs(h12 + np.conj(h21)) ** 2
+
+
+def passive(H: Complex) -> Flags:
+    """Whether the station takes up power at the frequency, however it is driven."""
+    h11, h12, h21, h22 = entries(H)
+    size = np.abs(h11 * h22) + np.abs(h12) ** 2 + np.abs(h21) ** 2
+    return (
+        (h11.real >= -_ROUNDING * np.abs(h11))
+        & (h22.real >= -_ROUNDING * np.abs(h22))
+        & (raisbeck(H) >= -_ROUNDING * size)
+    )
+
+
+def positive_real(system: control.lti.LTI) -> bool:
+    """Whether a rational system, as an impedance or hybrid matrix, is passive at all frequencies.
+
+    No frequency is missed: the least eigenvalue of G + G^H changes its sign only where the pencil
+    of G(s) + G(-s)^T has an eigenvalue, and it is evaluated once between any two of these.
+
+    Args:
+        system: continuous, with as many inputs as outputs, proper (of an impedance that is not,
+            pass the admittance).
+
+    Raises:
+        DrakeTeleopError: if it has no state space, is not square or is sampled.
+    """
+    import control
+    from scipy import linalg
+
+    if system.ninputs != system.noutputs or not system.isctime():
+        raise DrakeTeleopError("needs a continuous system with as many inputs as outputs")
+    try:
+        model = control.ss(system)
+    except (ValueError, TypeError, control.ControlMIMONotImplemented) as error:
+        raise DrakeTeleopError(
+            "this system has no state space", remedy="test its admittance"
+        ) from error
+    n, m = model.nstates, model.ninputs
+    # G(s + e) is strictly stable where G is, and still positive real if G is: so poles and zeros on
+    # the axis, as of a lossless spring, need no case of their own.
+    shift = 1e-9 * max(1.0, np.max(np.abs(model.poles()), initial=0.0))
+    A = model.A - shift * np.eye(n)
+    B, C, D = model.B, model.C, model.D
+    if n and np.max(linalg.eigvals(A).real) >= 0:
+        return False
+    pencil = np.block([[A, np.zeros((n, n)), B], [np.zeros((n, n)), -A.T, -C.T], [C, B.T, D + D.T]])
+    finite = linalg.block_diag(np.eye(2 * n), np.zeros((m, m)))
+    found = np.abs(linalg.eigvals(pencil, finite).imag)
+    edges = np.sort(found[np.isfinite(found)])
+    edges = np.concatenate([[0.0], edges, [2 * np.max(edges, initial=1.0)]])
+    omega = np.concatenate([edges, (edges[1:] + edges[:-1]) / 2])
+    inner = np.linalg.solve(
+        1j * omega[:, None, None] * np.eye(n) - A, np.broadcast_to(B, (len(omega), n, m))
+    )
+    G = C @ inner + D
+    least = np.linalg.eigvalsh(G + np.conj(np.swapaxes(G, 1, 2)))[:, 0]
+    return bool(np.all(least >= -1e-9 * np.max(np.abs(G), axis=(1, 2), initial=0.0)))
+
+
+def scattering_norm(S: Complex) -> Real:
+    """Largest singular value of S; the station is passive where it is at most 1."""
+    return _largest_singular_value(*entries(S))
+
+
+def structured_singular_value(
+    S: Complex, hand: ArrayLike = 1.0, environment: ArrayLike = 1.0
+) -> Real:
+    """mu of S for a hand and an environment that reflect no more than these shares of a wave.
+
+    With 1, which is anything passive, mu <= 1 where the station is absolutely stable. Exact: for
+    two ports mu is the least norm of D S D^-1, and that of the D that makes both transmissions
+    equally large.
+
+    Args:
+        S: (..., 2, 2) scattering matrices.
+        hand, environment: largest |Z - b| / |Z + b| with the reference b of S at that port.
+    """
+    s11, s12, s21, s22 = entries(S)
+    r1, r2 = np.asarray(hand), np.asarray(environment)
+    return _balanced_norm(s11 * r1, s12 * s21 * r1 * r2, s22 * r2)
+
+
+def _balanced_norm(first: Complex, product: Complex, second: Complex) -> Real:
+    """Norm of a matrix with this diagonal and product of the others, these being equally large."""
+    even = np.sqrt(np.abs(product))
+    turned = product / np.where(even > 0, even, 1.0)
+    return _largest_singular_value(first, turned, even, second)
+
+
+def _largest_singular_value(a: Complex, b: Complex, c: Complex, d: Complex) -> Real:
+    """Of [[a, b], [c, d]], as the half sum of two norms: exact where the two values are equal."""
+    determinant = a * d - b * c
+    size = np.abs(determinant)
+    phase = np.where(size > 0, determinant / np.where(size > 0, size, 1.0), 1.0)
+    d, c = phase * np.conj(d), phase * np.conj(c)
+    sums = np.abs(a + d) ** 2 + np.abs(b - c) ** 2
+    differences = np.abs(a - d) ** 2 + np.abs(b + c) ** 2
+    return (np.sqrt(sums) + np.sqrt(differences)) / 2
+
+
+def scanned_resistance(H: Complex, loads: int = 17, rounds: int = 8) -> Real:
+    """Least Re Z felt by the hand over all lossless environments, found by trying them [N s/m].
+
+    A second opinion of Llewellyn's criterion: where h11 and h22 have positive real parts the two
+    have the same sign. Each round tries `loads` susceptances around the best of the one before.
+    """
+    h11, h12, h21, h22 = (entry[..., None] for entry in entries(H))
+    scale = np.where(h22.real != 0, np.abs(h22.real), 1.0)
+    step = 2 * np.pi / (loads - 1)
+    angles = np.linspace(-np.pi, np.pi, loads)
+    centre = np.zeros_like(scale)
+    for _ in range(rounds):
+        tried = centre + angles
+        susceptance = scale * np.tan(tried / 2) - h22.imag
+        resistance = (h11 - h12 * h21 / (h22 + 1j * susceptance)).real
+        best = np.argmin(resistance, axis=-1, keepdims=True)
+        centre = np.take_along_axis(tried, best, axis=-1)
+        angles, step = np.linspace(-step, step, loads), 2 * step / (loads - 1)
+    return np.take_along_axis(resistance, best, axis=-1)[..., 0]
+
+
+class WorstLoads(NamedTuple):
+    """The lossless hand and environment that come nearest to oscillating, each (...,) [N s/m].
+
+    A reactance X > 0 at a frequency w is a mass X / w, X < 0 a spring of stiffness -X w.
+    """
+
+    hand: Real
+    environment: Real
+    resistance: Real  #: what is left of the loop; where it is negative they oscillate ever more
+
+
+def worst_loads(H: Complex) -> WorstLoads:
+    """The terminations that prove a station not absolutely stable; Re h22 must not be 0."""
+    h11, h12, h21, h22 = entries(H)
+    product = h12 * h21
+    size = np.abs(product)
+    phase = np.where(size > 0, product / np.where(size > 0, size, 1.0), 1.0)
+    # 1 / (h22 + j B) is on a circle through 0; product times it has its largest real part here.
+    seen = (1 + np.conj(phase)) / (2 * h22.real)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reactance = -1 / (1 / seen - h22).imag
+    felt = h11 - product * seen
+    return WorstLoads(-felt.imag, reactance, felt.real)
+
+
+class ImpedanceRange(NamedTuple):
+    """Hands or environments m s + b + k / s with (smallest, largest) values.
+
+    At a frequency they are all the impedances of a rectangle.
+    """
+
+    mass: tuple[float, float]  #: kg
+    damping: tuple[float, float]  #: N s/m
+    stiffness: tuple[float, float]  #: N/m
+
+    def corners(self, omega: Real) -> Complex:
+        """(..., 4) corners of the rectangle [N s/m], once around."""
+        low = self.mass[0] * omega - self.stiffness[1] / omega
+        high = self.mass[1] * omega - self.stiffness[0] / omega
+        least, most = self.damping
+        return np.stack(
+            [least + 1j * low, most + 1j * low, most + 1j * high, least + 1j * high], -1
+        )
+
+    def contains(self, impedance: Complex, omega: Real) -> Flags:
+        """Whether there is one among them with this impedance [N s/m] at omega [rad/s]."""
+        corners = self.corners(omega)
+        low, high = corners[..., 0], corners[..., 2]
+        return (
+            (impedance.real >= low.real)
+            & (impedance.real <= high.real)
+            & (impedance.imag >= low.imag)
+            & (impedance.imag <= high.imag)
+        )
+
+
+def range_of_grips() -> ImpedanceRange:
+    """From the lightest to the firmest hand of the station's operator."""
+    from drake_teleop.master.operator import GRIPS
+
+    mass, damping, stiffness = (
+        (min(values), max(values))
+        for values in zip(
+            *((hand.mass, hand.damping, hand.stiffness) for hand in GRIPS.values()), strict=True
+        )
+    )
+    return ImpedanceRange(mass, damping, stiffness)
+
+
+def can_oscillate(
+    H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
+) -> Flags:
+    """Whether some hand and environment of the ranges keep up an oscillation at the frequency.
+
+    Exact: they do where Z_h + Z_to(Z_e) = 0 for impedances of the two rectangles. If it is so at no
+    frequency, all of them are stable or none is (zero exclusion), and one need be looked at. The
+    frequencies have to be dense; a range of hands without width can slip between them.
+
+    Args:
+        H: (..., 2, 2).
+        omega: [rad/s], broadcasts with H[..., 0, 0].
+        hand, environment: the ranges.
+    """
+    h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
+    z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]
+    dz, de = np.roll(z, -1, axis=-2) - z, np.roll(e, -1, axis=-1) - e
+    # Along an edge of each, (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e = a + b t + (c + d t) u, with t
+    # and u from 0 to 1. It is zero where t = -(a + c u) / (b + d u) is real.
+    a = (z + h11) * (1 + h22 * e) - h12 * h21 * e
+    b, c, d = dz * (1 + h22 * e), ((z + h11) * h22 - h12 * h21) * de, dz * h22 * de
+    q2, q1, q0 = (c * d.conj()).imag, (a * d.conj() + c * b.conj()).imag, (a * b.conj()).imag
+    with np.errstate(divide="ignore", invalid="ignore"):
+        half = -(q1 + np.copysign(np.sqrt(q1**2 - 4 * q2 * q0), q1)) / 2
+        u = np.stack([half / q2, q0 / half])
+        t = -((a + c * u) / (b + d * u)).real
+        crossing = np.any((t >= 0) & (t <= 1) & (u >= 0) & (u <= 1), axis=(0, -2, -1))
+        # No edges cross if one region is within the other.
+        felt = transmitted_impedance(H, e[..., 0, 0])
+        z1, h11, h12, h21, h22 = (x[..., 0, 0] for x in (z, h11, h12, h21, h22))
+        wanted = 1 / (h12 * h21 / (z1 + h11) - h22)
+    return crossing | hand.contains(-felt, omega) | environment.contains(wanted, omega)
+
+
+def bounded_singular_value(
+    H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
+) -> Real:
+    """mu for hands and environments of the ranges; none can oscillate where it is less than 1.
+
+    Sufficient, and graded where `can_oscillate` is not: the rectangle of each range is enlarged to
+    a disc, from the smallest around it to nearly the half plane of all that have as much damping,
+    and the pair of discs counts that does best. What is said of the ranges holds for any linear
+    hand and environment in these discs.
+
+    Args:
+        H: (..., 2, 2).
+        omega: [rad/s], broadcasts with H[..., 0, 0].
+        hand, environment: the ranges.
+    """
+    z, r1 = (values[..., :, None] for values in _discs(hand.corners(omega)))
+    e, r2 = (values[..., None, :] for values in _discs(environment.corners(omega)))
+    h11, h12, h21, h22 = entries(absorb(H[..., None, None, :, :], z, e))
+    # (z + r1 d1) + Z_to(e + r2 d2) vanishes for some |d1|, |d2| <= 1 where mu >= 1 of the matrix
+    # with this diagonal and this product of the other two.
+    through = h12 * h21 / h11
+    return np.min(
+        _balanced_norm(r1 / h11, r1 * r2 * -through / h11, r2 * (h22 - through)), axis=(-2, -1)
+    )
+
+
+_WIDENING = np.array([0.0, 0.25, 1.0, 4.0, 16.0, 64.0])  # of a disc, in half diagonals
+
+
+def _discs(corners: Complex) -> tuple[Complex, Real]:
+    """Centres and radii (..., 6) of discs through the two corners with the least damping."""
+    diagonal = corners[..., 2] - corners[..., 0]
+    right = diagonal.real[..., None] / 2 + np.abs(diagonal)[..., None] / 2 * _WIDENING
+    middle = corners[..., 0] + 0.5j * diagonal.imag
+    return middle[..., None] + right, np.hypot(right, diagonal.imag[..., None] / 2)

@@ -1,0 +1,411 @@
+"""Criteria against what they are criteria for: loads that oscillate, energies, roots."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+
+from drake_teleop.analysis import absolute_stability as ab
+from drake_teleop.analysis import two_port as tp
+from drake_teleop.analysis.one_axis import OneAxis
+from drake_teleop.errors import DrakeTeleopError
+
+OMEGA = np.geomspace(0.1, 3000.0, 500)
+S = 1j * OMEGA
+
+
+def random_two_ports(n: int, seed: int) -> np.ndarray:
+    """Hybrid matrices about the edge of absolute stability, some with active ports."""
+    rng = np.random.default_rng(seed)
+    H = rng.normal(size=(n, 2, 2)) + 1j * rng.normal(size=(n, 2, 2))
+    H *= np.exp(rng.normal(size=(n, 2, 2)))
+    passive_ports = rng.random(n) < 0.8
+    for i in (0, 1):
+        H[passive_ports, i, i] = np.abs(H[passive_ports, i, i].real) + 1j * (
+            H[passive_ports, i, i].imag
+        )
+    H[:, 0, 1] *= 0.7
+    return H
+
+
+def test_llewellyn_agrees_with_trying_lossless_loads():
+    H = random_two_ports(5000, 1)
+    stable = (ab.scanned_resistance(H) >= 0) & (H[:, 1, 1].real >= 0)
+    assert np.array_equal(ab.absolutely_stable(H), stable)
+    assert 1000 < np.sum(stable) < 4000
+    # And by random passive loads at both ends: |det| of the terminated station has no zero.
+    rng = np.random.default_rng(2)
+    for h, is_stable in zip(H[:200], stable[:200], strict=True):
+        z_e = 1j * np.tan(rng.uniform(-np.pi / 2, np.pi / 2, 20000)) * np.exp(rng.normal())
+        felt = tp.transmitted_impedance(h, z_e).real
+        assert not (is_stable and felt.min() < 0)
+
+
+def random_station(rng: np.random.Generator) -> OneAxis:
+    return OneAxis(
+        device_mass=rng.uniform(0.05, 2.0),
+        device_damping=rng.uniform(0.1, 10.0),
+        slave_mass=rng.uniform(1.0, 30.0),
+        position_gain=rng.uniform(20.0, 100.0),
+        velocity_gain=rng.uniform(100.0, 600.0),
+        tool_mass=rng.uniform(0.2, 5.0),
+        force_scale=rng.uniform(0.05, 2.0),
+        position_scale=rng.uniform(0.2, 3.0),
+        sigma=rng.uniform(0.0, 2.0),
+        gamma=rng.uniform(0.2, 2.0),
+        delay=rng.choice([0.0, rng.uniform(0.0, 0.1)]),
+    )
+
+
+def test_where_llewellyn_fails_springs_and_masses_make_it_oscillate():
+    """300 stations: the terminations that it names give a root to the right of the axis."""
+    rng = np.random.default_rng(3)
+    proven = 0
+    while proven < 300:
+        axis = random_station(rng)
+        H = tp.hybrid(axis, S)
+        failing = np.flatnonzero(~ab.absolutely_stable(H))
+        if not failing.size:
+            continue
+        i = rng.choice(failing)
+        w, loads = OMEGA[i], ab.worst_loads(H[i])
+        assert loads.resistance < 0
+
+        def environment(s, x=loads.environment, w=w):
+            return s * x / w if x > 0 else -w * x / s
+
+        def felt(s, axis=axis, environment=environment):
+            return tp.transmitted_impedance(tp.hybrid(axis, s), environment(s))
+
+        # The hand's reactance of a spring and a mass so heavy that the loop's own hardly changes.
+        slope = abs(felt(1j * w * 1.0001) - felt(1j * w)) / (1e-4 * w)
+        mass = max(100 * slope, 100 * abs(loads.resistance) / w, abs(loads.hand) / w)
+        spring = mass * w**2 - loads.hand * w
+        assert spring >= 0
+
+        def around(s, mass=mass, spring=spring, felt=felt):
+            return mass * s + spring / s + felt(s)
+
+        s = 1j * w - loads.resistance / (2 * mass)
+        for _ in range(20):
+            step = 1e-6 * abs(s)
+            s = s - around(s) * 2 * step / (around(s + step) - around(s - step))
+        assert abs(around(s)) < 1e-8 * abs(mass * s)
+        assert s.real > 0
+        proven += 1
+
+
+def test_a_passive_station_is_absolutely_stable_and_not_the_other_way_round():
+    H = random_two_ports(20000, 4)
+    passive, stable = ab.passive(H), ab.absolutely_stable(H)
+    assert not np.any(passive & ~stable)
+    assert np.sum(passive) > 500
+    assert np.sum(stable & ~passive) > 500
+    # Passive is what no drive gets power out of: least eigenvalue of the Hermitian part.
+    least = np.linalg.eigvalsh(H + np.conj(np.swapaxes(H, 1, 2)))[:, 0]
+    assert np.array_equal(passive, least >= 0)
+    # With the power of one side counted as it suits, the two criteria are one.
+    even = tp.power_scaled(H, np.abs(H[:, 0, 1] / H[:, 1, 0]))
+    np.testing.assert_allclose(ab.raisbeck(even), 2 * ab.llewellyn(H), rtol=1e-9, atol=1e-9)
+
+
+def test_scales_alone_are_not_activity():
+    axis = OneAxis(ideal_servo=True, force_scale=1 / 17.5, position_scale=2.0, gamma=1.4)
+    H = tp.hybrid(axis, S)
+    assert np.all(ab.raisbeck(H) < -1)
+    scaled = tp.power_scaled(H, tp.power_ratio(axis))
+    np.testing.assert_allclose(ab.raisbeck(scaled), 0.0, atol=1e-12)
+    assert np.all(ab.passive(scaled))
+    np.testing.assert_allclose(ab.llewellyn(scaled), ab.llewellyn(H), atol=1e-12)
+
+
+def test_force_and_velocity_through_a_delay():
+    delay = 0.02
+    H = tp.force_velocity_exchange(S, delay)
+    scattered = tp.scattering(H)
+    largest = np.linalg.svd(scattered, compute_uv=False)[:, 0]
+    wt = OMEGA * delay
+    np.testing.assert_allclose(ab.scattering_norm(scattered), largest, rtol=1e-9)
+    np.testing.assert_allclose(largest, np.abs(np.tan(wt)) + 1 / np.abs(np.cos(wt)), rtol=1e-9)
+    # The least resistance of the loads tried, times twice the loss added behind it, is the value.
+    loss = 0.37
+    lossy = tp.two_port(H[:, 0, 0], H[:, 0, 1], H[:, 1, 0], loss)
+    tried = 2 * loss * ab.scanned_resistance(lossy)
+    np.testing.assert_allclose(ab.llewellyn(H), tried, atol=1e-9)
+    np.testing.assert_allclose(ab.llewellyn(H), np.cos(2 * wt) - 1, rtol=1e-9, atol=1e-12)
+
+
+def test_waves_are_lossless_whatever_the_delay():
+    for impedance, reference in ((1.0, 1.0), (3.7, 3.7), (3.7, 0.8)):
+        H = tp.wave_line(S, 0.02, impedance)
+        scattered = tp.scattering(H, (reference, reference))
+        # Where cos(wT) vanishes the hybrid matrix is infinite and its entries lose digits.
+        sound = np.abs(np.cos(0.02 * OMEGA)) > 0.01
+        np.testing.assert_allclose(ab.scattering_norm(scattered)[sound], 1.0, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.svd(scattered[sound])[1], 1.0, atol=1e-12)
+    late = np.exp(-0.02 * S)
+    matched = tp.scattering(tp.wave_line(S, 0.02, 3.7), (3.7, 3.7))
+    exact = tp.two_port(0, late, late, 0)
+    np.testing.assert_allclose(matched, exact, atol=1e-10)
+
+
+def test_four_channels_are_absolutely_stable_without_delay_only():
+    master, slave = 0.5 * S + 3 + 50 / S, 3.13 * S + 300 + 9000 / S
+    for c5, c6 in ((-0.5, -0.5), (0.0, 0.0), (1.0, 1.0)):
+        channels = tp.transparent_channels(master, slave, c5, c6)
+        ideal = tp.four_channel(S, master, slave, channels)
+        np.testing.assert_allclose(ab.llewellyn(ideal), 0.0, atol=1e-12)
+        for delay in (1e-5, 1e-3, 5e-3, 0.1):
+            late = tp.four_channel(S, master, slave, channels, delay)
+            assert not np.all(ab.absolutely_stable(late))
+
+
+def pd_station(omega, axis):
+    """A position-force station behind a PD servo on the error of velocity, as a two-port."""
+    s = 1j * omega
+    Z_s, C = 3.13 * s, 300 + 9000 / s
+    return tp.hybrid(axis, s, servo=(C / (Z_s + C), 1 / (Z_s + C)))
+
+
+def test_position_force_is_not_absolutely_stable_even_without_delay():
+    omega = np.geomspace(1.0, 1e4, 4000)
+    axis = OneAxis(device_damping=0.0, sigma=0.0)
+    H = pd_station(omega, axis)
+    assert not np.any(ab.absolutely_stable(H)[omega > 100])
+    needed = ab.required_damping(H)
+    assert np.max(needed) == pytest.approx(890, rel=0.01)
+    # 890 is that at 10^4 rad/s, and there is no end to it: k_f m_s w / 2.
+    assert np.argmax(needed) == len(omega) - 1
+    for w in (1e5, 1e6):
+        last = ab.required_damping(pd_station(np.array([w]), axis))[0]
+        assert last == pytest.approx(3.13 * w / 17.5 / 2, rel=1e-2)
+    # It is the damping at which no lossless load gives a negative resistance.
+    some = slice(1000, None, 100)
+    less = tp.absorb(H, hand=0.999 * needed)
+    more = tp.absorb(H, hand=1.001 * needed)
+    assert np.all(ab.scanned_resistance(less)[some] < 0)
+    assert np.all(ab.scanned_resistance(more)[some] > 0)
+    # The servo that the station has damps its own velocity and asks for much less.
+    paper = tp.hybrid(OneAxis(device_damping=0.0), 1j * np.geomspace(0.01, 1e6, 4000))
+    assert np.max(ab.required_damping(paper)) == pytest.approx(95.1, abs=0.1)
+
+
+def test_structured_singular_value_is_llewellyn():
+    H = random_two_ports(20000, 5)
+    reference = (2.0, 0.5)
+    mu = ab.structured_singular_value(tp.scattering(H, reference))
+    assert np.array_equal(mu <= 1, ab.absolutely_stable(H))
+    # It does not see how the two sides' powers are counted, which the norm does, and is below it.
+    scaled = tp.scattering(tp.power_scaled(H, 7.0), reference)
+    np.testing.assert_allclose(ab.structured_singular_value(scaled), mu, rtol=1e-9)
+    assert np.all(mu <= ab.scattering_norm(scaled) * (1 + 1e-12))
+
+
+def test_structured_singular_value_is_the_largest_gain_of_passive_terminations():
+    scattered = tp.scattering(random_two_ports(30, 6))
+    turns = np.exp(2j * np.pi * np.linspace(0, 1, 5001))
+    for one, mu in zip(scattered, ab.structured_singular_value(scattered), strict=True):
+        loads = np.zeros((len(turns), 2, 2), dtype=complex)
+        loads[:, 0, 0], loads[:, 1, 1] = 1, turns
+        radius = np.max(np.abs(np.linalg.eigvals(one @ loads)))
+        assert radius == pytest.approx(mu, rel=1e-6)
+        share = (0.3, 0.8)
+        less = np.max(np.abs(np.linalg.eigvals(one @ np.diag(share) @ loads)))
+        assert less == pytest.approx(ab.structured_singular_value(one, *share), rel=1e-6)
+
+
+def roots(axis: OneAxis, hand: np.ndarray, wall: np.ndarray) -> np.ndarray:
+    """Largest real part of the roots without delay; hand (n, 3) is m, b, k, wall (n, 2) is b, k.
+
+    hand and device (s) x + force(s) / slave(s) x = 0 with the servo's spring in the force.
+    """
+    (m_h, b_h, k_h), (b_e, k_e) = hand.T, wall.T
+    kv, kp, m_s = axis.velocity_gain, axis.position_gain, axis.slave_mass
+    zero = np.zeros_like(b_e)
+    device = np.array([m_h + axis.device_mass, b_h + axis.device_damping, k_h])
+    slave = np.array([zero + m_s, m_s * kv + b_e, m_s * kv * kp + k_e])
+    force = np.array([zero + axis.felt_tool_mass, axis.gamma * b_e, axis.gamma * k_e])
+    force *= axis.force_scale * axis.position_scale * m_s * kv * kp
+    polynomial = np.zeros((5, len(m_h)))
+    for i in range(3):
+        polynomial[2 + i] += force[i]
+        for j in range(3):
+            polynomial[i + j] += device[i] * slave[j]
+    companion = np.zeros((len(m_h), 4, 4))
+    companion[:, 0] = -(polynomial[1:] / polynomial[0]).T
+    companion[:, [1, 2, 3], [0, 1, 2]] = 1
+    return np.linalg.eigvals(companion).real.max(axis=1)
+
+
+def members(hand: ab.ImpedanceRange, wall: ab.ImpedanceRange, n: int):
+    grids = [np.linspace(*r, n) for r in (*hand, wall.damping, wall.stiffness)]
+    points = np.stack(np.meshgrid(*grids, indexing="ij"), -1).reshape(-1, 5)
+    return points[:, :3], points[:, 3:]
+
+
+def random_ranges(rng: np.random.Generator) -> tuple[ab.ImpedanceRange, ab.ImpedanceRange]:
+    def between(low, high):
+        return tuple(np.sort(np.exp(rng.uniform(np.log(low), np.log(high), 2))))
+
+    hand = ab.ImpedanceRange(between(0.05, 2.0), between(0.3, 30.0), between(10.0, 1000.0))
+    wall = ab.ImpedanceRange((0.0, 0.0), between(1.0, 100.0), between(10.0, 30000.0))
+    return hand, wall
+
+
+def test_ranges_without_delay_against_the_roots_of_their_members():
+    """Some oscillate at some frequency exactly if some members are stable and some are not."""
+    rng = np.random.default_rng(7)
+    omega = np.geomspace(0.1, 3000.0, 1500)
+    counts = np.zeros((2, 2), dtype=int)
+    while counts.sum() < 40:
+        axis = OneAxis(
+            force_scale=rng.uniform(0.05, 1.0),
+            sigma=rng.uniform(0, 1),
+            slave_mass=rng.uniform(4, 20),
+        )
+        hand, wall = random_ranges(rng)
+        growth = roots(axis, *members(hand, wall, 5))
+        if np.max(growth) < 0 and np.max(growth) > -0.02 * abs(np.min(growth)):
+            continue  # A coarse grid of members does not settle it.
+        H = tp.hybrid(axis, 1j * omega)
+        oscillates = np.any(ab.can_oscillate(H, omega, hand, wall))
+        mixed = np.min(growth) < 0 < np.max(growth)
+        counts[int(mixed), int(oscillates)] += 1
+        if not oscillates:
+            assert not mixed
+        if np.max(ab.bounded_singular_value(H, omega, hand, wall)) < 1:
+            assert not oscillates
+    assert counts[0, 1] == 0
+    assert counts[1, 0] == 0
+    assert np.all(np.diag(counts) > 8)
+
+
+def first_crossing(mass, damping, stiffness, contact):
+    """Least round trip at which m s^2 + b s + k + K e^(-s RTT) has a root on the axis."""
+    # |k - m w^2 + j b w|^2 = K^2 is a quadratic in w^2; at its larger root the root moves right.
+    a, b, c = mass**2, damping**2 - 2 * mass * stiffness, stiffness**2 - contact**2
+    with np.errstate(invalid="ignore"):
+        w = np.sqrt((-b + np.sqrt(b**2 - 4 * a * c)) / (2 * a))
+        trip = np.arctan2(damping * w, mass * w**2 - stiffness) / w
+    return np.where(np.isnan(trip), np.inf, trip)
+
+
+@pytest.mark.parametrize(
+    "hand",
+    [ab.range_of_grips(), ab.ImpedanceRange((0.099, 0.101), (1.98, 2.02), (49.0, 51.0))],
+    ids=["all grips", "light grip"],
+)
+def test_ranges_with_delay_against_the_closed_form_of_their_members(hand):
+    axis = OneAxis(ideal_servo=True)
+    wall = ab.ImpedanceRange((0.0, 0.0), (0.0, 0.0), (4000.0, 5100.0))
+    hands, walls = members(hand, wall, 9)
+    trips = first_crossing(
+        hands[:, 0] + axis.device_mass,
+        hands[:, 1] + axis.device_damping,
+        hands[:, 2],
+        axis.force_scale * walls[:, 1],
+    )
+    omega = np.linspace(5.0, 120.0, 3000)
+
+    def quiet(delay):
+        H = tp.hybrid(OneAxis(ideal_servo=True, delay=delay), 1j * omega)
+        return not np.any(ab.can_oscillate(H, omega, hand, wall))
+
+    first = np.min(trips) / 2
+    assert all(quiet(share * first) for share in (0.0, 0.3, 0.8, 0.998))
+    assert not quiet(1.002 * first)
+    assert 2 * first == pytest.approx(0.0087, rel=0.02)  # Light grip against the leaf.
+
+
+def last(holds, high):
+    """Where `holds` ends, by bisection from 0."""
+    low = 0.0
+    while high - low > 1e-3 * high:
+        middle = (low + high) / 2
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
+
+
+def test_how_much_is_given_away_on_the_way_to_a_sufficient_test():
+    """Softest wall that is refused, by the discs and exactly; Llewellyn refuses all of them."""
+    omega = np.geomspace(0.5, 3000.0, 1500)
+    hand = ab.range_of_grips()
+    for force_scale, delay, exact in (
+        (1 / 17.5, 0.0, 3484),
+        (1 / 17.5, 0.02, 888),
+        (1, 0.005, 112),
+    ):
+        axis = OneAxis(force_scale=force_scale, delay=delay)
+        H = tp.hybrid(axis, 1j * omega)
+        assert not np.all(ab.absolutely_stable(tp.absorb(H, hand=hand.damping[0])))
+
+        def wall(stiffness):
+            return ab.ImpedanceRange((0.0, 0.0), (0.0, 0.1), (0.0, stiffness))
+
+        def quiet(stiffness, H=H):
+            return not np.any(ab.can_oscillate(H, omega, hand, wall(stiffness)))
+
+        def small(stiffness, H=H):
+            return np.all(ab.bounded_singular_value(H, omega, hand, wall(stiffness)) < 1)
+
+        largest, sufficient = last(quiet, 1e4), last(small, 1e4)
+        assert largest == pytest.approx(exact, rel=0.02)
+        assert 0.9 * largest < sufficient < largest
+
+
+@pytest.mark.parametrize(
+    ("numerator", "denominator", "passive"),
+    [
+        ([1], [1, 0], True),  # spring
+        ([-1], [1, 0], False),
+        ([1], [1, 0, 0], False),  # free mass, force to position
+        ([1, 0], [1, 0, 4], True),  # lossless resonance
+        ([-1, 0], [1, 0, 4], False),
+        ([1, 2], [1, 1], True),
+        ([1, 0.1], [1, 1, 1], True),
+        ([1, 1.1], [1, 1, 1], False),
+        ([1, -0.1], [1, 1], False),
+        ([1, 1], [1, -1], False),
+        ([0], [1], True),
+        ([2], [1], True),
+        ([-2], [1], False),
+    ],
+)
+def test_positive_real(numerator, denominator, passive):
+    assert ab.positive_real(control.tf(numerator, denominator)) is passive
+
+
+def test_positive_real_of_stations():
+    """A passive servo coupling is passive, with more tool felt than there is it is not."""
+    for damping, passive in ((200.0, True), (-0.1, False)):
+        mass, spring = 3.0, 500.0
+        A = [[-damping / mass, -spring / mass, 0], [1, 0, 0], [0, 0, 0]]
+        # Mass and spring driven by a force, velocity out; a lossless integrator beside it.
+        B, C = [[1 / mass, 0], [0, 0], [0, 1]], [[1, 0, 0], [0, 0, 2]]
+        assert ab.positive_real(control.ss(A, B, C, np.zeros((2, 2)))) is passive
+    with pytest.raises(DrakeTeleopError, match="no state space"):
+        ab.positive_real(control.tf([0.15, 0.5], [1]))
+    with pytest.raises(DrakeTeleopError, match="as many inputs"):
+        ab.positive_real(control.ss([[-1.0]], [[1.0]], [[1.0], [1.0]], [[0.0], [0.0]]))
+
+
+def test_positive_real_agrees_with_the_linear_matrix_inequality():
+    pytest.importorskip("cvxopt")
+    rng = np.random.default_rng(8)
+    answers = []
+    while len(answers) < 100:
+        n, ports = rng.integers(1, 5), rng.integers(1, 3)
+        A = rng.normal(size=(n, n))
+        A -= (np.max(np.linalg.eigvals(A).real) + rng.choice([0.2, 1.0, -0.1])) * np.eye(n)
+        B = rng.normal(size=(n, ports))
+        C = B.T + rng.choice([0.3, 1.0]) * rng.normal(size=(ports, n))
+        D = rng.uniform(0.1, 3.0) * np.eye(ports)
+        system = control.ss(A, B, C, D)
+        shifted = (control.ss(A, B, C, D + d * np.eye(ports)) for d in (-0.01, 0.01))
+        if len({ab.positive_real(one) for one in shifted}) > 1:
+            continue  # On the edge the inequality's solver has no answer.
+        answers.append((ab.positive_real(system), control.ispassive(system)))
+    ours, theirs = zip(*answers, strict=True)
+    assert ours == theirs
+    assert 20 < sum(ours) < 80
