@@ -259,7 +259,8 @@ def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -
     Returns:
         (N, ...).
     """
-    w = np.atleast_1d(np.asarray(frequency, dtype=float)).reshape(-1, *[1] * loop.period.ndim)
+    dimensions = max(loop.period.ndim, np.ndim(delay))
+    w = np.atleast_1d(np.asarray(frequency, dtype=float)).reshape(-1, *[1] * dimensions)
     z = np.exp(1j * w * loop.period)[..., None]
     # Factor by factor, so that poles close to z = 1 cost no digits.
     L = 1 - np.prod((z - loop.closed) / (z - loop.open), axis=-1)
@@ -312,7 +313,7 @@ def _period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> 
     periods, events = _events(sampling)
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
     sections = _sections(sampling)
-    first_line = _FILTER + 2 * len(sections)
+    first_line = _FILTER + 2 * sections.shape[-2]
     n = first_line + 2 * steps
     rows = _Rows(axis, n + 3)
     command = first_line + steps - 1 if steps else _X_M
@@ -377,10 +378,19 @@ def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, b
 
 
 def _sections(sampling: Sampling) -> Array:
-    """(2, 5) of the low-pass at the sensor's rate, (0, 5) for the ideal sensor."""
+    """(..., 2, 5) of the low-pass at the sensor's rate, (0, 5) for the ideal sensor."""
     if sampling.low_pass_hz is None:
         return np.zeros((0, 5))
-    return butterworth_sections(sampling.low_pass_hz, sampling.sensor_hz)
+    cutoffs, rates = np.broadcast_arrays(sampling.low_pass_hz, sampling.sensor_hz)
+    if not (cutoffs < rates / 2).all():
+        raise DrakeTeleopError(
+            "the low-pass lets half the sensor's rate pass",
+            where="sampling.low_pass_hz",
+            remedy="choose less than half of sensor_hz",
+        )
+    pairs = zip(cutoffs.flat, rates.flat, strict=True)
+    sections = np.array([butterworth_sections(cutoff, rate) for cutoff, rate in pairs])
+    return sections.reshape(*rates.shape, 2, 5)
 
 
 class _Rows:
@@ -436,7 +446,8 @@ class _Rows:
             }
         ) + self._row({_SERVO: axis.force_scale * felt_mass})
         memory = []
-        for k, (b0, b1, b2, a1, a2) in enumerate(sections):
+        for k in range(sections.shape[-2]):
+            b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
             first, second = _FILTER + 2 * k, _FILTER + 2 * k + 1
             filtered = b0 * value + self._row({first: 1.0})
             memory.append(b1 * value - a1 * filtered + self._row({second: 1.0}))
