@@ -1,0 +1,369 @@
+"""Margins of loops with delay, against closed forms, time, roots and the control library."""
+
+import time
+from dataclasses import replace
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drake_teleop.analysis.margins import (
+    DelayedLoop,
+    contact_delay_margin,
+    delay_independent_mass,
+    delay_independent_stiffness,
+    delay_margin,
+    encirclements,
+    held_device,
+    margins,
+    margins_of_response,
+    nyquist_frequencies,
+    stable_delays,
+    station_loop,
+    tolerated_mass_error,
+    unstable_delays_of_mass,
+    unstable_poles,
+)
+from drake_teleop.analysis.one_axis import (
+    OneAxis,
+    device_impedance,
+    environment_impedance,
+    hand_impedance,
+    servo_admittance,
+    servo_response,
+)
+from drake_teleop.errors import DrakeTeleopError
+
+GRIPS = {"light": (0.1, 2.0, 50.0), "medium": (0.25, 8.0, 250.0), "firm": (0.5, 20.0, 700.0)}
+WALLS = (1000.0, 5100.0, 20000.0)
+
+
+def held(grip: str, **fields) -> OneAxis:
+    mass, damping, stiffness = GRIPS[grip]
+    return OneAxis(
+        hand_mass=mass,
+        hand_damping=damping,
+        hand_stiffness=stiffness,
+        **{"ideal_servo": True, **fields},
+    )
+
+
+positive = st.floats(0.02, 5.0)
+devices = st.tuples(positive, st.floats(0.1, 50.0), st.floats(1.0, 3000.0))
+
+
+def test_the_loop_is_the_felt_impedance_over_that_of_hand_and_device():
+    axis = OneAxis(sigma=0.7, gamma=0.9, mass_error=0.3, wall_damping=40.0, delay=0.02)
+    s = 1j * np.geomspace(0.1, 1000, 50)
+    G, Y, Z_e = servo_response(axis, s), servo_admittance(axis, s), environment_impedance(axis, s)
+    M, scale = axis.felt_tool_mass, axis.force_scale * axis.position_scale
+    # h11 - Z_m and h12 h21 of the position-force two-port, then its transmitted impedance
+    inertial = scale * M * s * G * np.exp(-2 * s * axis.delay)
+    product = -scale * G * (axis.gamma - M * s * Y) * np.exp(-2 * s * axis.delay)
+    felt = inertial - product * Z_e / (1 + Y * Z_e)
+    L = felt / (hand_impedance(axis, s) + device_impedance(axis, s))
+    np.testing.assert_allclose(station_loop(axis)(s), L, rtol=1e-12)
+
+
+@given(devices, st.floats(0.01, 20.0))
+def test_delay_margin_of_contact_is_the_closed_form(device, ratio):
+    m, b, k = device
+    K = ratio * k
+    loop = DelayedLoop([K], [m, b, k], 0.0)
+    closed = contact_delay_margin(m, b, k, K)
+    np.testing.assert_allclose(delay_margin(loop), closed, rtol=1e-6)
+    assert np.isinf(closed) == (delay_independent_stiffness(m, b, k) >= K)
+
+
+@given(devices, st.floats(0.02, 0.98))
+def test_windows_of_free_motion_are_the_closed_form(device, ratio):
+    m, b, k = device
+    mu = ratio * m
+    loop = DelayedLoop([mu, 0, 0], [m, b, k], 0.0)
+    unstable = unstable_delays_of_mass(m, b, k, mu, 3.0)
+    stable = stable_delays(loop, 3.0)
+    assert bool(unstable) == (mu > delay_independent_mass(m, b, k)) or stable == [(0.0, 3.0)]
+    edges = sorted({0.0, 3.0} ^ {t for window in unstable for t in window})
+    np.testing.assert_allclose(np.ravel(stable), edges, rtol=1e-6)
+
+
+def test_table_of_contact():
+    """Largest round trip times [ms] of a softer wall, the paper's leaf and a stiffer one."""
+    stated = [[51, np.inf, np.inf], [8.7, 36, np.inf], [2.2, 7.7, 21]]
+    computed = [
+        [1e3 * delay_margin(station_loop(held(g, wall_stiffness=k))) for g in GRIPS] for k in WALLS
+    ]
+    np.testing.assert_allclose(computed, stated, rtol=0.01)
+
+
+def test_windows_of_a_light_grip_that_feels_the_tool():
+    axis = held("light", sigma=1.0)
+    loop = station_loop(axis, contact=False)
+    (_, first), (back, second), (again, _) = stable_delays(loop, 0.8)
+    np.testing.assert_allclose(
+        [first, back, second, again], [0.190, 0.339, 0.497, 0.788], atol=1e-3
+    )
+    assert stable_delays(station_loop(held("light", sigma=0.92), contact=False), 100.0) == [
+        (0, 100)
+    ]
+    bounds = [delay_independent_mass(*held_device(held(g))) for g in GRIPS]
+    np.testing.assert_allclose(bounds, [0.165, 0.308, 0.548], atol=6e-4)
+    medium = station_loop(held("medium", sigma=2.0), contact=False)
+    assert stable_delays(medium, 0.1)[0][1] == pytest.approx(0.061, abs=1e-3)
+    assert unstable_poles(station_loop(replace(axis, sigma=0.0), contact=False)) == 0
+
+
+def test_a_heavier_tool_than_the_device_leaves_no_delay():
+    m, _, _ = held_device(held("light"))
+    bound = tolerated_mass_error(m, 1 / 17.5, 1.0)
+    assert bound == pytest.approx(4.4, abs=0.03)
+    assert tolerated_mass_error(m, 1.0, 1.0) == pytest.approx(0.25)
+    for error, any_delay in ((1.01 * bound, np.inf), (0.99 * bound, 2)):
+        axis = held("light", sigma=0.0, mass_error=error, delay=np.array([0.0, 1e-3]))
+        counts = unstable_poles(station_loop(axis, contact=False))
+        assert counts[1] >= any_delay
+    assert delay_margin(station_loop(held("light", mass_error=1.01 * bound), contact=False)) == 0
+
+
+def growth(m, b, k, mu, K, delays, *, longest=20.0, step=2.5e-4):
+    """Ratio of late to early motion of m x'' + b x' + k x = -mu x''(t - T) - K x(t - T).
+
+    Many cases at once: the trapezoidal rule with the delays a whole number of steps.
+    """
+    lag = np.round(delays / step).astype(int)
+    n = int(longest / step)
+    lag, m, b, k, mu, K = np.broadcast_arrays(lag, m, b, k, mu, K)
+    cases = np.arange(lag.size)
+    back = lag.max()
+    x, a = np.zeros((back + n, lag.size)), np.zeros((back + n, lag.size))
+    velocity = np.ones(lag.size)
+    a[back] = -b * velocity / m
+    mass = m + step / 2 * b + step**2 / 4 * k
+    for i in range(back, back + n - 1):
+        old = i + 1 - lag
+        force = -mu * a[old, cases] - K * x[old, cases]
+        v_free = velocity + step / 2 * a[i]
+        x_free = x[i] + step * velocity + step**2 / 4 * a[i]
+        a[i + 1] = (force - b * v_free - k * x_free) / mass
+        velocity = v_free + step / 2 * a[i + 1]
+        x[i + 1] = x_free + step**2 / 4 * a[i + 1]
+    x = np.abs(x[back:])
+    return x[-n // 3 :].max(axis=0) / x[n // 3 : 2 * n // 3].max(axis=0)
+
+
+def test_boundaries_in_time():
+    """Two milliseconds within the margin motion dies out, two beyond it grows."""
+    cases = []
+    for grip, wall in (
+        ("light", 1000),
+        ("light", 5100),
+        ("medium", 5100),
+        ("medium", 20000),
+        ("firm", 20000),
+    ):
+        m, b, k = held_device(held(grip))
+        edge = delay_margin(station_loop(held(grip, wall_stiffness=float(wall))))
+        cases += [(m, b, k, 0.0, wall / 17.5, edge, 1)]
+    for grip, sigma, which in (("light", 1.0, 0), ("medium", 2.0, 0)):
+        m, b, k = held_device(held(grip))
+        edge = stable_delays(station_loop(held(grip, sigma=sigma), contact=False), 0.5)[which][1]
+        cases += [(m, b, k, sigma * 3.13 / 17.5, 0.0, edge, 1)]
+    m, b, k = held_device(held("light"))
+    edge = stable_delays(station_loop(held("light", sigma=1.0), contact=False), 0.5)[1][0]
+    cases += [(m, b, k, 3.13 / 17.5, 0.0, edge, -1)]
+    m, b, k, mu, K, edge, direction = np.array(cases, dtype=float).T
+    assert np.all(growth(m, b, k, mu, K, edge - 0.002 * direction) < 0.97)
+    assert np.all(growth(m, b, k, mu, K, edge + 0.002 * direction) > 1.03)
+
+
+def count_by_collocation(loop: DelayedLoop, nodes: int = 120) -> int:
+    """Unstable roots of D + N e^(-s T), from the history over one delay on Chebyshev's nodes.
+
+    Breda, Maset and Vermiglio (2005): the delay equation is a transport equation on [-T, 0].
+    """
+    N, D, T = loop.numerator, loop.denominator, float(loop.delay)
+    n = len(D) - 1
+    theta = np.cos(np.pi * np.arange(nodes + 1) / nodes)
+    weight = np.r_[2, np.ones(nodes - 1), 2] * (-1.0) ** np.arange(nodes + 1)
+    gap = theta[:, None] - theta[None, :] + np.eye(nodes + 1)
+    derivative = weight[:, None] / weight[None, :] / gap
+    derivative -= np.diag(derivative.sum(axis=1))
+    derivative *= 2 / T
+    # State x, x', ..; x^(n) = -(D_i / D_0) x^(i) - (N_i / D_0) x^(i)(t - T)
+    present = np.eye(n, k=1)
+    present[-1] = -D[:0:-1] / D[0]
+    past, neutral = np.zeros((n, n)), np.zeros((n, n))
+    past[-1] = -N[:0:-1] / D[0]
+    neutral[-1, -1] = -N[0] / D[0]
+    A = np.kron(derivative, np.eye(n))
+    A[:n] = neutral @ A[-n:]
+    A[:n, :n] += present
+    A[:n, -n:] += past
+    roots = np.linalg.eigvals(A)
+    s = roots[roots.real > 0]
+    # Eigenvalues beyond the resolution of the nodes are not roots.
+    balance = np.polyval(N, s) / np.polyval(D, s) * np.exp(-s * T)
+    return int(np.sum(np.abs(1 + balance) < 1e-3))
+
+
+def random_loops(count: int, order: int, neutral: bool, seed: int):
+    random = np.random.default_rng(seed)
+    for _ in range(count):
+        D = np.poly(-random.uniform(0.2, 4, order))
+        N = random.normal(size=order + 1) * random.uniform(0.2, 3) * np.abs(D)
+        N[0] = random.uniform(-0.9, 0.9) if neutral else 0.0
+        yield DelayedLoop(N, D, random.uniform(0.05, 3.0))
+
+
+@pytest.mark.parametrize("order, neutral", [(1, False), (2, False), (3, False), (2, True)])
+def test_counts_by_crossing_encirclement_and_roots_agree(order, neutral):
+    seen = set()
+    for loop in random_loops(40, order, neutral, seed=order + 10 * neutral):
+        count = unstable_poles(loop)
+        assert encirclements(loop(1j * nyquist_frequencies(loop))) == count
+        assert count_by_collocation(loop) == count
+        seen.add(float(count))
+    assert len(seen) > 1
+
+
+def test_poles_at_the_origin():
+    """A free hand: integrators in the loop, which the contour passes on the right."""
+    for denominator, poles in (([1.0, 2.0, 0.0], 1), ([1.0, 2.0, 0.0, 0.0], 2)):
+        for K, T in ((1.0, 0.1), (1.0, 3.0), (30.0, 0.2)):
+            loop = DelayedLoop([0.3 * K, K], denominator, T)
+            omega = nyquist_frequencies(loop)
+            count = encirclements(loop(1j * omega), poles_at_origin=poles)
+            assert count == unstable_poles(loop)
+
+
+def test_an_unstable_open_loop():
+    omega = np.geomspace(1e-3, 100, 2000)
+    for K, count in ((0.5, 1), (2.0, 0)):
+        response = K / (1j * omega - 1)
+        assert encirclements(response, open_loop_poles=1) == count
+        assert unstable_poles(DelayedLoop([K], [1, -1], 0.0)) == count
+
+
+def test_encirclements_of_a_sampled_loop():
+    """A delayed integrator K z^-d / (z - 1), against the roots of z^d (z - 1) + K."""
+    theta = np.linspace(1e-3, np.pi, 20000)
+    z = np.exp(1j * theta)
+    for d in (0, 1, 3):
+        for K in (0.1, 0.35, 0.8, 1.7, 2.5):
+            polynomial = np.zeros(d + 2)
+            polynomial[:2], polynomial[-1] = (1, -1), polynomial[-1] + K
+            if d == 0:
+                polynomial = np.array([1, -1 + K])
+            outside = np.sum(np.abs(np.roots(polynomial)) > 1)
+            count = encirclements(K * z**-d / (z - 1), poles_at_origin=1, sampled=True)
+            assert count == outside, (d, K)
+
+
+@settings(max_examples=40)
+@given(devices, st.floats(0.3, 20.0), st.floats(0.001, 0.2))
+def test_margins_without_delay_are_those_of_control(device, ratio, lag):
+    m, b, k = device
+    loop = DelayedLoop([ratio * k], np.polymul([m, b, k], [lag, 1]), 0.0)
+    if unstable_poles(loop):
+        return
+    ours = margins(loop)
+    transfer = control.tf([ratio * k], np.polymul([m, b, k], [lag, 1]))
+    gain, phase, _, w_gain, w_phase, _ = control.stability_margins(transfer)
+    np.testing.assert_allclose(ours.gain, gain, rtol=1e-6)
+    np.testing.assert_allclose(ours.gain_frequency, w_gain, rtol=1e-6)
+    if np.isfinite(phase):
+        np.testing.assert_allclose(ours.phase, np.radians(phase), rtol=1e-5)
+        np.testing.assert_allclose(ours.phase_frequency, w_phase, rtol=1e-5)
+    else:
+        assert np.isinf(ours.phase)
+
+
+@given(
+    st.sampled_from(list(GRIPS)),
+    st.floats(300, 30000),
+    st.floats(0.0, 1.5),
+    st.floats(0.0, 0.1),
+)
+def test_at_its_margins_the_loop_meets_minus_one(grip, wall, sigma, delay):
+    axis = held(grip, wall_stiffness=wall, sigma=sigma, delay=delay, ideal_servo=False)
+    loop = station_loop(axis)
+    m = margins(loop)
+    if m.unstable_poles:
+        assert (m.gain, m.phase, m.delay) == (1, 0, 0)
+        return
+    for factor, more, w in ((m.gain, 0.0, m.gain_frequency), (1.0, m.delay, m.delay_frequency)):
+        if np.isfinite(w):
+            moved = DelayedLoop(factor * loop.numerator, loop.denominator, loop.delay + more)
+            assert abs(1 + moved(1j * w)) < 1e-6
+            for within in (0.5, 0.999):
+                safe = DelayedLoop(
+                    (1 + within * (factor - 1)) * loop.numerator,
+                    loop.denominator,
+                    loop.delay + within * more,
+                )
+                assert unstable_poles(safe) == 0
+    if np.isfinite(m.phase):
+        away = loop(1j * m.phase_frequency) * np.exp([1j * m.phase, -1j * m.phase])
+        assert np.min(np.abs(1 + away)) < 1e-6
+
+
+def test_margins_of_a_frequency_response():
+    axis = held("medium", ideal_servo=False, delay=np.array([0.0, 0.004, 0.01]), sigma=0.5)
+    omega = np.geomspace(0.1, 1000, 3000)
+    loop = station_loop(axis)
+    exact = margins(loop)
+    data = margins_of_response(omega, loop(1j * omega))
+    undelayed = station_loop(replace(axis, delay=0.0))
+    frd = control.frd(undelayed(1j * omega), omega)
+    added = margins_of_response(frd.omega, frd.frdata[0, 0], delay=2 * axis.delay)
+    for found in (data, added):
+        np.testing.assert_array_equal(found.unstable_poles, exact.unstable_poles)
+        for name in ("gain", "gain_frequency", "phase", "phase_frequency", "delay"):
+            np.testing.assert_allclose(getattr(found, name), getattr(exact, name), rtol=2e-4)
+
+
+def test_loops_of_control():
+    transfer = control.tf([291.0], [0.4, 8.5, 250.0])
+    for system in (transfer, control.ss(transfer)):
+        loop = DelayedLoop.from_control(system)
+        assert delay_margin(loop) == pytest.approx(contact_delay_margin(0.4, 8.5, 250.0, 291.0))
+    with pytest.raises(DrakeTeleopError, match="margins_of_response"):
+        DelayedLoop.from_control(control.tf([1.0], [1.0, 0.5], 0.001))
+
+
+def test_a_grid_of_parameters():
+    delay, wall = np.linspace(0, 0.2, 100)[:, None], np.geomspace(100, 1e5, 100)
+    started = time.thread_time()
+    loop = station_loop(held("medium", ideal_servo=False, delay=delay, wall_stiffness=wall))
+    count, margin = unstable_poles(loop), delay_margin(loop)
+    assert time.thread_time() - started < 2.0
+    assert count.shape == margin.shape == (100, 100)
+    for i, j in ((0, 0), (50, 60), (10, 99), (99, 40)):
+        single = station_loop(
+            held("medium", ideal_servo=False, delay=delay[i, 0], wall_stiffness=wall[j])
+        )
+        assert unstable_poles(single) == count[i, j]
+        np.testing.assert_allclose(delay_margin(single), margin[i, j], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "spoilt, match",
+    [
+        (lambda: held_device(replace(OneAxis(), hand_mass=-1.0)), "mass of hand and device"),
+        (lambda: station_loop(OneAxis(hand_damping=-0.5)), "damping of hand and device"),
+        (lambda: station_loop(OneAxis(slave_mass=0.0)), "mass of the slave"),
+        (lambda: station_loop(OneAxis(delay=-0.001)), "delay of the loop"),
+        (lambda: contact_delay_margin(0.4, 8.5, -1.0, 291.0), "stiffness of the hand"),
+        (lambda: unstable_delays_of_mass(0.4, 8.5, 250.0, 0.5, 1.0), "less that of the tool"),
+        (lambda: DelayedLoop([1, 0, 0], [1, 1], 0.0), "higher order"),
+        (lambda: encirclements([3.0, -3.0]), "right angle"),
+        (lambda: encirclements([3.0, 2.5]), "last frequency"),
+        (lambda: margins_of_response([2.0, 1.0], [0.1, 0.1]), "must rise"),
+        (lambda: nyquist_frequencies(DelayedLoop([2], [1, 2, 1, 0], 0.0)), "at its limit"),
+    ],
+)
+def test_bad_numbers(spoilt, match):
+    with pytest.raises(DrakeTeleopError, match=match):
+        spoilt()
