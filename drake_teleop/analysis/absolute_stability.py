@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.analysis.one_axis import Complex
-from drake_teleop.analysis.two_port import absorb, entries, transmitted_impedance
+from drake_teleop.analysis.two_port import entries, transmitted_impedance
 from drake_teleop.errors import DrakeTeleopError
 
 if TYPE_CHECKING:
@@ -153,14 +153,10 @@ def structured_singular_value(
     """
     s11, s12, s21, s22 = entries(S)
     r1, r2 = np.asarray(hand), np.asarray(environment)
-    return _balanced_norm(s11 * r1, s12 * s21 * r1 * r2, s22 * r2)
-
-
-def _balanced_norm(first: Complex, product: Complex, second: Complex) -> Real:
-    """Norm of a matrix with this diagonal and product of the others, these being equally large."""
+    product = s12 * s21 * r1 * r2
     even = np.sqrt(np.abs(product))
     turned = product / np.where(even > 0, even, 1.0)
-    return _largest_singular_value(first, turned, even, second)
+    return _largest_singular_value(s11 * r1, turned, even, s22 * r2)
 
 
 def _largest_singular_value(a: Complex, b: Complex, c: Complex, d: Complex) -> Real:
@@ -169,9 +165,13 @@ def _largest_singular_value(a: Complex, b: Complex, c: Complex, d: Complex) -> R
     size = np.abs(determinant)
     phase = np.where(size > 0, determinant / np.where(size > 0, size, 1.0), 1.0)
     d, c = phase * np.conj(d), phase * np.conj(c)
-    sums = np.abs(a + d) ** 2 + np.abs(b - c) ** 2
-    differences = np.abs(a - d) ** 2 + np.abs(b + c) ** 2
+    sums = _square(a + d) + _square(b - c)
+    differences = _square(a - d) + _square(b + c)
     return (np.sqrt(sums) + np.sqrt(differences)) / 2
+
+
+def _square(z: Complex) -> Real:
+    return z.real**2 + z.imag**2
 
 
 def scanned_resistance(H: Complex, loads: int = 17, rounds: int = 8) -> Real:
@@ -315,13 +315,17 @@ def bounded_singular_value(
     """
     z, r1 = (values[..., :, None] for values in _discs(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _discs(environment.corners(omega)))
-    h11, h12, h21, h22 = entries(absorb(H[..., None, None, :, :], z, e))
+    h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
+    give = 1 / (1 + h22 * e)
+    felt = z + h11 - h12 * h21 * e * give
+    through = h12 * h21 * give**2 / felt
     # (z + r1 d1) + Z_to(e + r2 d2) vanishes for some |d1|, |d2| <= 1 where mu >= 1 of the matrix
     # with this diagonal and this product of the other two.
-    through = h12 * h21 / h11
-    return np.min(
-        _balanced_norm(r1 / h11, r1 * r2 * -through / h11, r2 * (h22 - through)), axis=(-2, -1)
-    )
+    first, second, product = r1 / felt, r2 * (h22 * give - through), -r1 * r2 * through / felt
+    square = _square(first) + _square(second) + 2 * np.abs(product)
+    determinant = 4 * _square(first * second - product)
+    square += np.sqrt(np.maximum(square**2 - determinant, 0.0))
+    return np.sqrt(np.min(square, axis=(-2, -1)) / 2)
 
 
 _WIDENING = np.array([0.0, 0.25, 1.0, 4.0, 16.0, 64.0])  # of a disc, in half diagonals
