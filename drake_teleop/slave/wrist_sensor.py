@@ -325,6 +325,11 @@ class WristSensor(LeafSystem):
         self.DeclareDiscreteState(1 + n + _FILTER + 12 * NOISE_BLOCK)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
+    @property
+    def offset(self) -> NDArray[np.float64]:
+        """(6,) of force and torque [N, N m], a view: an offset may drift during a simulation."""
+        return self._constants[:6]
+
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         memory = discrete_state.get_mutable_value(1)
         if memory[0] % NOISE_BLOCK == 0:

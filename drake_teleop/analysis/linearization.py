@@ -1,0 +1,572 @@
+"""The actual Diagram, linearised at a state of rest, over one period of its mixed rates.
+
+Every state of the Diagram that acts on anything is displaced by a little, up and down; the Diagram
+is simulated for one period of the hand; what has become of the displacement after that is a column
+of the state transition. Nothing of the blocks is written a second time.
+
+The loops are cut where an analysis wants to put something else in:
+
+    cut                                 output              input
+    the hand lets go of the stylus      operator_wrench     hand_wrench      F_E_B at E, in B
+    the network, master to slave        pose_command        pose_received    of S, in W
+    the network, slave to master        wrench_B            wrench_received  F_E_B, in B
+
+and `Linearization.close` closes them again, with a delay of any number of periods, exactly. The
+input `tool_wrench` is a wrench of the environment on the tool, about So, in W; the environment of
+the scenario is part of the model besides. All inputs are held for a period; outputs are those of
+its start.
+
+What is left out, because it has no linear part at rest: noise, offset, quantisation and range of
+the sensors; Coulomb friction of the master, whose tanh(v / 0.01) would be a huge damping at rest
+and which only takes energy; friction of a contact, likewise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Role, RoleAssign
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialForce
+from pydrake.systems.analysis import InitializeParams
+from pydrake.systems.framework import Diagram
+
+from drake_teleop.analysis.one_axis import Complex
+from drake_teleop.analysis.two_port import two_port
+from drake_teleop.channel.channel import Channel
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.master import device
+from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
+from drake_teleop.scenario import Scenario, replace
+from drake_teleop.simulation import MakeSimulator
+from drake_teleop.slave.arm import ArmModelFromPlant, forward_kinematics, jacobian
+from drake_teleop.slave.wrist_sensor import NOISE_BLOCK
+from drake_teleop.station import MakeTeleopStation
+
+Array = NDArray[np.float64]
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+_INPUTS = ("hand_wrench", "pose_received", "wrench_received", "tool_wrench")
+_OUTPUTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twist_slave")
+
+# Displacements up and down. The error of a difference is their square, or rounding over them.
+_ANGLE, _RATE, _OTHER = 1e-4, 1e-4, 1.0
+# So little that even a servo of a few samples stays within the motors' torque.
+_COMMAND = 2e-6
+_AT_REST = 1e-6  # of these displacements, that a state of rest may move in a period
+_MOST_STEPS = 8  # of Newton's method on the way to rest
+_RAMP, _SETTLE = 0.3, 0.1  # s, of the slave on its way to the operating point, and there
+_LARGEST_DENSE = 800  # states, beyond which eigenvalues are sought by Arnoldi's method
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """x' = A x + B u, y = C x + D u from one period to the next, and loops closed with delay.
+
+    Args:
+        A, B, C, D: of small deviations from rest.
+        dt: the period [s].
+        states, inputs, outputs: their names; a port's parts are "port.x", ..., "port.rz": poses as
+            translation [m] and rotation vector [rad], wrenches [N, N m], twists [m/s, rad/s].
+        loops: (outputs, inputs, periods) that are closed with a delay: u += z^-periods y.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    dt: float
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    loops: tuple[tuple[tuple[int, ...], tuple[int, ...], int], ...] = ()
+
+    def close(
+        self, outputs: str | Sequence[str], inputs: str | Sequence[str], periods: int = 0
+    ) -> Linearization:
+        """Feeds outputs back to inputs: u += z^-periods y. The inputs remain, and add to that.
+
+        Args:
+            outputs, inputs: a port's name, or names of its parts.
+            periods: whole periods of delay.
+        """
+        rows, columns = self._indices(outputs, self.outputs), self._indices(inputs, self.inputs)
+        if periods > 0:
+            return dataclasses.replace(self, loops=(*self.loops, (rows, columns, periods)))
+        A = self.A + self.B[:, columns] @ self.C[list(rows)]
+        return dataclasses.replace(self, A=A)
+
+    def frequency_response(self, omega: Array) -> Complex:
+        """G(e^(j omega dt)), (n, outputs, inputs), at omega (n,) [rad/s], with exact delays."""
+        z = np.exp(1j * np.asarray(omega, dtype=float) * self.dt)
+        identity = np.eye(len(self.A))
+        # A solution for each frequency: eigenvectors of a chain of delays would be defective.
+        states = [np.linalg.solve(w * identity - self.A, self.B.astype(complex)) for w in z]
+        G: Complex = self.C @ np.stack(states) + self.D
+        for rows, columns, periods in self.loops:
+            delay = z[:, None, None] ** -periods
+            L = delay * G[:, list(rows)][:, :, list(columns)]
+            back = np.linalg.solve(np.eye(len(rows)) - L, delay * G[:, list(rows)])
+            G = G + G[:, :, list(columns)] @ back
+        return G
+
+    @property
+    def multipliers(self) -> Complex:
+        """The eigenvalues of the transition over a period, the largest first; stable below 1.
+
+        With so long a delay that it makes more than 800 states, the 40 largest.
+        """
+        expanded = self.expanded()
+        if len(expanded.A) <= _LARGEST_DENSE:
+            values = np.linalg.eigvals(expanded.A)
+        else:
+            from scipy.sparse import csr_array
+            from scipy.sparse.linalg import eigs
+
+            start = np.random.default_rng(0).standard_normal(len(expanded.A))
+            values = eigs(csr_array(expanded.A), 40, v0=start, return_eigenvectors=False)
+        return values[np.argsort(-np.abs(values))].astype(complex)
+
+    def expanded(self) -> Linearization:
+        """The same without `loops`: each delay as a shift register among the states."""
+        result = dataclasses.replace(self, loops=())
+        for rows, columns, periods in self.loops:
+            result = _with_register(result, rows, columns, periods)
+        return result
+
+    def to_control(self) -> Any:
+        """As a discrete `control.StateSpace`, with the names of inputs, outputs and states."""
+        import control
+
+        system = self.expanded()
+        return control.StateSpace(
+            *(system.A, system.B, system.C, system.D, system.dt),
+            inputs=list(system.inputs),
+            outputs=list(system.outputs),
+            states=list(system.states),
+        )
+
+    @staticmethod
+    def _indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
+        parts = _parts(names) if isinstance(names, str) else names
+        return tuple(known.index(name) for name in parts)
+
+
+def _with_register(
+    system: Linearization, rows: tuple[int, ...], columns: tuple[int, ...], periods: int
+) -> Linearization:
+    n, width = len(system.A), len(rows)
+    size = n + width * periods
+    A, B = np.zeros((size, size)), np.zeros((size, len(system.inputs)))
+    C = np.zeros((len(system.outputs), size))
+    A[:n, :n], B[:n], C[:, :n] = system.A, system.B, system.C
+    A[n : n + width, :n] = system.C[list(rows)]
+    A[n + width :, n : size - width] = np.eye(size - n - width)
+    A[:n, size - width :] = system.B[:, columns]
+    names = [f"delayed {system.outputs[row]} {k + 1}" for k in range(periods) for row in rows]
+    return dataclasses.replace(system, A=A, B=B, C=C, states=(*system.states, *names))
+
+
+def linearize(
+    scenario: Scenario,
+    *,
+    load_estimate: Array | None = None,
+    displacement: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Linearization:
+    """The Diagram of a scenario, linearised at rest with its loops cut; see the module.
+
+    Args:
+        scenario: its intent, its network and its method do not matter: their loops are cut.
+        load_estimate: (16,) as for `MakeTeleopStation`.
+        displacement: of the master from its start [m], in B, where all is at rest; the slave
+            follows, and leans on what is in its way.
+
+    Raises:
+        DrakeTeleopError: if the rates have no common period that a cut can be made at, or if the
+            slave does not come to rest.
+    """
+    period = _Period(scenario, load_estimate)
+    x = period.rest(np.asarray(displacement, dtype=float))
+    A, C = period.derivative(x)
+    B = period.input_derivative(x)
+    acts = _acting(A, C)
+    names = tuple(name for name, kept in zip(period.states, acts, strict=True) if kept)
+    D = np.zeros((len(C), B.shape[1]))
+    A, B, C = A[np.ix_(acts, acts)], B[acts], C[:, acts]
+    return Linearization(A, B, C, D, period.dt, names, _parts(*_INPUTS), _parts(*_OUTPUTS))
+
+
+def _parts(*ports: str) -> tuple[str, ...]:
+    return tuple(f"{port}.{axis}" for port in ports for axis in AXES)
+
+
+def linearize_station(
+    scenario: Scenario,
+    *,
+    load_estimate: Array | None = None,
+    displacement: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Linearization:
+    """As `linearize`, with all loops closed: the operator holds the stylus over the network.
+
+    Args:
+        scenario: of its network, the constant part of the delay matters.
+        load_estimate, displacement: as for `linearize`.
+
+    Raises:
+        DrakeTeleopError: as `linearize`, or if a method of passivity is in the channel, which is
+            not linear.
+    """
+    if scenario.passivity.method != "none":
+        raise DrakeTeleopError(
+            f"'{scenario.passivity.method}' is not linear",
+            where="passivity.method",
+            remedy="linearise with method: none, or identify the frequency response",
+        )
+    cut = linearize(scenario, load_estimate=load_estimate, displacement=displacement)
+    forward, backward = delays(scenario)
+    system = cut.close("operator_wrench", "hand_wrench")
+    system = system.close("pose_command", "pose_received", forward)
+    return system.close("wrench_B", "wrench_received", backward)
+
+
+def delays(scenario: Scenario) -> tuple[int, int]:
+    """Periods of the hand that a pose and a wrench take over the scenario's network.
+
+    None if the network is ideal, which is nothing but wires; otherwise at least one.
+    """
+    lines = scenario.channel.lines()
+    if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
+        return 0, 0
+    ahead, back = (
+        max(1, round(max(line.delay, line.playout) * scenario.rates.hand_hz)) for line in lines
+    )
+    return ahead, back
+
+
+def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
+    """[F_h; -V_s] = H [V_m; F_e] along one direction of the hand and one of the tool.
+
+    All other directions are as the system has them: closed by the operator, or free. As in
+    `sampled_loop`, forces are the share of a held one that is of the frequency itself.
+
+    Args:
+        system: a linearisation, with the loop of the hand cut in the direction `hand`. The hand's
+            mass is part of its device.
+        omega: (n,) [rad/s], not zero.
+        hand: (6,) direction in B at E, of the hand's force and V_m.
+        tool: (6,) direction in W as a wrench about So, see `TaskDirection`: F_e tool is what the
+            tool exerts on the environment, V_s = tool . [v; omega].
+
+    Returns:
+        (n, 2, 2).
+    """
+    G = system.frequency_response(omega)
+    i, o = list(system.inputs), list(system.outputs)
+
+    def response(output: str, left: Array, input_: str, right: Array) -> Complex:
+        row, column = o.index(f"{output}.x"), i.index(f"{input_}.x")
+        return left @ G[:, row : row + 6, column : column + 6] @ right
+
+    step = 1j * np.asarray(omega) * system.dt
+    hold = -np.expm1(-step) / step
+    mm = response("twist_master", hand, "hand_wrench", hand) / hold
+    ms = response("twist_master", hand, "tool_wrench", tool) / hold
+    sm = response("twist_slave", tool, "hand_wrench", hand) / hold
+    ss = response("twist_slave", tool, "tool_wrench", tool) / hold
+    # The tool feels -F_e.
+    return two_port(1 / mm, ms / mm, -sm / mm, ss - sm * ms / mm)
+
+
+def _acting(A: Array, C: Array) -> NDArray[np.bool_]:
+    """Which states act on an output, by any way."""
+    acts = (C != 0.0).any(axis=0)
+    while True:
+        more = acts | (A[acts] != 0.0).any(axis=0)
+        if (more == acts).all():
+            return acts
+        acts = more
+
+
+@dataclass(frozen=True)
+class _States:
+    """Some states of one block: `part` of its discrete `group`, or of the continuous state."""
+
+    system: str
+    group: int | None
+    part: slice
+    steps: Array  # displacements for the differences
+
+
+class _Period:
+    """One period of the station's Diagram as a function of its states and of the cut inputs."""
+
+    def __init__(self, scenario: Scenario, load_estimate: Array | None) -> None:
+        _check_rates(scenario)
+        self.dt = 1 / scenario.rates.hand_hz
+        smooth = _smooth(scenario)
+        self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
+        if smooth.sheet_spring is not None:
+            _remove_friction(self._diagram)
+        self._simulator = MakeSimulator(self._diagram, smooth.simulation)
+        # Steps that followed the error would follow the displacements too.
+        self._simulator.get_mutable_integrator().set_fixed_step_mode(True)
+        plant = self._diagram.GetSubsystemByName("slave_plant")
+        self._arm = ArmModelFromPlant(plant, plant.GetModelInstanceByName("rx90")).table
+        self._push = ExternallyAppliedSpatialForce()
+        self._push.body_index = plant.GetBodyByName("tool").index()
+        self._sensor = None if smooth.wrist_sensor.ideal else self._system("wrist_sensor")
+        self._groups = self._state_groups()
+        self._steps = np.concatenate([group.steps for group in self._groups])
+        self.states = tuple(
+            f"{g.system} {'' if g.group is None else g.group}[{k}]"
+            for g in self._groups
+            for k in range(len(g.steps))
+        )
+        self._start_B = np.array([1.0, 0.0, 0.0, 0.0, *smooth.master.position])
+        self._pose = self._eval("kinematic_scaling", "pose_command")
+        self._hand, self._wrench = np.zeros(6), np.zeros(6)
+        self._apply(np.zeros(24))
+        self._simulator.Initialize()
+
+    def _system(self, name: str) -> Any:
+        return self._diagram.GetSubsystemByName(name)
+
+    def _context(self, name: str) -> Any:
+        root = self._simulator.get_mutable_context()
+        return self._system(name).GetMyMutableContextFromRoot(root)
+
+    def _eval(self, system: str, port: str) -> Array:
+        return np.array(self._system(system).GetOutputPort(port).Eval(self._context(system)))
+
+    def _fix(self, system: str, port: str, value: object) -> None:
+        self._system(system).GetInputPort(port).FixValue(self._context(system), value)
+
+    def _state_groups(self) -> list[_States]:
+        """All that acts. Not the clutch's references, which stay; not monitor, log and noise."""
+
+        def whole(system: str, group: int, *steps: Array) -> _States:
+            return _States(system, group, slice(None), np.concatenate(steps))
+
+        joints = self._context("slave_plant").num_continuous_states() // 2
+        sample = self._context("wrist_sensor").get_discrete_state(0).size()
+        groups = [
+            whole("master_device", 0, np.full(6, _ANGLE), np.full(6, _RATE)),
+            whole("master_device", 1, np.full(7, _ANGLE)),
+            whole("master_device", 2, np.full(6, _RATE)),
+            whole("joint_control", 0, np.full(6, _OTHER)),
+            _States("slave_plant", None, slice(None), np.repeat([_COMMAND, _RATE], joints)),
+            whole("wrist_sensor", 0, np.full(16, _OTHER), np.full(sample - 16, _ANGLE)),
+        ]
+        if self._sensor is not None:
+            # The last reading of the encoders and the filter: between the counter and the noise.
+            end = self._context("wrist_sensor").get_discrete_state(1).size() - 12 * NOISE_BLOCK
+            steps = np.concatenate([np.full(6, _ANGLE), np.full(end - 7, _OTHER)])
+            groups.append(_States("wrist_sensor", 1, slice(1, end), steps))
+        return groups
+
+    def get(self) -> Array:
+        """The states now."""
+        parts = []
+        for group in self._groups:
+            context = self._context(group.system)
+            if group.group is None:
+                parts.append(context.get_continuous_state_vector().CopyToVector())
+            else:
+                parts.append(context.get_discrete_state(group.group).value()[group.part])
+        return np.concatenate(parts)
+
+    def _set(self, x: Array) -> None:
+        ends = np.cumsum([len(group.steps) for group in self._groups])
+        for group, values in zip(self._groups, np.split(x, ends[:-1]), strict=True):
+            context = self._context(group.system)
+            if group.group is None:
+                context.SetContinuousState(values)
+            else:
+                state = context.get_mutable_discrete_state(group.group)
+                state.get_mutable_value()[group.part] = values
+
+    def _apply(self, u: Array) -> None:
+        """Sets the cut inputs: `u` (24,) is what they are more than at the operating point."""
+        self._fix("master_device", "hand_wrench_E", self._hand + u[:6])
+        self._fix("inverse_kinematics", "pose_command", _moved(self._pose, u[6:12]))
+        self._fix("force_display", "wrench_command", self._wrench + u[12:18])
+        push = u[18:24]
+        self._push.F_Bq_W = SpatialForce(push[3:], push[:3])
+        self._fix("slave_plant", "applied_spatial_force", [self._push])
+        if self._sensor is not None:
+            # It sees contacts, not this; and what pushes the tool is missing in what holds it.
+            R_WS, _ = self._pose_WS()
+            self._sensor.offset[:] = -np.concatenate([R_WS.T @ push[:3], R_WS.T @ push[3:]])
+
+    def _pose_WS(self) -> tuple[Array, Array]:
+        q, R, p = self._slave_state()[:6], np.empty((3, 3)), np.empty(3)
+        forward_kinematics(self._arm, q, R, p)
+        return R, p
+
+    def _slave_state(self) -> Array:
+        return self._eval("slave_plant", "rx90_state")
+
+    def _run(self) -> Array:
+        """The states after a period, from those now."""
+        # The sample of noise, which is 0, and the log have other instants.
+        context = self._simulator.get_mutable_context()
+        context.SetTime(self.dt)
+        self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+        self._simulator.AdvanceTo(2 * self.dt)
+        return self.get()
+
+    def _outputs(self) -> Array:
+        pose, state = self._eval("kinematic_scaling", "pose_command"), self._slave_state()
+        J = np.empty((6, 6))
+        jacobian(self._arm, state[:6], J)
+        return np.concatenate(
+            [
+                self._eval("operator", "hand_wrench_E"),
+                _difference(pose, self._pose),
+                self._eval("force_scaling", "wrench_B"),
+                self._eval("master_device", "twist_master"),
+                J @ state[6:],
+            ]
+        )
+
+    def rest(self, displacement: Array) -> Array:
+        """The states at the operating point, where the cut inputs become what keeps it at rest."""
+        start = self._pose
+        pose_B = self._start_B.copy()
+        pose_B[4:] += displacement
+        q = device.inverse_kinematics(pose_B)
+        context = self._context("master_device")
+        for group, value in enumerate((np.append(q, np.zeros(6)), pose_B, np.zeros(6))):
+            context.SetDiscreteState(group, value)
+        target = self._eval("kinematic_scaling", "pose_command")
+        ramp = round(_RAMP / self.dt) if displacement.any() else 0
+        for k in range(ramp + round(_SETTLE / self.dt)):
+            u = min((k + 1) / ramp, 1.0) if ramp else 1.0
+            share = u**3 * (10 + u * (6 * u - 15))
+            self._pose = start + share * (target - start)
+            self._apply(np.zeros(24))
+            self._run()
+        return self._newton(self._balanced())
+
+    def _balanced(self) -> Array:
+        """The states, where the hand holds the master against what it displays."""
+        self._wrench = self._eval("force_scaling", "wrench_B")
+        self._apply(np.zeros(24))
+        self._hand = -self._eval("force_display", "force_to_master")
+        self._apply(np.zeros(24))
+        return self.get()
+
+    def _newton(self, x: Array) -> Array:
+        """The states where nothing moves. The master rests already; unheld, it could anywhere."""
+        slave = np.array([not name.startswith("master") for name in self.states])
+        for _ in range(_MOST_STEPS):
+            self._set(x)
+            moved = self._run() - x
+            if (np.abs(moved) < _AT_REST * self._steps).all():
+                self._set(x)
+                return x
+            A, C = self.derivative(x)
+            free = slave & _acting(A, C)
+            moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
+            x[slave] += moved[slave]
+            self._set(x)
+            x = self._balanced()
+        raise DrakeTeleopError(
+            f"the slave does not come to rest, {self.states[np.argmax(np.abs(moved))]} moves",
+            where="displacement",
+            remedy="choose another operating point",
+        )
+
+    def derivative(self, x: Array) -> tuple[Array, Array]:
+        """A and C at the states x, by central differences."""
+        A, C = np.empty((len(x), len(x))), np.empty((30, len(x)))
+        self._apply(np.zeros(24))
+        for k, step in enumerate(self._steps):
+            ends, outputs = [], []
+            for sign in (1.0, -1.0):
+                displaced = x.copy()
+                displaced[k] += sign * step
+                self._set(displaced)
+                outputs.append(self._outputs())
+                ends.append(self._run())
+            A[:, k] = (ends[0] - ends[1]) / (2 * step)
+            C[:, k] = (outputs[0] - outputs[1]) / (2 * step)
+        return A, C
+
+    def input_derivative(self, x: Array) -> Array:
+        """B at the states x."""
+        B = np.empty((len(x), 24))
+        for k in range(24):
+            ends = []
+            step = _COMMAND if 6 <= k < 12 else _OTHER
+            for sign in (1.0, -1.0):
+                self._set(x)
+                self._apply(sign * step * np.eye(24)[k])
+                ends.append(self._run())
+            B[:, k] = (ends[0] - ends[1]) / (2 * step)
+        return B
+
+
+def _moved(pose: Array, change: Array) -> Array:
+    """The pose after a translation [m] and a rotation vector [rad]."""
+    return np.concatenate(
+        [multiply(exponential(tuple(change[3:])), pose[:4]), pose[4:] + change[:3]]
+    )
+
+
+def _difference(pose: Array, other: Array) -> Array:
+    """What moves `other` to `pose`, see `_moved`."""
+    turn = logarithm(multiply(tuple(pose[:4]), conjugate(tuple(other[:4]))))
+    return np.concatenate([pose[4:] - other[4:], turn])
+
+
+def _smooth(scenario: Scenario) -> Scenario:
+    """The scenario's linear part at rest, without what the cuts replace."""
+    sensor = dataclasses.replace(
+        scenario.wrist_sensor,
+        force_noise=0.0,
+        torque_noise=0.0,
+        acceleration_noise=0.0,
+        angular_acceleration_noise=0.0,
+        resolution=0.0,
+        encoder_resolution=0.0,
+        offset=[0.0] * 6,
+    )
+    return replace(
+        scenario,
+        simulation__integrator="runge_kutta3",
+        simulation__max_step=0.5 / scenario.rates.sensor_hz,
+        rates__log_hz=1.0,
+        operator__intent=[],
+        channel=Channel(),
+        passivity=PassivityConfig(),
+        wrist_sensor=sensor,
+        master__friction=dataclasses.replace(scenario.master.friction, coulomb=[0.0] * 6),
+        load_estimator__enabled=False,
+    )
+
+
+def _remove_friction(diagram: Diagram) -> None:
+    plant = diagram.GetSubsystemByName("slave_plant")
+    scene_graph = diagram.GetSubsystemByName("scene_graph")
+    inspector, source = scene_graph.model_inspector(), plant.get_source_id()
+    for geometry in inspector.GetAllGeometryIds(Role.kProximity):
+        properties = inspector.GetProximityProperties(geometry)
+        properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(0.0, 0.0))
+        scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
+
+
+def _check_rates(scenario: Scenario) -> None:
+    rates = scenario.rates
+    if rates.joint_control_hz != rates.hand_hz or rates.sensor_hz % rates.hand_hz != 0.0:
+        raise DrakeTeleopError(
+            "the loops can only be cut at instants that hand and joint control share",
+            where="rates",
+            remedy="set joint_control_hz to hand_hz, and sensor_hz to a multiple of it",
+        )
