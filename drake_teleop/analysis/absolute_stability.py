@@ -283,13 +283,16 @@ def can_oscillate(
     dz, de = np.roll(z, -1, axis=-2) - z, np.roll(e, -1, axis=-1) - e
     # Along an edge of each, (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e = a + b t + (c + d t) u, with t
     # and u from 0 to 1. It is zero where t = -(a + c u) / (b + d u) is real.
-    a = (z + h11) * (1 + h22 * e) - h12 * h21 * e
-    b, c, d = dz * (1 + h22 * e), ((z + h11) * h22 - h12 * h21) * de, dz * h22 * de
-    q2, q1, q0 = (c * d.conj()).imag, (a * d.conj() + c * b.conj()).imag, (a * b.conj()).imag
+    product, held, give = h12 * h21, z + h11, 1 + h22 * e
+    a, b = held * give - product * e, dz * give
+    c, d = (held * h22 - product) * de, dz * h22 * de
+    # (a + c u) conj(b + d u) as a polynomial of u: its imaginary part vanishes.
+    p0, p1, p2 = a * b.conj(), a * d.conj() + c * b.conj(), c * d.conj()
     with np.errstate(divide="ignore", invalid="ignore"):
-        half = -(q1 + np.copysign(np.sqrt(q1**2 - 4 * q2 * q0), q1)) / 2
-        u = np.stack([half / q2, q0 / half])
-        t = -((a + c * u) / (b + d * u)).real
+        half = -(p1.imag + np.copysign(np.sqrt(p1.imag**2 - 4 * p2.imag * p0.imag), p1.imag)) / 2
+        u = np.stack([half / p2.imag, p0.imag / half])
+        size = _square(b) + u * (2 * (b * d.conj()).real + u * _square(d))
+        t = -(p0.real + u * (p1.real + u * p2.real)) / size
         crossing = np.any((t >= 0) & (t <= 1) & (u >= 0) & (u <= 1), axis=(0, -2, -1))
         # No edges cross if one region is within the other.
         felt = transmitted_impedance(H, e[..., 0, 0])
@@ -304,7 +307,7 @@ def bounded_singular_value(
     """mu for hands and environments of the ranges; none can oscillate where it is less than 1.
 
     Sufficient, and graded where `can_oscillate` is not: the rectangle of each range is enlarged to
-    a disc, from the smallest around it to nearly the half plane of all that have as much damping,
+    a disc, from nearly the smallest around it to nearly the half plane of all that have as much damping,
     and the pair of discs counts that does best. What is said of the ranges holds for any linear
     hand and environment in these discs.
 
@@ -328,11 +331,11 @@ def bounded_singular_value(
     return np.sqrt(np.min(square, axis=(-2, -1)) / 2)
 
 
-_WIDENING = np.array([0.0, 0.25, 1.0, 4.0, 16.0, 64.0])  # of a disc, in half diagonals
+_WIDENING = np.array([0.3, 1.0, 3.0, 10.0, 100.0])  # of a disc, in half diagonals
 
 
 def _discs(corners: Complex) -> tuple[Complex, Real]:
-    """Centres and radii (..., 6) of discs through the two corners with the least damping."""
+    """Centres and radii (..., 5) of discs through the two corners with the least damping."""
     diagonal = corners[..., 2] - corners[..., 0]
     right = diagonal.real[..., None] / 2 + np.abs(diagonal)[..., None] / 2 * _WIDENING
     middle = corners[..., 0] + 0.5j * diagonal.imag

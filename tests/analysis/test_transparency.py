@@ -1,0 +1,230 @@
+"""What is felt, against the station's equations solved at each frequency."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from drake_teleop.analysis import absolute_stability as ab
+from drake_teleop.analysis import transparency as tr
+from drake_teleop.analysis import two_port as tp
+from drake_teleop.analysis.one_axis import OneAxis, device_impedance, environment_impedance
+from drake_teleop.errors import DrakeTeleopError
+
+OMEGA = np.geomspace(0.1, 1000.0, 200)
+S = 1j * OMEGA
+AXIS = OneAxis(
+    device_mass=0.4, force_scale=0.3, position_scale=1.7, sigma=0.6, gamma=1.3, delay=0.015,
+    mass_error=0.2, wall_damping=30.0,
+)  # fmt: skip
+
+
+def closed(axis: OneAxis, s: complex, stiffness: float) -> dict[str, complex]:
+    """All signals for V_m = 1 of station and wall, solved together."""
+    late = np.exp(-s * axis.delay)
+    spring = axis.slave_mass * axis.velocity_gain * axis.position_gain / s
+    slave = axis.slave_mass * (s + axis.velocity_gain) + spring
+    estimate = axis.tool_mass + axis.mass_error
+    names = ["hand", "slave", "wall", "sensor", "sent"]
+    A, b = np.zeros((5, 5), dtype=complex), np.zeros(5, dtype=complex)
+    A[0, [0, 4]], b[0] = [1, -axis.force_scale * late], axis.device_mass * s + axis.device_damping
+    A[1, [1, 2]], b[1] = [slave, 1], spring * axis.position_scale * late
+    A[2, [2, 1]] = [1, -(axis.wall_damping + stiffness / s)]
+    A[3, [3, 2, 1]] = [1, -1, -axis.tool_mass * s]
+    A[4, [4, 3, 1]] = [1, -axis.gamma, (axis.gamma - axis.sigma) * estimate * s]
+    return dict(zip(names, np.linalg.solve(A, b), strict=True))
+
+
+def solved(name: str, stiffness: float = AXIS.wall_stiffness, axis: OneAxis = AXIS) -> np.ndarray:
+    return np.array([closed(axis, s, stiffness)[name] for s in S])
+
+
+def test_felt_impedance_and_tracking():
+    H, wall, device = tp.hybrid(AXIS, S), environment_impedance(AXIS, S), device_impedance(AXIS, S)
+    hand, slave, pushed, sent = (solved(name) for name in ("hand", "slave", "wall", "sent"))
+    np.testing.assert_allclose(tp.transmitted_impedance(H, wall), hand, rtol=1e-9)
+    track = tr.tracking(H, wall, device)
+    np.testing.assert_allclose(track.position, slave, rtol=1e-9)
+    np.testing.assert_allclose(track.force, hand / pushed, rtol=1e-9)
+    late = np.exp(-S * AXIS.delay)
+    reflected = AXIS.force_scale * late * sent / pushed
+    np.testing.assert_allclose(track.reflected, reflected, rtol=1e-9)
+
+
+def test_ideal_station_is_faithful():
+    values = {**AXIS.__dict__, "ideal_servo": True, "delay": 0.0, "mass_error": 0.0}
+    axis = OneAxis(**values)
+    H, wall, device = tp.hybrid(axis, S), environment_impedance(axis, S), device_impedance(axis, S)
+    felt, ideal = tp.transmitted_impedance(H, wall), tr.ideal_impedance(axis, S, wall)
+    same = tr.fidelity(felt, ideal)
+    np.testing.assert_allclose(same.level, 0.0, atol=1e-11)
+    np.testing.assert_allclose(same.phase, 0.0, atol=1e-11)
+    assert not np.any(same.noticed)
+    track = tr.tracking(H, wall, device)
+    np.testing.assert_allclose(track.position, axis.position_scale, rtol=1e-12)
+    np.testing.assert_allclose(
+        tr.sensitivity(H, wall), axis.force_scale * axis.gamma * axis.position_scale, rtol=1e-12
+    )
+    # Without load on the sensor only the wall is sent.
+    values |= {"sigma": 0.0}
+    H = tp.hybrid(OneAxis(**values), S)
+    reflected = tr.tracking(H, wall, device).reflected
+    np.testing.assert_allclose(reflected, axis.force_scale * axis.gamma, rtol=1e-9)
+
+
+def test_fidelity_says_by_how_much_and_whether_one_notices():
+    ideal = 2.0 + 3.0 * S
+    ratio = 10 ** (3 / 20) * np.exp(1j * np.radians(-20))
+    level, phase, noticed = tr.fidelity(ideal * ratio, ideal)
+    np.testing.assert_allclose(level, 3.0, rtol=1e-12)
+    np.testing.assert_allclose(phase, -20.0, rtol=1e-12)
+    assert np.all(noticed)
+    assert not np.any(tr.fidelity(1.22 * ideal, ideal).noticed)
+    assert np.all(tr.fidelity(1.24 * ideal, ideal).noticed)
+    # A station with a servo is near its ideal where hands move, and not far beyond.
+    axis = OneAxis(sigma=0.5, wall_stiffness=1000.0)
+    wall = environment_impedance(axis, S)
+    felt = tp.transmitted_impedance(tp.hybrid(axis, S), wall)
+    near = tr.fidelity(felt, tr.ideal_impedance(axis, S, wall))
+    assert not np.any(near.noticed[OMEGA < 2.0])
+    assert np.any(near.noticed[OMEGA > 10.0])
+
+
+def test_apparent_mass_damping_and_stiffness():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        m, b, k = rng.uniform(-1, 3), rng.uniform(0, 50), rng.uniform(0, 5000)
+        fitted = tr.apparent(m * S + b + k / S, OMEGA)
+        np.testing.assert_allclose(fitted, [m, b, k], rtol=1e-9, atol=1e-9)
+        each = tr.apparent_at_each(m * S + b, OMEGA)
+        np.testing.assert_allclose(each.mass, m, rtol=1e-9)
+        np.testing.assert_allclose(each.damping, b, rtol=1e-9)
+        np.testing.assert_allclose(tr.apparent_at_each(b + k / S, OMEGA).stiffness, k, rtol=1e-9)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.5, 1.0, 1.5])
+def test_apparent_mass_in_free_motion_is_that_of_the_scales(sigma):
+    slow = 1j * np.linspace(0.5, 5.0, 50)
+    axis = OneAxis(sigma=sigma, ideal_servo=True, mass_error=-0.1)
+    felt = tr.apparent(tp.hybrid(axis, slow)[:, 0, 0], slow.imag)
+    error = (sigma - 1.0) * -0.1
+    mass = axis.device_mass + (sigma * axis.tool_mass + error) / 17.5
+    assert felt.mass == pytest.approx(mass, rel=1e-9)
+    assert felt.damping == pytest.approx(axis.device_damping, rel=1e-9)
+    # A servo that lags makes a damper of the tool, of negative damping.
+    real = tr.apparent(tp.hybrid(OneAxis(sigma=1.0), slow)[:, 0, 0], slow.imag)
+    assert real.damping > axis.device_damping
+    assert real.mass == pytest.approx(axis.device_mass + axis.tool_mass / 17.5, rel=0.02)
+
+
+def test_transmitted_width():
+    width = tr.transmitted_width(tp.hybrid(AXIS, S))
+    np.testing.assert_allclose(
+        width.free,
+        solved("hand", 0.0, OneAxis(**{**AXIS.__dict__, "wall_damping": 0.0})),
+        rtol=1e-9,
+    )
+    np.testing.assert_allclose(width.rigid, solved("hand", 1e18), rtol=1e-9)
+    np.testing.assert_allclose(
+        width.decades, np.log10(np.abs(width.rigid / width.free)), rtol=1e-12
+    )
+    # At rest a rigid wall is as stiff as the servo's spring, scaled.
+    axis = OneAxis()
+    rigid = tr.transmitted_width(tp.hybrid(axis, np.array([1e-3j]))).rigid
+    spring = axis.slave_mass * axis.velocity_gain * axis.position_gain
+    stiffness = tr.apparent_at_each(rigid, np.array([1e-3])).stiffness
+    assert stiffness == pytest.approx(spring * axis.force_scale, rel=1e-6)
+    assert np.all(np.isinf(tr.transmitted_width(tp.hybrid(OneAxis(ideal_servo=True), S)).rigid))
+
+
+def test_sensitivity_is_the_derivative():
+    H, wall = tp.hybrid(AXIS, S), environment_impedance(AXIS, S)
+    step = 1e-4 * np.abs(wall)
+    difference = tp.transmitted_impedance(H, wall + step) - tp.transmitted_impedance(H, wall - step)
+    np.testing.assert_allclose(tr.sensitivity(H, wall), difference / (2 * step), rtol=1e-6)
+
+
+@pytest.mark.parametrize("stiffness", [0.0, 50.0, 5100.0, 1e6])
+def test_smallest_change_is_where_the_two_differ_by_the_weber_fraction(stiffness):
+    H = tp.hybrid(AXIS, S)
+    change = tr.smallest_stiffness_change(H, OMEGA, stiffness, 0.23, AXIS.wall_damping)
+    found = np.isfinite(change)
+    before = tp.transmitted_impedance(H, AXIS.wall_damping + stiffness / S)
+    for i in np.flatnonzero(found):
+        wall = AXIS.wall_damping + (stiffness + change[i] * np.array([0.3, 0.9, 1.0, 1.1])) / S[i]
+        share = np.abs(tp.transmitted_impedance(H[i], wall) / before[i] - 1)
+        assert share[2] == pytest.approx(0.23, rel=1e-6)
+        assert np.all(share[:2] < 0.23)
+    trial = np.geomspace(1e-3, 1e12, 400)[:, None]
+    share = np.abs(
+        tp.transmitted_impedance(H, AXIS.wall_damping + (stiffness + trial) / S) / before - 1
+    )
+    assert np.array_equal(np.any(share > 0.23, axis=0), found)
+
+
+def test_a_transparent_station_hides_nothing():
+    direct = tp.two_port(0.0 * S, 1.0, -1.0, 0.0)
+    for k in (10.0, 5100.0):
+        np.testing.assert_allclose(
+            tr.smallest_stiffness_change(direct, OMEGA, k, 0.23), 0.23 * k, rtol=1e-12
+        )
+    # The device's mass and damping are felt with the wall, and may cancel some of it.
+    axis, k = OneAxis(ideal_servo=True), 5100.0
+    change = tr.smallest_stiffness_change(tp.hybrid(axis, S), OMEGA, k, 0.23)
+    felt = axis.device_damping + 1j * (axis.device_mass * OMEGA - k / 17.5 / OMEGA)
+    np.testing.assert_allclose(change, 0.23 * np.abs(felt) * OMEGA * 17.5, rtol=1e-9)
+    # The servo's spring is in series with the wall: a stiffer one must change by more.
+    H, axis = tp.hybrid(OneAxis(), S), OneAxis()
+    spring = axis.slave_mass * axis.velocity_gain * axis.position_gain
+    for k in (5100.0, 200000.0):
+        both = 1.23 / (1 / k + 1 / spring)
+        stiffer = 1 / (1 / both - 1 / spring) - k
+        hidden = tr.smallest_stiffness_change(H, OMEGA, k, 0.23)[0]
+        assert hidden == pytest.approx(stiffer, rel=1e-3)
+    # Beyond some stiffness all walls feel the same.
+    assert np.isinf(tr.smallest_stiffness_change(H, OMEGA, 5 * spring, 0.23)[0])
+    # The softest wall that one notices: against the force that the device takes by itself.
+    w = 2 * np.pi
+    axis = OneAxis(ideal_servo=True)
+    softest = tr.smallest_stiffness_change(tp.hybrid(axis, np.array([1j * w])), np.array([w]), 0.0)
+    device = abs(axis.device_mass * 1j * w + axis.device_damping)
+    assert softest[0] == pytest.approx(0.23 * device * w * 17.5, rel=1e-9)
+    with pytest.raises(DrakeTeleopError, match="weber"):
+        tr.smallest_stiffness_change(H, OMEGA, 1.0, 0.0)
+
+
+def test_a_whole_analysis_takes_milliseconds():
+    """1000 frequencies, all criteria and measures of the two-port."""
+    omega = np.geomspace(0.1, 3000.0, 1000)
+    hand = ab.range_of_grips()
+    wall = ab.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, 5100.0))
+
+    def analysis():
+        s = 1j * omega
+        axis = OneAxis(sigma=0.5, delay=0.01)
+        H = tp.hybrid(axis, s)
+        scattered = tp.scattering(H)
+        environment = environment_impedance(axis, s)
+        scaled = tp.power_scaled(H, tp.power_ratio(axis))
+        felt = tp.transmitted_impedance(H, environment)
+        return (
+            tp.impedance(H), tp.admittance(H), tp.chain(H),
+            ab.absolutely_stable(H), ab.required_damping(H), ab.worst_loads(H),
+            ab.passive(scaled), ab.scattering_norm(tp.scattering(scaled)),
+            ab.structured_singular_value(scattered),
+            ab.can_oscillate(H, omega, hand, wall), ab.bounded_singular_value(H, omega, hand, wall),
+            tr.fidelity(felt, tr.ideal_impedance(axis, s, environment)),
+            tr.apparent(H[:, 0, 0], omega), tr.apparent_at_each(felt, omega),
+            tr.tracking(H, environment, device_impedance(axis, s)),
+            tr.transmitted_width(H).decades, tr.sensitivity(H, environment),
+            tr.smallest_stiffness_change(H, omega, 5100.0),
+        )  # fmt: skip
+
+    taken = []
+    for _ in range(20):
+        start = time.thread_time()
+        analysis()
+        taken.append(time.thread_time() - start)
+    assert min(taken) <= 10e-3
