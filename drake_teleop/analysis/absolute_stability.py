@@ -307,9 +307,9 @@ def bounded_singular_value(
     """mu for hands and environments of the ranges; none can oscillate where it is less than 1.
 
     Sufficient, and graded where `can_oscillate` is not: the rectangle of each range is enlarged to
-    a disc, from nearly the smallest around it to nearly the half plane of all that have as much damping,
-    and the pair of discs counts that does best. What is said of the ranges holds for any linear
-    hand and environment in these discs.
+    a disc, from nearly the smallest around it to nearly the half plane of all that have as much
+    damping, and the pair of discs counts that does best. It holds for any linear hand and
+    environment in these discs.
 
     Args:
         H: (..., 2, 2).
