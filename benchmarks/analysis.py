@@ -1,28 +1,61 @@
 """Is what the analysis says of stability what a simulation does, and how long does it take?
 
-`python benchmarks/analysis.py [--json] [--environments N]` bisects the round trip at which a
-simulation of one axis becomes unstable, for N (4) environments and three grips in contact, and for
-free motion with the tool felt, and compares it with the delay margin of the sampled loop. The
-simulation knows nothing of the analysis: events, rings of packets, Runge-Kutta steps.
+`python benchmarks/analysis.py [--json]` prints three things.
+
+* The round trip at which a simulation of one axis becomes unstable, by bisection, next to the delay
+  margin of the sampled loop: three grips before four environments each, with and without the tool
+  felt, and free motion with a light grip. The simulation knows nothing of the analysis: events,
+  rings of packets, Runge-Kutta steps. Baseline: the delay margin of the continuous loop.
+* The time that five maps of 100 x 100 take, distortion and boundary included. Baseline: eigenvalues
+  of the closed loop with its registers, cell by cell, over a sample of the cells.
+* The time of one axis at 1000 frequencies with all tests.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import math
+import sys
+import time
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from drake_teleop.analysis.one_axis import OneAxis
+from drake_teleop.analysis import absolute_stability, margins, two_port
+from drake_teleop.analysis.maps import StabilityMap, stability_map
+from drake_teleop.analysis.one_axis import OneAxis, environment_impedance
 from drake_teleop.analysis.sampled_loop import (
     Sampling,
+    cut_loop,
+    delay_margin,
     delay_steps,
+    growth_rate,
+    loop_response,
+    sampled_loop,
+    sampled_two_port,
 )
+from drake_teleop.master.operator import GRIPS
 from drake_teleop.slave.wrist_sensor import butterworth_sections
 
 Array = NDArray[np.float64]
+
+JR3 = Sampling(low_pass_hz=500.0)
+#: Before these each grip is pressed: [N/m], [N s/m].
+WALLS = {
+    "light": ((1e3, 0.0), (1.5e3, 0.0), (2e3, 10.0), (5.1e3, 0.0)),
+    "medium": ((2e3, 0.0), (5.1e3, 0.0), (7e3, 20.0), (1e4, 0.0)),
+    "firm": ((5.1e3, 0.0), (1.4e4, 0.0), (2e4, 50.0), (3e4, 0.0)),
+}
+#: Environments that `analyse` lets the tool touch.
+WALL_RANGE = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 50.0), (0.0, 5.1e3))
+WITHIN = 2e-3  # [s] between simulated and computed margin
+N = 100  # cells of a map in each direction
+SAMPLE = 40  # cells of a map that the baseline does too
 
 SECONDS = 20.0  # of a simulation, which is compared with itself over its first and last windows
 WINDOW = 2.0
@@ -133,13 +166,13 @@ def simulated_growth(axis: OneAxis, sampling: Sampling) -> float:
     return math.log(max(last.max(), 1e-300) / max(first.max(), 1e-300)) * sampling.hand_hz / between
 
 
-def simulated_margin(axis: OneAxis, sampling: Sampling) -> float:
+def simulated_margin(axis: OneAxis, sampling: Sampling, longest: float = LONGEST) -> float:
     """Round trip [s] at which the simulation begins to grow, between two whole periods."""
 
     def grows(steps: int) -> bool:
         return simulated_growth(replace(axis, delay=steps / sampling.hand_hz), sampling) > 0
 
-    low, high = 0, int(LONGEST * sampling.hand_hz)
+    low, high = 0, int(longest * sampling.hand_hz)
     if grows(0):
         return 0.0
     if not grows(high):
@@ -148,3 +181,175 @@ def simulated_margin(axis: OneAxis, sampling: Sampling) -> float:
         middle = (low + high) // 2
         low, high = (low, middle) if grows(middle) else (middle, high)
     return (low + high) / sampling.hand_hz
+
+
+def held(grip: str, **fields: float) -> OneAxis:
+    """The station's axis in this hand."""
+    hand = GRIPS[grip]
+    axis = OneAxis(hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness)
+    return replace(axis, **fields)
+
+
+def margin_rows() -> list[dict[str, Any]]:
+    """Simulated and computed margins."""
+    cases: list[tuple[str, OneAxis, float]] = [
+        (grip, held(grip, sigma=sigma, wall_stiffness=k, wall_damping=b), LONGEST)
+        for sigma in (0.0, 1.0)
+        for grip, walls in WALLS.items()
+        for k, b in walls
+    ]
+    # The first window of instability ends at 161 ms one way.
+    cases.append(("light", held("light", sigma=1.0, wall_stiffness=0.0), 0.13))
+    rows = []
+    for grip, axis, longest in cases:
+        continuous = float(margins.delay_margin(margins.station_loop(axis)))
+        rows.append(
+            {
+                "grip": grip,
+                "sigma": axis.sigma,
+                "stiffness": axis.wall_stiffness,
+                "damping": axis.wall_damping,
+                "simulated": simulated_margin(axis, JR3, longest),
+                "sampled": float(delay_margin(cut_loop(axis, JR3))),
+                "continuous": continuous,
+            }
+        )
+    return rows
+
+
+def off(row: dict[str, Any], name: str = "sampled") -> float:
+    """By how much a margin differs from the simulated one [s]."""
+    return 0.0 if row[name] == row["simulated"] else abs(row[name] - row["simulated"])
+
+
+def map_rows() -> list[dict[str, Any]]:
+    """Times of maps, and how many of the sample of cells eigenvalues say the same of."""
+    free = {"wall_stiffness": 0.0}
+    delay = np.arange(N) / 2e3  # whole periods, for the eigenvalues' sake
+    stiffness, sigma = np.geomspace(100.0, 1e5, N), np.linspace(0.0, 2.0, N)
+    maps = {
+        "delay x stiffness": (OneAxis(), JR3, "delay", delay, "wall_stiffness", stiffness),
+        "sigma x delay, contact": (OneAxis(), JR3, "sigma", sigma, "delay", delay),
+        "sigma x delay, free": (held("light", **free), JR3, "sigma", sigma, "delay", 4 * delay),
+        "error of phi x sigma": (
+            replace(OneAxis(), force_scale=1.0, **free), JR3,
+            "mass_error", np.linspace(-1.0, 1.0, N), "sigma", sigma / 2,
+        ),
+        "rate x stiffness": (
+            OneAxis(), JR3, "rate", np.geomspace(300.0, 1e4, N), "wall_stiffness", stiffness,
+        ),
+    }  # fmt: skip
+    rows = []
+    for name, arguments in maps.items():
+        found = stability_map(*arguments)
+        ours = seconds(lambda: stability_map(*arguments), 3)  # noqa: B023
+        began = time.thread_time()
+        same = eigenvalues_agree(*arguments[:2], found)
+        each = (time.thread_time() - began) / SAMPLE
+        rows.append(
+            {
+                "map": name,
+                "seconds": ours,
+                "eigenvalues": each * N * N / ours,
+                "same": same,
+                "stable": float(found.stable.mean()),
+                "boundary": len(found.boundary),
+            }
+        )
+    return rows
+
+
+def eigenvalues_agree(axis: OneAxis, sampling: Sampling, found: StabilityMap) -> int:
+    """Of how many cells of a random sample the closed loop's eigenvalues say the same."""
+    rng, same = np.random.default_rng(1), 0
+    for i, j in rng.integers(N, size=(SAMPLE, 2)):
+        cell, rates = axis, sampling
+        for name, value in ((found.x_name, found.x[j]), (found.y_name, found.y[i])):
+            if name == "rate":
+                rates = replace(rates, hand_hz=value, joint_control_hz=value, sensor_hz=4 * value)
+            else:
+                cell = replace(cell, **{name: float(value)})
+        same += bool((growth_rate(sampled_loop(cell, rates)) < 0) == found.stable[i, j])
+    return same
+
+
+def seconds(call: Callable[[], Any], rounds: int) -> float:
+    """Of the thread, the shortest of some rounds."""
+    times = []
+    for _ in range(rounds):
+        began = time.thread_time()
+        call()
+        times.append(time.thread_time() - began)
+    return min(times)
+
+
+def analyse(axis: OneAxis, omega: Array) -> None:
+    """One axis: two-ports, absolute stability, passivity, margins, transmitted impedance."""
+    s = 1j * omega
+    H = two_port.hybrid(axis, s)
+    scaled = two_port.power_scaled(H, two_port.power_ratio(axis))
+    two_port.transmitted_impedance(H, environment_impedance(axis, s))
+    absolute_stability.llewellyn(H)
+    absolute_stability.required_damping(H)
+    absolute_stability.raisbeck(scaled)
+    S = two_port.scattering(scaled)
+    absolute_stability.scattering_norm(S)
+    absolute_stability.structured_singular_value(S)
+    hands, walls = absolute_stability.range_of_grips(), WALL_RANGE
+    absolute_stability.can_oscillate(H, omega, hands, walls)
+    absolute_stability.bounded_singular_value(H, omega, hands, walls)
+    margins.margins(margins.station_loop(axis))
+    loop = cut_loop(axis, JR3)
+    delay_margin(loop)
+    loop_response(loop, omega, axis.delay)
+    sampled_two_port(axis, JR3, omega)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the comparisons and prints them; returns 0 if `holds`."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    options = parser.parse_args(arguments)
+    axis = replace(OneAxis(), delay=10e-3)
+    omega = 2 * np.pi * np.geomspace(0.1, 500.0, 1000)
+    analyse(axis, omega)  # compiles
+    result: dict[str, Any] = {"margins": margin_rows(), "maps": map_rows()}
+    result["analysis"] = seconds(lambda: analyse(axis, omega), 10)
+    if options.json:
+        print(json.dumps(result))
+    else:
+        print_tables(result)
+    return 0 if holds(result) else 1
+
+
+def print_tables(result: dict[str, Any]) -> None:
+    """What `main` prints without --json."""
+    print("delay margin, ms of round trip")
+    print("grip    sigma  wall kN/m  N s/m  simulated  sampled  continuous")
+    for row in result["margins"]:
+        print(
+            f"{row['grip']:<8}{row['sigma']:5.0f}{row['stiffness'] / 1e3:11.1f}"
+            f"{row['damping']:7.0f}{1e3 * row['simulated']:11.1f}{1e3 * row['sampled']:9.1f}"
+            f"{1e3 * row['continuous']:12.1f}"
+        )
+    print(f"largest difference {1e3 * max(map(off, result['margins'])):.2f} ms")
+    print(f"\nmap of {N} x {N}          seconds  eigenvalues take  same    stable  boundary")
+    for row in result["maps"]:
+        print(
+            f"{row['map']:<24}{row['seconds']:9.2f}{row['eigenvalues']:13.0f} x"
+            f"{row['same']:7d}/{SAMPLE}{100 * row['stable']:7.0f} %{row['boundary']:8d}"
+        )
+    print(f"\none axis, 1000 frequencies: {1e3 * result['analysis']:.1f} ms")
+
+
+def holds(result: dict[str, Any]) -> bool:
+    """Whether margins agree, no cell of a map differs, and the times are as they should be."""
+    return (
+        all(off(row) <= WITHIN for row in result["margins"])
+        and all(row["same"] == SAMPLE and row["seconds"] <= 5.0 for row in result["maps"])
+        and result["analysis"] <= 10e-3
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import matrix_balance, schur
 
 from drake_teleop.analysis.one_axis import Complex, OneAxis
 from drake_teleop.errors import DrakeTeleopError
@@ -175,18 +176,15 @@ def sampled_response(system: Any, frequency: ArrayLike) -> Complex:
     """C (z - A)^-1 B + D at z = e^(j w T).
 
     Args:
-        system: a `SampledLoop` or a discrete `control.StateSpace`.
+        system: one `SampledLoop` or discrete `control.StateSpace`.
         frequency: (N,) w [rad/s].
 
     Returns:
-        (N, outputs, inputs), frequencies along the first axis, before the shape of the system.
+        (N, outputs, inputs).
     """
     period = system.period if isinstance(system, SampledLoop) else system.dt
-    A, B = np.asarray(system.A), np.asarray(system.B)
-    w = np.atleast_1d(np.asarray(frequency, dtype=float))
-    z = np.exp(1j * w * period).reshape(-1, *[1] * A.ndim)
-    states = np.linalg.solve(z * np.eye(A.shape[-1]) - A, B)
-    return system.C @ states + system.D
+    z = np.exp(1j * np.atleast_1d(np.asarray(frequency, dtype=float)) * period)
+    return _resolvent(system.A, system.B, system.C, z) + system.D
 
 
 def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
@@ -197,12 +195,16 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
     are the station's own holds and samples.
 
     Args:
-        axis: hand and wall do not belong to the two-port and are left out.
+        axis: hand and wall do not belong to the two-port and are left out; the delay, one number,
+            is rounded as the channel does.
         sampling: the rates.
-        frequency: (N,) w [rad/s], not zero, below half the rate of the common period.
+        frequency: (N,) w [rad/s], not zero, below half the hand's rate.
 
     Returns:
         (N, 2, 2) [N s/m, 1; 1, m/(N s)].
+
+    Raises:
+        DrakeTeleopError: as `cut_loop`.
     """
     bare = replace(
         axis,
@@ -212,13 +214,23 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
         wall_stiffness=0.0,
         wall_damping=0.0,
     )
-    system = sampled_loop(bare, sampling)
+    M = _cut_map(bare, sampling)
+    n, period = M.shape[-1] - 3, 1 / sampling.hand_hz
     w = np.atleast_1d(np.asarray(frequency, dtype=float))
-    hold = -np.expm1(-1j * w * system.period) / (1j * w * system.period)
-    velocities = [OUTPUTS.index("v_m"), OUTPUTS.index("v_s")]
-    Y = sampled_response(system, w)[:, velocities, :] / hold[:, None, None]
-    a, b, c, d = Y[:, 0, 0], Y[:, 0, 1], Y[:, 1, 0], Y[:, 1, 1]
-    return np.moveaxis(np.array([[1 / a, -b / a], [-c / a, c * b / a - d]]), 2, 0)
+    z = np.exp(1j * w * period)
+    late = z ** -delay_steps(axis, sampling)
+    # Without delay, of the device's own force and of the environment's.
+    C = np.eye(n)[[_V_M, _V_S, _SAMPLE]]
+    response = _resolvent(M[:n, :n], M[:n, n : n + 2], C, z)
+    (v_m, _), (v_s, give), (felt, felt_e) = np.moveaxis(response, 0, 2)
+    hold = -np.expm1(-1j * w * period) / (1j * w * period)
+    H = np.array(
+        [
+            [hold * (1 + late**2 * felt) / v_m, late * felt_e],
+            [-late * v_s / v_m, -give / hold],
+        ]
+    )
+    return np.moveaxis(H, 2, 0)
 
 
 def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
@@ -228,13 +240,7 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
         DrakeTeleopError: for an ideal servo, or if servo or sensor do not run at the hand's rate or
             a whole number of times faster.
     """
-    M, periods = _period_map(axis, sampling, 0, cut=True)
-    if periods != 1:
-        raise DrakeTeleopError(
-            "the hand's period is not the period of all rates",
-            where="sampling",
-            remedy="let servo and sensor run a whole number of times faster, or use `sampled_loop`",
-        )
+    M = _cut_map(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()
     closed[..., :, _SAMPLE] += M[..., :n, n + 3 + _RECEIVED]
@@ -298,6 +304,18 @@ def delay_margin(loop: CutLoop) -> Array:
     return np.where(unstable_multipliers(loop, 0.0) > 0, 0.0, first)
 
 
+def _cut_map(axis: OneAxis, sampling: Sampling) -> Array:
+    """(..., n + 3, n + 3) over the hand's period, without delay."""
+    M, periods = _period_map(axis, sampling, 0, cut=True)
+    if periods != 1:
+        raise DrakeTeleopError(
+            "the hand's period is not the period of all rates",
+            where="sampling",
+            remedy="let servo and sensor run a whole number of times faster, or use `sampled_loop`",
+        )
+    return M
+
+
 def _period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> tuple[Array, int]:
     """The map of [states; held inputs; force received] over the common period, and its length.
 
@@ -323,7 +341,8 @@ def _period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> 
         rows.servo(command),
         rows.sensor(sections),
     )
-    flows = {gap: rows.slave(float(gap) * hand_period) for gap, *_ in events}
+    gaps = {gap for gap, *_ in events}
+    flows = {gap: rows.slave(float(gap) * hand_period) for gap in gaps}
     shape = np.broadcast_shapes(
         *(part.shape[:-2] for part in (hand, servo, sensor, *flows.values()))
     )
@@ -480,6 +499,18 @@ def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Ar
     M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t
     E = _exponential(M)
     return E[..., :2, 0], E[..., :2, 1], E[..., :2, 2]
+
+
+def _resolvent(A: Array, B: Array, C: Array, z: Complex) -> Complex:
+    """C (z - A)^-1 B, (N, p, m) at z (N,): by A's Schur form, triangular for every z."""
+    balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    T, Q = schur(balanced, output="complex")
+    right, left = Q.conj().T @ (B / scale[:, None]), (C * scale) @ Q
+    states = np.empty((len(T), len(z), right.shape[1]), complex)
+    for i in reversed(range(len(T))):
+        known = right[i] + np.tensordot(T[i, i + 1 :], states[i + 1 :], 1)
+        states[i] = known / (z - T[i, i])[:, None]
+    return np.moveaxis(np.tensordot(left, states, 1), 1, 0)
 
 
 def _exponential(M: Array) -> Array:

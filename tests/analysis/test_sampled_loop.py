@@ -151,6 +151,24 @@ def test_short_periods_give_the_continuous_two_port() -> None:
     np.testing.assert_allclose(limit / expected, 1.0, atol=1e-4)
 
 
+@pytest.mark.parametrize("sampling", [STATION, JR3])
+@pytest.mark.parametrize("delay", [0.0, 4e-3])
+def test_the_two_port_is_that_of_the_closed_loop_without_hand_and_wall(
+    sampling: Sampling, delay: float
+) -> None:
+    axis = OneAxis(sigma=0.6, mass_error=0.3, delay=delay, position_scale=2.0)
+    w = 2 * np.pi * np.geomspace(1.0, 900.0, 20)
+    H = sampled_two_port(axis, sampling, w)
+    bare = replace(axis, hand_mass=0.0, hand_damping=0.0, hand_stiffness=0.0, wall_stiffness=0.0)
+    response = sampled_response(sampled_loop(bare, sampling), w)
+    hold = (1 - np.exp(-1j * w / 2e3)) / (1j * w / 2e3)
+    for force in range(2):
+        v_m, v_s = response[:, 1, force] / hold, response[:, 3, force] / hold
+        F = np.array([1 - force, force])
+        np.testing.assert_allclose(H[:, 0, 0] * v_m + H[:, 0, 1] * F[1], F[0], atol=1e-9)
+        np.testing.assert_allclose((H[:, 1, 0] * v_m + H[:, 1, 1] * F[1]) / v_s, -1.0, atol=1e-9)
+
+
 @settings(max_examples=60, deadline=None)
 @given(axis=axes, steps=st.integers(0, 30), low_pass=st.booleans())
 def test_the_argument_principle_counts_what_eigenvalues_say(
