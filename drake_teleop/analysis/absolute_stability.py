@@ -12,6 +12,7 @@ whose mass, damping and stiffness lie within `ImpedanceRange`s.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -220,15 +221,27 @@ def worst_loads(H: Complex) -> WorstLoads:
     return WorstLoads(-felt.imag, reactance, felt.real)
 
 
-class ImpedanceRange(NamedTuple):
+@dataclass(frozen=True)
+class ImpedanceRange:
     """Hands or environments m s + b + k / s with (smallest, largest) values.
 
     At a frequency they are all the impedances of a rectangle.
+
+    Raises:
+        DrakeTeleopError: if a smallest value exceeds its largest, or they are not finite.
     """
 
     mass: tuple[float, float]  #: kg
     damping: tuple[float, float]  #: N s/m
     stiffness: tuple[float, float]  #: N/m
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "damping", "stiffness"):
+            low, high = getattr(self, name)
+            if not -np.inf < low <= high < np.inf:
+                raise DrakeTeleopError(
+                    f"no range from {low} to {high}", where=name, remedy="give (smallest, largest)"
+                )
 
     def corners(self, omega: Real) -> Complex:
         """(..., 4) corners of the rectangle [N s/m], once around."""
@@ -270,8 +283,9 @@ def can_oscillate(
     """Whether some hand and environment of the ranges keep up an oscillation at the frequency.
 
     Exact: they do where Z_h + Z_to(Z_e) = 0 for impedances of the two rectangles. If it is so at no
-    frequency, all of them are stable or none is (zero exclusion), and one need be looked at. The
-    frequencies have to be dense; a range of hands without width can slip between them.
+    frequency, all of them are stable or none is (zero exclusion), and one need be looked at; behind
+    an ideal servo that is so if the felt mass of the tool is less than that of hand and device.
+    The frequencies have to be dense: a range of hands without width slips between them.
 
     Args:
         H: (..., 2, 2).
@@ -281,9 +295,45 @@ def can_oscillate(
     h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
     z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]
     dz, de = np.roll(z, -1, axis=-2) - z, np.roll(e, -1, axis=-1) - e
-    # Along an edge of each, (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e = a + b t + (c + d t) u, with t
-    # and u from 0 to 1. It is zero where t = -(a + c u) / (b + d u) is real.
-    product, held, give = h12 * h21, z + h11, 1 + h22 * e
+    t, u = _edges_meet(h11, h12 * h21, h22, z, dz, e, de)
+    crossing = np.any((t >= 0) & (t <= 1) & (u >= 0) & (u <= 1), axis=(0, -2, -1))
+    # No edges cross if one region is within the other.
+    felt = transmitted_impedance(H, e[..., 0, 0])
+    z1, h11, h12, h21, h22 = (x[..., 0, 0] for x in (z, h11, h12, h21, h22))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        wanted = 1 / (h12 * h21 / (z1 + h11) - h22)
+    return crossing | hand.contains(-felt, omega) | environment.contains(wanted, omega)
+
+
+def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange, damping: float = 0.0) -> Real:
+    """The softest wall with which some hand of the range oscillates at each frequency [N/m].
+
+    The least over the frequencies is the stiffness up to which all hands of the range are stable,
+    if they are without a wall; infinite if none of them oscillates with any. Exact, as
+    `can_oscillate`.
+
+    Args:
+        H: (..., 2, 2).
+        omega: [rad/s], broadcasts with H[..., 0, 0].
+        hand: the range.
+        damping: of the wall [N s/m].
+    """
+    h11, h12, h21, h22 = (entry[..., None] for entry in entries(H))
+    z = hand.corners(omega)
+    wall: Complex = np.array(damping, dtype=complex)
+    stiffer: Complex = (-1j / omega)[..., None]
+    t, u = _edges_meet(h11, h12 * h21, h22, z, np.roll(z, -1, axis=-1) - z, wall, stiffer)
+    limit = np.min(np.where((t >= 0) & (t <= 1) & (u >= 0), u, np.inf), axis=(0, -1))
+    return np.where(hand.contains(-transmitted_impedance(H, wall), omega), 0.0, limit)
+
+
+def _edges_meet(
+    h11: Complex, product: Complex, h22: Complex, z: Complex, dz: Complex, e: Complex, de: Complex
+) -> tuple[Real, Real]:
+    """(2, ...) t and u, nan if none, at which a hand z + t dz oscillates with a wall e + u de."""
+    # (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e = a + b t + (c + d t) u; it is zero where
+    # t = -(a + c u) / (b + d u) is real.
+    held, give = z + h11, 1 + h22 * e
     a, b = held * give - product * e, dz * give
     c, d = (held * h22 - product) * de, dz * h22 * de
     # (a + c u) conj(b + d u) as a polynomial of u: its imaginary part vanishes.
@@ -292,13 +342,7 @@ def can_oscillate(
         half = -(p1.imag + np.copysign(np.sqrt(p1.imag**2 - 4 * p2.imag * p0.imag), p1.imag)) / 2
         u = np.stack([half / p2.imag, p0.imag / half])
         size = _square(b) + u * (2 * (b * d.conj()).real + u * _square(d))
-        t = -(p0.real + u * (p1.real + u * p2.real)) / size
-        crossing = np.any((t >= 0) & (t <= 1) & (u >= 0) & (u <= 1), axis=(0, -2, -1))
-        # No edges cross if one region is within the other.
-        felt = transmitted_impedance(H, e[..., 0, 0])
-        z1, h11, h12, h21, h22 = (x[..., 0, 0] for x in (z, h11, h12, h21, h22))
-        wanted = 1 / (h12 * h21 / (z1 + h11) - h22)
-    return crossing | hand.contains(-felt, omega) | environment.contains(wanted, omega)
+        return -(p0.real + u * (p1.real + u * p2.real)) / size, u
 
 
 def bounded_singular_value(

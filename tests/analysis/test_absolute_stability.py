@@ -239,7 +239,8 @@ def roots(axis: OneAxis, hand: np.ndarray, wall: np.ndarray) -> np.ndarray:
 
 
 def members(hand: ab.ImpedanceRange, wall: ab.ImpedanceRange, n: int):
-    grids = [np.linspace(*r, n) for r in (*hand, wall.damping, wall.stiffness)]
+    ranges = (hand.mass, hand.damping, hand.stiffness, wall.damping, wall.stiffness)
+    grids = [np.linspace(*r, n) for r in ranges]
     points = np.stack(np.meshgrid(*grids, indexing="ij"), -1).reshape(-1, 5)
     return points[:, :3], points[:, 3:]
 
@@ -350,8 +351,35 @@ def test_how_much_is_given_away_on_the_way_to_a_sufficient_test():
             return np.all(ab.bounded_singular_value(H, omega, hand, wall(stiffness)) < 1)
 
         largest, sufficient = last(quiet, 1e4), last(small, 1e4)
+        limit = np.min(ab.stiffness_limit(H, omega, hand))
+        assert limit == pytest.approx(largest, rel=2e-3)
         assert largest == pytest.approx(exact, rel=0.02)
         assert 0.9 * largest < sufficient < largest
+
+
+def test_stiffness_limit_of_an_ideal_servo_is_that_of_its_lightest_grip():
+    omega, hand = np.linspace(1.0, 100.0, 4000), ab.range_of_grips()
+    for delay in (0.002, 0.01, 0.05):
+        axis = OneAxis(ideal_servo=True, delay=delay)
+        limit = np.min(ab.stiffness_limit(tp.hybrid(axis, 1j * omega), omega, hand))
+        stiffnesses = limit * np.array([0.995, 1.005])
+        wall = ab.ImpedanceRange((0.0, 0.0), (0.0, 0.0), tuple(stiffnesses))
+        hands, walls = members(hand, wall, 11)
+        trip = first_crossing(
+            hands[:, 0] + axis.device_mass, hands[:, 1] + 0.5, hands[:, 2], walls[:, 1] / 17.5
+        )
+        assert np.min(trip[walls[:, 1] == stiffnesses[0]]) > 2 * delay
+        assert np.min(trip[walls[:, 1] == stiffnesses[1]]) < 2 * delay
+    # A wall that some hands of the range do not even need.
+    unstable = tp.absorb(tp.hybrid(axis, 1j * omega), hand=-1e3)
+    wide = ab.ImpedanceRange((0.0, 1.0), (0.0, 2e3), (0.0, 1e3))
+    assert np.min(ab.stiffness_limit(unstable, omega, wide)) == 0.0
+
+
+def test_a_range_is_from_its_smallest_to_its_largest():
+    for bad in ((2.0, 1.0), (0.0, np.inf), (np.nan, 1.0)):
+        with pytest.raises(DrakeTeleopError, match="damping: no range"):
+            ab.ImpedanceRange((0.0, 0.0), bad, (0.0, 1.0))
 
 
 @pytest.mark.parametrize(
