@@ -321,7 +321,7 @@ def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange, damping: floa
     h11, h12, h21, h22 = (entry[..., None] for entry in entries(H))
     z = hand.corners(omega)
     wall: Complex = np.array(damping, dtype=complex)
-    stiffer: Complex = (-1j / omega)[..., None]
+    stiffer: Complex = np.array(-1j / omega, dtype=complex)[..., None]
     t, u = _edges_meet(h11, h12 * h21, h22, z, np.roll(z, -1, axis=-1) - z, wall, stiffer)
     limit = np.min(np.where((t >= 0) & (t <= 1) & (u >= 0), u, np.inf), axis=(0, -1))
     return np.where(hand.contains(-transmitted_impedance(H, wall), omega), 0.0, limit)
