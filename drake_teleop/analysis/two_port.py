@@ -285,7 +285,7 @@ def from_control(system: control.lti.LTI, omega: NDArray[np.float64] | None = No
     """The response of a python-control object: (n, outputs, inputs), or (n,) of a single one.
 
     Args:
-        system: FRD, TransferFunction or StateSpace.
+        system: FRD, TransferFunction or StateSpace, continuous or sampled.
         omega: (n,) [rad/s]; None takes those that an FRD has.
 
     Raises:
@@ -295,7 +295,9 @@ def from_control(system: control.lti.LTI, omega: NDArray[np.float64] | None = No
         omega = getattr(system, "omega", None)
     if omega is None:
         raise DrakeTeleopError("no frequencies", where="omega", remedy="say at which to evaluate")
-    response = np.moveaxis(system(1j * omega, squeeze=False), -1, 0)
+    sampled = system.isdtime(strict=True)
+    points = np.exp(1j * omega * system.dt) if sampled else 1j * omega
+    response = np.moveaxis(system(points, squeeze=False), -1, 0)
     return response[:, 0, 0] if response.shape[1:] == (1, 1) else response
 
 

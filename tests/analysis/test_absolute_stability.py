@@ -34,7 +34,7 @@ def test_llewellyn_agrees_with_trying_lossless_loads():
     stable = (ab.scanned_resistance(H) >= 0) & (H[:, 1, 1].real >= 0)
     assert np.array_equal(ab.absolutely_stable(H), stable)
     assert 1000 < np.sum(stable) < 4000
-    # And by random passive loads at both ends: |det| of the terminated station has no zero.
+    # And with loads at random, which know nothing of the circle that the scan walks on.
     rng = np.random.default_rng(2)
     for h, is_stable in zip(H[:200], stable[:200], strict=True):
         z_e = 1j * np.tan(rng.uniform(-np.pi / 2, np.pi / 2, 20000)) * np.exp(rng.normal())

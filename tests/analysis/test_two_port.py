@@ -246,6 +246,9 @@ def test_control_objects_in_and_out():
     frd = tp.to_frd(H, OMEGA)
     assert np.array_equal(tp.from_control(frd), H)
     assert np.array_equal(tp.from_control(tp.to_frd(H[:, 0, 0], OMEGA)), H[:, 0, 0])
+    backward = control.tf([1, -1], [1e-3, 0], 1e-3)  # (z - 1) / (z T)
+    z = np.exp(1e-3 * S)
+    np.testing.assert_allclose(tp.from_control(backward, OMEGA), (z - 1) / (1e-3 * z), rtol=1e-9)
     servo = control.ss(tp.transfer_function(axis)[1, 1])
     np.testing.assert_allclose(tp.from_control(servo, OMEGA), H[:, 1, 1], rtol=1e-9)
 
