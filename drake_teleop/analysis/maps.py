@@ -32,6 +32,7 @@ from drake_teleop.analysis.sampled_loop import (
     loop_response,
     unstable_multipliers,
 )
+from drake_teleop.analysis.transparency import ideal_impedance
 from drake_teleop.errors import DrakeTeleopError
 
 Array = NDArray[np.float64]
@@ -120,11 +121,10 @@ def stability_map(
 
 
 def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _BAND) -> Array:
-    """The largest error of the force that the hand feels when it moves, in a band, (...).
+    """How far off what the hand has to exert is, the worst of a band, (...).
 
-    The error of what the loop displays against the ideal k_f l_p (gamma Z_e + sigma m_t s), as a
-    share of all that the hand would have to exert ideally: for itself, the device and that. So it
-    is small where the hand would not notice, in free motion too.
+    All of it: for itself, the device and what the loop displays, as a share of the same with the
+    `ideal_impedance`. So it is small where the hand would not notice, in free motion too.
 
     Args:
         axis: the axis (...), its delay one way.
@@ -136,11 +136,10 @@ def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _BAND) -> Ar
     )
     w = np.atleast_1d(np.asarray(frequency, dtype=float))
     s: Complex = 1j * w.reshape(-1, *[1] * len(shape))
-    load = axis.gamma * environment_impedance(axis, s) + axis.sigma * axis.tool_mass * s
-    ideal = axis.force_scale * axis.position_scale * load
-    own = hand_impedance(axis, s) + device_impedance(axis, s)
-    displayed = -loop_response(loop, w, axis.delay) * own
-    return np.abs((displayed - ideal) / (own + ideal)).max(axis=0)
+    hand = hand_impedance(axis, s)
+    ideal = hand + ideal_impedance(axis, s, environment_impedance(axis, s))
+    exerted = (hand + device_impedance(axis, s)) * (1 - loop_response(loop, w, axis.delay))
+    return np.abs(exerted / ideal - 1).max(axis=0)
 
 
 def _increasing(name: str, values: ArrayLike) -> Array:

@@ -51,6 +51,7 @@ _HAND, _ENVIRONMENT, _RECEIVED = -3, -2, -1
 _MOST_EVENTS = 1000
 # Frequencies at which L is looked at, as angles of z: five decades up to half the hand's rate.
 _ANGLES = np.pi * np.logspace(-5, 0, 401)
+_AROUND = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
 _MOST_CROSSINGS = 32
 _ON_THE_CIRCLE = 1e-9  # a multiplier as close to 1 is taken for 1
 
@@ -546,7 +547,7 @@ def _find_crossings(opened, closed, angles, found):
         if size > 1.0:
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
-        for angle in angles:
+        for angle in _with_peaks(angles, poles):
             last_size, last_phase = size, phase
             value = _loop(zeros, poles, complex(math.cos(angle), math.sin(angle)))
             size, phase = abs(value), _unwrapped(value, last_phase)
@@ -568,6 +569,21 @@ def _find_crossings(opened, closed, angles, found):
         if size > 1.0 and count < found.shape[2]:
             found[0, n, count], found[2, n, count] = math.pi, 1.0
             found[1, n, count] = math.pi * np.rint(phase / math.pi)
+
+
+@njit(cache=True)
+def _with_peaks(angles, poles):
+    """The angles, and more at every pole, where |L| may have a peak as narrow as 1 - |pole|."""
+    all_angles = np.empty(angles.shape[0] + _AROUND.shape[0] * poles.shape[0])
+    all_angles[: angles.shape[0]] = angles
+    count = angles.shape[0]
+    for pole in poles:
+        for share in _AROUND:
+            angle = abs(math.atan2(pole.imag, pole.real)) + share * abs(1.0 - abs(pole))
+            if angles[0] < angle < math.pi:
+                all_angles[count] = angle
+                count += 1
+    return np.sort(all_angles[:count])
 
 
 @njit(cache=True)

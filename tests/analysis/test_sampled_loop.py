@@ -55,7 +55,8 @@ def held(grip: str, **fields: float) -> OneAxis:
 axes = st.builds(
     OneAxis,
     hand_mass=st.floats(0.05, 0.6),
-    hand_damping=st.floats(1.0, 25.0),
+    hand_damping=st.floats(0.01, 25.0),
+    device_damping=st.sampled_from([0.0, 0.5]),
     hand_stiffness=st.floats(0.0, 900.0),
     sigma=st.floats(0.0, 2.0),
     gamma=st.floats(0.0, 2.0),
