@@ -26,9 +26,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from drake_teleop.analysis import absolute_stability, margins, two_port
+from drake_teleop.analysis import absolute_stability, margins, transparency, two_port
 from drake_teleop.analysis.maps import StabilityMap, stability_map
-from drake_teleop.analysis.one_axis import OneAxis, environment_impedance
+from drake_teleop.analysis.one_axis import OneAxis, device_impedance, environment_impedance
 from drake_teleop.analysis.sampled_loop import (
     Sampling,
     cut_loop,
@@ -284,11 +284,17 @@ def seconds(call: Callable[[], Any], rounds: int) -> float:
 
 
 def analyse(axis: OneAxis, omega: Array) -> None:
-    """One axis: two-ports, absolute stability, passivity, margins, transmitted impedance."""
+    """One axis: absolute stability, passivity, bounded loads, margins, transparency, sampled."""
     s = 1j * omega
     H = two_port.hybrid(axis, s)
+    wall, device = environment_impedance(axis, s), device_impedance(axis, s)
+    felt = two_port.transmitted_impedance(H, wall)
+    transparency.fidelity(felt, transparency.ideal_impedance(axis, s, wall))
+    transparency.apparent(felt, omega)
+    transparency.tracking(H, wall, device)
+    transparency.transmitted_width(H)
+    transparency.sensitivity(H, wall)
     scaled = two_port.power_scaled(H, two_port.power_ratio(axis))
-    two_port.transmitted_impedance(H, environment_impedance(axis, s))
     absolute_stability.llewellyn(H)
     absolute_stability.required_damping(H)
     absolute_stability.raisbeck(scaled)
