@@ -91,6 +91,13 @@ class DelayedLoop:
             np.asarray(delay),
         )
 
+    def to_control(self, omega: ArrayLike) -> Any:
+        """A single loop with its delay as control.FrequencyResponseData at omega (n,) [rad/s]."""
+        import control
+
+        omega = np.asarray(omega, dtype=float)
+        return control.frd(self(1j * omega), omega)
+
     def __call__(self, s: ArrayLike) -> Complex:
         """L at s [rad/s], (n,): (n, *grid)."""
         s = np.asarray(s, dtype=complex)
