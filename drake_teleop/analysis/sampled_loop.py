@@ -115,6 +115,9 @@ class CutLoop:
         angles, phases, signs: (..., 32) where |L(e^(j angle))| passes 1, between 0 and pi: the
             unwrapped phase there, 1 where |L| falls below 1, -1 where it rises above. An end of
             the range that lies within |L| > 1 counts as a crossing. Unused places have sign 0.
+
+    Crossings are looked for at 80 frequencies in a decade, and closely around the cut loop's own:
+    what may be missed is a peak that comes within about 0.1 % of 1.
     """
 
     open: Complex
@@ -123,6 +126,15 @@ class CutLoop:
     angles: Array
     phases: Array
     signs: Array
+
+    @classmethod
+    def of(cls, opened: Complex, closed: Complex, period: ArrayLike) -> CutLoop:
+        """From the multipliers and the period; finds the crossings."""
+        n = opened.shape[-1]
+        found = np.zeros((3, *opened.shape[:-1], _MOST_CROSSINGS))
+        places = found.reshape(3, -1, _MOST_CROSSINGS)
+        _find_crossings(opened.reshape(-1, n), closed.reshape(-1, n), _ANGLES, places)
+        return cls(opened, closed, np.broadcast_to(period, opened.shape[:-1]), *found)
 
 
 def delay_steps(axis: OneAxis, sampling: Sampling) -> int:
@@ -247,12 +259,7 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
     closed[..., :, _SAMPLE] += M[..., :n, n + 3 + _RECEIVED]
     opened = np.linalg.eigvals(M[..., :n, :n]).astype(np.complex128)
     zeros = np.linalg.eigvals(closed).astype(np.complex128)
-    shape = opened.shape[:-1]
-    found = np.zeros((3, *shape, _MOST_CROSSINGS))
-    _find_crossings(
-        opened.reshape(-1, n), zeros.reshape(-1, n), _ANGLES, found.reshape(3, -1, _MOST_CROSSINGS)
-    )
-    return CutLoop(opened, zeros, np.broadcast_to(1 / np.asarray(sampling.hand_hz), shape), *found)
+    return CutLoop.of(opened, zeros, 1 / np.asarray(sampling.hand_hz))
 
 
 def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -> Complex:

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from drake_teleop.analysis.one_axis import OneAxis
 from drake_teleop.analysis.sampled_loop import (
+    CutLoop,
     Sampling,
     cut_loop,
     delay_margin,
@@ -181,6 +182,27 @@ def test_the_argument_principle_counts_what_eigenvalues_say(
     if np.abs(size - 1).min() > 1e-9:  # on the circle itself there is nothing to count
         count = unstable_multipliers(cut_loop(axis, sampling), delay)
         assert count == (size > 1).sum()
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    poles=st.lists(st.floats(-1.2, 1.2), min_size=2, max_size=4),
+    numerator=st.lists(st.floats(-2.0, 2.0), min_size=2, max_size=2),
+    D=st.integers(0, 12),
+)
+def test_the_count_holds_for_any_loop_and_at_both_ends_of_the_circle(
+    poles: list[float], numerator: list[float], D: int
+) -> None:
+    """|L| > 1 at z = 1 or -1, either sign, unstable cut loops; against the roots themselves."""
+    p, q = np.poly(poles), np.array(numerator)
+    loop = CutLoop.of(np.array(poles, complex), np.roots(np.polysub(p, q)).astype(complex), 1.0)
+    size = np.abs(np.roots(np.polysub(np.append(p, np.zeros(D)), q)))
+    on_the_circle = np.abs(np.concatenate([size, np.abs(poles)]) - 1).min() < 1e-3
+    w = np.linspace(0, np.pi, 2001)
+    gain = np.abs(loop_response(loop, w))
+    grazing = np.abs(gain[1:-1] - 1)[(np.diff(gain)[1:] * np.diff(gain)[:-1]) <= 0]
+    if not on_the_circle and (grazing > 1e-2).all():
+        assert unstable_multipliers(loop, D / 2) == (size > 1).sum()
 
 
 @pytest.mark.parametrize("sampling", [STATION, JR3])
