@@ -113,13 +113,15 @@ def positive_real(system: control.lti.LTI) -> bool:
             "this system has no state space", remedy="test its admittance"
         ) from error
     n, m = model.nstates, model.ninputs
-    # G(s + e) is strictly stable where G is, and still positive real if G is: so poles and zeros on
-    # the axis, as of a lossless spring, need no case of their own.
-    shift = 1e-9 * max(1.0, np.max(np.abs(model.poles()), initial=0.0))
-    A = model.A - shift * np.eye(n)
-    B, C, D = model.B, model.C, model.D
-    if n and np.max(linalg.eigvals(A).real) >= 0:
+    # G(s + e) is positive real for all small e > 0 if and only if G is: so poles on the axis, as of
+    # a lossless spring, need no case of their own.
+    poles = model.poles()
+    shift = 1e-11 * max(1.0, np.max(np.abs(poles), initial=0.0))
+    furthest = np.max(poles.real, initial=-np.inf)
+    if furthest >= shift:
         return False
+    A = model.A - (shift if furthest > -shift else 0.0) * np.eye(n)
+    B, C, D = model.B, model.C, model.D
     pencil = np.block([[A, np.zeros((n, n)), B], [np.zeros((n, n)), -A.T, -C.T], [C, B.T, D + D.T]])
     finite = linalg.block_diag(np.eye(2 * n), np.zeros((m, m)))
     found = np.abs(linalg.eigvals(pencil, finite).imag)

@@ -245,6 +245,18 @@ def members(hand: ab.ImpedanceRange, wall: ab.ImpedanceRange, n: int):
     return points[:, :3], points[:, 3:]
 
 
+def test_a_region_within_the_other_is_found():
+    """No edges cross, yet there is a member that oscillates."""
+    direct, omega = tp.two_port(np.zeros(1), 1.0, -1.0, 0.0), np.array([2.0])  # Z_to = Z_e
+    large = ab.ImpedanceRange((-10.0, 10.0), (-10.0, 10.0), (0.0, 0.0))
+    small = ab.ImpedanceRange((0.9, 1.1), (-1.1, -0.9), (0.0, 0.0))
+    mirrored = ab.ImpedanceRange((-1.1, -0.9), (0.9, 1.1), (0.0, 0.0))
+    assert ab.can_oscillate(direct, omega, large, small)[0]
+    assert ab.can_oscillate(direct, omega, small, large)[0]
+    assert ab.can_oscillate(direct, omega, small, mirrored)[0]
+    assert not ab.can_oscillate(direct, omega, small, small)[0]
+
+
 def random_ranges(rng: np.random.Generator) -> tuple[ab.ImpedanceRange, ab.ImpedanceRange]:
     def between(low, high):
         return tuple(np.sort(np.exp(rng.uniform(np.log(low), np.log(high), 2))))
@@ -402,6 +414,16 @@ def test_a_range_is_from_its_smallest_to_its_largest():
 )
 def test_positive_real(numerator, denominator, passive):
     assert ab.positive_real(control.tf(numerator, denominator)) is passive
+
+
+@pytest.mark.parametrize(("depth", "passive"), [(0.99, True), (1.01, False)])
+def test_positive_real_does_not_miss_a_narrow_notch(depth, passive):
+    """Re G is negative within a millionth of a frequency only."""
+    for w in (0.3, 17.0, 900.0):
+        notch = control.tf([2e-6 * w, 0], [1, 2e-6 * w, w**2])
+        lag = control.tf([1, 0], [1, 400.0])  # Adds some at high frequencies, where the rest is.
+        assert ab.positive_real(control.ss(1 - depth * notch)) is passive
+        assert ab.positive_real(control.ss(1 + 1e-3 * lag - depth * notch)) is passive
 
 
 def test_positive_real_of_stations():
