@@ -57,8 +57,8 @@ _OUTPUTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twis
 
 # Displacements up and down. The error of a difference is their square, or rounding over them.
 _ANGLE, _RATE, _OTHER = 1e-4, 1e-4, 1.0
-# So little that even a servo of a few samples stays within the motors' torque.
-_COMMAND = 2e-6
+_ACCELERATION = 20.0  # rad/s^2, that the servo may ask of a joint: within the motors' torque
+_IN_CONTACT = 1e-6  # rad, m: much less than what a newton indents
 _AT_REST = 1e-6  # of these displacements, that a state of rest may move in a period
 _MOST_STEPS = 8  # of Newton's method on the way to rest
 _RAMP, _SETTLE = 0.3, 0.1  # s, of the slave on its way to the operating point, and there
@@ -321,6 +321,10 @@ class _Period:
         self._push = ExternallyAppliedSpatialForce()
         self._push.body_index = plant.GetBodyByName("tool").index()
         self._sensor = None if smooth.wrist_sensor.ideal else self._system("wrist_sensor")
+        servo = smooth.joint_control
+        gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
+        largest = _ANGLE if smooth.sheet_spring is None else _IN_CONTACT
+        self._joint_step = min(largest, _ACCELERATION / gain)
         self._groups = self._state_groups()
         self._steps = np.concatenate([group.steps for group in self._groups])
         self.states = tuple(
@@ -360,7 +364,7 @@ class _Period:
             whole("master_device", 1, np.full(7, _ANGLE)),
             whole("master_device", 2, np.full(6, _RATE)),
             whole("joint_control", 0, np.full(6, _OTHER)),
-            _States("slave_plant", None, slice(None), np.repeat([_COMMAND, _RATE], joints)),
+            _States("slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE], joints)),
             whole("wrist_sensor", 0, np.full(16, _OTHER), np.full(sample - 16, _ANGLE)),
         ]
         if self._sensor is not None:
@@ -504,7 +508,7 @@ class _Period:
         B = np.empty((len(x), 24))
         for k in range(24):
             ends = []
-            step = _COMMAND if 6 <= k < 12 else _OTHER
+            step = self._joint_step if 6 <= k < 12 else _OTHER
             for sign in (1.0, -1.0):
                 self._set(x)
                 self._apply(sign * step * np.eye(24)[k])
