@@ -52,7 +52,9 @@ _MOST_EVENTS = 1000
 # Frequencies at which L is looked at, as angles of z: five decades up to half the hand's rate.
 _ANGLES = np.pi * np.logspace(-5, 0, 401)
 _AROUND = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
+_GOLDEN, _GOLDEN_STEPS = 0.6180339887498949, 25
 _MOST_CROSSINGS = 32
+_DOUBLINGS, _HALVINGS, _NEWTON_STEPS = 12, 30, 12  # for the rate of growth, from 1/s
 _ON_THE_CIRCLE = 1e-9  # a multiplier as close to 1 is taken for 1
 
 
@@ -116,8 +118,8 @@ class CutLoop:
             unwrapped phase there, 1 where |L| falls below 1, -1 where it rises above. An end of
             the range that lies within |L| > 1 counts as a crossing. Unused places have sign 0.
 
-    Crossings are looked for at 80 frequencies in a decade, and closely around the cut loop's own:
-    what may be missed is a peak that comes within about 0.1 % of 1.
+    Crossings are looked for between 80 frequencies in a decade, more around the cut loop's own, and
+    the peaks that those leave near 1.
     """
 
     open: Complex
@@ -128,13 +130,20 @@ class CutLoop:
     signs: Array
 
     @classmethod
-    def of(cls, opened: Complex, closed: Complex, period: ArrayLike) -> CutLoop:
-        """From the multipliers and the period; finds the crossings."""
-        n = opened.shape[-1]
-        found = np.zeros((3, *opened.shape[:-1], _MOST_CROSSINGS))
-        places = found.reshape(3, -1, _MOST_CROSSINGS)
-        _find_crossings(opened.reshape(-1, n), closed.reshape(-1, n), _ANGLES, places)
-        return cls(opened, closed, np.broadcast_to(period, opened.shape[:-1]), *found)
+    def of(
+        cls, opened: Complex, closed: Complex, period: ArrayLike, level: ArrayLike = 1.0
+    ) -> CutLoop:
+        """From the multipliers and the period; finds the crossings, of |L| = level."""
+        shape, n = opened.shape[:-1], opened.shape[-1]
+        found = np.zeros((3, *shape, _MOST_CROSSINGS))
+        _find_crossings(
+            opened.reshape(-1, n),
+            closed.reshape(-1, n),
+            np.broadcast_to(level, shape).ravel(),
+            _ANGLES,
+            found.reshape(3, -1, _MOST_CROSSINGS),
+        )
+        return cls(opened, closed, np.broadcast_to(period, shape), *found)
 
 
 def delay_steps(axis: OneAxis, sampling: Sampling) -> int:
@@ -310,6 +319,62 @@ def delay_margin(loop: CutLoop) -> Array:
     steps = np.mod(loop.phases, 2 * np.pi) / np.where(inside, loop.angles, 1.0)
     first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period
     return np.where(unstable_multipliers(loop, 0.0) > 0, 0.0, first)
+
+
+def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
+    """The largest multiplier of the closed loop, of a pair the one above the real axis, (...).
+
+    By the same count as `unstable_multipliers` on circles of other radii, bisected, and Newton's
+    method from there: no matrix grows with the delay.
+
+    Args:
+        loop: the cut loop (...).
+        delay: one way [s], (...); exact at whole hand periods.
+    """
+    shape = np.broadcast_shapes(loop.period.shape, np.shape(delay))
+    n = loop.open.shape[-1]
+    opened, closed = (np.broadcast_to(m, (*shape, n)) for m in (loop.open, loop.closed))
+    period = np.broadcast_to(loop.period, shape)
+    delay = np.broadcast_to(np.asarray(delay, dtype=float), shape)
+    D = 2 * delay / period
+
+    def on_circle(growth: Array) -> CutLoop:
+        radius = np.exp(growth * period)[..., None]
+        return CutLoop.of(opened / radius, closed / radius, period, radius[..., 0] ** D)
+
+    # Growth rates: one with no multiplier outside, one with some.
+    high, low = np.ones(shape), -np.ones(shape)
+    for _ in range(_DOUBLINGS):
+        some = unstable_multipliers(on_circle(high), delay) > 0
+        none = unstable_multipliers(on_circle(low), delay) == 0
+        if not (some | none).any():
+            break
+        high, low = np.where(some, 2 * high, high), np.where(none, 2 * low, low)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        some = unstable_multipliers(on_circle(middle), delay) > 0
+        low, high = np.where(some, middle, low), np.where(some, high, middle)
+    # Which one it is: roots of P (1 - z^-D) + M z^-D with P and M the products over `open` and
+    # `closed`, from where |L| crosses on the circle and from the multipliers without delay.
+    radius = np.exp(high * period)[..., None]
+    crossings = np.where(radius > 0, radius * np.exp(1j * on_circle(high).angles), 0)
+    z = np.concatenate([crossings, closed * (1 + 1e-7)], axis=-1)
+    opened, closed, D = opened[..., None, :], closed[..., None, :], D[..., None]
+    found = np.zeros(z.shape, dtype=bool)
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            to_open, to_closed = z[..., None] - opened, z[..., None] - closed
+            P, M, late = to_open.prod(axis=-1), to_closed.prod(axis=-1), z**-D
+            slope = P * (1 / to_open).sum(axis=-1) * (1 - late)
+            slope += (M * (1 / to_closed).sum(axis=-1) + (P - M) * D / z) * late
+            value = P * (1 - late) + M * late
+            step = np.where(value == 0, 0.0, value / slope)
+            # Once there it stays: on a root that is in P or M itself the slope means nothing.
+            z = np.where(found | ~np.isfinite(step), z, z - step)
+            found |= np.abs(step) < 1e-10
+    off = np.where(found, np.abs(np.abs(z) / radius - 1), np.inf)
+    z = np.take_along_axis(z, off.argmin(axis=-1)[..., None], axis=-1)[..., 0]
+    return np.where(z.imag < 0, z.conj(), z)
 
 
 def _cut_map(axis: OneAxis, sampling: Sampling) -> Array:
@@ -535,7 +600,9 @@ def _exponential(M: Array) -> Array:
 
 
 @njit(cache=True)
-def _loop(closed, opened, z):
+def _loop(closed, opened, angle, radius):
+    """L at z = radius e^(j angle)."""
+    z = complex(radius * math.cos(angle), radius * math.sin(angle))
     ratio = 1.0 + 0.0j
     for i in range(opened.shape[0]):
         ratio *= (z - closed[i]) / (z - opened[i])
@@ -543,37 +610,35 @@ def _loop(closed, opened, z):
 
 
 @njit(cache=True)
-def _find_crossings(opened, closed, angles, found):
-    """Writes where |L| passes 1: angles, unwrapped phases, signs, `found` (3, loops, places)."""
+def _find_crossings(opened, closed, levels, angles, found):
+    """Writes where |L| passes the level: angles, phases, signs, `found` (3, loops, places)."""
     for n in range(opened.shape[0]):
-        poles, zeros, count = opened[n], closed[n], 0
+        poles, zeros, level, count = opened[n], closed[n], levels[n], 0
         # Around z = 1, where the cut loop has a multiplier if the hand has no stiffness.
-        value = _loop(zeros, poles, complex(1.0 + _ON_THE_CIRCLE))
+        value = _loop(zeros, poles, 0.0, 1.0 + _ON_THE_CIRCLE)
         before, size = 0.0, abs(value)
         phase = 0.0 if value.real >= 0.0 else math.pi
-        if size > 1.0:
+        if size > level:
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
-        for angle in _with_peaks(angles, poles):
+        for angle in _with_extremes(_with_peaks(angles, poles), poles, zeros, level):
             last_size, last_phase = size, phase
-            value = _loop(zeros, poles, complex(math.cos(angle), math.sin(angle)))
+            value = _loop(zeros, poles, angle, 1.0)
             size, phase = abs(value), _unwrapped(value, last_phase)
-            if (size > 1.0) != (last_size > 1.0) and count < found.shape[2]:
+            if (size > level) != (last_size > level) and count < found.shape[2]:
                 low, high = before, angle
                 while high - low > 1e-12 * high:
                     middle = 0.5 * (low + high)
-                    crossing = _loop(zeros, poles, complex(math.cos(middle), math.sin(middle)))
-                    if (abs(crossing) > 1.0) == (last_size > 1.0):
+                    if (abs(_loop(zeros, poles, middle, 1.0)) > level) == (last_size > level):
                         low = middle
                     else:
                         high = middle
-                crossing = _loop(zeros, poles, complex(math.cos(low), math.sin(low)))
                 found[0, n, count] = low
-                found[1, n, count] = _unwrapped(crossing, last_phase)
+                found[1, n, count] = _unwrapped(_loop(zeros, poles, low, 1.0), last_phase)
                 found[2, n, count] = 1.0 if size < last_size else -1.0
                 count += 1
             before = angle
-        if size > 1.0 and count < found.shape[2]:
+        if size > level and count < found.shape[2]:
             found[0, n, count], found[2, n, count] = math.pi, 1.0
             found[1, n, count] = math.pi * np.rint(phase / math.pi)
 
@@ -581,16 +646,41 @@ def _find_crossings(opened, closed, angles, found):
 @njit(cache=True)
 def _with_peaks(angles, poles):
     """The angles, and more at every pole, where |L| may have a peak as narrow as 1 - |pole|."""
-    all_angles = np.empty(angles.shape[0] + _AROUND.shape[0] * poles.shape[0])
-    all_angles[: angles.shape[0]] = angles
-    count = angles.shape[0]
+    more = np.empty(_AROUND.shape[0] * poles.shape[0])
+    count = 0
     for pole in poles:
         for share in _AROUND:
             angle = abs(math.atan2(pole.imag, pole.real)) + share * abs(1.0 - abs(pole))
             if angles[0] < angle < math.pi:
-                all_angles[count] = angle
+                more[count] = angle
                 count += 1
-    return np.sort(all_angles[:count])
+    return np.sort(np.concatenate((angles, more[:count])))
+
+
+@njit(cache=True)
+def _with_extremes(angles, poles, zeros, level):
+    """The angles, and where between them |L| comes nearest to the level, to pass it or not."""
+    size = np.empty(angles.shape[0])
+    for i in range(angles.shape[0]):
+        size[i] = abs(_loop(zeros, poles, angles[i], 1.0))
+    more = np.empty(angles.shape[0])
+    count = 0
+    for i in range(1, angles.shape[0] - 1):
+        below = size[i] <= level
+        sign = 1.0 if below else -1.0
+        is_extreme = sign * size[i] >= max(sign * size[i - 1], sign * size[i + 1])
+        if is_extreme and 0.5 * level < size[i] < 2.0 * level:
+            low, high = angles[i - 1], angles[i + 1]
+            for _ in range(_GOLDEN_STEPS):
+                a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+                at_a, at_b = _loop(zeros, poles, a, 1.0), _loop(zeros, poles, b, 1.0)
+                if sign * abs(at_a) > sign * abs(at_b):
+                    high = b
+                else:
+                    low = a
+            more[count] = 0.5 * (low + high)
+            count += 1
+    return np.sort(np.concatenate((angles, more[:count])))
 
 
 @njit(cache=True)

@@ -20,6 +20,7 @@ from drake_teleop.analysis.sampled_loop import (
     Sampling,
     cut_loop,
     delay_margin,
+    dominant_multiplier,
     growth_rate,
     loop_response,
     multipliers,
@@ -182,6 +183,35 @@ def test_the_argument_principle_counts_what_eigenvalues_say(
     if np.abs(size - 1).min() > 1e-9:  # on the circle itself there is nothing to count
         count = unstable_multipliers(cut_loop(axis, sampling), delay)
         assert count == (size > 1).sum()
+
+
+@settings(max_examples=60, deadline=None)
+@given(axis=axes, steps=st.integers(0, 60), low_pass=st.booleans())
+def test_the_dominant_multiplier_is_the_largest_eigenvalue(
+    axis: OneAxis, steps: int, low_pass: bool
+) -> None:
+    sampling = JR3 if low_pass else STATION
+    delay = steps / sampling.hand_hz
+    values = multipliers(sampled_loop(replace(axis, delay=delay), sampling))
+    largest = np.abs(values).max()
+    # Of several that are equally large it may be any; a double one has but half the digits.
+    alike = values[np.abs(values) > largest - 1e-7]
+    found = dominant_multiplier(cut_loop(axis, sampling), delay)
+    assert abs(found) == pytest.approx(largest, abs=1e-8)
+    assert np.abs(alike.real + 1j * np.abs(alike.imag) - found).min() < 1e-6
+
+
+def test_the_dominant_multiplier_of_long_delays_and_arrays() -> None:
+    """Two seconds one way would be 8000 registers; the loop still returns to itself."""
+    loop = cut_loop(replace(OneAxis(), sigma=np.array([0.0, 1.0])), STATION)
+    delay = np.array([[0.02], [2.0]])
+    found = dominant_multiplier(loop, delay)
+    assert found.shape == (2, 2)
+    back = 1 - np.prod((found[..., None] - loop.closed) / (found[..., None] - loop.open), axis=-1)
+    np.testing.assert_allclose(back * found ** -np.rint(2 * delay * 2e3), 1.0, atol=1e-8)
+    one = growth_rate(sampled_loop(OneAxis(delay=0.02), STATION))
+    assert np.log(abs(found[0, 0])) * 2e3 == pytest.approx(one, rel=1e-6)
+    assert ((np.abs(found) > 1) == (unstable_multipliers(loop, delay) > 0)).all()
 
 
 @settings(max_examples=200, deadline=None)
