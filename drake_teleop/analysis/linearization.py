@@ -62,7 +62,9 @@ _IN_CONTACT = 1e-6  # rad, m: much less than what a newton indents
 _AT_REST = 1e-6  # of these displacements, that a state of rest may move in a period
 _MOST_STEPS = 8  # of Newton's method on the way to rest
 _RAMP, _SETTLE = 0.3, 0.1  # s, of the slave on its way to the operating point, and there
-_LARGEST_DENSE = 800  # states, beyond which eigenvalues are sought by Arnoldi's method
+_LARGEST_DENSE = 800  # states, beyond which eigenvalues are sought piece by piece
+_HIGHEST = 100.0  # Hz, up to which
+_AT_ONCE = 40  # of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,18 +122,31 @@ class Linearization:
     def multipliers(self) -> Complex:
         """The eigenvalues of the transition over a period, the largest first; stable below 1.
 
-        With so long a delay that it makes more than 800 states, the 40 largest.
+        With so long a delay that it makes more than 800 states, those near the unit circle up to
+        100 Hz.
         """
-        expanded = self.expanded()
-        if len(expanded.A) <= _LARGEST_DENSE:
-            values = np.linalg.eigvals(expanded.A)
+        size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
+        if size <= _LARGEST_DENSE:
+            values = np.linalg.eigvals(self.expanded().A)
         else:
-            from scipy.sparse import csr_array
-            from scipy.sparse.linalg import eigs
-
-            start = np.random.default_rng(0).standard_normal(len(expanded.A))
-            values = eigs(csr_array(expanded.A), 40, v0=start, return_eigenvectors=False)
+            values = _near_the_circle(self._with_lines(size), 2 * np.pi * _HIGHEST * self.dt)
         return values[np.argsort(-np.abs(values))].astype(complex)
+
+    def _with_lines(self, size: int) -> Any:
+        """`expanded().A`, sparse."""
+        from scipy.sparse import lil_array
+
+        n = end = len(self.A)
+        A = lil_array((size, size), dtype=complex)
+        A[:n, :n] = self.A
+        for rows, columns, periods in self.loops:
+            start, width = end, len(rows)
+            end = start + width * periods
+            A[start : start + width, :n] = self.C[list(rows)]
+            A[:n, end - width : end] = self.B[:, columns]
+            for k in range(start + width, end):
+                A[k, k - width] = 1.0
+        return A.tocsc()
 
     def expanded(self) -> Linearization:
         """The same without `loops`: each delay as a shift register among the states."""
@@ -156,6 +171,26 @@ class Linearization:
     def _indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
         parts = _parts(names) if isinstance(names, str) else names
         return tuple(known.index(name) for name in parts)
+
+
+def _near_the_circle(A: Any, highest: float) -> Complex:
+    """Eigenvalues of a large sparse A near the unit circle, from angle 0 to `highest`.
+
+    A delay's multipliers lie all around the circle, hardly apart in size: what is found at a time
+    are the nearest to a point on it (shift and invert), and the next point is where they end.
+    """
+    from scipy.sparse.linalg import eigs
+
+    start = np.random.default_rng(0).standard_normal(A.shape[0]).astype(complex)
+    found, angle = np.zeros(0, dtype=complex), 0.0
+    while angle < highest:
+        # A little beside the circle, so that none of them is met exactly.
+        shift = 1.0005 * np.exp(1j * angle)
+        values = eigs(A, _AT_ONCE, sigma=shift, v0=start, return_eigenvectors=False)
+        known = np.abs(values[:, None] - found).min(axis=1, initial=np.inf) < 1e-9
+        found = np.concatenate([found, values[~known]])
+        angle = max(float(np.angle(values).max()), angle + 1e-4)
+    return found
 
 
 def _with_register(
@@ -192,8 +227,7 @@ def linearize(
             slave does not come to rest.
     """
     period = _Period(scenario, load_estimate)
-    x = period.rest(np.asarray(displacement, dtype=float))
-    A, C = period.derivative(x)
+    x, A, C = period.rest(np.asarray(displacement, dtype=float))
     B = period.input_derivative(x)
     acts = _acting(A, C)
     names = tuple(name for name, kept in zip(period.states, acts, strict=True) if kept)
@@ -439,8 +473,11 @@ class _Period:
             ]
         )
 
-    def rest(self, displacement: Array) -> Array:
-        """The states at the operating point, where the cut inputs become what keeps it at rest."""
+    def rest(self, displacement: Array) -> tuple[Array, Array, Array]:
+        """The states at the operating point, A and C.
+
+        The cut inputs become what keeps it at rest.
+        """
         start = self._pose
         pose_B = self._start_B.copy()
         pose_B[4:] += displacement
@@ -466,17 +503,16 @@ class _Period:
         self._apply(np.zeros(24))
         return self.get()
 
-    def _newton(self, x: Array) -> Array:
-        """The states where nothing moves. The master rests already; unheld, it could anywhere."""
+    def _newton(self, x: Array) -> tuple[Array, Array, Array]:
+        """To where nothing moves that acts. The master rests already; unheld, it could anywhere."""
         slave = np.array([not name.startswith("master") for name in self.states])
         for _ in range(_MOST_STEPS):
-            self._set(x)
-            moved = self._run() - x
-            if (np.abs(moved) < _AT_REST * self._steps).all():
-                self._set(x)
-                return x
             A, C = self.derivative(x)
             free = slave & _acting(A, C)
+            self._set(x)
+            moved = self._run() - x
+            if (np.abs(moved) < _AT_REST * self._steps)[free].all():
+                return x, A, C
             moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
             x[slave] += moved[slave]
             self._set(x)

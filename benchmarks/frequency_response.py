@@ -1,0 +1,116 @@
+"""How well does the linearised Diagram predict what the nonlinear station does?
+
+A multi-sine is drawn by the operator, with all the sensor's noise, and measured responses are
+compared with those of the linearisation: vertically, in free motion for several sigma, and pressing
+on a leaf. The load is known exactly. Times are thread CPU time.
+
+    python benchmarks/frequency_response.py [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+from drake_teleop.analysis.frequency_response import (
+    MultiSine,
+    measure_frequency_response,
+    predict_frequency_response,
+)
+from drake_teleop.analysis.task_direction import task_direction
+from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.experiments.identification import slave_arm
+from drake_teleop.master.operator import MinimumJerk
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+
+_UP = (0.0, 0.0, 1.0)
+_GAP, _DEPTH = 0.03, 0.03  # m, from the tip to the leaf; how deep it is pressed
+_RATIOS = (
+    ("hand_force", "hand_velocity"),
+    ("felt_force", "hand_velocity"),
+    ("tool_velocity", "hand_velocity"),
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    arguments = parser.parse_args()
+    figures: dict[str, float] = {}
+    for friction in (0.0, 1.0):
+        for sigma in (0.0, 0.5, 1.0, 1.5):
+            name = f"sigma {sigma:g}{', with friction' if friction else ''}"
+            figures |= _compared(name, _scenario(sigma, friction), MultiSine())
+    for ideal in (True, False):
+        pressing = replace(_scenario(0.0, 0.0), sheet_spring=_leaf(), wrist_sensor__ideal=ideal)
+        name = f"pressing, {'ideal' if ideal else 'noisy'} sensor"
+        figures |= _compared(name, pressing, MultiSine(velocity=0.015), -_GAP - _DEPTH)
+    for name, figure in figures.items():
+        print(f"{name:80s} {figure:10.5f}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def _scenario(sigma: float, friction: float) -> Scenario:
+    scenario = LoadScenario("free_motion_force")
+    coulomb = [friction * value for value in scenario.master.friction.coulomb]
+    return replace(
+        scenario,
+        force_scaling__sigma=sigma,
+        operator__grip="medium",
+        master__friction=dataclasses.replace(scenario.master.friction, coulomb=coulomb),
+    )
+
+
+def _leaf() -> SheetSpring:
+    position = [0.55, 0.0, 0.45 - 0.2 - _GAP]
+    return SheetSpring(position=position, length=0.12, width=0.05, thickness=0.0015)
+
+
+def _compared(
+    name: str, scenario: Scenario, excitation: MultiSine, reach: float = 0.0
+) -> dict[str, float]:
+    estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+    if not scenario.wrist_sensor.ideal:
+        estimate[:6] = scenario.wrist_sensor.offset
+    displacement = (0.0, 0.0, reach)
+    task = task_direction(scenario, _UP, displacement=displacement)
+    started = time.thread_time()
+    response = measure_frequency_response(
+        scenario, task, excitation, load_estimate=estimate, approach=_approach(scenario, reach)
+    )
+    figures = {f"{name}: measured in, s": time.thread_time() - started}
+    started = time.thread_time()
+    predicted = predict_frequency_response(
+        scenario, task, response.omega, load_estimate=estimate, displacement=displacement
+    )
+    figures[f"{name}: predicted in, s"] = time.thread_time() - started
+    if not reach:
+        figures[f"{name}: apparent mass, kg"] = response.apparent_mass()
+    for output, input_ in _RATIOS:
+        if output == "felt_force" and not reach and not scenario.force_scaling.sigma:
+            continue  # there is nothing to feel
+        ratio = response.response(output, input_) / predicted.response(output, input_)
+        label = f"{name}: {output} / {input_}"
+        figures[f"{label}, magnitude, %"] = 100 * np.abs(np.abs(ratio) - 1).max()
+        figures[f"{label}, phase, deg"] = np.degrees(np.abs(np.angle(ratio))).max()
+        figures[f"{label}, coherence"] = response.coherence(output, input_).min()
+    return figures
+
+
+def _approach(scenario: Scenario, reach: float) -> list[MinimumJerk]:
+    """So far that the hand's spring leaves it at `reach` [m]."""
+    if not reach or scenario.sheet_spring is None:
+        return []
+    force = scenario.force_scaling.force_scale * scenario.sheet_spring.stiffness * _DEPTH
+    target = reach - force / scenario.operator.hand.stiffness
+    return [MinimumJerk(t_start=0.1, duration=0.8, translation=[0.0, 0.0, target])]
+
+
+if __name__ == "__main__":
+    main()

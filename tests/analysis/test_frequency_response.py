@@ -1,0 +1,100 @@
+"""Frequency responses measured on the nonlinear station against its linearisation."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drake_teleop.analysis.frequency_response import (
+    MultiSine,
+    StationResponse,
+    measure_frequency_response,
+    predict_frequency_response,
+)
+from drake_teleop.analysis.task_direction import task_direction
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.experiments.identification import slave_arm
+from drake_teleop.master.operator import intent_at
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+
+UP = (0.0, 0.0, 1.0)
+EXCITATION = MultiSine(lowest=0.6, period=1.5, settle=1.0)
+
+
+def station(sigma: float, coulomb: float) -> Scenario:
+    """In free motion, with all the sensor's noise, quantisation and offsets."""
+    scenario = LoadScenario("free_motion_force")
+    friction = scenario.master.friction
+    friction = dataclasses.replace(friction, coulomb=[coulomb * c for c in friction.coulomb])
+    return replace(
+        scenario,
+        force_scaling__sigma=sigma,
+        operator__grip="medium",
+        master__friction=friction,
+    )
+
+
+def measured(scenario: Scenario):
+    offset = scenario.wrist_sensor.offset
+    estimate = np.concatenate([offset, slave_arm(scenario).phi_load])
+    task = task_direction(scenario, UP)
+    response = measure_frequency_response(scenario, task, EXCITATION, load_estimate=estimate)
+    predicted = predict_frequency_response(scenario, task, response.omega, load_estimate=estimate)
+    return response, predicted
+
+
+def assert_agrees(
+    response: StationResponse, predicted: StationResponse, output: str, input_: str
+) -> None:
+    ratio = response.response(output, input_) / predicted.response(output, input_)
+    assert np.abs(np.abs(ratio) - 1).max() < 0.02
+    assert np.degrees(np.abs(np.angle(ratio))).max() < 2.0
+    assert response.coherence(output, input_).min() > 0.95
+
+
+def test_station_with_the_tool_felt():
+    response, predicted = measured(station(sigma=1.0, coulomb=0.0))
+    assert response.omega[-1] >= 2 * np.pi * 29.99
+    assert_agrees(response, predicted, "hand_velocity", "hand_force")
+    assert_agrees(response, predicted, "felt_force", "hand_velocity")
+    assert_agrees(response, predicted, "tool_velocity", "hand_velocity")
+    assert response.apparent_mass() == pytest.approx(3.13, rel=0.01)
+    frd = response.to_control("felt_force", "hand_velocity")
+    felt = response.response("felt_force", "hand_velocity")
+    assert frd(1j * response.omega[3]) == pytest.approx(felt[3])
+
+
+def test_station_without_the_tool_and_with_friction():
+    """What is felt is next to nothing; friction, which is not linear, changes only the device."""
+    response, predicted = measured(station(sigma=0.0, coulomb=1.0))
+    assert_agrees(response, predicted, "tool_velocity", "hand_velocity")
+    assert response.apparent_mass() == pytest.approx(0.0, abs=0.02)
+    force, velocity = "hand_force", "hand_velocity"
+    drag = response.response(force, velocity) - predicted.response(force, velocity)
+    assert drag.real.mean() > 0.2  # N s/m
+
+
+def test_multisine():
+    lines = EXCITATION.multiples()
+    assert (lines % 2 == 1).all() and (np.diff(lines) > 0).all()
+    direction = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    segments = EXCITATION.segments(direction, start=0.2)
+    start = np.array([1.0, 0.0, 0.0, 0.0, 0.27, 0.0, 0.03])
+    steps = 3000
+    t = 0.2 + EXCITATION.settle + np.arange(steps) / 2000.0
+    _, twists = intent_at(segments, start, t)
+    velocity = twists[:, 2]
+    spectrum = np.abs(np.fft.rfft(velocity)) * 2 / steps
+    assert spectrum[lines] == pytest.approx(EXCITATION.velocity, rel=1e-6)
+    assert np.delete(spectrum, lines).max() < 1e-6
+    assert np.abs(velocity).max() / velocity.std() < 2.2
+
+
+def test_what_cannot_be_measured_is_said():
+    scenario = station(sigma=1.0, coulomb=0.0)
+    task = task_direction(scenario, UP)
+    with pytest.raises(DrakeTeleopError, match=r"MultiSine\.period"):
+        measure_frequency_response(scenario, task, MultiSine(period=1.0001))
+    few = StationResponse(2 * np.pi * np.array([1.0, 30.0]), {}, 1.0, 1.0)
+    with pytest.raises(DrakeTeleopError, match="4 Hz"):
+        few.apparent_mass()
