@@ -621,9 +621,10 @@ def _find_crossings(opened, closed, levels, angles, found):
         if size > level:
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
-        for angle in _with_extremes(_with_peaks(angles, poles), poles, zeros, level):
+        at, values = _with_extremes(_with_peaks(angles, poles), poles, zeros, level)
+        for i in range(at.shape[0]):
+            angle, value = at[i], values[i]
             last_size, last_phase = size, phase
-            value = _loop(zeros, poles, angle, 1.0)
             size, phase = abs(value), _unwrapped(value, last_phase)
             if (size > level) != (last_size > level) and count < found.shape[2]:
                 low, high = before, angle
@@ -659,15 +660,15 @@ def _with_peaks(angles, poles):
 
 @njit(cache=True)
 def _with_extremes(angles, poles, zeros, level):
-    """The angles, and where between them |L| comes nearest to the level, to pass it or not."""
-    size = np.empty(angles.shape[0])
+    """More angles, where |L| comes nearest to the level between two of them; and L at each."""
+    values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
-        size[i] = abs(_loop(zeros, poles, angles[i], 1.0))
+        values[i] = _loop(zeros, poles, angles[i], 1.0)
+    size = np.abs(values)
     more = np.empty(angles.shape[0])
     count = 0
     for i in range(1, angles.shape[0] - 1):
-        below = size[i] <= level
-        sign = 1.0 if below else -1.0
+        sign = 1.0 if size[i] <= level else -1.0
         is_extreme = sign * size[i] >= max(sign * size[i - 1], sign * size[i + 1])
         if is_extreme and 0.5 * level < size[i] < 2.0 * level:
             low, high = angles[i - 1], angles[i + 1]
@@ -679,8 +680,13 @@ def _with_extremes(angles, poles, zeros, level):
                 else:
                     low = a
             more[count] = 0.5 * (low + high)
+            values = np.append(values, _loop(zeros, poles, more[count], 1.0))
             count += 1
-    return np.sort(np.concatenate((angles, more[:count])))
+    if count == 0:
+        return angles, values
+    angles = np.concatenate((angles, more[:count]))
+    order = np.argsort(angles)
+    return angles[order], values[order]
 
 
 @njit(cache=True)
