@@ -29,6 +29,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -440,7 +441,7 @@ def _period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> 
 def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
     """Hand periods in the common period; each event's time to the next, and who updates at it."""
     hand = np.asarray(sampling.hand_hz, dtype=float)
-    lengths = [Fraction(1)]
+    ratios = []
     for name in ("joint_control_hz", "sensor_hz"):
         ratio = np.unique(np.asarray(getattr(sampling, name) / hand, dtype=float))
         exact = Fraction(float(ratio[0])).limit_denominator(100)
@@ -450,7 +451,16 @@ def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, b
                 where=f"sampling.{name}",
                 remedy="choose rates whose ratios are ratios of small whole numbers",
             )
-        lengths.append(1 / exact)
+        ratios.append(exact)
+    return _schedule(*ratios)
+
+
+@cache
+def _schedule(
+    servo: Fraction, sensor: Fraction
+) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
+    """`_events` of a servo and a sensor so many times as fast as the hand."""
+    lengths = [Fraction(1), 1 / servo, 1 / sensor]
     common = Fraction(
         math.lcm(*(length.numerator for length in lengths)),
         math.gcd(*(length.denominator for length in lengths)),
