@@ -12,8 +12,10 @@ from drake_teleop.analysis.linearization import (
     linearize,
     linearize_station,
 )
+from drake_teleop.analysis.one_axis import device_impedance
 from drake_teleop.analysis.sampled_loop import Sampling, sampled_two_port
 from drake_teleop.analysis.task_direction import task_direction
+from drake_teleop.analysis.two_port import hybrid
 from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.errors import DrakeTeleopError
@@ -156,6 +158,32 @@ def test_real_station_within_one_percent_to_30_hz(sigma):
     axis = changed(task.axis, device_mass=task.axis.device_mass + task.axis.hand_mass)
     sampling = Sampling(low_pass_hz=scenario.wrist_sensor.bandwidth_hz)
     assert (difference(H, sampled_two_port(axis, sampling, OMEGA)) < 0.01).all()
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1.0])
+def test_continuous_closed_form_with_the_delays_of_holds_and_filter(sigma):
+    """Half a period in the servo's loop; a period and the low-pass's delay on the force's way.
+
+    An input of the model that is held acts on the sensor 1.5 of its samples sooner than a smooth
+    one would.
+    """
+    scenario = replace(LoadScenario("free_motion_force"), force_scaling__sigma=sigma)
+    task = task_direction(scenario, UP)
+    cut = linearize(scenario, load_estimate=true_load(scenario))
+    H = hybrid_along(wired(cut), OMEGA, task.hand, task.tool)
+    axis, s = task.axis, 1j * OMEGA
+    held = np.exp(-s * PERIOD / 2)
+    pull = axis.velocity_gain * (s + axis.position_gain) * held
+    spring = axis.velocity_gain * axis.position_gain * held
+    servo = spring / (s**2 + pull), s / (axis.slave_mass * (s**2 + pull))
+    low_pass = 2 * (np.cos(np.pi / 8) + np.cos(3 * np.pi / 8))
+    low_pass /= 2 * np.pi * scenario.wrist_sensor.bandwidth_hz
+    late = np.exp(-s * (PERIOD + low_pass - 1.5 / scenario.rates.sensor_hz))
+    paper = hybrid(axis, s, servo=servo)
+    device = device_impedance(axis, s)
+    paper[:, 0, 0] = device + axis.hand_mass * s + late * (paper[:, 0, 0] - device)
+    paper[:, 0, 1] *= late
+    assert (difference(H, paper) < 0.01).all()
 
 
 def test_tool_that_turns_when_it_is_pushed():
