@@ -86,7 +86,7 @@ def simulate(
     return out
 
 
-@njit(cache=True)
+@njit
 def _simulate(master, slave, servo, force, every, tick, delay, sections, substeps, start, out):
     mass, friction, hand_b, hand_k = master
     heavy, wall_k, wall_b = slave
@@ -138,7 +138,7 @@ def _simulate(master, slave, servo, force, every, tick, delay, sections, substep
         i += 1
 
 
-@njit(cache=True)
+@njit
 def _advance(x, v, push, stiffness, damping, duration, substeps):
     """x'' = push - stiffness x - damping x' by classical Runge-Kutta steps."""
     h = duration / substeps
