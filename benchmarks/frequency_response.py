@@ -49,7 +49,9 @@ def main() -> None:
     for ideal in (True, False):
         pressing = replace(_scenario(0.0, 0.0), sheet_spring=_leaf(), wrist_sensor__ideal=ideal)
         name = f"pressing, {'ideal' if ideal else 'noisy'} sensor"
-        figures |= _compared(name, pressing, MultiSine(velocity=0.015), -_GAP - _DEPTH)
+        figures |= _compared(
+            name, pressing, MultiSine(lowest=3.0, velocity=0.1, periods=5), -_GAP - _DEPTH
+        )
     for name, figure in figures.items():
         print(f"{name:80s} {figure:10.5f}")
     if arguments.json:

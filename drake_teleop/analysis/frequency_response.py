@@ -34,7 +34,7 @@ from drake_teleop.station import MakeTeleopStation
 Array = NDArray[np.float64]
 
 _DRAWS = 300  # of random phases, of which the flattest is taken
-_APPARENT_MASS_BAND = 2 * np.pi * 4.0  # rad/s, up to which the apparent mass is fitted
+_APPARENT_MASS_BAND = 2 * np.pi * 10.0  # rad/s, up to which the apparent mass is fitted
 
 
 @dataclass(frozen=True)
@@ -105,13 +105,12 @@ class StationResponse:
         spectra: signal -> (periods, n) amplitudes; predicted: (1, n), for a unit push. The signals:
             `hand_force` on the stylus [N], `hand_velocity` [m/s], `felt_force` that the device
             displays [N], `tool_velocity` at the tip [m/s].
-        force_scale, position_scale: of the station.
+        force_scale: of the station.
     """
 
     omega: Array
     spectra: dict[str, Complex]
     force_scale: float
-    position_scale: float
 
     def response(self, output: str, input_: str) -> Complex:
         """(n,) output over input."""
@@ -126,28 +125,30 @@ class StationResponse:
         return cross / power
 
     def apparent_mass(self) -> float:
-        """What the tool is felt to weigh in motion, in the slave's units [kg].
+        """What the hand feels of the tool's mass, in the slave's units [kg]: sigma m_t on paper.
 
-        The felt force over the hand's acceleration, undone of both scales, towards zero frequency:
-        its real part is even in frequency.
+        The felt force, undone of its scale, over the tool's acceleration, towards zero frequency;
+        a delay of far less than 1/10 Hz leaves its real part even in frequency. It is what the hand
+        feels of its own acceleration as well, times both scales, as long as the servo follows.
 
         Raises:
-            DrakeTeleopError: if fewer than three lines are below 4 Hz.
+            DrakeTeleopError: if fewer than three lines are below 10 Hz.
         """
         low = self.omega <= _APPARENT_MASS_BAND
         if np.count_nonzero(low) < 3:
             raise DrakeTeleopError(
-                "fewer than three lines below 4 Hz",
+                "fewer than three lines below 10 Hz",
                 where="MultiSine",
                 remedy="lower `lowest` or lengthen `period`",
             )
         omega = self.omega[low]
-        impedance = -self.response("felt_force", "hand_velocity")[low]
-        mass = (impedance / (1j * omega)).real / (self.force_scale * self.position_scale)
-        powers = (omega[:, None] / omega[-1]) ** [0, 2, 4]
-        # All lines have about the same force of noise, so the mass of slow ones is less certain.
-        solution = np.linalg.lstsq(omega[:, None] * powers, omega * mass, rcond=None)[0]
-        return float(solution[0])
+        felt = -self.response("felt_force", "tool_velocity")[low] / self.force_scale
+        # Noise of the force is about the same at all lines: the mass times their acceleration.
+        acceleration = omega * np.abs(self.spectra["tool_velocity"].mean(axis=0))[low]
+        powers = (omega[:, None] / omega[-1]) ** [0, 2]
+        mass = (felt / (1j * omega)).real
+        weighted = acceleration[:, None] * powers
+        return float(np.linalg.lstsq(weighted, acceleration * mass, rcond=None)[0][0])
 
     def to_control(self, output: str, input_: str) -> Any:
         """`response` as a `control.FRD`."""
@@ -204,7 +205,7 @@ def measure_frequency_response(
     return StationResponse(
         np.asarray(2 * np.pi / excitation.period * multiples, dtype=float),
         spectra,
-        *_scales(scenario),
+        scenario.force_scaling.force_scale,
     )
 
 
@@ -240,11 +241,7 @@ def predict_frequency_response(
         "felt_force": late * along("wrench_B", task.hand),
         "tool_velocity": along("twist_slave", task.tool),
     }
-    return StationResponse(omega, spectra, *_scales(scenario))
-
-
-def _scales(scenario: Scenario) -> tuple[float, float]:
-    return scenario.force_scaling.force_scale, scenario.kinematic_scaling.translation_scale
+    return StationResponse(omega, spectra, scenario.force_scaling.force_scale)
 
 
 def _signals(result: SimulationResult, scenario: Scenario, task: TaskDirection) -> dict[str, Array]:
