@@ -256,6 +256,28 @@ class _Names(click.ParamType):
         return tuple(name.strip() for name in value.split(","))
 
 
+@cli.command()
+@click.argument("scenario")
+@click.option(
+    "--direction",
+    type=click.Choice(["x", "y", "z"]),
+    default="z",
+    show_default=True,
+    help="Of the task, an axis of the world.",
+)
+@_out("analyze")
+@_quiet
+def analyze(scenario: str, direction: str, out: Path, quiet: bool) -> None:
+    """Analyse stability and transparency of a scenario.
+
+    SCENARIO is the name of a shipped one or a YAML file. Linearises the station itself: margins,
+    passivity, felt impedance, maps over two parameters. Writes pictures and report.html.
+    """
+    from drake_teleop.experiments.analyze import analyze_command
+
+    analyze_command(scenario, out, direction=direction, quiet=quiet)
+
+
 @cli.command("compare-passivity")
 @click.option("--networks", type=_Names(), help="Presets.  [default: lan to lunar]")
 @click.option("--methods", type=_Names(), help="Methods.  [default: all]")

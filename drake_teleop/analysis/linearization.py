@@ -63,6 +63,7 @@ _AT_REST = 1e-6  # of these displacements, that a state of rest may move in a pe
 _MOST_STEPS = 8  # of Newton's method on the way to rest
 _RAMP, _SETTLE = 0.3, 0.1  # s, of the slave on its way to the operating point, and there
 _LARGEST_DENSE = 800  # states, beyond which eigenvalues are sought piece by piece
+MOST_STATES = 8000  #: with those of the delay, of which multipliers are still found
 _HIGHEST = 100.0  # Hz, up to which
 _AT_ONCE = 40  # of them
 
@@ -124,10 +125,19 @@ class Linearization:
 
         With so long a delay that it makes more than 800 states, those near the unit circle up to
         100 Hz.
+
+        Raises:
+            DrakeTeleopError: for more than 8000 states, whose multipliers lie too close together.
         """
         size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
         if size <= _LARGEST_DENSE:
             values = np.linalg.eigvals(self.expanded().A)
+        elif size > MOST_STATES:
+            raise DrakeTeleopError(
+                f"{size} states, most of them of the delay, are too many",
+                where="channel.delay",
+                remedy="count unstable multipliers of one axis instead (sampled_loop)",
+            )
         else:
             values = _near_the_circle(self._with_lines(size), 2 * np.pi * _HIGHEST * self.dt)
         return values[np.argsort(-np.abs(values))].astype(complex)
