@@ -134,7 +134,7 @@ def difference(H, other):
     return np.abs(H / other - 1).max(axis=0)
 
 
-@pytest.mark.parametrize("sigma", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("sigma", [0.0, 1.0])
 @pytest.mark.parametrize("servo", [{}, DEADBEAT], ids=["servo", "ideal servo"])
 def test_one_direction_equals_the_model_on_paper(servo, sigma):
     scenario = replace(

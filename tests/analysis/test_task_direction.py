@@ -1,0 +1,74 @@
+"""The one-axis numbers of a scenario against its models."""
+
+import numpy as np
+import pytest
+
+from drake_teleop.analysis.task_direction import TIP, OneAxisFromScenario, task_direction
+from drake_teleop.channel.channel import Channel
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.experiments.identification import slave_arm
+from drake_teleop.master import device
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+
+
+def test_device_whose_inner_link_alone_moves():
+    """Upright force at q = 0: M22 over the link's length squared, wrist and reflected motor too."""
+    scenario = replace(Scenario(), master__position=[0.215, 0.0, -0.17])
+    axis = OneAxisFromScenario(scenario, (0, 0, 2.0))
+    assert axis.device_mass == pytest.approx(device.mass_matrix(np.zeros(6))[1, 1] / 0.215**2)
+    assert axis.device_damping == pytest.approx(scenario.master.friction.viscous[1] / 0.215**2)
+
+
+def test_what_the_scenario_says():
+    scenario = replace(
+        Scenario(),
+        channel=Channel(delay=0.02, backward=NetworkConfig(delay=0.04)),
+        sheet_spring=SheetSpring(thickness=0.001),
+        force_scaling__sigma=0.5,
+        kinematic_scaling__translation_scale=2.0,
+        operator__grip="firm",
+    )
+    estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+    estimate[6] += 0.1
+    axis = OneAxisFromScenario(scenario, (1, 0, 0), load_estimate=estimate)
+    assert (axis.hand_mass, axis.hand_stiffness, axis.sigma, axis.position_scale) == (
+        *(0.5, 700.0, 0.5, 2.0),
+    )
+    assert axis.delay == pytest.approx(0.03)
+    assert axis.tool_mass == pytest.approx(3.13)
+    assert axis.mass_error == pytest.approx(0.1)
+    assert axis.wall_stiffness == scenario.sheet_spring.stiffness
+    assert OneAxisFromScenario(replace(scenario, sheet_spring=None), (1, 0, 0)).wall_stiffness == 0
+
+
+@pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 0.5)])
+def test_slave_is_lighter_where_the_push_can_turn_it(direction):
+    """A free arm is lighter than one that is guided; along the tool a push turns it little."""
+    task = task_direction(LoadScenario("free_motion_force"), direction)
+    assert np.linalg.norm(task.tool[:3]) == pytest.approx(1.0)
+    assert np.linalg.norm(task.tool[3:]) <= TIP[2] + 1e-12
+    assert 3.13 * task.tool_coupling < task.axis.slave_mass
+    if direction == (0, 0, 1):
+        assert task.tool_coupling == pytest.approx(1.0, abs=1e-3)
+
+
+def test_aligned_master():
+    turned = replace(Scenario(), kinematic_scaling__alignment=[0.0, 0.0, np.pi / 2])
+    task = task_direction(turned, (0, 1, 0))
+    assert task.hand[:3] == pytest.approx([1, 0, 0], abs=1e-12)
+
+
+def test_what_makes_no_axis_is_said():
+    with pytest.raises(DrakeTeleopError, match="cannot follow"):
+        far = replace(Scenario(), kinematic_scaling__translation_scale=20.0)
+        task_direction(far, (0, 0, 1), displacement=(0.05, 0, 0.05))
+    eta = replace(
+        Scenario(),
+        force_scaling__sigma=0.0,
+        force_scaling__eta=0.5,
+        force_scaling__gripper_phi=[1.0] + [0.0] * 9,
+    )
+    with pytest.raises(DrakeTeleopError, match=r"force_scaling\.eta"):
+        task_direction(eta, (0, 0, 1))
