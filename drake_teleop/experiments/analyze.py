@@ -22,7 +22,8 @@ transparency free and wall: mass_kg, damping_Ns_per_m, stiffness_N_per_m of what
 z_width      device's damping and rate; list: wall_damping, passive_N_per_m, stable_N_per_m
 maps         list: x, y, stable (share of the map), boundary (places)
 measured     in free motion, by multi-sine in the nonlinear simulation: frequency_Hz, felt_re,
-             felt_im, coherence, and the greatest deviation from the linearisation
+             felt_im, coherence, greatest_error and greatest_error_deg against the linearisation
+             (hand's mass included); null if free motion is unstable
 verdict      sentences
 ============ ==================================================================================
 """
@@ -40,6 +41,7 @@ from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 
 from drake_teleop.analysis import absolute_stability, margins, sampled_wall, transparency
+from drake_teleop.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.analysis.linearization import (
     AXES,
     MOST_STATES,
@@ -54,9 +56,8 @@ from drake_teleop.analysis.sampled_loop import (
     Sampling,
     cut_loop,
     delay_margin,
+    dominant_multiplier,
     loop_response,
-    multipliers,
-    sampled_loop,
     sampled_two_port,
     unstable_multipliers,
 )
@@ -87,7 +88,7 @@ _S: Complex = 1j * _OMEGA.astype(complex)
 _PRESSED = 5e-3  # m, how deep the hand presses into the leaf
 _FELT_BAND = 2 * np.pi * 5.0  # rad/s, up to which mass, damping and stiffness are fitted
 _PIXELS = 80  # of a map, each way
-_MOST_STEPS = 200  # of delay, for which the sampled model is set up with all its states
+_MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +177,7 @@ def analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str,
     )
     closed_form = hybrid(axis, _S)
     progress(0.3)
-    figures = {
+    figures: dict[str, Any] = {
         "direction": direction,
         "grip": scenario.operator.grip,
         "method": method,
@@ -209,6 +210,10 @@ def analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str,
         for title, shown in maps.items()
     ]
     figures["measured"] = None
+    if figures["diagram"][0]["stable"]:
+        measured = stage("Multi-sine in the nonlinear simulation")
+        figures["measured"] = measured_figures(linear, along, held_elsewhere(free, linear, along))
+        measured(1.0)
     figures = _plain(figures)
     figures["verdict"] = verdict(figures)
     nyquist = {}
@@ -288,21 +293,18 @@ def diagram_figures(
     Beyond a second or so of delay the Diagram's multipliers are too many; then one axis says it.
     """
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
-    counted = unstable_multipliers(cut_loop(axis, sampling), axis.delay)
+    loop = cut_loop(axis, sampling)
+    one_axis = _dying(complex(dominant_multiplier(loop, axis.delay)), float(loop.period))
     figures: dict[str, Any] = {
         "point": name,
         "states": len(system.A) + lines,
-        "stable": bool(counted == 0),
+        "stable": one_axis["stable"],
         "decay_1_per_s": None,
         "frequency_Hz": None,
-        "one_axis": None,
+        "one_axis": one_axis,
     }
     if figures["states"] <= MOST_STATES:
         figures |= _dying(system.multipliers[0], system.dt)
-    if axis.delay * sampling.hand_hz <= _MOST_STEPS:
-        loop = sampled_loop(axis, sampling)
-        values = multipliers(loop)
-        figures["one_axis"] = _dying(values[np.argmax(np.abs(values))], loop.period)
     return figures
 
 
@@ -323,10 +325,10 @@ def deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
         found = np.abs(H - other).max(axis=0) / np.abs(other).max(axis=0)
         return {f"h{i + 1}{j + 1}": float(found[i, j]) for i in range(2) for j in range(2)}
 
-    figures: dict[str, Any] = {"closed_form": greatest(hybrid(axis, _S[compared])), "sampled": None}
-    if axis.delay * sampling.hand_hz <= _MOST_STEPS:
-        figures["sampled"] = greatest(sampled_two_port(axis, sampling, omega))
-    return figures
+    return {
+        "closed_form": greatest(hybrid(axis, _S[compared])),
+        "sampled": greatest(sampled_two_port(axis, sampling, omega)),
+    }
 
 
 def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict[str, Any]]:
@@ -449,6 +451,35 @@ def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
             }
             for B, alone, in_hand, limit in zip(damping, passive, held, stable, strict=True)
         ],
+    }
+
+
+def measured_figures(
+    scenario: Scenario, along: TaskDirection, system: Linearization
+) -> dict[str, Any]:
+    """What the hand feels in free motion, simulated with all of the sensor's noise.
+
+    The device's Coulomb friction is left out here too: what it does depends on the amplitude.
+    """
+    coulomb = dataclasses.replace(scenario.master.friction, coulomb=[0.0] * 6)
+    smooth = replace(scenario, sheet_spring=None, master__friction=coulomb)
+    estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
+    if scenario.wrist_sensor.ideal:
+        estimate[:6] = 0.0
+    found = measure_frequency_response(smooth, along, _MULTI_SINE, load_estimate=estimate)
+    # Of a force that is held for a period, the share of the frequency itself, as in the two-port.
+    step = 1j * found.omega / scenario.rates.hand_hz
+    held = found.response("hand_force", "hand_velocity") * -np.expm1(-step) / step
+    # The hand's mass moves with the stylus and belongs to the hand.
+    felt = held - 1j * found.omega * along.axis.hand_mass
+    ratio = held / hybrid_along(system, found.omega, along.hand, along.tool)[:, 0, 0]
+    return {
+        "frequency_Hz": found.omega / (2 * np.pi),
+        "felt_re": felt.real,
+        "felt_im": felt.imag,
+        "coherence": found.coherence("hand_velocity", "hand_force"),
+        "greatest_error": np.abs(np.abs(ratio) - 1).max(),
+        "greatest_error_deg": np.abs(np.angle(ratio, deg=True)).max(),
     }
 
 

@@ -51,6 +51,13 @@ def test_the_diagram_is_the_sampled_model_of_one_axis(run):
     assert deviation["h11"] < 0.01
 
 
+def test_the_nonlinear_simulation_feels_as_the_linearised_diagram(run):
+    measured = run[0]["measured"]
+    assert max(measured["frequency_Hz"]) > 29.9
+    assert measured["greatest_error"] < 0.02 and measured["greatest_error_deg"] < 2.0
+    assert min(measured["coherence"]) > 0.95
+
+
 def test_what_is_said_of_stability_is_one_story(run):
     """The linearised Diagram, the margins, the stiffest walls and the maps agree."""
     summary, _ = run
