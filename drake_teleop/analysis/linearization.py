@@ -57,6 +57,7 @@ _OUTPUTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twis
 
 # Displacements up and down. The error of a difference is their square, or rounding over them.
 _ANGLE, _RATE, _OTHER = 1e-4, 1e-4, 1.0
+_WRENCH = 0.01  # N, N m, of an input: far below what the device's wrist can display
 _ACCELERATION = 20.0  # rad/s^2, that the servo may ask of a joint: within the motors' torque
 _IN_CONTACT = 1e-6  # rad, m: much less than what a newton indents
 _AT_REST = 1e-6  # of these displacements, that a state of rest may move in a period
@@ -554,7 +555,7 @@ class _Period:
         B = np.empty((len(x), 24))
         for k in range(24):
             ends = []
-            step = self._joint_step if 6 <= k < 12 else _OTHER
+            step = self._joint_step if 6 <= k < 12 else _WRENCH
             for sign in (1.0, -1.0):
                 self._set(x)
                 self._apply(sign * step * np.eye(24)[k])

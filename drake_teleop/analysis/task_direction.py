@@ -1,6 +1,11 @@
 """The one-axis numbers of a scenario along a direction of its task, from its models.
 
 They are the plant's truth, for analysis; no estimator may see them.
+
+One axis is the whole station only where a push of the environment turns nothing, as along the tool.
+Sideways a push at the tip, 0.2 m away from the sensor, is a torque at the hand, whose wrist yields,
+and the tool follows its turn: the tip is some hundred times as soft as the servo makes it, and with
+sigma > 0 the tool's moment of inertia is felt as well. `linearization` has all six directions.
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.analysis.linearization import (
+    AXES,
     Linearization,
     hybrid_along,
     linearize,
@@ -14,7 +15,7 @@ from drake_teleop.analysis.linearization import (
 )
 from drake_teleop.analysis.one_axis import device_impedance
 from drake_teleop.analysis.sampled_loop import Sampling, sampled_two_port
-from drake_teleop.analysis.task_direction import task_direction
+from drake_teleop.analysis.task_direction import TIP, task_direction
 from drake_teleop.analysis.two_port import hybrid
 from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
@@ -201,6 +202,24 @@ def test_tool_that_turns_when_it_is_pushed():
     assert np.abs(H[:, 0, 1] / turned[:, 0, 1] - 1).max() < 1e-3
     assert np.abs(H[:, 0, 1] / paper[:, 0, 1] - 1).max() > 0.1
     assert np.abs(H[:, 0, 0] / paper[:, 0, 0] - 1).max() < 1e-3
+
+
+def test_sideways_the_tip_gives_way_through_the_hands_wrist():
+    """A push at the tip is a torque at the hand, whose turn the tool follows: 130 times as soft."""
+    scenario = replace(LoadScenario("ideal_sensor"), operator=OperatorConfig(grip="medium"))
+    task = task_direction(scenario, (1.0, 0.0, 0.0))
+    system = wired(linearize(scenario, load_estimate=true_load(scenario)))
+    others = [axis for axis in AXES if axis != "x"]
+    operator, hand = (
+        [f"{port}.{a}" for a in others] for port in ("operator_wrench", "hand_wrench")
+    )
+    omega = np.array([0.5])  # rad/s
+    H = hybrid_along(system.close(operator, hand), omega, task.hand, task.tool)
+    compliance = (H[0, 1, 1] / (1j * omega[0])).real
+    axis = task.axis
+    servo = 1 / (axis.slave_mass * axis.velocity_gain * axis.position_gain)
+    turning = TIP[2] ** 2 * axis.force_scale / scenario.operator.hand.rotational_stiffness
+    assert compliance == pytest.approx(servo + turning, rel=0.01)
 
 
 def leaf(scenario: Scenario) -> Scenario:
