@@ -57,7 +57,7 @@ _OUTPUTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twis
 
 # Displacements up and down. The error of a difference is their square, or rounding over them.
 _ANGLE, _RATE, _OTHER = 1e-4, 1e-4, 1.0
-_WRENCH = 0.01  # N, N m, of an input: far below what the device's wrist can display
+_AT_THE_HAND = np.repeat([1.0, 0.02], 3)  # N, N m: within what the device can display
 _ACCELERATION = 20.0  # rad/s^2, that the servo may ask of a joint: within the motors' torque
 _IN_CONTACT = 1e-6  # rad, m: much less than what a newton indents
 _AT_REST = 1e-6  # of these displacements, that a state of rest may move in a period
@@ -553,9 +553,9 @@ class _Period:
     def input_derivative(self, x: Array) -> Array:
         """B at the states x."""
         B = np.empty((len(x), 24))
-        for k in range(24):
+        pose, tool = np.full(6, self._joint_step), np.full(6, _OTHER)
+        for k, step in enumerate(np.concatenate([_AT_THE_HAND, pose, _AT_THE_HAND, tool])):
             ends = []
-            step = self._joint_step if 6 <= k < 12 else _WRENCH
             for sign in (1.0, -1.0):
                 self._set(x)
                 self._apply(sign * step * np.eye(24)[k])
