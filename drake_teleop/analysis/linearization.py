@@ -2,7 +2,8 @@
 
 Every state of the Diagram that acts on anything is displaced by a little, up and down; the Diagram
 is simulated for one period of the hand; what has become of the displacement after that is a column
-of the state transition. Nothing of the blocks is written a second time.
+of the state transition. Nothing of the blocks is written a second time. Differences, because the
+blocks are compiled for numbers and take no automatic derivatives.
 
 The loops are cut where an analysis wants to put something else in:
 
