@@ -14,7 +14,8 @@ are never overdrawn, whatever the network does, as long as |x''| <= a_max at bot
 
 A slave that is slower than a_max T might pay even for its brake: with an empty tank it would coast
 on for ever. So the slave keeps a reserve that is neither sent nor spent on the spring; only the
-brake may use it.
+brake may use it. And what a servo that is pulled harder than a_max has overdrawn is written off when
+energy arrives: else that would be swallowed, and the slave would stay where it is.
 
 Where the tank of the master is below its level, a damper on the hand fills it. Of what the tank
 holds the wrench may drain only a share in a step, which takes the edge off an empty tank; small
@@ -105,7 +106,7 @@ def _exchange(received, dx, T, p, memory, packet):
         level = memory[LEDGER + g] - dot(memory[HELD : HELD + 6], dx, g)
         more = received[ENERGY + g] - memory[RECEIVED + g]
         if more > 0.0:
-            level += more
+            level = max(level, 0.0) + more
             memory[RECEIVED + g] += more
         sent = min(T * p[_SEND], 1.0) * max(level - _RESERVE * p[_CAPACITY + g], 0.0)
         level -= sent
