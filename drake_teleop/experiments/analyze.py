@@ -538,6 +538,13 @@ def verdict(figures: dict[str, Any]) -> list[str]:
         for row in figures["margins"]
         if row["grip"] == figures["grip"] and row["wall_N_per_m"] == figures["wall_N_per_m"]
     ]
+    worst = max(figures["two_port"]["sampled"].values())
+    if worst > 0.1:
+        said.append(
+            f"Along {figures['direction']} the station is not one axis: its two-port differs by up "
+            f"to {100 * worst:.2g} % below 30 Hz, because a push turns hand and tool. Margins and "
+            "maps, which are those of one axis, are rough there."
+        )
     bounded = figures["bounded"]
     each = ", ".join(f"{grip} {_stiffness(K)}" for grip, K in bounded["each"].items())
     said.append(
@@ -578,6 +585,8 @@ def _bears(row: dict[str, Any], delay: float) -> str:
 
 
 def _stiffness(value: float | None) -> str:
+    if value == 0:
+        return "none"
     return "any stiffness" if value is None else f"{value / 1e3:.3g} kN/m"
 
 

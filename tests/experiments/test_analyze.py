@@ -109,6 +109,9 @@ def test_another_direction_and_a_method_that_is_not_linear():
     found = figures(scenario, "x")
     assert "tdpa is not linear" in found["verdict"][0]
     assert found["direction"] == "x" and found["delay_s"] == 0.01
+    # Sideways, a push turns the tool; that one axis does not know it is said.
+    assert found["two_port"]["sampled"]["h22"] > 0.1
+    assert any("is not one axis" in sentence for sentence in found["verdict"])
 
 
 def test_eta_has_no_single_sigma():
