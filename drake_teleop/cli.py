@@ -312,6 +312,102 @@ def compare_passivity(
     )
 
 
+class _Positive(click.ParamType):
+    """Positive numbers with commas between them."""
+
+    name = "number,..."
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        if isinstance(value, tuple):
+            return value
+        number = _Number(min=0, min_open=True)
+        return tuple(number.convert(part, param, ctx) for part in value.split(","))
+
+
+@cli.command()
+@click.argument("scenario", default="identification")
+@click.option("--model", type=_PATH, help="Another arm: URDF, SDF, MJCF or .dmd.yaml.")
+@click.option("--sensor-frame", metavar="NAME", help="Its frame or link with the sensor.")
+@click.option(
+    "--package-path",
+    "package_paths",
+    type=_PATH,
+    multiple=True,
+    metavar="DIR",
+    help="Where its package:// addresses are looked up; may be repeated.",
+)
+@click.option(
+    "--acceleration",
+    type=_Positive(),
+    default=(),
+    help="Limits of its joints in rad/s^2, one for all or one for each.",
+)
+@click.option(
+    "--payload",
+    type=_Number(min=0, min_open=True),
+    metavar="KG",
+    help="Its heaviest load.  [default: what the model holds beyond the sensor, and 30 %]",
+)
+@click.option(
+    "--criterion",
+    type=click.Choice(["kappa_w10", "kappa10", "kappa16", "A16", "D16"]),
+    default="kappa_w10",
+    show_default=True,
+    help="Condition numbers (whitened; plain SI; with offsets), or predicted errors.",
+)
+@click.option("--period", type=_Number(0.5, 600), default=6.0, show_default=True, metavar="SECONDS")
+@click.option("--harmonics", type=click.IntRange(2, 20), default=5, show_default=True)
+@click.option(
+    "--time",
+    "seconds",
+    type=_Number(min=0, min_open=True),
+    metavar="SECONDS",
+    help="CPU time of the optimiser.  [default: four starts, the same on every machine]",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@_out("excite")
+@_quiet
+def excite(
+    scenario: str,
+    model: Path | None,
+    sensor_frame: str | None,
+    package_paths: tuple[Path, ...],
+    acceleration: tuple[float, ...],
+    payload: float | None,
+    criterion: str,
+    period: float,
+    harmonics: int,
+    seconds: float | None,
+    seed: int,
+    out: Path,
+    quiet: bool,
+) -> None:
+    """Design a motion that shows all of a load.
+
+    For the slave of SCENARIO, or with --model for another arm with SCENARIO's sensor. A Fourier
+    series from rest to rest, optimised, and checked against every limit and for collisions.
+    """
+    from drake_teleop.experiments.excite import excite_command
+
+    excite_command(
+        scenario,
+        out,
+        model=model,
+        sensor_frame=sensor_frame,
+        package_paths=package_paths,
+        acceleration=acceleration,
+        payload=payload,
+        criterion=criterion,
+        period=period,
+        harmonics=harmonics,
+        seconds=seconds,
+        seed=seed,
+        quiet=quiet,
+    )
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command line and exits: 0, 2 for unusable input, 130 for Ctrl-C."""
     try:

@@ -57,7 +57,9 @@ def test_no_command_shows_the_help(capsys):
     assert status == 2
     status, out, _ = run_main(capsys, "--help")
     assert status == 0
-    for command in ("reproduce", "run", "identify", "eliminate", "inspect", "compare-passivity"):
+    for command in (
+        "reproduce", "run", "identify", "eliminate", "inspect", "compare-passivity", "excite"
+    ):  # fmt: skip
         assert f"  {command} " in out
     assert "..." not in out.split("Commands:")[1]  # every summary fits its line
 
@@ -77,6 +79,10 @@ def test_no_command_shows_the_help(capsys):
         ["run"],
         ["run", "free_motion_force", "--seed", "-1"],
         ["reproduce", "--frobnicate"],
+        ["excite", "--criterion", "kappa11"],
+        ["excite", "--harmonics", "1"],
+        ["excite", "--period", "0"],
+        ["excite", "--model", "a.urdf", "--sensor-frame", "s", "--acceleration", "1,-2"],
     ],
 )
 def test_wrong_usage_is_one_error_line_and_status_2(capsys, arguments):

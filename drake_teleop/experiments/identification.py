@@ -13,15 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.excitation.check import check
+from drake_teleop.excitation.excite import criteria_of, excite
+from drake_teleop.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.experiments.progress import Progress, Stage, silent
-from drake_teleop.load.excitation import FourierTrajectory, condition_numbers, design_excitation
+from drake_teleop.load.excitation import FourierTrajectory
 from drake_teleop.load.identification import Identification, identify
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import ArmModel
-from drake_teleop.slave.excitation import excitation_limits, sensor_motion_of
-from drake_teleop.slave.plant import AddSlavePlant, home_position
+from drake_teleop.slave.plant import AddSlavePlant
 from drake_teleop.station import MakeIdentificationStation
 
 Array = NDArray[np.float64]
@@ -39,7 +42,7 @@ class LoadIdentification:
         result: the recorded signals.
         estimate: (16,) Eq. (7), [offsets; phi] of the recursive estimator in the loop at the end.
         batch: the same record by batch least squares.
-        kappa_w10: condition number of the motion, see `condition_numbers`.
+        kappa_w10: condition number of the motion, see `excitation/criteria.py`.
         real_time_factor: of the simulation.
     """
 
@@ -87,28 +90,25 @@ def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
     )
 
 
-def identify_load(scenario: Scenario, stage: Stage = silent) -> LoadIdentification:
-    """Designs an excitation trajectory of the scenario's duration, runs it, and identifies.
+def identify_load(
+    scenario: Scenario, stage: Stage = silent, *, trajectory: FourierTrajectory | None = None
+) -> LoadIdentification:
+    """Runs an excitation trajectory, and identifies.
 
     Args:
         scenario: with the load estimator enabled.
         stage: where progress is shown.
+        trajectory: to run, of the scenario's duration; a new one is designed if there is none.
 
     Raises:
-        DrakeTeleopError: if no trajectory respects the limits of arm and sensor.
+        DrakeTeleopError: if no trajectory respects the limits of arm and sensor, or the one that
+            was given does not, or has another duration.
     """
-    arm = slave_arm(scenario)
-    motion = sensor_motion_of(arm)
-    designed = stage("Design the excitation trajectory")
-    trajectory = design_excitation(
-        motion,
-        excitation_limits(arm),
-        home=home_position(arm, scenario.slave.position),
-        seed=_DESIGN_SEED,
-        period=scenario.simulation.duration,
-    )
-    samples = motion(*trajectory.evaluate(np.arange(0.0, trajectory.period, 1e-3)))
-    designed(1.0)
+    robot = RobotFromScenario(scenario)
+    if trajectory is None:
+        trajectory = _designed(robot, scenario.simulation.duration, stage)
+    else:
+        _check_given(robot, trajectory, scenario.simulation.duration)
     station = MakeIdentificationStation(scenario, trajectory)
     result, factor = timed(station, scenario.simulation, stage("Identify the load"))
     usable = result["saturated"][:, 0] == 0
@@ -116,9 +116,35 @@ def identify_load(scenario: Scenario, stage: Stage = silent) -> LoadIdentificati
         *(signal[usable] for signal in sensor_samples(result)),
         noise=scenario.wrist_sensor.noise_std()[:6],
     )
-    kappa = condition_numbers(*samples[:3]).kappa_w10
+    kappa = criteria_of(robot, trajectory)["kappa_w10"]
     estimate = result["load_estimate"][-1]
     return LoadIdentification(trajectory, result, estimate, batch, kappa, factor)
+
+
+def _designed(robot: Robot, period: float, stage: Stage) -> FourierTrajectory:
+    progress = stage("Design the excitation trajectory")
+    found = excite(
+        robot, period=period, seed=_DESIGN_SEED, designing=lambda done, best: progress(0.5 * done)
+    )
+    progress(1.0)
+    return found.trajectory
+
+
+def _check_given(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
+    if len(trajectory.q0) != robot.arm.num_joints:
+        raise DrakeTeleopError(
+            f"it moves {len(trajectory.q0)} joints, the arm has {robot.arm.num_joints}",
+            where="trajectory",
+        )
+    if not np.isclose(trajectory.period, duration, rtol=1e-9):
+        raise DrakeTeleopError(
+            f"its period is {trajectory.period:g} s, the simulation lasts {duration:g} s",
+            where="trajectory",
+            remedy="set simulation.duration to the period",
+        )
+    worst = check(robot, trajectory)[0]
+    if worst.share > 1:
+        raise DrakeTeleopError(f"it uses {worst}", where="trajectory")
 
 
 def timed(

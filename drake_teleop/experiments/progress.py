@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeAlias
 
-Progress: TypeAlias = Callable[[float], None]
-"""Called with the fraction done, 0 to 1."""
+Progress: TypeAlias = Callable[..., None]
+"""Called with the fraction done, 0 to 1, and perhaps with words on how it stands."""
 Stage: TypeAlias = Callable[[str], Progress]
 """Opens a stage by its name."""
 
 
 def silent(name: str) -> Progress:
     """A stage that shows nothing."""
-    return lambda fraction: None
+    return lambda fraction, words="": None
 
 
 @contextmanager
@@ -23,18 +23,20 @@ def progress_bars(quiet: bool) -> Iterator[Stage]:
     if quiet:
         yield silent
         return
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+    from rich import progress as rich_progress
 
     columns = (
-        TextColumn("{task.description:34s}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
+        rich_progress.TextColumn("{task.description:34s}"),
+        rich_progress.BarColumn(),
+        rich_progress.TaskProgressColumn(),
+        rich_progress.TimeElapsedColumn(),
     )
-    with Progress(*columns) as bars:
+    with rich_progress.Progress(*columns) as bars:
 
-        def stage(name: str) -> Callable[[float], None]:
+        def stage(name: str) -> Progress:
             task = bars.add_task(name, total=1.0)
-            return lambda fraction: bars.update(task, completed=fraction)
+            return lambda fraction, words="": bars.update(
+                task, completed=fraction, description=f"{name} {words}"
+            )
 
         yield stage

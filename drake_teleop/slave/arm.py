@@ -370,6 +370,27 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 
 
 @njit(cache=True)
+def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
+    """Motion of every link, and of S as the last one, in world coordinates.
+
+    Args:
+        table: `ArmModel.table`.
+        q: (n,) joint positions [rad].
+        v: (n,) joint velocities [rad/s].
+        vdot: (n,) joint accelerations [rad/s^2].
+        out: (n+1, 21) filled: row j with the state x (see the module) of table's row j.
+    """
+    n = table.shape[0] - 1
+    _start(table, out[0])
+    for row in range(n):
+        if row > 0:
+            out[row] = out[row - 1]
+        _advance(table, row, q[row], v[row], vdot[row], out[row])
+    out[n] = out[n - 1]
+    _advance(table, n, 0.0, 0.0, 0.0, out[n])
+
+
+@njit(cache=True)
 def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
     """Fills link[row]: axis z and origin p of L, then what moves the link (force; moment about Wo).
 

@@ -1,0 +1,1 @@
+"""The design of excitation trajectories: an arm, its limits, a criterion, an optimiser, a check."""

@@ -1,0 +1,164 @@
+"""An excitation trajectory for a robot: designed, and checked; or an error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import accumulate
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.excitation.check import RATE, Use, check
+from drake_teleop.excitation.criteria import CRITERIA, Criterion, predicted_deviations
+from drake_teleop.excitation.design import Iterate, design
+from drake_teleop.excitation.limits import (
+    LIMITS,
+    empty_motions,
+    limit_uses,
+    motions_of,
+    sensor_vectors,
+)
+from drake_teleop.excitation.problem import Task
+from drake_teleop.excitation.robot import Robot
+from drake_teleop.load.excitation import FourierTrajectory
+
+Array = NDArray[np.float64]
+
+# A trajectory between whose samples the optimiser missed a peak is made smaller about its middle.
+_REPAIRS = (1.0, 0.995, 0.99, 0.98)
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """A trajectory that was checked.
+
+    Attributes:
+        robot: the arm, its surroundings and its limits.
+        trajectory: at rest at both ends.
+        criterion: name of what was minimised.
+        values: every criterion, by name, of one period at 1 kHz.
+        deviations: (16,) predicted standard deviations of offsets and phi, see
+            `predicted_deviations`.
+        uses: of every limit, as checked, the largest first.
+        history: (K, 2) thread CPU time [s] and best value of the criterion until then.
+        starts: how many candidates were followed.
+    """
+
+    robot: Robot
+    trajectory: FourierTrajectory
+    criterion: str
+    values: dict[str, float]
+    deviations: Array
+    uses: list[Use]
+    history: Array
+    starts: int
+
+
+def excite(
+    robot: Robot,
+    *,
+    criterion: str = "kappa_w10",
+    period: float = 6.0,
+    harmonics: int = 5,
+    seed: int = 0,
+    starts: int = 4,
+    seconds: float | None = None,
+    designing: Callable[[float, float], None] = lambda done, best: None,
+    checking: Callable[[float], None] = lambda done: None,
+) -> Excitation:
+    """Designs an excitation trajectory and checks it.
+
+    Args:
+        robot: from `RobotFromScenario` or `RobotFromModel`.
+        criterion: one of `criteria.CRITERIA`.
+        period: of the trajectory [s].
+        harmonics: N of Eq. (9), at least 2.
+        seed, starts, seconds: see `design`.
+        designing, checking: progress, see `design` and `check`.
+
+    Raises:
+        DrakeTeleopError: if nothing was found that respects all limits.
+    """
+    task = Task(
+        robot.arm.table,
+        robot.limits,
+        Criterion(criterion, robot.scales),
+        robot.home,
+        period,
+        harmonics,
+    )
+    found = design(task, seed=seed, starts=starts, seconds=seconds, progress=designing)
+    worst = None
+    for trajectory in _candidates(found, robot):
+        uses = check(robot, trajectory, checking)
+        if uses[0].share <= 1:
+            best = accumulate((iterate.value for iterate in found), min)
+            return Excitation(
+                robot,
+                trajectory,
+                criterion,
+                criteria_of(robot, trajectory),
+                _deviations(robot, trajectory),
+                uses,
+                np.array([(it.seconds, value) for it, value in zip(found, best, strict=True)]),
+                len({iterate.start for iterate in found}),
+            )
+        if worst is None or uses[0].share < worst.share:
+            worst = uses[0]
+    raise DrakeTeleopError(
+        "no trajectory was found that respects all limits"
+        + (f": the best uses {worst}" if worst else ""),
+        where=robot.name,
+        remedy="take more time, a longer period or another seed",
+    )
+
+
+def criteria_of(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
+    """The value of every criterion over one period at 1 kHz."""
+    motion = sensor_motion(robot, trajectory)
+    return {
+        name: Criterion(name, robot.scales).value(*motion, trajectory.period) for name in CRITERIA
+    }
+
+
+def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, Array, Array]:
+    """s, omega, alpha of S, (T, 3) each, in S, of one period at 1 kHz."""
+    joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
+    motions = empty_motions(*joints[0].shape)
+    motions_of(robot.arm.table, *joints, motions)
+    out = np.empty((3, len(motions), 3))
+    sensor_vectors(motions, out)
+    s, omega, alpha = out
+    return s, omega, alpha
+
+
+def _deviations(robot: Robot, trajectory: FourierTrajectory) -> Array:
+    motion = sensor_motion(robot, trajectory)
+    return predicted_deviations(*motion, robot.scales.noise, trajectory.period)
+
+
+def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
+    """Of each start the best that respects the limits between the optimiser's samples too.
+
+    The best first. This saves vain checks, no more: the check has kernels of its own.
+    """
+    ranked = sorted(found, key=lambda iterate: iterate.value)
+    for start in dict.fromkeys(iterate.start for iterate in ranked):
+        of_start = [iterate for iterate in ranked if iterate.start == start]
+        for factor in _REPAIRS:
+            trajectory = of_start[0].trajectory.scaled(factor)
+            if _largest_use(robot, trajectory) <= 1:
+                yield trajectory
+                break
+
+
+def _largest_use(robot: Robot, trajectory: FourierTrajectory) -> float:
+    joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
+    motions = empty_motions(*joints[0].shape)
+    motions_of(robot.arm.table, *joints, motions)
+    smooth, largest = np.empty((2, len(LIMITS)))
+    gradients = np.empty((len(LIMITS), 3, *joints[0].shape))
+    limit_uses(robot.arm.table, *joints, motions, robot.limits, 1e3, smooth, largest, gradients)
+    return float(largest.max())

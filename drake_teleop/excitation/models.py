@@ -1,0 +1,170 @@
+"""Reading robot models as they are found: meshes missing, base hanging free, packages elsewhere."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame, ModelInstanceIndex
+
+from drake_teleop.errors import DrakeTeleopError
+
+# Of meshes that Drake can use as collision shapes.
+_READABLE = (".obj", ".gltf", ".vtk")
+
+
+@dataclass(frozen=True)
+class ParsedModel:
+    """What `ParseModel` found.
+
+    Attributes:
+        instance: the arm's.
+        sensor_frame: S.
+        efforts: torque limits by joint [N m]; Drake drops them where a URDF has no transmission.
+        lost_meshes: those that were left out.
+    """
+
+    instance: ModelInstanceIndex
+    sensor_frame: Frame
+    efforts: dict[str, float]
+    lost_meshes: list[str]
+
+
+def ParseModel(
+    plant: MultibodyPlant, path: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()
+) -> ParsedModel:
+    """Parses a model and welds its base to the world if it hangs on nothing.
+
+    Args:
+        plant: not finalized.
+        path: a URDF or SDF, or anything else that Drake reads by its suffix.
+        sensor_frame: name of the frame or link at which the sensor measures.
+        package_paths: folders in which `package://` addresses are looked up.
+
+    Raises:
+        DrakeTeleopError: if the file cannot be read, or has no such frame.
+    """
+    if not path.is_file():
+        raise DrakeTeleopError("there is no such file", where=str(path))
+    packages = _Packages(path, package_paths)
+    parser = Parser(plant)
+    for name, folder in packages.found.items():
+        parser.package_map().Add(name, str(folder))
+    kind = path.suffix.lower().removeprefix(".")
+    efforts: dict[str, float] = {}
+    lost: list[str] = []
+    try:
+        root = _xml(path) if kind in ("urdf", "sdf") else None
+        if root is None:
+            instances = parser.AddModels(str(path))
+        else:
+            lost = _without_lost_meshes(root, packages)
+            efforts = _efforts(root)
+            text = ElementTree.tostring(root, encoding="unicode")
+            instances = parser.AddModelsFromString(text, kind)
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).replace("<literal-string>", "")
+        raise DrakeTeleopError(
+            f"cannot be read as a robot ({reason.strip()})",
+            where=str(path),
+            remedy="give a URDF, SDF, MJCF or .dmd.yaml model, with --package-path for package://",
+        ) from None
+    having = [i for i in instances if plant.HasFrameNamed(sensor_frame, i)]
+    if len(having) != 1:
+        frames = [
+            plant.get_frame(index).name()
+            for instance in instances
+            for index in plant.GetFrameIndices(instance)
+        ]
+        raise DrakeTeleopError(
+            f"{len(having) or 'no'} frames are named {sensor_frame!r}",
+            where=str(path),
+            remedy=f"--sensor-frame with one of {', '.join(sorted(set(frames)))}",
+        )
+    frame = plant.GetFrameByName(sensor_frame, having[0])
+    _weld_base(plant, frame)
+    return ParsedModel(having[0], frame, efforts, lost)
+
+
+def _xml(path: Path) -> ElementTree.Element | None:
+    """The root of an XML file; None if Drake has to read it, or to say what is wrong with it."""
+    try:
+        for _, (prefix, address) in ElementTree.iterparse(path, events=["start-ns"]):
+            # Drake knows its own elements by their prefix.
+            ElementTree.register_namespace(prefix, address)
+        return ElementTree.parse(path).getroot()
+    except (ElementTree.ParseError, ValueError):
+        return None
+
+
+def _weld_base(plant: MultibodyPlant, frame: Frame) -> None:
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    inboard = {joint.child_body().index(): joint.parent_body() for joint in joints}
+    body = frame.body()
+    while body.index() in inboard:
+        body = inboard[body.index()]
+    if body.index() != plant.world_body().index():
+        plant.WeldFrames(plant.world_frame(), body.body_frame())
+
+
+class _Packages:
+    """Where the addresses of a model's meshes lead."""
+
+    def __init__(self, model: Path, package_paths: tuple[Path, ...]) -> None:
+        self._folder = model.resolve().parent
+        self.found: dict[str, Path] = {}
+        text = model.read_bytes().decode("utf-8", errors="replace")
+        for name in set(re.findall(r"package://([^/\s\"'<]+)", text)):
+            for folder in (*package_paths, *self._folder.parents):
+                for candidate in (folder / name, folder):
+                    if candidate.is_dir() and candidate.name == name:
+                        self.found.setdefault(name, candidate.resolve())
+
+    def file(self, address: str) -> Path | None:
+        """The file at an address; None if it is not there."""
+        match = re.match(r"(package|model)://([^/]+)/(.*)", address)
+        if match:
+            folder = self.found.get(match[2])
+            path = None if folder is None else folder / match[3]
+        else:
+            path = self._folder / address.removeprefix("file://")
+        return path if path is not None and path.is_file() else None
+
+
+def _without_lost_meshes(root: ElementTree.Element, packages: _Packages) -> list[str]:
+    """Removes shapes whose mesh is missing or not readable, and makes the others' paths absolute.
+
+    Returns:
+        The addresses of those that are removed.
+    """
+    lost: list[str] = []
+    for link in root.iter("link"):
+        for role in ("visual", "collision"):
+            for shape in link.findall(role):
+                mesh = shape.find("geometry/mesh")
+                if mesh is None:
+                    continue
+                address = mesh.get("filename") or mesh.findtext("uri") or ""
+                file = packages.file(address.strip())
+                if file is None or file.suffix.lower() not in _READABLE:
+                    link.remove(shape)
+                    lost.append(address)
+                elif mesh.get("filename"):
+                    mesh.set("filename", file.as_uri())
+                else:
+                    mesh.find("uri").text = file.as_uri()  # type: ignore[union-attr]
+    return lost
+
+
+def _efforts(root: ElementTree.Element) -> dict[str, float]:
+    """Torque limits of URDF joints."""
+    limits = ((joint.get("name"), joint.find("limit")) for joint in root.findall("joint"))
+    return {
+        name: float(limit.get("effort", "0"))
+        for name, limit in limits
+        if name is not None and limit is not None
+    }

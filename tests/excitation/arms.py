@@ -1,0 +1,98 @@
+"""Two arms that are not the station's, as people find them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def write_urdf(folder: Path) -> Path:
+    """Six joints, base hanging free, a gripper with a finger, meshes here, elsewhere and nowhere.
+
+    No accelerations; one joint is continuous, one has no speed.
+    """
+    package = folder / "somewhere" / "parts"
+    package.mkdir(parents=True)
+    (package / "forearm.obj").write_text(
+        "".join(
+            f"v {x} {y} {z}\n" for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (0.02, 0.28)
+        )
+        + "f 1 2 4 3\nf 5 6 8 7\nf 1 2 6 5\nf 3 4 8 7\nf 1 3 7 5\nf 2 4 8 6\n"
+    )
+
+    def link(name: str, mass: float, shape: str, length: float) -> str:
+        return (
+            f'<link name="{name}"><inertial><origin xyz="0 0 {length / 2}"/><mass value="{mass}"/>'
+            f'<inertia ixx="{0.02 * mass}" ixy="0" ixz="0" iyy="{0.02 * mass}" iyz="0"'
+            f' izz="{0.005 * mass}"/></inertial><collision><origin xyz="0 0 {length / 2}"/>'
+            f"<geometry>{shape}</geometry></collision></link>"
+        )
+
+    def joint(k: int, xyz: str, axis: str, limit: str, kind: str = "revolute") -> str:
+        return (
+            f'<joint name="j{k}" type="{kind}"><parent link="l{k - 1}"/><child link="l{k}"/>'
+            f'<origin xyz="{xyz}"/><axis xyz="{axis}"/><limit {limit}/></joint>'
+        )
+
+    rod = '<cylinder radius="0.04" length="0.2"/>'
+    links = [
+        link("l0", 5, '<box size="0.2 0.2 0.1"/>', 0.1),
+        link("l1", 4, rod, 0.2),
+        link("l2", 4, rod, 0.35),
+        link("l3", 3, '<mesh filename="package://parts/forearm.obj"/>', 0.0),
+        link("l4", 1, '<mesh filename="package://absent/wrist.stl"/>', 0.05),
+        link("l5", 1, '<cylinder radius="0.03" length="0.05"/>', 0.05),
+        link("l6", 0.3, '<cylinder radius="0.03" length="0.04"/>', 0.04),
+        link("gripper", 0.8, '<box size="0.04 0.1 0.06"/>', 0.06),
+        link("finger", 0.1, '<box size="0.01 0.01 0.05"/>', 0.05),
+    ]
+    wide = 'lower="-2.9" upper="2.9" velocity="3" effort="200"'
+    joints = [
+        joint(1, "0 0 0.15", "0 0 1", wide),
+        joint(2, "0 0 0.25", "0 1 0", 'lower="-1.9" upper="1.9" velocity="2.5" effort="200"'),
+        joint(3, "0 0 0.4", "0 1 0", 'lower="0.1" upper="2.6" velocity="3" effort="150"'),
+        joint(4, "0 0 0.3", "0 0 1", 'velocity="5" effort="30"', "continuous"),
+        joint(5, "0 0 0.1", "0 1 0", 'lower="-2" upper="2" velocity="0" effort="30"'),
+        joint(6, "0 0 0.1", "0 0 1", 'lower="-3" upper="3" velocity="6" effort="15"'),
+    ]
+    fixed = (
+        '<joint name="mount" type="fixed"><parent link="l6"/><child link="gripper"/>'
+        '<origin xyz="0 0 0.04"/></joint>'
+        '<joint name="slide" type="prismatic"><parent link="gripper"/><child link="finger"/>'
+        '<origin xyz="0 0 0.06"/><axis xyz="0 1 0"/>'
+        '<limit lower="0" upper="0.04" velocity="1" effort="20"/></joint>'
+    )
+    path = folder / "arm.urdf"
+    path.write_text(f'<robot name="six">{"".join(links + joints)}{fixed}</robot>')
+    return path
+
+
+def write_sdf(folder: Path) -> Path:
+    """Seven joints, all limits given, nothing beyond the last link's frame `wrist`."""
+    links, joints, z = [], [], 0.0
+    axes = ("0 0 1", "0 1 0", "0 0 1", "0 1 0", "0 0 1", "0 1 0", "0 0 1")
+    reach = (0.16, 0.2, 0.2, 0.2, 0.2, 0.2, 0.1)
+    for k, length in enumerate((0.12, *reach)):
+        mass = 4.0 if k < 5 else 1.0
+        links.append(
+            f'<link name="l{k}"><pose>0 0 {z} 0 0 0</pose><inertial><mass>{mass}</mass>'
+            f"<inertia><ixx>{0.02 * mass}</ixx><iyy>{0.02 * mass}</iyy><izz>{0.01 * mass}</izz>"
+            '</inertia></inertial><visual name="v"><pose>0 0 0.07 0 0 0</pose><geometry>'
+            "<capsule><radius>0.05</radius><length>0.06</length></capsule></geometry></visual>"
+            "</link>"
+        )
+        z += length
+        if k == 7:
+            break
+        joints.append(
+            f'<joint name="j{k + 1}" type="revolute"><parent>l{k}</parent><child>l{k + 1}</child>'
+            f"<axis><xyz>{axes[k]}</xyz><limit><lower>-2.2</lower><upper>2.2</upper>"
+            f"<velocity>{2 + k / 2}</velocity><effort>{200 - 20 * k}</effort>"
+            f"<drake:acceleration>{10 + 2 * k}</drake:acceleration></limit></axis></joint>"
+        )
+    frame = '<frame name="wrist" attached_to="l7"><pose>0 0 0.12 0 0 0.5</pose></frame>'
+    path = folder / "arm.sdf"
+    path.write_text(
+        '<?xml version="1.0"?><sdf version="1.9" xmlns:drake="drake.mit.edu"><model name="seven">'
+        f"{''.join(links + joints)}{frame}</model></sdf>"
+    )
+    return path

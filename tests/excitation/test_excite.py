@@ -1,0 +1,255 @@
+"""Designs for the station's arm and for others: feasible, checked by other means, and of use."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+from arms import write_sdf, write_urdf
+
+from drake_teleop.cli import main
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.excitation.check import check
+from drake_teleop.excitation.criteria import predicted_deviations
+from drake_teleop.excitation.excite import excite, sensor_motion
+from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
+from drake_teleop.experiments.excite import excite_command
+from drake_teleop.experiments.identification import identify_load
+from drake_teleop.load.excitation import FourierTrajectory
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import regressor
+from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.slave.wrist_sensor import WristSensorConfig
+
+
+@pytest.fixture(scope="module")
+def slave() -> Robot:
+    return RobotFromScenario(LoadScenario("identification"))
+
+
+@pytest.fixture(scope="module")
+def designed(slave):
+    return excite(slave, starts=2)
+
+
+@pytest.fixture(scope="module")
+def short(slave):
+    """A quick one, for what asks nothing of its quality."""
+    return excite(slave, starts=1, period=2.4, harmonics=2)
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    return write_urdf(tmp_path)
+
+
+def test_the_slaves_motion_is_good_at_rest_and_uses_no_limit_up(slave, designed):
+    assert designed.values["kappa_w10"] < 4.3
+    assert designed.history[-1, 1] == pytest.approx(designed.values["kappa_w10"], rel=0.01)
+    _, qd, qdd = designed.trajectory.evaluate(np.array([0.0, 6.0]))
+    np.testing.assert_allclose([qd, qdd], 0, atol=1e-12)
+    names = {use.limit for use in designed.uses}
+    assert names == {
+        "position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance"
+    }  # fmt: skip
+    assert all(0 < use.share <= 1 for use in designed.uses)
+    # Some limit is what stops it, or more would have been better.
+    assert designed.uses[0].share > 0.97
+    assert slave.limits.phi[0] == pytest.approx(1.3 * 3.13)
+
+
+def test_same_seed_same_trajectory_other_seed_another(slave, short):
+    again, other = (
+        excite(slave, starts=1, period=2.4, harmonics=2, seed=seed).trajectory for seed in (0, 1)
+    )
+    np.testing.assert_array_equal(again.rho, short.trajectory.rho)
+    assert not np.allclose(other.rho, again.rho, atol=1e-3)
+
+
+def test_the_executed_motion_keeps_the_limits(slave, short):
+    """In the whole simulation, with the station's joint control."""
+    scenario = replace(LoadScenario("identification"), simulation__duration=2.4)
+    found = identify_load(scenario, trajectory=short.trajectory)
+    assert found.trajectory is short.trajectory
+    limits, state = slave.limits, found.result["slave_state"]
+    q, qd = state[:, :6], state[:, 6:]
+    qdd = np.gradient(qd, found.result.t, axis=0)
+    assert np.all(np.abs(q - limits.q_middle) < limits.q_half)
+    assert np.all(np.abs(qd) < limits.velocity)
+    assert np.all(np.abs(qdd) < limits.acceleration)
+    assert not found.result["saturated"].any()
+    assert found.kappa_w10 == pytest.approx(short.values["kappa_w10"], rel=1e-9)
+
+
+def test_predicted_and_observed_scatter_agree(slave, designed):
+    """100 records of white noise at 1 kHz, weighted least squares with offsets."""
+    s, omega, alpha = sensor_motion(slave, designed.trajectory)
+    V = regressor(s, omega, alpha)
+    rows = np.concatenate([np.tile(np.eye(6), (len(V), 1, 1)), V], axis=2)
+    rows = (rows / np.repeat(slave.scales.noise, 3)[:, None]).reshape(-1, 16)
+    size = np.linalg.norm(rows, axis=0)
+    draws = np.random.default_rng(0).standard_normal((len(rows), 400))
+    observed = (np.linalg.pinv(rows / size) @ draws).std(axis=1) / size
+    predicted = predicted_deviations(s, omega, alpha, slave.scales.noise, 6.0)
+    np.testing.assert_allclose(observed, predicted, rtol=0.2)
+    np.testing.assert_allclose(designed.deviations, predicted, rtol=1e-12)
+
+
+def test_the_check_finds_every_kind_of_violation(slave, short):
+    """The same motion in a world where each limit in turn is a little less than what it uses."""
+    uses = {use.limit: use.share for use in short.uses}
+    limits = slave.limits
+    less = {
+        "position": {"q_half": 0.99 * uses["position"] * limits.q_half},
+        "velocity": {"velocity": 0.99 * uses["velocity"] * limits.velocity},
+        "acceleration": {"acceleration": 0.99 * uses["acceleration"] * limits.acceleration},
+        "torque": {"effort": 0.99 * uses["torque"] * limits.effort},
+        "sensor": {"sensor": 0.99 * uses["sensor"] * limits.sensor},
+        "workspace": {"box_half": 0.99 * uses["workspace"] * limits.box_half},
+        "clearance": {"clearance": 1.01 * limits.clearance / uses["clearance"]},
+    }
+    for name, changes in less.items():
+        tight = dataclasses.replace(slave, limits=limits._replace(**changes))
+        worst = check(tight, short.trajectory)[0]
+        assert (worst.limit, worst.share > 1, worst.share < 1.03) == (name, True, True)
+
+
+def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
+    t = np.zeros((6, 2))
+    for q, bodies in (
+        ([0, -1.9, -2.4, 0, -1.5, 0], {"tool", "link_1", "base", "link_2", "link_6", "link_5"}),
+        ([0, -2.2, 0.3, 0, 0, 0], {"world"}),
+    ):
+        worst = check(slave, FourierTrajectory(np.array(q, float), t, t, 1.0))
+        clearance = next(use for use in worst if use.limit == "clearance")
+        assert clearance.share > 1
+        assert bodies & set(clearance.what.split(" and "))
+
+
+def test_an_infeasible_design_is_never_returned_nor_written(slave, tmp_path, capsys):
+    box = slave.limits._replace(box_half=np.full(3, 0.01))
+    with pytest.raises(DrakeTeleopError, match="no trajectory was found that respects all limits"):
+        excite(dataclasses.replace(slave, limits=box), harmonics=2, starts=1)
+    path = write_sdf(tmp_path)
+    options = ["--sensor-frame", "wrist", "--payload", "60", "--harmonics", "2"]
+    with pytest.raises(SystemExit) as stop:
+        main(["excite", "--model", str(path), *options, "--quiet", "--out", str(tmp_path / "out")])
+    assert stop.value.code == 2
+    assert "respects all limits" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_trajectory_that_does_not_fit_the_run_is_refused(short):
+    scenario = LoadScenario("identification")
+    with pytest.raises(DrakeTeleopError, match=r"period is 2\.4 s, the simulation lasts 6 s"):
+        identify_load(scenario, trajectory=short.trajectory)
+    fitting = replace(scenario, simulation__duration=2.4)
+    with pytest.raises(DrakeTeleopError, match=r"trajectory: it uses 1\d\d\.\d% of its"):
+        identify_load(fitting, trajectory=short.trajectory.scaled(1.1))
+    with pytest.raises(DrakeTeleopError, match="moves 5 joints, the arm has 6"):
+        less = {name: getattr(short.trajectory, name)[:5] for name in ("q0", "rho", "delta")}
+        identify_load(fitting, trajectory=dataclasses.replace(short.trajectory, **less))
+
+
+def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
+    robot = RobotFromModel(urdf, "l6", WristSensorConfig())
+    assert robot.arm.joint_names == ("j1", "j2", "j3", "j4", "j5", "j6")
+    words = "; ".join(robot.assumptions)
+    assert "a range of +-3.142 rad for j4" in words
+    assert "a speed limit of 3.142 rad/s for j5" in words
+    assert "acceleration limits that reach full speed in 0.4 s (--acceleration) for all" in words
+    assert "no shape for 2 meshes" in words
+    # 80 % of what the model says; the gripper with its finger is the load, and 30 % more.
+    np.testing.assert_allclose(robot.limits.effort, 0.8 * np.array([200, 200, 150, 30, 30, 15]))
+    np.testing.assert_allclose(robot.limits.acceleration[:2], [7.5, 6.25])
+    assert robot.limits.phi[0] == pytest.approx(1.3 * 0.9)
+    found = RobotFromModel(
+        urdf, "l6", WristSensorConfig(), package_paths=(urdf.parent / "somewhere",),
+        acceleration=(5.0,), payload=3.0,
+    )  # fmt: skip
+    assert "no shape for 1 meshes" in "; ".join(found.assumptions)
+    np.testing.assert_array_equal(found.limits.acceleration, np.full(6, 5.0))
+    assert found.limits.phi[0] == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--sensor-frame", "nose"], "no frames are named 'nose'"),
+        (["--sensor-frame", "l6", "--acceleration", "1,2"], "2 acceleration limits for 6 joints"),
+        (["--sensor-frame", "l6", "--acceleration", "fast"], "--acceleration"),
+        (["--sensor-frame", "l6", "--payload", "0.1"], "holds 0.9 kg beyond the sensor"),
+        (["--sensor-frame", "finger"], "slide"),
+        (["--sensor-frame", "l0"], "no revolute joint"),
+        ([], "--sensor-frame"),
+    ],
+)
+def test_a_model_that_cannot_be_used_is_one_error_line(urdf, tmp_path, capsys, options, expected):
+    out = str(tmp_path / "out")
+    with pytest.raises(SystemExit) as stop:
+        main(["excite", "--model", str(urdf), *options, "--quiet", "--out", out])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert error.startswith("error: ") and error.count("\n") == 1
+    assert expected in error
+
+
+@pytest.mark.parametrize("text", ["", "<robot", "<robot name='r'><link name='a'/>", "hello"])
+@pytest.mark.parametrize("name", ["a.urdf", "a.sdf", "a.txt"])
+def test_a_file_that_is_no_robot_is_one_error_line(tmp_path, capsys, name, text):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(SystemExit) as stop:
+        main(["excite", "--model", str(path), "--sensor-frame", "a", "--quiet"])
+    assert stop.value.code == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1 and name in lines[0]
+
+
+def test_options_of_models_need_one(capsys, tmp_path):
+    with pytest.raises(SystemExit) as stop:
+        main(["excite", "--payload", "2", "--quiet", "--out", str(tmp_path)])
+    assert (stop.value.code, capsys.readouterr().err) == (2, "error: --payload: needs --model\n")
+
+
+@pytest.mark.parametrize(
+    ("write", "frame", "joints"), [(write_urdf, "l6", 6), (write_sdf, "wrist", 7)]
+)
+def test_any_arm_gets_its_motion_and_identify_closes_the_loop(write, frame, joints, tmp_path):
+    path, out = write(tmp_path), tmp_path / "out"
+    summary = excite_command(
+        "identification", out, model=path, sensor_frame=frame, period=4.0, harmonics=4, quiet=True
+    )
+    assert all(use["share"] <= 1 for use in summary["limit_use"].values())
+    assert json.loads((out / "summary.json").read_text()) == summary
+    assert (out / "excitation.png").stat().st_size > 20_000
+    table = pl.read_csv(out / "trajectory.csv")
+    assert table.shape == (4001, 1 + 3 * joints)
+    trajectory = FourierTrajectory.load(out / "excitation.yaml")
+    np.testing.assert_allclose(
+        trajectory.evaluate(table["t"].to_numpy())[0],
+        table.select([f"q_j{k + 1}" for k in range(joints)]).to_numpy(),
+        atol=1e-12,
+    )
+    robot = RobotFromModel(path, frame, WristSensorConfig())
+    motion = sensor_motion(robot, trajectory)
+    phi = phi_from_mass_com_inertia(0.8, [0.01, 0.02, 0.05], np.diag([2e-3, 2.2e-3, 1e-3]))
+    rng = np.random.default_rng(0)
+    sigma = np.repeat([0.25, 0.012], 3)
+    wrench = regressor(*motion) @ phi + [1, 2, 3, 0.1, 0.2, 0.3]
+    wrench += sigma * rng.standard_normal(wrench.shape)
+    names = ["f", "tau", "s", "omega", "alpha"]
+    columns = {"t": np.arange(len(wrench)) * 1e-3}
+    for name, values in zip(names, [wrench[:, :3], wrench[:, 3:], *motion], strict=True):
+        columns |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate("xyz")}
+    pl.DataFrame(columns).write_csv(tmp_path / "log.csv")
+    with pytest.raises(SystemExit) as stop:
+        main(["identify", str(tmp_path / "log.csv"), "--out", str(tmp_path / "load"), "--quiet"])
+    assert stop.value.code == 0
+    found = json.loads((tmp_path / "load" / "identification.json").read_text())
+    np.testing.assert_allclose(found["phi"], phi, atol=5 * max(summary["predicted_std"].values()))
+    assert found["phi"][0] == pytest.approx(0.8, rel=0.01)
+    assert found["phi"][4] == pytest.approx(phi[4], rel=0.1)

@@ -1,0 +1,165 @@
+"""Criteria and limits: what their docstrings say, and gradients against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.excitation.criteria import (
+    CRITERIA,
+    Criterion,
+    Scales,
+    characteristic_length,
+    predicted_deviations,
+)
+from drake_teleop.excitation.limits import LIMITS, Limits, capsule_distances, empty_motions
+from drake_teleop.excitation.problem import Problem, Task
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import regressor
+from drake_teleop.slave.plant import AddSlavePlant
+
+PHI = phi_from_mass_com_inertia(3.0, [0.01, -0.02, 0.08], np.diag([0.012, 0.0115, 0.0045]))
+SCALES = Scales((0.3, 0.02), 0.07, PHI)
+
+
+def motion(samples: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.standard_normal((3, samples, 3)) * np.array([10.0, 2.0, 30.0])[:, None, None]
+
+
+def value(name: str, samples: np.ndarray, duration: float = 1.0) -> float:
+    return Criterion(name, SCALES).value(*samples, duration)
+
+
+def test_condition_numbers_are_what_their_docstring_says():
+    samples = motion(300)
+    V = regressor(*samples)
+    rows = np.array(3 * [0.3] + 3 * [0.02])
+    columns = np.array([1.0] + 3 * [0.07] + 6 * [0.07**2])
+    whitened = (V / rows[:, None] * columns).reshape(-1, 10)
+    with_offsets = np.concatenate([np.tile(np.eye(6), (300, 1, 1)), V], axis=2).reshape(-1, 16)
+    assert value("kappa_w10", samples) == pytest.approx(np.linalg.cond(whitened), rel=1e-9)
+    assert value("kappa10", samples) == pytest.approx(np.linalg.cond(V.reshape(-1, 10)), rel=1e-9)
+    assert value("kappa16", samples) == pytest.approx(np.linalg.cond(with_offsets), rel=1e-7)
+
+
+def test_the_floor_of_kappa10_is_reached_and_never_passed():
+    """sqrt(8/3) for any motion; reached by isotropic, uncorrelated s and alpha, alpha^2 = 3 s^2."""
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    s = np.repeat(axes, 6, axis=0)
+    alpha = np.sqrt(3) * np.tile(axes, (6, 1))
+    assert value("kappa10", (s, 0 * s, alpha)) == pytest.approx(np.sqrt(8 / 3), rel=1e-12)
+    rng = np.random.default_rng(4)
+    for scale in (0.1, 1.0, 10.0):
+        omega = scale * rng.standard_normal(s.shape)
+        assert value("kappa10", (s, omega, alpha)) > np.sqrt(8 / 3)
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+def test_a_motion_that_determines_too_little_has_no_finite_value(name):
+    s = np.random.default_rng(5).standard_normal((50, 3))
+    assert value(name, (s, 0 * s, 0 * s)) == np.inf
+
+
+def test_an_unknown_criterion_lists_the_known_ones():
+    with pytest.raises(DrakeTeleopError, match="kappa_w10, kappa10"):
+        Criterion("kappa11", SCALES)
+
+
+def test_predicted_deviations_are_those_of_white_noise():
+    """Spread of weighted least squares over 400 draws, and A16 and D16 from the same covariance."""
+    samples = motion(200, seed=2)
+    sigma = np.repeat(SCALES.noise, 3)
+    rows = np.concatenate([np.tile(np.eye(6), (200, 1, 1)), regressor(*samples)], axis=2)
+    whitened = (rows / sigma[:, None]).reshape(-1, 16)
+    errors = np.linalg.pinv(whitened) @ np.random.default_rng(3).standard_normal((1200, 400))
+    predicted = predicted_deviations(*samples, SCALES.noise, duration=0.2)
+    np.testing.assert_allclose(errors.std(axis=1), predicted, rtol=0.12)
+
+    inertia = 0.1 * (PHI[4] + PHI[7] + PHI[9]) / 3
+    would_do = np.array([*3 * [0.1], *3 * [0.005], 0.03, *3 * [0.003], *6 * [inertia]])
+    rms = np.sqrt(np.mean((predicted / would_do)[6:] ** 2))
+    assert value("A16", samples, 0.2) == pytest.approx(rms, rel=1e-6)
+    covariance = np.linalg.inv(whitened.T @ whitened) / np.outer(would_do, would_do)
+    mean_axis = np.exp(np.linalg.slogdet(covariance)[1] / 32)
+    assert value("D16", samples, 0.2) == pytest.approx(mean_axis, rel=1e-6)
+
+
+def test_the_length_is_never_above_the_radius_of_gyration():
+    assert characteristic_length(PHI) == pytest.approx(0.1, rel=0.05)
+    near = phi_from_mass_com_inertia(2.0, [0, 0, 0], 2.0 * 0.03**2 * np.eye(3) * 2 / 3)
+    assert characteristic_length(near) == pytest.approx(0.03)
+
+
+def limits_of(arm) -> Limits:
+    """All of them in reach of a moderate motion, three capsules, one of them still."""
+    middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
+    return Limits(
+        q_middle=middle,
+        q_half=half,
+        velocity=arm.velocity_limit,
+        acceleration=arm.acceleration_limit,
+        effort=arm.effort_limit,
+        phi=arm.phi_load,
+        sensor=np.array([180.0, 10.0, 50.0, 500.0]),
+        points_S=np.array([[0.0, 0.0, -0.085], [0.01, 0.02, 0.2]]),
+        box_middle=np.array([0.65, 0.0, 0.7]),
+        box_half=np.array([0.4, 0.7, np.inf]),
+        capsule_row=np.array([1, 5, -1]),
+        capsule_ends=np.array(
+            [
+                [[0.0, 0.0, -0.12], [0.45, 0.0, -0.12]],
+                [[0.0, 0.0, 0.1], [0.0, 0.0, 0.28]],
+                [[0.5, 0.1, 0.0], [0.5, 0.1, 0.3]],
+            ]
+        ),
+        capsule_radius=np.array([0.08, 0.04, 0.05]),
+        pairs=np.array([[0, 1], [1, 2]]),
+        clearance=0.02,
+    )
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+def test_gradients_of_criterion_and_limits(arm, name):
+    # With damping, which the station's arm has not.
+    table = arm.table.copy()
+    table[:-1, 23] = 0.5
+    home = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0])
+    task = Task(table, limits_of(arm), Criterion(name, SCALES), home, 6.0, 3)
+    problem = Problem(task)
+    x = problem.candidate(np.random.default_rng(0), near_home=True)
+    gradients = problem.evaluate(x, 3.0, 5.0).gradients
+    scale = np.abs(gradients).max(axis=1)
+    assert np.all(scale > 1e-3), LIMITS
+    step = 1e-6
+    for k, unit in enumerate(np.eye(len(x))):
+        ahead, behind = (problem.evaluate(x + sign * step * unit, 3.0, 5.0) for sign in (1, -1))
+        of_criterion = ahead.log_criterion - behind.log_criterion
+        numeric = np.array([of_criterion, *(ahead.uses - behind.uses)]) / (2 * step)
+        np.testing.assert_allclose(gradients[:, k] / scale, numeric / scale, rtol=0, atol=2e-5)
+
+
+def test_distances_of_capsules():
+    """Crossing lines, parallel segments, end to end, and points."""
+    ends = np.array(
+        [
+            [[-1.0, 0, 0], [1, 0, 0]],
+            [[0.0, -1, 0.5], [0, 1, 0.5]],
+            [[0.5, 0.3, 0], [2, 0.3, 0]],
+            [[2.0, 0, 0], [3, 0, 0]],
+            [[0.0, 0, 2], [0, 0, 2]],
+            [[0.0, 3, 2], [0, 3, 2]],
+        ]
+    )
+    rows, radii = np.full(6, -1), np.full(6, 0.1)
+    pairs = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [4, 5], [3, 4], [4, 3]])
+    distances = capsule_distances(empty_motions(1, 1), rows, ends, radii, pairs)[0]
+    expected = [0.5, 0.3, 1, 2, 3, np.sqrt(8), np.sqrt(8)]
+    np.testing.assert_allclose(distances, np.array(expected) - 0.2, atol=1e-12)
