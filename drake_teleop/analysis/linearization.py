@@ -100,6 +100,9 @@ class Linearization:
         Args:
             outputs, inputs: a port's name, or names of its parts.
             periods: whole periods of delay.
+
+        Raises:
+            DrakeTeleopError: if there is no such output or input.
         """
         rows, columns = self._indices(outputs, self.outputs), self._indices(inputs, self.inputs)
         if periods > 0:
@@ -168,21 +171,34 @@ class Linearization:
         return result
 
     def to_control(self) -> Any:
-        """As a discrete `control.StateSpace`, with the names of inputs, outputs and states."""
+        """As a discrete `control.StateSpace` with the same names, but "port[x]" for "port.x"."""
         import control
 
         system = self.expanded()
         return control.StateSpace(
             *(system.A, system.B, system.C, system.D, system.dt),
-            inputs=list(system.inputs),
-            outputs=list(system.outputs),
+            # python-control takes no dots in the names of inputs and outputs.
+            inputs=[_in_brackets(name) for name in system.inputs],
+            outputs=[_in_brackets(name) for name in system.outputs],
             states=list(system.states),
         )
 
     @staticmethod
     def _indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
         parts = _parts(names) if isinstance(names, str) else names
+        if missing := [name for name in parts if name not in known]:
+            ports = sorted({name.rpartition(".")[0] or name for name in known})
+            raise DrakeTeleopError(
+                f"there is no {missing[0]}",
+                where="close",
+                remedy=f"name one of {', '.join(ports)}, or a list of parts, as ['{known[0]}']",
+            )
         return tuple(known.index(name) for name in parts)
+
+
+def _in_brackets(name: str) -> str:
+    port, dot, part = name.rpartition(".")
+    return f"{port}[{part}]" if dot else name
 
 
 def _near_the_circle(A: Any, highest: float) -> Complex:

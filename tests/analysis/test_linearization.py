@@ -344,6 +344,18 @@ def test_loops_with_delay(periods):
     assert loop * z**-periods == pytest.approx(1.0, rel=1e-8)
 
 
+def test_ports_have_names_in_control_too():
+    parts = {"inputs": ("hand_wrench.x", "hand_wrench.rx"), "outputs": ("twist_master.x", "felt")}
+    system = changed(small_system(), **parts).to_control()
+    assert system.input_labels == ["hand_wrench[x]", "hand_wrench[rx]"]
+    assert system.output_labels == ["twist_master[x]", "felt"]
+
+
+def test_a_port_that_is_not_there_is_said():
+    with pytest.raises(DrakeTeleopError, match=r"there is no pose\.x; name one of"):
+        small_system().close("pose", "wrench")
+
+
 def test_many_states_still_give_the_largest_multipliers():
     few = small_system().close(["felt"], ["wrench"], 40)
     padded = few.expanded()
