@@ -41,6 +41,13 @@ def llewellyn(H: Complex) -> Real:
     return 2 * h11.real * h22.real - product.real - np.abs(product)
 
 
+def llewellyn_parameter(H: Complex) -> Real:
+    """(2 Re h11 Re h22 - Re h12 h21) / |h12 h21|, at least 1 where absolutely stable."""
+    product = np.abs(H[..., 0, 1] * H[..., 1, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return 1.0 + llewellyn(H) / product
+
+
 def absolutely_stable(H: Complex) -> Flags:
     """Whether no passive hand and environment can make the station oscillate at the frequency."""
     h11, h12, h21, h22 = entries(H)

@@ -205,6 +205,22 @@ def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) 
     )
 
 
+def reference_impedances(axis: OneAxis) -> tuple[float, float]:
+    """For `scattering`: the damping of the hand, and what it is seen through the scales [N s/m].
+
+    Raises:
+        DrakeTeleopError: if one of the scales is 0.
+    """
+    scale = axis.force_scale * axis.position_scale
+    if scale == 0:
+        raise DrakeTeleopError(
+            "nothing is seen through a scale of 0",
+            where="force_scale, translation_scale",
+            remedy="set both above 0",
+        )
+    return axis.hand_damping, axis.hand_damping / scale
+
+
 def power_ratio(axis: OneAxis) -> float:
     """k_f gamma / l_p: how much of the slave's power its scales let through to the hand."""
     return axis.force_scale * axis.gamma / axis.position_scale

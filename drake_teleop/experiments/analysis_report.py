@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +11,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from drake_teleop.analysis import absolute_stability, transparency
 from drake_teleop.analysis.maps import StabilityMap
-from drake_teleop.analysis.one_axis import Complex
+from drake_teleop.analysis.one_axis import Complex, OneAxis
 from drake_teleop.analysis.two_port import (
     power_ratio,
     power_scaled,
+    reference_impedances,
     scattering,
     transmitted_impedance,
 )
-from drake_teleop.experiments.analyze import Curves, llewellyn_parameter, references
 from drake_teleop.html import embedded, render
 from drake_teleop.style import COLOURS, GREY, VERMILION, Picture, house_style
 
@@ -33,6 +35,27 @@ _AXES = {
     "mass_error": ("estimated minus true mass [kg]", 1.0),
     "rate": ("rate of the hand [kHz]", 1e-3),
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """What the pictures show beyond the figures.
+
+    Args:
+        omega: (n,) [rad/s].
+        H: (n, 2, 2) of the Diagram, without the hand's mass; closed_form: likewise.
+        wall: stiffness and damping of the environment [N/m], [N s/m].
+        nyquist: grip -> (n,) loop, which is at its limit where it is -1.
+        maps: title -> grip -> map.
+    """
+
+    axis: OneAxis
+    omega: NDArray[np.float64]
+    H: Complex
+    closed_form: Complex
+    wall: tuple[float, float]
+    nyquist: dict[str, Complex]
+    maps: dict[str, dict[str, StabilityMap]]
 
 
 def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
@@ -160,14 +183,14 @@ def draw_passive_loads(curves: Curves) -> Figure:
     hertz, axis = curves.omega / (2 * np.pi), curves.axis
     ratio = power_ratio(axis)
     scaled = power_scaled(curves.H, ratio) if ratio > 0 else curves.H
-    S = scattering(scaled, references(axis))
+    S = scattering(scaled, reference_impedances(axis))
     wall = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, curves.wall[0]))
     hands = absolute_stability.range_of_grips()
     bounded = absolute_stability.bounded_singular_value(curves.H, curves.omega, hands, wall)
     with house_style():
         figure = Picture(figsize=(9.0, 3.6))
         left, right = figure.subplots(1, 2)
-        left.semilogx(hertz, llewellyn_parameter(curves.H), color=COLOURS[0])
+        left.semilogx(hertz, absolute_stability.llewellyn_parameter(curves.H), color=COLOURS[0])
         left.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
         left.set_ylim(-1.2, 5.0)
         left.set_title("Llewellyn's parameter: absolutely stable from 1 on")

@@ -32,7 +32,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -67,10 +66,13 @@ from drake_teleop.analysis.two_port import (
     hybrid,
     power_ratio,
     power_scaled,
+    reference_impedances,
     scattering,
     transmitted_impedance,
 )
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.experiments.analysis_report import Curves, print_tables, write_report
+from drake_teleop.experiments.analysis_verdict import verdict
 from drake_teleop.experiments.identification import slave_arm
 from drake_teleop.experiments.progress import Stage, progress_bars
 from drake_teleop.master.operator import GRIPS
@@ -89,27 +91,6 @@ _PRESSED = 5e-3  # m, how deep the hand presses into the leaf
 _FELT_BAND = 2 * np.pi * 5.0  # rad/s, up to which mass, damping and stiffness are fitted
 _PIXELS = 80  # of a map, each way
 _MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Curves:
-    """What the pictures show beyond the figures.
-
-    Args:
-        omega: (n,) [rad/s].
-        H: (n, 2, 2) of the Diagram, without the hand's mass; closed_form: likewise.
-        wall: stiffness and damping of the environment [N/m], [N s/m].
-        nyquist: grip -> (n,) loop, which is at its limit where it is -1.
-        maps: title -> grip -> map.
-    """
-
-    axis: OneAxis
-    omega: Array
-    H: Complex
-    closed_form: Complex
-    wall: tuple[float, float]
-    nyquist: dict[str, Complex]
-    maps: dict[str, dict[str, StabilityMap]]
 
 
 def analyze_command(
@@ -134,8 +115,6 @@ def analyze_command(
     with progress_bars(quiet) as stage:
         summary, curves = analyze(setup, direction, stage)
     summary = {"scenario": scenario, **summary}
-    from drake_teleop.experiments.analysis_report import print_tables, write_report
-
     (out / "summary.json").write_text(
         json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8"
     )
@@ -354,10 +333,10 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
 
 def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
     """For anything passive at either end: Llewellyn; Raisbeck and scattering on scaled ports."""
-    parameter = llewellyn_parameter(H)
+    parameter = absolute_stability.llewellyn_parameter(H)
     worst = int(np.argmin(parameter))
     scaled = power_scaled(H, power_ratio(axis)) if power_ratio(axis) > 0 else H
-    norm = absolute_stability.scattering_norm(scattering(scaled, references(axis)))
+    norm = absolute_stability.scattering_norm(scattering(scaled, reference_impedances(axis)))
     return {
         "absolutely_stable": bool(absolute_stability.absolutely_stable(H).all()),
         "least_parameter": float(parameter[worst]),
@@ -366,18 +345,6 @@ def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
         "passive": bool(absolute_stability.passive(scaled).all()),
         "scattering_norm": float(norm.max()),
     }
-
-
-def llewellyn_parameter(H: Complex) -> Array:
-    """(2 Re h11 Re h22 - Re h12 h21) / |h12 h21|; 1 and more is absolutely stable."""
-    product = np.abs(H[:, 0, 1] * H[:, 1, 0])
-    return 1.0 + absolute_stability.llewellyn(H) / np.maximum(product, 1e-300)
-
-
-def references(axis: OneAxis) -> tuple[float, float]:
-    """Impedances to which waves refer: the hand's damping, and that as the slave sees it."""
-    scale = max(axis.force_scale * axis.position_scale, 1e-12)
-    return axis.hand_damping, axis.hand_damping / scale
 
 
 def bounded_figures(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
@@ -509,85 +476,6 @@ def parameter_maps(
         found[title] = {grip: stability_map(held_by(base, grip), sampling, *grid) for grip in GRIPS}
         progress((done + 1) / len(wanted))
     return found
-
-
-def verdict(figures: dict[str, Any]) -> list[str]:
-    """The figures in words."""
-    said = []
-    if figures["method"] != "none":
-        said.append(
-            f"The method {figures['method']} is not linear: what follows is the station without it."
-        )
-    for point in figures["diagram"]:
-        pace, hertz = point["decay_1_per_s"], point["frequency_Hz"]
-        if pace is None:
-            stable = "stable" if point["stable"] else "unstable"
-            said.append(f"In the state '{point['point']}' one axis of the station is {stable}.")
-            continue
-        motion = f"at {hertz:.3g} Hz" if hertz > 0.01 else "without oscillation"
-        said.append(
-            f"In the state '{point['point']}', with the {figures['grip']} grip, the Diagram is "
-            + (
-                f"stable: what dies last halves every {1e3 * np.log(2) / pace:.3g} ms, {motion}."
-                if point["stable"]
-                else f"unstable: it doubles every {-1e3 * np.log(2) / pace:.3g} ms, {motion}."
-            )
-        )
-    said += [
-        _bears(row, figures["delay_s"])
-        for row in figures["margins"]
-        if row["grip"] == figures["grip"] and row["wall_N_per_m"] == figures["wall_N_per_m"]
-    ]
-    worst = max(figures["two_port"]["sampled"].values())
-    if worst > 0.1:
-        said.append(
-            f"Along {figures['direction']} the station is not one axis: its two-port differs by up "
-            f"to {100 * worst:.2g} % below 30 Hz, because a push turns hand and tool. Margins and "
-            "maps, which are those of one axis, are rough there."
-        )
-    bounded = figures["bounded"]
-    each = ", ".join(f"{grip} {_stiffness(K)}" for grip, K in bounded["each"].items())
-    said.append(
-        f"Walls are stable up to a stiffness that depends on the hand: {each}; for every hand "
-        f"between the lightest and the firmest grip {_stiffness(bounded['grips'])}."
-    )
-    absolute = figures["absolute"]
-    if absolute["absolutely_stable"]:
-        said.append("It is absolutely stable: no passive hand and environment make it oscillate.")
-    else:
-        lacking = absolute["lacking_damping_Ns_per_m"]
-        remedy = "no amount of" if lacking is None else f"{lacking:.3g} N s/m more"
-        said.append(
-            "It is not absolutely stable, as no position-force station behind a servo is: some "
-            f"passive hand and environment would oscillate, most of all at {absolute['at_Hz']:.3g} "
-            f"Hz; {remedy} damping of the device would prevent it. For hands and walls that there "
-            "are, the limits above count."
-        )
-    free, wall = figures["transparency"]["free"], figures["transparency"]["wall"]
-    felt, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]
-    said.append(
-        f"In free motion the hand feels {1e3 * free['felt']['mass']:.3g} g, where device and "
-        f"σ = {figures['axis']['sigma']:g} make {1e3 * free['ideal']['mass']:.3g} g; of the wall "
-        f"it feels {felt:.3g} N/m of {ideal:.3g} N/m. A human could not tell the wall from the "
-        f"ideal one up to {wall['unnoticed_to_Hz']:.2g} Hz; the slave follows up to "
-        f"{figures['transparency']['tracking_bandwidth_Hz']:.3g} Hz."
-    )
-    return said
-
-
-def _bears(row: dict[str, Any], delay: float) -> str:
-    wall = f"a wall of {_stiffness(row['wall_N_per_m'])}"
-    if not row["stable"]:
-        return f"Before {wall} it is unstable with that grip."
-    spare = None if row["round_trip_s"] is None else row["round_trip_s"] - 2 * delay
-    longest = "any delay" if spare is None else f"{1e3 * spare:.3g} ms more round trip"
-    return f"Before {wall} it bears {longest}, and {row['gain']:.3g} times its gain."
-
-
-def _stiffness(value: float | None) -> str:
-    if value == 0:
-        return "none"
-    return "any stiffness" if value is None else f"{value / 1e3:.3g} kN/m"
 
 
 def _plain(value: Any) -> Any:
