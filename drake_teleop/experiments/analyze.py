@@ -136,17 +136,20 @@ def analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str,
     linear = replace(scenario, passivity=PassivityConfig())
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
     along = task_direction(linear, DIRECTIONS[direction])
-    axis, sampling = along.axis, sampling_of(linear)
-    wall = (axis.wall_stiffness, axis.wall_damping) if scenario.sheet_spring else (5100.0, 0.0)
+    sampling = sampling_of(linear)
+    wall = (5100.0, 0.0)
+    if scenario.sheet_spring is not None:
+        wall = (along.axis.wall_stiffness, along.axis.wall_damping)
+    axis = dataclasses.replace(along.axis, wall_stiffness=0.0, wall_damping=0.0)
     contact = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
 
     progress = stage("Linearise the Diagram")
     free = linearize(replace(linear, sheet_spring=None), load_estimate=estimate)
     progress(0.5)
-    points = {"free motion": free}
+    points = [("free motion", free, axis)]
     if scenario.sheet_spring is not None:
-        pressed = pressing(linear)
-        points["on the leaf"] = linearize(linear, load_estimate=estimate, displacement=pressed)
+        pressed = linearize(linear, load_estimate=estimate, displacement=pressing(linear))
+        points.append(("on the leaf", pressed, contact))
     progress(1.0)
 
     progress = stage("Two-port, margins, transparency")
@@ -164,10 +167,8 @@ def analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str,
         "wall_N_per_m": wall[0],
         "axis": dataclasses.asdict(axis) | {"tool_coupling": along.tool_coupling},
         "diagram": [
-            diagram_figures(
-                name, closed(system, linear), axis if name == "free motion" else contact, sampling
-            )
-            for name, system in points.items()
+            diagram_figures(name, closed(system, linear), on_paper, sampling)
+            for name, system, on_paper in points
         ],
         "two_port": deviations(H, axis, sampling),
         "margins": margin_rows(axis, sampling, wall[0]),
@@ -454,7 +455,6 @@ def parameter_maps(
     axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: Stage
 ) -> dict[str, dict[str, StabilityMap]]:
     """Title -> grip -> stability over two parameters."""
-    free = dataclasses.replace(axis, wall_stiffness=0.0, wall_damping=0.0)
     touching = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
     n, tool = _PIXELS, axis.tool_mass
     delay, sigma = np.linspace(0.0, 0.2, n), np.linspace(0.0, 2.0, n)
@@ -464,10 +464,10 @@ def parameter_maps(
     rate = np.geomspace(max(slowest, 100.0), 10e3, n)
     wanted: dict[str, tuple[Any, ...]] = {
         "Delay and stiffness of the wall": (touching, "delay", delay, "wall_stiffness", walls),
-        "Delay and σ, in free motion": (free, "delay", delay, "sigma", sigma),
+        "Delay and σ, in free motion": (axis, "delay", delay, "sigma", sigma),
         "Delay and σ, on the wall": (touching, "delay", delay, "sigma", sigma),
         "Error of the estimated mass and σ, in free motion": (
-            *(free, "mass_error", np.linspace(-0.9, 4.0, n) * tool, "sigma", sigma),
+            *(axis, "mass_error", np.linspace(-0.9, 4.0, n) * tool, "sigma", sigma),
         ),
         "Rate and stiffness of the wall": (touching, RATE, rate, "wall_stiffness", walls),
     }

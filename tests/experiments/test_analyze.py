@@ -53,6 +53,13 @@ def test_the_diagram_is_the_sampled_model_of_one_axis(run):
     assert deviation["h11"] < 0.01
 
 
+def test_what_dies_last_dies_as_on_one_axis(run):
+    """Of this scenario it is the vertical motion, which the wrist's coupling changes by 1 %."""
+    for point in run[0]["diagram"]:
+        for name in ("decay_1_per_s", "frequency_Hz"):
+            assert point[name] == pytest.approx(point["one_axis"][name], rel=0.02)
+
+
 def test_the_nonlinear_simulation_feels_as_the_linearised_diagram(run):
     measured = run[0]["measured"]
     assert max(measured["frequency_Hz"]) > 29.9
