@@ -7,7 +7,8 @@ whole hand periods, so that its boundaries are curves instead of steps.
 Over-compensation. Where the slave is free and sigma = 0, an error dm of the estimated mass is felt
 as the mass -k_f l_p gamma dm. If the slave follows at once, that must not exceed the mass m that
 hand and device move anyway: dm < m / (k_f l_p gamma), and with sigma > 0
-(gamma - sigma) dm - sigma m_t < m / (k_f l_p). A servo's lag shifts the bound by a few percent.
+(gamma - sigma) dm - sigma m_t < m / (k_f l_p). The lag of the station's servo lowers the bound, by
+2 % with the firm grip, 10 % with the medium and 18 % with the light one.
 """
 
 from __future__ import annotations

@@ -1,0 +1,149 @@
+"""docs/analysis.md: its scripts run, its tables are what they print or what the Diagram says."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_teleop.analysis.absolute_stability import (
+    range_of_grips,
+    required_damping,
+    stiffness_limit,
+    worst_loads,
+)
+from drake_teleop.analysis.linearization import AXES, hybrid_along, linearize
+from drake_teleop.analysis.margins import (
+    delay_independent_mass,
+    held_device,
+    tolerated_mass_error,
+)
+from drake_teleop.analysis.one_axis import OneAxis
+from drake_teleop.analysis.sampled_loop import (
+    Sampling,
+    cut_loop,
+    sampled_two_port,
+    unstable_multipliers,
+)
+from drake_teleop.analysis.task_direction import OneAxisFromScenario, task_direction
+from drake_teleop.analysis.two_port import absorb, hybrid
+from drake_teleop.experiments.identification import slave_arm
+from drake_teleop.scenario import LoadScenario
+from drake_teleop.scenario import replace as with_values
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "docs" / "analysis.md").read_text(encoding="utf-8")
+MARGINS, IN_PYTHON, DIAGRAM = re.findall("```python\n(.*?)```", TEXT, re.S)
+UP = (0.0, 0.0, 1.0)
+
+
+def rows(heading: str) -> list[list[str]]:
+    """Cells of the table whose heading begins so."""
+    _, table = TEXT.split(f"| {heading} |", 1)
+    lines = table.split("\n\n", 1)[0].splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def axis_of(grip: str) -> OneAxis:
+    scenario = LoadScenario("contact_transition")
+    scenario.operator.grip = grip
+    return OneAxisFromScenario(scenario, UP)
+
+
+def test_the_table_of_margins_is_what_its_script_prints(capsys):
+    exec(compile(MARGINS, "analysis.md", "exec"), {})
+    printed = capsys.readouterr().out.splitlines()
+    assert [line for line in TEXT.splitlines() if line in printed] == printed
+    assert len(rows("grip | wall, kN/m")) == len(printed) == 12
+
+
+def test_the_functions_work_as_shown():
+    names: dict = {}
+    exec(compile(IN_PYTHON, "analysis.md", "exec"), names)
+    assert not names["is_robust"]
+    assert 0 < names["softest"] < np.inf
+    undelayed = hybrid(replace(names["axis"], delay=0.0), names["s"])
+    np.testing.assert_allclose(names["same"], undelayed, rtol=1e-9)
+    assert names["closed"].isdtime(strict=True)
+
+
+def test_the_diagram_works_as_shown():
+    # The estimate that the script takes some seconds to identify.
+    shown = 'dt.identify_load(dt.LoadScenario("identification")).estimate'
+    assert shown in DIAGRAM
+    true = np.concatenate([np.zeros(6), slave_arm(LoadScenario("free_motion_force")).phi_load])
+    names: dict = {"true": true}
+    exec(compile(DIAGRAM.replace(shown, "true"), "analysis.md", "exec"), names)
+    assert abs(names["closed"].multipliers[0]) < 1
+    assert names["H"].shape == (50, 2, 2)
+
+
+@pytest.fixture(scope="module")
+def diagrams():
+    """Sensor -> (omega, H of the Diagram, its axis, its rates)."""
+    omega, found = 2 * np.pi * np.geomspace(0.1, 300.0, 500), {}
+    for sensor, name in (("real", "contact_transition"), ("ideal", "ideal_sensor")):
+        scenario = with_values(LoadScenario(name), sheet_spring=None, force_scaling__sigma=0.0)
+        scenario.operator.grip = "firm"
+        along = task_direction(scenario, UP)
+        estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+        cut = linearize(scenario, load_estimate=estimate)
+        others = [axis for axis in AXES if axis != "z"]
+        system = cut.close(
+            [f"operator_wrench.{axis}" for axis in others],
+            [f"hand_wrench.{axis}" for axis in others],
+        )
+        system = system.close("pose_command", "pose_received").close("wrench_B", "wrench_received")
+        H = hybrid_along(system, omega, along.hand, along.tool)
+        H = absorb(H, hand=-1j * omega * along.axis.hand_mass)
+        low_pass = None if sensor == "ideal" else scenario.wrist_sensor.bandwidth_hz
+        found[sensor] = omega, H, along.axis, Sampling(low_pass_hz=low_pass)
+    return found
+
+
+def test_how_far_the_models_are_from_the_diagram(diagrams):
+    for model, sensor, *said in rows("model | sensor"):
+        omega, H, axis, sampling = diagrams[sensor]
+        band = omega <= 2 * np.pi * 30
+        omega, H = omega[band], H[band]
+        other = (
+            hybrid(axis, 1j * omega)
+            if model == "closed form"
+            else sampled_two_port(axis, sampling, omega)
+        )
+        off = 100 * np.abs(H - other).max(axis=0) / np.abs(other).max(axis=0)
+        np.testing.assert_allclose(off.ravel(), [float(x) for x in said], atol=0.02, rtol=0.01)
+
+
+def test_what_llewellyn_lacks_and_what_the_grips_bear(diagrams):
+    omega, H, *_ = diagrams["real"]
+    (damping,) = re.findall(r"lacks (\d+) N s/m", TEXT)
+    assert required_damping(H).max() == pytest.approx(float(damping), rel=0.01)
+    (limit,) = re.findall(r"before walls up to\n([\d.]+) kN/m", TEXT)
+    softest = stiffness_limit(H, omega, range_of_grips()).min()
+    ((mass, wall),) = re.findall(
+        r"at 10 Hz a hand of ([\d.]+) kg before a wall of ([\d.]+) MN", TEXT
+    )
+    at = int(np.argmin(np.abs(omega - 20 * np.pi)))
+    worst = worst_loads(H[at])
+    assert worst.hand / omega[at] == pytest.approx(float(mass), rel=0.05)
+    assert -worst.environment * omega[at] == pytest.approx(1e6 * float(wall), rel=0.05)
+    assert softest == pytest.approx(1e3 * float(limit), rel=0.01)
+
+
+def test_errors_of_the_load():
+    error, sampling = np.arange(0.0, 14.0, 0.01), Sampling(low_pass_hz=500.0)
+    for grip, *said in rows("grip | bound, kg"):
+        axis = axis_of(grip)
+        device = held_device(axis)
+        wrong = replace(axis, wall_stiffness=0.0, wall_damping=0.0, mass_error=error)
+        unstable = unstable_multipliers(cut_loop(wrong, sampling), 0.0) > 0
+        found = [
+            tolerated_mass_error(device[0], axis.force_scale, axis.position_scale),
+            error[np.argmax(unstable)],
+            delay_independent_mass(*device) / axis.force_scale,
+        ]
+        np.testing.assert_allclose(found, [float(x) for x in said], atol=0.06)
