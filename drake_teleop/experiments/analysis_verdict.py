@@ -77,7 +77,8 @@ def _bears(row: dict[str, Any], delay: float) -> str:
         return f"Before {wall} it is unstable with that grip."
     spare = None if row["round_trip_s"] is None else row["round_trip_s"] - 2 * delay
     longest = "any delay" if spare is None else f"{1e3 * spare:.3g} ms more round trip"
-    return f"Before {wall} it bears {longest}, and {row['gain']:.3g} times its gain."
+    more = "any gain" if row["gain"] is None else f"{row['gain']:.3g} times its gain"
+    return f"Before {wall} it bears {longest}, and {more}."
 
 
 def _stiffness(value: float | None) -> str:

@@ -89,6 +89,7 @@ _OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
 _S: Complex = 1j * _OMEGA.astype(complex)
 _PRESSED = 5e-3  # m, how deep the hand presses into the leaf
 _FELT_BAND = 2 * np.pi * 5.0  # rad/s, up to which mass, damping and stiffness are fitted
+_NOTHING = 1e-9  # a loop that is nowhere larger than this is none
 _PIXELS = 80  # of a map, each way
 _MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
@@ -312,20 +313,26 @@ def deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
 
 
 def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict[str, Any]]:
-    """Gain and phase margins of the continuous loop, the round trip of the sampled one."""
+    """Gain, phase and round trip of the sampled loop, for each grip before each wall."""
     rows = []
+    omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
     for grip in GRIPS:
         for wall in sorted({*WALLS, own_wall}):
-            held = dataclasses.replace(held_by(axis, grip), wall_stiffness=wall, wall_damping=0.0)
-            found = margins.margins(margins.station_loop(held))
+            held = dataclasses.replace(held_by(axis, grip), wall_stiffness=wall)
             loop = cut_loop(held, sampling)
+            response = -loop_response(loop, omega, axis.delay)
+            stable = bool(unstable_multipliers(loop, axis.delay) == 0)
+            gain, phase = (np.inf, np.inf) if stable else (1.0, 0.0)
+            if stable and np.abs(response).max() > _NOTHING:
+                found = margins.margins_of_response(omega, response, sampled=True)
+                gain, phase = float(found.gain), float(np.degrees(found.phase))
             rows.append(
                 {
                     "grip": grip,
                     "wall_N_per_m": wall,
-                    "stable": bool(unstable_multipliers(loop, axis.delay) == 0),
-                    "gain": float(found.gain),
-                    "phase_deg": float(np.degrees(found.phase)),
+                    "stable": stable,
+                    "gain": gain,
+                    "phase_deg": phase,
                     "round_trip_s": float(delay_margin(loop)),
                 }
             )
