@@ -51,6 +51,23 @@ felt = result.t[np.argmax(result["force_to_master"][:, 2] > 5.0 / 17.5)]
 assert abs(felt - happened - 0.12) < 0.01
 assert result["ports"][:, :4].sum(axis=1).min() > -0.0204
 """,
+    "03_stability_and_transparency": """
+below = omega <= 2 * np.pi * 30
+assert deviation["sampled"][below].max(axis=0)[0, 1] < 1e-4 < deviation["paper"][below].max()
+assert deviation["sampled"][below].max() < 0.02
+np.testing.assert_allclose(list(apparent.values()), [0.0, 1.565, 3.13], atol=0.03)
+assert 0.018 < exact < continuous < 0.025
+assert trips["light"] == 0.0 and trips["firm"] == np.inf
+assert parameter.min() < 0 and lacking > 100
+assert 2e3 < limit.min() < 3e3
+assert (stable > passive).all() and stable[-1] > 5 * stable[0]
+swinging, held = maps["free motion, light grip"], maps["wall of 5.1 kN/m, medium grip"]
+assert swinging.stable[0].all() and not swinging.stable[50].all()  # sigma = 0, about 1
+assert held.stable[0].sum() < held.stable[50].sum() < held.stable[-1].sum()
+assert 0.7 * bound < most < bound
+assert abs(closed.multipliers[0]) < 1
+assert np.abs(ratio - 1).max() < 0.02 and coherence.min() > 0.95
+""",
 }
 
 
