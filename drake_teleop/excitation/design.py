@@ -111,6 +111,9 @@ class _Search:
         self._best = self._best_of_start = float("inf")
         self._evaluations = 0
         self._key = b""
+        from scipy.optimize import minimize
+
+        self._minimize = minimize
         # Compiles, if that has not been done, before the clock starts.
         self._last = problem.evaluate(
             self._problem.candidate(np.random.default_rng(0), near_home=True), 1.0, 1.0
@@ -131,17 +134,15 @@ class _Search:
 
     def follow(self, x: Array) -> None:
         """Descends from x; what is feasible on the way is remembered."""
-        from scipy.optimize import minimize
-
         self._evaluations, self._best_of_start = 0, float("inf")
         for of_criterion, of_maxima, weight, iterations in _APPROACH:
             options = {"maxiter": iterations}
             stage = (of_criterion, of_maxima, weight)
-            x = minimize(self._penalised, x, stage, "L-BFGS-B", jac=True, options=options).x
+            x = self._minimize(self._penalised, x, stage, "L-BFGS-B", jac=True, options=options).x
         for k, (*sharpness, iterations) in enumerate(_DESCENT):
             if k > 0 and self._best_of_start > _PROMISING * self._best:
                 return
-            x = minimize(
+            x = self._minimize(
                 lambda x, *sharpness: self._at(x, *sharpness).log_criterion,
                 x,
                 tuple(sharpness),

@@ -43,7 +43,7 @@ class Excitation:
             `predicted_deviations`.
         uses: of every limit, as checked, the largest first.
         history: (K, 2) thread CPU time [s] and best value of the criterion until then.
-        starts: how many candidates were followed.
+        starts: how many candidates led to something feasible.
     """
 
     robot: Robot
@@ -90,21 +90,38 @@ def excite(
         harmonics,
     )
     found = design(task, seed=seed, starts=starts, seconds=seconds, progress=designing)
-    worst = None
+    trajectory, uses = best_checked(robot, found, checking)
+    best = accumulate((iterate.value for iterate in found), min)
+    return Excitation(
+        robot,
+        trajectory,
+        criterion,
+        criteria_of(robot, trajectory),
+        _deviations(robot, trajectory),
+        uses,
+        np.array([(it.seconds, value) for it, value in zip(found, best, strict=True)]),
+        len({iterate.start for iterate in found}),
+    )
+
+
+def best_checked(
+    robot: Robot, found: list[Iterate], progress: Callable[[float], None] = lambda done: None
+) -> tuple[FourierTrajectory, list[Use]]:
+    """The best of `design` that passes the check, and what it uses of every limit.
+
+    Args:
+        robot: the arm in its surroundings.
+        found: from `design`.
+        progress: of each check.
+
+    Raises:
+        DrakeTeleopError: if nothing passes.
+    """
+    worst: Use | None = None
     for trajectory in _candidates(found, robot):
-        uses = check(robot, trajectory, checking)
+        uses = check(robot, trajectory, progress)
         if uses[0].share <= 1:
-            best = accumulate((iterate.value for iterate in found), min)
-            return Excitation(
-                robot,
-                trajectory,
-                criterion,
-                criteria_of(robot, trajectory),
-                _deviations(robot, trajectory),
-                uses,
-                np.array([(it.seconds, value) for it, value in zip(found, best, strict=True)]),
-                len({iterate.start for iterate in found}),
-            )
+            return trajectory, uses
         if worst is None or uses[0].share < worst.share:
             worst = uses[0]
     raise DrakeTeleopError(

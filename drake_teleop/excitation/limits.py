@@ -48,8 +48,10 @@ class Limits(NamedTuple):
         capsule_row: (C,) link of each capsule, as a row of `link_motions`; -1 is the world.
         capsule_ends: (C, 2, 3) ends of its axis in the link's frame [m].
         capsule_radius: (C,) [m].
-        pairs: (K, 2) capsules that keep the clearance from each other.
-        clearance: [m].
+        pairs: (K, 2) capsules that keep a distance from each other.
+        distances: (K,) which [m]; below the clearance, even below zero, where capsules are much
+            larger than their shapes.
+        clearance: of the shapes, for the check [m].
     """
 
     q_middle: Array
@@ -66,6 +68,7 @@ class Limits(NamedTuple):
     capsule_ends: Array
     capsule_radius: Array
     pairs: NDArray[np.int64]
+    distances: Array
     clearance: float
 
 
@@ -273,7 +276,7 @@ def _clearance(qd, qdd, motions, limits, sharpness, smooth, largest, gradient, w
             distance = _FAR
             if not _is_far(ends[t, a], ends[t, b], reach + CLEARANCE_SCALE):
                 distance = _between(ends[t, a], ends[t, b], nearest) - reach
-            use[t, k] = 1.0 - (distance - limits.clearance) / CLEARANCE_SCALE
+            use[t, k] = 1.0 - (distance - limits.distances[k]) / CLEARANCE_SCALE
     largest[6], smooth[6] = _soften(use, sharpness)
     for t in range(T):
         if use[t].max() < _NEGLIGIBLE:

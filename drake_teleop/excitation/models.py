@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 
+import numpy as np
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex
@@ -15,6 +18,8 @@ from drake_teleop.errors import DrakeTeleopError
 
 # Of meshes that Drake can use as collision shapes.
 _READABLE = (".obj", ".gltf", ".vtk")
+# Of a triangle in a binary STL file: normal, three corners, attributes.
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 
 
 @dataclass(frozen=True)
@@ -25,13 +30,15 @@ class ParsedModel:
         instance: the arm's.
         sensor_frame: S.
         efforts: torque limits by joint [N m]; Drake drops them where a URDF has no transmission.
-        lost_meshes: those that were left out.
+        shapeless: links that lost all their shapes, because of their meshes.
+        folder: of converted meshes; Drake reads them when it needs them.
     """
 
     instance: ModelInstanceIndex
     sensor_frame: Frame
     efforts: dict[str, float]
-    lost_meshes: list[str]
+    shapeless: list[str]
+    folder: TemporaryDirectory[str]
 
 
 def ParseModel(
@@ -56,13 +63,18 @@ def ParseModel(
         parser.package_map().Add(name, str(folder))
     kind = path.suffix.lower().removeprefix(".")
     efforts: dict[str, float] = {}
-    lost: list[str] = []
+    shapeless: list[str] = []
+    converted = TemporaryDirectory(prefix="drake_teleop_")
+    log = logging.getLogger("drake")
+    level = log.level
     try:
+        # Of elements that Drake does not know; what it cannot do without raises.
+        log.setLevel(logging.ERROR)
         root = _xml(path) if kind in ("urdf", "sdf") else None
         if root is None:
             instances = parser.AddModels(str(path))
         else:
-            lost = _without_lost_meshes(root, packages)
+            shapeless = _without_lost_meshes(root, packages, Path(converted.name))
             efforts = _efforts(root)
             text = ElementTree.tostring(root, encoding="unicode")
             instances = parser.AddModelsFromString(text, kind)
@@ -73,6 +85,8 @@ def ParseModel(
             where=str(path),
             remedy="give a URDF, SDF, MJCF or .dmd.yaml model, with --package-path for package://",
         ) from None
+    finally:
+        log.setLevel(level)
     having = [i for i in instances if plant.HasFrameNamed(sensor_frame, i)]
     if len(having) != 1:
         frames = [
@@ -87,7 +101,7 @@ def ParseModel(
         )
     frame = plant.GetFrameByName(sensor_frame, having[0])
     _weld_base(plant, frame)
-    return ParsedModel(having[0], frame, efforts, lost)
+    return ParsedModel(having[0], frame, efforts, shapeless, converted)
 
 
 def _xml(path: Path) -> ElementTree.Element | None:
@@ -135,29 +149,59 @@ class _Packages:
         return path if path is not None and path.is_file() else None
 
 
-def _without_lost_meshes(root: ElementTree.Element, packages: _Packages) -> list[str]:
+def _without_lost_meshes(root: ElementTree.Element, packages: _Packages, folder: Path) -> list[str]:
     """Removes shapes whose mesh is missing or not readable, and makes the others' paths absolute.
 
+    Instead of STL files, which Drake does not read, there stand their convex hulls.
+
     Returns:
-        The addresses of those that are removed.
+        The links that have no shape any more.
     """
-    lost: list[str] = []
+    shapeless: list[str] = []
     for link in root.iter("link"):
-        for role in ("visual", "collision"):
-            for shape in link.findall(role):
-                mesh = shape.find("geometry/mesh")
-                if mesh is None:
-                    continue
-                address = mesh.get("filename") or mesh.findtext("uri") or ""
-                file = packages.file(address.strip())
-                if file is None or file.suffix.lower() not in _READABLE:
-                    link.remove(shape)
-                    lost.append(address)
-                elif mesh.get("filename"):
-                    mesh.set("filename", file.as_uri())
-                else:
-                    mesh.find("uri").text = file.as_uri()  # type: ignore[union-attr]
-    return lost
+        shapes = link.findall("visual") + link.findall("collision")
+        kept = len(shapes)
+        for shape in shapes:
+            mesh = shape.find("geometry/mesh")
+            if mesh is None:
+                continue
+            address = mesh.get("filename") or mesh.findtext("uri") or ""
+            file = packages.file(address.strip())
+            if file is not None and file.suffix.lower() == ".stl":
+                file = _hull_of_stl(file, folder)
+            if file is None or file.suffix.lower() not in _READABLE:
+                link.remove(shape)
+                kept -= 1
+            elif mesh.get("filename"):
+                mesh.set("filename", file.as_uri())
+            else:
+                mesh.find("uri").text = file.as_uri()  # type: ignore[union-attr]
+        if shapes and kept == 0:
+            shapeless.append(link.get("name", ""))
+    return shapeless
+
+
+def _hull_of_stl(path: Path, folder: Path) -> Path | None:
+    """An OBJ file with the convex hull of an STL file's corners; None if they have none."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    data = path.read_bytes()
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) == 84 + count * _TRIANGLE.itemsize:
+        corners = np.frombuffer(data, _TRIANGLE, count, 84)["corners"].reshape(-1, 3)
+    else:
+        lines = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data)
+        corners = np.array(lines, dtype=float).reshape(-1, 3)
+    try:
+        hull = ConvexHull(np.unique(corners.astype(float), axis=0))
+    except (QhullError, ValueError):
+        return None
+    number = {vertex: k + 1 for k, vertex in enumerate(hull.vertices)}
+    rows = ["v {:.9g} {:.9g} {:.9g}".format(*hull.points[vertex]) for vertex in hull.vertices]
+    rows += ["f {} {} {}".format(*(number[k] for k in face)) for face in hull.simplices]
+    target = folder / f"{len(list(folder.iterdir()))}_{path.stem}.obj"
+    target.write_text("\n".join(rows) + "\n")
+    return target
 
 
 def _efforts(root: ElementTree.Element) -> dict[str, float]:

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 # Samples of a period for each harmonic.
 _SAMPLES = 24
 # Random motions have this share of the size that would use all of a speed or acceleration.
-_SIZE = 0.5
+_SIZE = 0.35
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,10 @@ What a model lacks is assumed, and every assumption is named.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,8 +66,9 @@ _RANGE, _SPEED, _TIME_TO_SPEED = np.pi, np.pi, 0.4
 CLEARANCE = 0.005
 # Pairs of shapes nearer than that in this share of random postures are neighbours by design.
 _NEIGHBOURS, _POSTURES = 0.95, 1000
-# Capsules stand for shapes if at least this share of those that seem near are near.
-_TRUTHFUL = 0.7
+# Distances at which shapes are about to touch [m], and the share of such postures in which capsules
+# may be too small by what is allowed for.
+_BAND, _LEAST = (-0.02, 0.05), 0.25
 
 _TABLE = "drake_teleop_table"
 # A plane as a ball of 1 km: 2 m away it is 2 mm too low, and the check has the plane.
@@ -93,6 +95,7 @@ class Robot:
         scales: what criteria divide by; with the heaviest load.
         home: (n,) a posture to begin from [rad].
         assumptions: what was not in the model.
+        folders: with converted meshes, which live as long as this.
     """
 
     name: str
@@ -105,6 +108,7 @@ class Robot:
     scales: Scales
     home: Array
     assumptions: tuple[str, ...]
+    folders: tuple[TemporaryDirectory[str], ...] = ()
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
@@ -158,12 +162,14 @@ def RobotFromModel(
         DrakeTeleopError: if the model cannot be read or is no such arm.
     """
     efforts: dict[str, float] = {}
-    lost: list[str] = []
+    shapeless: list[str] = []
+    folders: list[TemporaryDirectory[str]] = []
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
         efforts.update(model.efforts)
-        lost[:] = model.lost_meshes
+        shapeless[:] = model.shapeless
+        folders.append(model.folder)
         return model.instance, model.sensor_frame
 
     assumptions = ["a table at z = 0"]
@@ -182,8 +188,9 @@ def RobotFromModel(
             )
         reserve = _payload(mass - load[0])
     scene = _Scene(parse, reserve, visuals_count=False)
-    if lost:
-        assumptions.append(f"no shape for {len(lost)} meshes that were not found or not readable")
+    if shapeless:
+        links = ", ".join(shapeless)
+        assumptions.append(f"no shape for {links}: meshes not found or not readable")
     scene.arm, completed = _completed(scene.arm, efforts, acceleration, str(path))
     return scene.robot(
         path.name,
@@ -192,6 +199,7 @@ def RobotFromModel(
         points_S=np.zeros((1, 3)),
         box=(np.zeros(3), np.full(3, np.inf)),
         assumptions=assumptions + completed,
+        folders=folders,
     )
 
 
@@ -235,6 +243,7 @@ class _Scene:
         points_S: Array,
         box: tuple[Array, Array],
         assumptions: list[str],
+        folders: Sequence[TemporaryDirectory[str]] = (),
     ) -> Robot:
         """Limits and all else, see `Robot`; `box` is its middle and half size in W [m]."""
         arm = self.arm
@@ -242,7 +251,7 @@ class _Scene:
         postures = middle + half * np.random.default_rng(0).uniform(-1, 1, (_POSTURES, len(half)))
         bodies = self._rows()
         candidates = self._without_neighbours(bodies, postures)
-        rows, capsules, pairs = self._capsules(bodies, candidates, postures)
+        rows, capsules, pairs, distances = self._capsules(bodies, candidates, postures)
         phi = arm.phi_load
         limits = Limits(
             q_middle=middle,
@@ -266,6 +275,7 @@ class _Scene:
             capsule_ends=np.array([capsule.ends for capsule in capsules]).reshape(-1, 2, 3),
             capsule_radius=np.array([capsule.radius for capsule in capsules]),
             pairs=pairs,
+            distances=distances,
             clearance=CLEARANCE,
         )
         noise = sensor.noise_std()
@@ -280,6 +290,7 @@ class _Scene:
             scales=Scales((float(noise[0]), float(noise[3])), characteristic_length(phi), phi),
             home=home,
             assumptions=tuple(assumptions),
+            folders=tuple(folders),
         )
 
     def _rows(self) -> dict[BodyIndex, int]:
@@ -293,21 +304,22 @@ class _Scene:
 
     def _without_neighbours(
         self, rows: dict[BodyIndex, int], postures: Array
-    ) -> dict[_Pair, NDArray[np.bool_]]:
-        """Pairs of shapes that may collide, and in which postures they are near.
+    ) -> dict[_Pair, Array]:
+        """Pairs of shapes that may collide, with their distance in each posture (inf: far).
 
-        Those that are always near are neighbours by design and no longer count.
+        Those on one link and those that are always near no longer count.
         """
         manager = self.scene_graph.collision_filter_manager()
-        still = [
-            shape
-            for body, row in rows.items()
-            if row < 0
-            for shape in self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
-        ]
-        manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(still)))
+        for link in set(rows.values()):
+            together = [
+                shape
+                for body, row in rows.items()
+                if row == link
+                for shape in self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
+            ]
+            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(together)))
         candidates = self.scene_graph.model_inspector().GetCollisionCandidates()
-        near = {pair: np.zeros(len(postures), bool) for pair in candidates}
+        distances = {pair: np.full(len(postures), np.inf) for pair in candidates}
         context = self.diagram.CreateDefaultContext()
         of_plant = self.plant.GetMyMutableContextFromRoot(context)
         of_scene = self.scene_graph.GetMyContextFromRoot(context)
@@ -316,25 +328,26 @@ class _Scene:
             q[self.arm.position_index] = posture
             self.plant.SetPositions(of_plant, q)
             query = self.scene_graph.get_query_output_port().Eval(of_scene)
-            for found in query.ComputeSignedDistancePairwiseClosestPoints(CLEARANCE):
-                near[found.id_A, found.id_B][k] = True
-        for (a, b), when in list(near.items()):
-            if when.mean() >= _NEIGHBOURS:
+            for found in query.ComputeSignedDistancePairwiseClosestPoints(_BAND[1]):
+                distances[found.id_A, found.id_B][k] = found.distance
+        for (a, b), of_pair in list(distances.items()):
+            if np.mean(of_pair < CLEARANCE) >= _NEIGHBOURS:
                 exclude = CollisionFilterDeclaration().ExcludeBetween
                 manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
-                del near[a, b]
-        return near
+                del distances[a, b]
+        return distances
 
     def _capsules(
         self,
         rows: dict[BodyIndex, int],
-        candidates: dict[_Pair, NDArray[np.bool_]],
+        candidates: dict[_Pair, Array],
         postures: Array,
-    ) -> tuple[NDArray[np.int64], list[Capsule], NDArray[np.int64]]:
-        """Rows, capsules and pairs of them; those without which the optimiser does well left out.
+    ) -> tuple[NDArray[np.int64], list[Capsule], NDArray[np.int64], Array]:
+        """Rows, capsules, pairs of them, and which distance each pair keeps.
 
-        That is pairs that others stand for, that are hardly ever near, or that are often near where
-        their shapes are not. The check looks at all shapes.
+        Left out are pairs that others stand for, or that are never near. Capsules are larger than
+        their shapes; where the shapes are about to touch, the least by which most are too large is
+        allowed for. The check looks at the shapes.
         """
         inspector = self.scene_graph.model_inspector()
         motions = empty_motions(1, self.arm.num_joints)
@@ -354,21 +367,30 @@ class _Scene:
                 capsules[shape] = row, _TABLE_CAPSULE
         outer = {shape: _outermost(shape, capsules) for shape in capsules}
         kept = sorted({outer[shape] for shape in outer}, key=_number)
-        near: dict[tuple[int, int], NDArray[np.bool_]] = {}
-        for (a, b), when in candidates.items():
+        true: dict[tuple[int, int], Array] = {}
+        for (a, b), of_pair in candidates.items():
             first, second = sorted((kept.index(outer[a]), kept.index(outer[b])))
-            near[first, second] = when | near.get((first, second), False)
-        pairs = np.array(sorted(near), dtype=np.int64).reshape(-1, 2)
+            true[first, second] = np.minimum(of_pair, true.get((first, second), np.inf))
+        pairs = np.array(sorted(true), dtype=np.int64).reshape(-1, 2)
         of_rows = np.array([capsules[shape][0] for shape in kept], dtype=np.int64)
         shapes = [capsules[shape][1] for shape in kept]
         motions = empty_motions(len(postures), self.arm.num_joints)
         motions_of(self.arm.table, postures, 0 * postures, 0 * postures, motions)
         ends = np.array([capsule.ends for capsule in shapes]).reshape(-1, 2, 3)
         radii = np.array([capsule.radius for capsule in shapes])
-        seem_near = capsule_distances(motions, of_rows, ends, radii, pairs) < CLEARANCE
-        are_near = np.array([near[a, b] for a, b in pairs]).reshape(len(pairs), -1).sum(axis=1)
-        useful = are_near >= np.maximum(_TRUTHFUL * seem_near.sum(axis=0), 1)
-        return of_rows, shapes, pairs[useful]
+        of_capsules = capsule_distances(motions, of_rows, ends, radii, pairs)
+        of_shapes = [true[a, b] for a, b in pairs]
+        used = [k for k in range(len(pairs)) if of_shapes[k].min() < CLEARANCE]
+        allowed = [_allowance(of_shapes[k], of_capsules[:, k]) for k in used]
+        return of_rows, shapes, pairs[used], CLEARANCE - np.array(allowed)
+
+
+def _allowance(of_shapes: Array, of_capsules: Array) -> float:
+    """By how much capsules are too near where their shapes are about to touch [m]."""
+    touching = (of_shapes > _BAND[0]) & (of_shapes < _BAND[1])
+    if not touching.any():
+        return 0.0
+    return float(np.quantile((of_shapes - of_capsules)[touching], _LEAST))
 
 
 def _number(shape: GeometryId) -> int:

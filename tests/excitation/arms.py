@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 
 def write_urdf(folder: Path) -> Path:
-    """Six joints, base hanging free, a gripper with a finger, meshes here, elsewhere and nowhere.
+    """Six joints, base hanging free, a gripper with a finger, meshes (OBJ, STL) there and not.
 
     No accelerations; one joint is continuous, one has no speed.
     """
@@ -17,6 +19,15 @@ def write_urdf(folder: Path) -> Path:
             f"v {x} {y} {z}\n" for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (0.02, 0.28)
         )
         + "f 1 2 4 3\nf 5 6 8 7\nf 1 2 6 5\nf 3 4 8 7\nf 1 3 7 5\nf 2 4 8 6\n"
+    )
+
+    triangles = np.zeros(
+        4, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")]
+    )
+    points = np.array([[-0.03, -0.03, 0.0], [0.03, -0.03, 0.0], [0, 0.04, 0.0], [0, 0, 0.05]])
+    triangles["corners"] = points[[[0, 1, 2], [0, 1, 3], [1, 2, 3], [2, 0, 3]]]
+    (package / "wrist.stl").write_bytes(
+        bytes(80) + len(triangles).to_bytes(4, "little") + triangles.tobytes()
     )
 
     def link(name: str, mass: float, shape: str, length: float) -> str:
@@ -40,7 +51,7 @@ def write_urdf(folder: Path) -> Path:
         link("l2", 4, rod, 0.35),
         link("l3", 3, '<mesh filename="package://parts/forearm.obj"/>', 0.0),
         link("l4", 1, '<mesh filename="package://absent/wrist.stl"/>', 0.05),
-        link("l5", 1, '<cylinder radius="0.03" length="0.05"/>', 0.05),
+        link("l5", 1, '<mesh filename="package://parts/wrist.stl"/>', 0.0),
         link("l6", 0.3, '<cylinder radius="0.03" length="0.04"/>', 0.04),
         link("gripper", 0.8, '<box size="0.04 0.1 0.06"/>', 0.06),
         link("finger", 0.1, '<box size="0.01 0.01 0.05"/>', 0.05),

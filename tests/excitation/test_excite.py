@@ -161,7 +161,7 @@ def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
     assert "a range of +-3.142 rad for j4" in words
     assert "a speed limit of 3.142 rad/s for j5" in words
     assert "acceleration limits that reach full speed in 0.4 s (--acceleration) for all" in words
-    assert "no shape for 2 meshes" in words
+    assert "no shape for l3, l4, l5: meshes not found" in words
     # 80 % of what the model says; the gripper with its finger is the load, and 30 % more.
     np.testing.assert_allclose(robot.limits.effort, 0.8 * np.array([200, 200, 150, 30, 30, 15]))
     np.testing.assert_allclose(robot.limits.acceleration[:2], [7.5, 6.25])
@@ -170,7 +170,7 @@ def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
         urdf, "l6", WristSensorConfig(), package_paths=(urdf.parent / "somewhere",),
         acceleration=(5.0,), payload=3.0,
     )  # fmt: skip
-    assert "no shape for 1 meshes" in "; ".join(found.assumptions)
+    assert "no shape for l4: meshes" in "; ".join(found.assumptions)
     np.testing.assert_array_equal(found.limits.acceleration, np.full(6, 5.0))
     assert found.limits.phi[0] == pytest.approx(3.0)
 
@@ -205,8 +205,8 @@ def test_a_file_that_is_no_robot_is_one_error_line(tmp_path, capsys, name, text)
     with pytest.raises(SystemExit) as stop:
         main(["excite", "--model", str(path), "--sensor-frame", "a", "--quiet"])
     assert stop.value.code == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1 and name in lines[0]
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1 and name in error
 
 
 def test_options_of_models_need_one(capsys, tmp_path):

@@ -117,6 +117,7 @@ def limits_of(arm) -> Limits:
         ),
         capsule_radius=np.array([0.08, 0.04, 0.05]),
         pairs=np.array([[0, 1], [1, 2]]),
+        distances=np.array([0.02, -0.01]),
         clearance=0.02,
     )
 
