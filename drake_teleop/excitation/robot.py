@@ -69,6 +69,11 @@ _NEIGHBOURS, _POSTURES = 0.95, 1000
 # Distances at which shapes are about to touch [m], and the share of such postures in which capsules
 # may be too small by what is allowed for.
 _BAND, _LEAST = (-0.02, 0.05), 0.25
+# With fewer such postures nothing is allowed for.
+_FEW = 5
+# Capsules that are near in less than this share of the postures may be so; in more, only if their
+# shapes are ever near.
+_SELDOM = 0.05
 
 _TABLE = "drake_teleop_table"
 # A plane as a ball of 1 km: 2 m away it is 2 mm too low, and the check has the plane.
@@ -345,9 +350,9 @@ class _Scene:
     ) -> tuple[NDArray[np.int64], list[Capsule], NDArray[np.int64], Array]:
         """Rows, capsules, pairs of them, and which distance each pair keeps.
 
-        Left out are pairs that others stand for, or that are never near. Capsules are larger than
-        their shapes; where the shapes are about to touch, the least by which most are too large is
-        allowed for. The check looks at the shapes.
+        Left out are pairs that others stand for, and those whose capsules are often near though
+        their shapes never are. Capsules are larger than their shapes; where the shapes are about to
+        touch, the least by which most are too large is allowed for. The check looks at the shapes.
         """
         inspector = self.scene_graph.model_inspector()
         motions = empty_motions(1, self.arm.num_joints)
@@ -380,7 +385,9 @@ class _Scene:
         radii = np.array([capsule.radius for capsule in shapes])
         of_capsules = capsule_distances(motions, of_rows, ends, radii, pairs)
         of_shapes = [true[a, b] for a, b in pairs]
-        used = [k for k in range(len(pairs)) if of_shapes[k].min() < CLEARANCE]
+        are_near = np.array([distances.min() < CLEARANCE for distances in of_shapes], dtype=bool)
+        seem_near = np.mean(of_capsules < CLEARANCE, axis=0)
+        used = np.flatnonzero(are_near | ((seem_near > 0) & (seem_near < _SELDOM)))
         allowed = [_allowance(of_shapes[k], of_capsules[:, k]) for k in used]
         return of_rows, shapes, pairs[used], CLEARANCE - np.array(allowed)
 
@@ -388,7 +395,7 @@ class _Scene:
 def _allowance(of_shapes: Array, of_capsules: Array) -> float:
     """By how much capsules are too near where their shapes are about to touch [m]."""
     touching = (of_shapes > _BAND[0]) & (of_shapes < _BAND[1])
-    if not touching.any():
+    if touching.sum() < _FEW:
         return 0.0
     return float(np.quantile((of_shapes - of_capsules)[touching], _LEAST))
 

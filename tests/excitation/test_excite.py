@@ -129,6 +129,22 @@ def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
         assert bodies & set(clearance.what.split(" and "))
 
 
+def test_what_a_scenario_has_to_touch_is_not_touched():
+    """The sheet spring stands in the room in which the tool moves."""
+    robot = RobotFromScenario(LoadScenario("contact_transition"))
+    found = excite(robot, starts=2, period=2.4, harmonics=2)
+    assert all(use.share <= 1 for use in found.uses)
+    context = robot.diagram.CreateDefaultContext()
+    of_plant = robot.plant.GetMyMutableContextFromRoot(context)
+    of_scene = robot.scene_graph.GetMyContextFromRoot(context)
+    port = robot.scene_graph.get_query_output_port()
+    q = robot.plant.GetPositions(of_plant)
+    for t in np.linspace(0, 2.4, 100):
+        q[robot.arm.position_index] = found.trajectory.evaluate(t)[0]
+        robot.plant.SetPositions(of_plant, q)
+        assert not port.Eval(of_scene).HasCollisions()
+
+
 def test_an_infeasible_design_is_never_returned_nor_written(slave, tmp_path, capsys):
     box = slave.limits._replace(box_half=np.full(3, 0.01))
     with pytest.raises(DrakeTeleopError, match="no trajectory was found that respects all limits"):
