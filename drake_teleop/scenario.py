@@ -102,6 +102,7 @@ class Scenario:
         """
         check_ranges(self, where)
         self.force_scaling.scales(f"{where}:force_scaling")
+        self.load_estimator.check(f"{where}:load_estimator")
         _check_rates(self, where)
         _check_channel(self, where)
 

@@ -36,6 +36,9 @@ SIGNALS = {
             "N,N,N,N m,N m,N m,kg,kg m,kg m,kg m" + ",kg m^2" * 6,
             "offsets and phi, Eq. (7)",
         ),
+        _signal(
+            "load_state", "state", "1", "learning, settled, disturbed, changed: load/watched.py"
+        ),
         _signal("scaled_wrench_S", *_WRENCH, "F' of Fig. 2, before the scale to the master"),
         _signal("contact_wrench_S", *_WRENCH, "Eq. (13), calculated contact wrench"),
         _signal("true_contact_wrench_W", *_WRENCH, "environment on the tool, about the origin"),

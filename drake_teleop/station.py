@@ -41,7 +41,7 @@ _SLAVE_WIRES = (
     ("slave_plant.rx90_state", "wrist_sensor.slave_state"),
     ("slave_plant.rx90_generalized_acceleration", "wrist_sensor.slave_acceleration"),
 )
-# Only when it learns: at 8 kHz even a wire that nobody reads costs time.
+# Only when it learns or watches: at 8 kHz even a wire that nobody reads costs time.
 _LEARNING_WIRES = (("wrist_sensor.sample", "load_estimator.sample"),)
 _CONTACT_WIRES = (("slave_plant.contact_results", "tool_contact.contact_results"),)
 _TELEOP_WIRES = (
@@ -86,6 +86,7 @@ _SLAVE_SIGNALS = {
     "slave_state": "slave_plant.rx90_state",
     "joint_torque": "joint_control.joint_torque",
 }
+_WATCHING_SIGNALS = {"load_state": "load_estimator.load_state"}
 _CONTACT_SIGNALS = {
     "true_contact_wrench_W": "tool_contact.true_contact_wrench_W",
     "sheet_state": "slave_plant.sheet_spring_state",
@@ -113,7 +114,10 @@ _SAMPLE_SIZE = sum(sample_parts(6).values())
 
 
 def MakeTeleopStation(
-    scenario: Scenario, *, load_estimate: NDArray[np.float64] | None = None
+    scenario: Scenario,
+    *,
+    load_estimate: NDArray[np.float64] | None = None,
+    load_covariance: NDArray[np.float64] | None = None,
 ) -> Diagram:
     """Builds the bilateral station: operator, master, channel, slave, sensor, elimination.
 
@@ -132,6 +136,7 @@ def MakeTeleopStation(
         - saturated
         - joint_position
         - load_estimate
+        - load_state (if the load is watched)
         - slave_state
         - joint_torque
         - true_contact_wrench_W (with a sheet spring)
@@ -155,6 +160,9 @@ def MakeTeleopStation(
         load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, as an identification
             found it. It may be left out if sigma = gamma, which needs no estimate, and if the
             estimator learns in the loop.
+        load_covariance: (16, 16) of the estimate, with which a load that is to be watched
+            (`load_estimator.watch`) need not be learnt first. Of a method that allows for noise in
+            the motion ("total"): that of plain least squares is too small.
 
     Raises:
         DrakeTeleopError: for a value that cannot be right, a start out of reach, or scales that
@@ -169,7 +177,7 @@ def MakeTeleopStation(
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix()
 
     builder = DiagramBuilder()
-    slave, slave_signals = AddSlave(builder, scenario, load_estimate)
+    slave, slave_signals = AddSlave(builder, scenario, load_estimate, load_covariance)
     blocks = {
         "operator": Operator(scenario.operator, start_B),
         "master_device": MasterDevice(
@@ -234,7 +242,7 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
     scenario.check()
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
-    _, signals = AddSlave(builder, scenario, None, start)
+    _, signals = AddSlave(builder, scenario, q_start=start)
     builder.AddNamedSystem(
         "joint_trajectory", JointTrajectory(trajectory, scenario.simulation.settle)
     )
@@ -246,7 +254,8 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
 def AddSlave(
     builder: DiagramBuilder,
     scenario: Scenario,
-    load_estimate: NDArray[np.float64] | None,
+    load_estimate: NDArray[np.float64] | None = None,
+    load_covariance: NDArray[np.float64] | None = None,
     q_start: NDArray[np.float64] | None = None,
 ) -> tuple[SlavePlant, dict[str, str]]:
     """Adds the slave: plant, joint control, wrist sensor, load estimator, monitor.
@@ -271,6 +280,8 @@ def AddSlave(
             1 / rates.estimator_hz,
             _SAMPLE_SIZE,
             np.zeros(16) if load_estimate is None else load_estimate,
+            load_covariance,
+            scenario.force_scaling.gripper_phi,
         ),
     }
     for name, block in blocks.items():
@@ -280,13 +291,16 @@ def AddSlave(
         builder, slave.plant, slave.arm, sensor, 1 / rates.sensor_hz, start, contact=contact
     )
     _connect(builder, _SLAVE_WIRES)
-    if scenario.load_estimator.enabled:
+    signals = _SLAVE_SIGNALS
+    if scenario.load_estimator.enabled or scenario.load_estimator.watch:
         _connect(builder, _LEARNING_WIRES)
+    if scenario.load_estimator.watch:
+        signals = signals | _WATCHING_SIGNALS
     if not contact:
-        return slave, _SLAVE_SIGNALS
+        return slave, signals
     builder.AddNamedSystem("tool_contact", ToolContact(slave.tool))
     _connect(builder, _CONTACT_WIRES)
-    return slave, _SLAVE_SIGNALS | _CONTACT_SIGNALS
+    return slave, signals | _CONTACT_SIGNALS
 
 
 def _connect(builder: DiagramBuilder, wires: Iterable[tuple[str, ...]]) -> None:

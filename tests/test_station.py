@@ -293,8 +293,10 @@ def test_scales_change_while_running_without_a_step_of_the_force(slave):
 
 def test_every_output_port_is_a_documented_signal():
     scenario = replace(LoadScenario("contact_transition"), simulation=Simulation(duration=0.01))
-    scenario = replace(scenario, channel__network="lan")
-    station = MakeTeleopStation(scenario, load_estimate=np.zeros(16))
+    scenario = replace(scenario, channel__network="lan", load_estimator__watch=True)
+    station = MakeTeleopStation(
+        scenario, load_estimate=np.ones(16), load_covariance=np.identity(16)
+    )
     names = {station.get_output_port(i).get_name() for i in range(station.num_output_ports())}
     assert names == set(SIGNALS)
     for name in names:

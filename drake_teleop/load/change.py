@@ -40,6 +40,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 from numba import njit
@@ -80,7 +81,10 @@ _IMPOSSIBLE = 4.0
 # then beliefs [theta (16); P (256)]: the known load, the filter that watches it, and the new one.
 _STATE, _BASE, _IN_BLOCK, _SAMPLES, _SUM, _BACK_SUM, _AGE, _START, _LEARNT, _POWER = range(10)
 _RESIDUAL, _SQUARES, _WRENCH, _MOTION, _V, _KNOWN = 10, 16, 22, 28, 37, 97
-_WATCH, _NEW, _SIZE = _KNOWN + 272, _KNOWN + 544, _KNOWN + 816
+_WATCH, _NEW = _KNOWN + 272, _KNOWN + 544
+
+SIZE = _KNOWN + 816
+"""Of the memory of `change_update`."""
 
 
 @njit(cache=True)
@@ -186,7 +190,7 @@ def _restart(memory, belief):
 @njit(cache=True)
 def _settled(memory, bound):
     """Whether the new load's mass and first moments are known to `bound` of what has changed."""
-    theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : _SIZE].reshape(16, 16)
+    theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : SIZE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
     moment = bound * change * max(size, _SMALLEST_SIZE) * _MOMENTS
@@ -200,7 +204,7 @@ def _doubt_inertias(memory, noise, block):
 
     Least squares shrinks them by the share of noise in the power of alpha.
     """
-    theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : _SIZE].reshape(16, 16)
+    theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : SIZE].reshape(16, 16)
     expected = memory[_AGE] * (noise[12] + noise[13] + noise[14]) / block
     share = min(1.0, expected / max(memory[_POWER], 1e-300))
     moment = theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2
@@ -282,7 +286,7 @@ def _judge(memory, block, noise, window, hold, bound):
     elif memory[_STATE] == CHANGED and _settled(memory, bound):
         memory[_STATE] = memory[_BASE] = IDENTIFIED
         _doubt_inertias(memory, noise, block)
-        memory[_KNOWN:_WATCH] = memory[_NEW:_SIZE]
+        memory[_KNOWN:_WATCH] = memory[_NEW:SIZE]
         memory[_LEARNT] = memory[_AGE] * block
         memory[_RESIDUAL:_SQUARES] = memory[_SQUARES:_WRENCH] * (block / memory[_AGE])
         _restart(memory, _WATCH)
@@ -294,6 +298,76 @@ def _watch(memory, samples, states, block, noise, window, hold, bound):
     for k in range(samples.shape[0]):
         change_update(memory, samples[k], block, noise, window, hold, bound)
         states[k] = int(memory[_STATE])
+
+
+Parameters: TypeAlias = tuple[int, Array, int, int, float]
+
+
+def change_parameters(
+    wrench_std: ArrayLike,
+    motion_std: ArrayLike,
+    period: float,
+    *,
+    model_error: float = 0.0,
+    bound: float | None = None,
+) -> Parameters:
+    """What `change_update` takes beside memory and sample; arguments as of `LoadChangeMonitor`.
+
+    Raises:
+        DrakeTeleopError: for other shapes or values.
+    """
+    positive("period", period)
+    if not 0.0 <= model_error < 1.0:
+        raise DrakeTeleopError(f"{model_error} is not within [0, 1)", where="model_error")
+    bound = max(BOUND, 2.0 * model_error) if bound is None else float(positive("bound", bound))
+    block = max(1, round(BLOCK / period))
+    window, hold, lasts = (max(1, round(x / (block * period))) for x in (WINDOW, HOLD, MEMORY))
+    std = positive("wrench_std", wrench_std, 6), checked("motion_std", motion_std, 9)
+    noise = np.concatenate([*std, [model_error]]) ** 2
+    return block, np.append(noise, lasts), window, hold, bound
+
+
+def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFFSET_DRIFT) -> Array:
+    """The memory (n,) of `change_update` before the first sample.
+
+    Args:
+        theta: (16,) known [offsets; phi].
+        covariance: (16, 16) of it; what is not determined counts as wide open.
+        offset_drift: of `LoadChangeMonitor`.
+    """
+    prior = np.square(PRIOR_STD)
+    P = covariance.copy()
+    unknown = np.diag(P) > prior
+    P[unknown, :] = P[:, unknown] = 0.0
+    P[unknown, unknown] = prior[unknown]
+    P[range(6), range(6)] += np.square(offset_drift)
+    # Least inertias that the mass implies, as in `logs.processing.usable_phi`.
+    phi = theta[6:].copy()
+    point = phi_from_mass_com_inertia(phi[0], phi[1:4] / phi[0], np.zeros((3, 3)))
+    phi[4:] = np.where(unknown[10:], point[4:], phi[4:])
+    memory = np.zeros(SIZE)
+    memory[_KNOWN : _KNOWN + 16] = np.concatenate([theta[:6], phi])
+    memory[_KNOWN + 16 : _WATCH] = P.ravel()
+    memory[_WATCH:_NEW] = memory[_KNOWN:_WATCH]
+    return memory
+
+
+@njit(cache=True)
+def known_load(memory):
+    """(16,) [offsets; phi] of the known load, a view: its offsets may be corrected."""
+    return memory[_KNOWN : _KNOWN + 16]
+
+
+@njit(cache=True)
+def change_state(memory):
+    """Index into `STATES`; once a load was identified, it is the known one: `KNOWN` again."""
+    return KNOWN if memory[_STATE] == memory[_BASE] else int(memory[_STATE])
+
+
+@njit(cache=True)
+def new_load_age(memory):
+    """Samples since the newest new load has explained the wrench, if the known one does not."""
+    return memory[_SAMPLES] - memory[_START]
 
 
 class LoadChangeMonitor:
@@ -332,36 +406,17 @@ class LoadChangeMonitor:
         offset_drift: ArrayLike = OFFSET_DRIFT,
         bound: float | None = None,
     ) -> None:
-        positive("period", period)
-        if not 0.0 <= model_error < 1.0:
-            raise DrakeTeleopError(f"{model_error} is not within [0, 1)", where="model_error")
-        bound = max(BOUND, 2.0 * model_error) if bound is None else float(positive("bound", bound))
-        block = max(1, round(BLOCK / period))
-        window, hold, lasts = (max(1, round(x / (block * period))) for x in (WINDOW, HOLD, MEMORY))
-        std = positive("wrench_std", wrench_std, 6), checked("motion_std", motion_std, 9)
-        noise = np.concatenate([*std, [model_error]]) ** 2
-        self._parameters = (block, np.append(noise, lasts), window, hold, bound)
-        self._drift = checked("offset_drift", offset_drift, 6) ** 2
+        self._parameters = change_parameters(
+            wrench_std, motion_std, period, model_error=model_error, bound=bound
+        )
+        self._drift = checked("offset_drift", offset_drift, 6)
         self._first, self._period = known, float(period)
         self._memory = self.initial_memory()
 
     def initial_memory(self) -> Array:
         """The memory before the first sample, (n,)."""
-        prior = np.square(PRIOR_STD)
-        P = self._first.covariance.copy()
-        unknown = np.diag(P) > prior
-        P[unknown, :] = P[:, unknown] = 0.0
-        P[unknown, unknown] = prior[unknown]
-        P[range(6), range(6)] += self._drift
-        # Least inertias that the mass implies, as in `logs.processing.usable_phi`.
-        phi = self._first.phi.copy()
-        point = phi_from_mass_com_inertia(self._first.mass, self._first.com, np.zeros((3, 3)))
-        phi[4:] = np.where(unknown[10:], point[4:], phi[4:])
-        memory = np.zeros(_SIZE)
-        memory[_KNOWN : _KNOWN + 16] = np.concatenate([self._first.offsets, phi])
-        memory[_KNOWN + 16 : _WATCH] = P.ravel()
-        memory[_WATCH:_NEW] = memory[_KNOWN:_WATCH]
-        return memory
+        theta = np.concatenate([self._first.offsets, self._first.phi])
+        return change_memory(theta, self._first.covariance, self._drift)
 
     def update_into(self, memory: Array, sample: Array) -> None:
         """The update of a memory that is kept elsewhere; compiled, checks nothing.

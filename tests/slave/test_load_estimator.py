@@ -52,7 +52,7 @@ def run(system, rows):
         history.append(
             [
                 *system.GetOutputPort("load_estimate").Eval(context),
-                system.GetOutputPort("settled").Eval(context)[0],
+                system.GetOutputPort("load_state").Eval(context)[0],
             ]
         )
     return np.array(history)
