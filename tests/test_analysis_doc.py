@@ -75,6 +75,7 @@ def test_the_diagram_works_as_shown():
     shown = 'dt.identify_load(dt.LoadScenario("identification")).estimate'
     assert shown in DIAGRAM
     true = np.concatenate([np.zeros(6), slave_arm(LoadScenario("free_motion_force")).phi_load])
+    true.flags.writeable = False  # as that is
     names: dict = {"true": true}
     exec(compile(DIAGRAM.replace(shown, "true"), "analysis.md", "exec"), names)
     assert abs(names["closed"].multipliers[0]) < 1
