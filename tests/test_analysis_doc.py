@@ -127,7 +127,7 @@ def test_what_llewellyn_lacks_and_what_the_grips_bear(diagrams):
     (limit,) = re.findall(r"before walls up to\n([\d.]+) kN/m", TEXT)
     softest = stiffness_limit(H, omega, range_of_grips()).min()
     ((mass, wall),) = re.findall(
-        r"at 10 Hz a hand of ([\d.]+) kg before a wall of ([\d.]+) MN", TEXT
+        r"at 10 Hz a hand of\n([\d.]+) kg before a wall of ([\d.]+) MN", TEXT
     )
     at = int(np.argmin(np.abs(omega - 20 * np.pi)))
     worst = worst_loads(H[at])
