@@ -365,6 +365,12 @@ def change_state(memory):
 
 
 @njit(cache=True)
+def new_load(memory):
+    """(16,) [offsets; phi] of the new load as far as it is known."""
+    return memory[_NEW : _NEW + 16]
+
+
+@njit(cache=True)
 def new_load_age(memory):
     """Samples since the newest new load has explained the wrench, if the known one does not."""
     return memory[_SAMPLES] - memory[_START]

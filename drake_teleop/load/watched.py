@@ -20,9 +20,9 @@ step, and is never outside what the two loads give.
 
 **A constant push** and another weight are the same, at rest and for as long as they do not change.
 What looks like another load is therefore taken for a contact until the force that it exerts has
-changed by `VARIES`, just as the new load's would have: until the tool is turned or accelerated. A
-push of which friction or the hand change a part slowly may still be taken for a load: its force
-stays felt, together with the load's.
+changed by `VARIES`, and the new load has explained that for `EXPLAINED` seconds: until the tool is
+turned or accelerated. Its centre of mass has to be within `REACH`; a friction that changes with the
+motion needs one that is metres away.
 
 **Offsets** drift with temperature. While S rests and the load is the known one, the known offsets
 follow the residual with the time constant `FOLLOW`, as long as it is below `LARGEST`; what is
@@ -42,6 +42,7 @@ from drake_teleop.load.change import (
     change_state,
     change_update,
     known_load,
+    new_load,
     new_load_age,
 )
 from drake_teleop.load.regressor import non_contact_wrench_into
@@ -50,12 +51,14 @@ LOAD_STATES = ("learning", "settled", "disturbed", "changed")
 """What the state of a load estimator means; learning is what comes before this module."""
 LEARNING, SETTLED, DISTURBED, OTHER_LOAD = range(4)
 
-FADE, REST, FOLLOW = 0.1, 0.3, 3.0
+FADE, REST, FOLLOW, EXPLAINED = 0.1, 0.3, 3.0, 0.1
 """Durations in seconds (module docstring)."""
 LARGEST = np.array([0.3] * 3 + [0.015] * 3)
 """Three times `change.OFFSET_DRIFT` [N, N m]."""
 VARIES = 0.5
 """Noise never makes that much of a low-passed force [N]."""
+REACH = 1.0
+"""How far from So the centre of mass of something that is grasped or put down may be [m]."""
 
 # At rest, low-passed by _SMOOTH [s], S turns slower than that [rad/s] and its specific force stays
 # that near to where it was [m/s^2].
@@ -63,9 +66,9 @@ _SMOOTH, _TURNING, _MOVED = 0.05, 0.02, 0.1
 
 # Parts of the memory, before that of `change`: state; samples at rest; low-passed specific force,
 # angular velocity, residual; specific force at the beginning of the rest; least and largest
-# residual force since a new load has explained it.
+# residual force since a new load has explained it; samples since they are `VARIES` apart.
 _STATE, _RESTED, _S, _OMEGA, _RESIDUAL = 0, 1, 2, 5, 8
-_WHERE, _LEAST, _MOST, _CHANGE = 14, 17, 20, 23
+_WHERE, _LEAST, _MOST, _VARIED, _CHANGE = 14, 17, 20, 23, 24
 
 SIZE = _CHANGE + change.SIZE
 """Of the memory of `watched_update`."""
@@ -108,9 +111,9 @@ def _rests(memory, sample, period):
 
 @njit(cache=True)
 def _varies(memory, residual, age, period):
-    """Whether the residual force has changed since a new load has explained it, `age` samples."""
+    """Whether a new load, `age` samples old, has explained a change of the residual force."""
     low_passed = memory[_RESIDUAL : _RESIDUAL + 3]
-    least, most = memory[_LEAST:_MOST], memory[_MOST:_CHANGE]
+    least, most = memory[_LEAST:_MOST], memory[_MOST:_VARIED]
     share = 1.0 if age == 0.0 else period / (_SMOOTH + period)
     memory[_RESIDUAL : _RESIDUAL + 6] += share * (residual - memory[_RESIDUAL : _RESIDUAL + 6])
     if age * period < 2.0 * _SMOOTH:
@@ -118,7 +121,16 @@ def _varies(memory, residual, age, period):
         most[:] = low_passed
     least[:] = np.minimum(least, low_passed)
     most[:] = np.maximum(most, low_passed)
-    return ((most - least) ** 2).sum() > VARIES**2
+    apart = ((most - least) ** 2).sum() > VARIES**2
+    memory[_VARIED] = memory[_VARIED] + 1.0 if apart else 0.0
+    return memory[_VARIED] * period > EXPLAINED
+
+
+@njit(cache=True)
+def _is_within_reach(known, new):
+    """Whether what has come or gone has its centre of mass within `REACH`."""
+    moment = ((new[7:10] - known[7:10]) ** 2).sum()
+    return moment < (REACH * (new[6] - known[6])) ** 2
 
 
 @njit(cache=True)
@@ -146,7 +158,8 @@ def watched_update(out, memory, sample, fallback, period, block, noise, window, 
         if rests and (np.abs(memory[_RESIDUAL : _RESIDUAL + 6]) <= LARGEST).all():
             known[:6] += period / FOLLOW * residual
     elif memory[_STATE] != OTHER_LOAD:
-        memory[_STATE] = OTHER_LOAD if verdict == CHANGED and varies else DISTURBED
+        another = verdict == CHANGED and varies and _is_within_reach(known, new_load(watch))
+        memory[_STATE] = OTHER_LOAD if another else DISTURBED
     target[:] = known
     if memory[_STATE] == OTHER_LOAD:
         target[6:] = fallback

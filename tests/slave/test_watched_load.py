@@ -23,7 +23,7 @@ from drake_teleop.load.watched import (
     watched_state,
     watched_update,
 )
-from drake_teleop.master.operator import MinimumJerk, OperatorConfig
+from drake_teleop.master.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import MakeSimulator, advance, read_log, simulate
 from drake_teleop.slave.plant import AddSlavePlant
@@ -143,7 +143,7 @@ def test_what_is_handed_out_fades_without_a_step(grasped):
 
 
 def test_contacts_are_no_change(known):
-    """Fig. 8, and pressing down on the leaf for good: to be felt, so nothing fades."""
+    """Fig. 8, and pressing down on the leaf for good, still and sliding: nothing fades."""
     touch = replace(LoadScenario("contact_transition"), load_estimator__watch=True)
     press = MinimumJerk(t_start=0.2, duration=0.5, translation=[0.0, 0.0, -0.075])
     hold = replace(
@@ -152,7 +152,13 @@ def test_contacts_are_no_change(known):
         simulation__settle=0.0,
         simulation__duration=2.0,
     )
-    for scenario, last in ((touch, SETTLED), (hold, DISTURBED)):
+    sway = Sine(t_start=0.9, duration=9.0, ramp=0.5, frequency=1.0, translation=[0.0, 0.003, 0.0])
+    slide = replace(
+        hold,
+        operator=OperatorConfig(grip="firm", intent=[press, sway]),
+        simulation__duration=2.6,
+    )
+    for scenario, last in ((touch, SETTLED), (hold, DISTURBED), (slide, DISTURBED)):
         station = MakeTeleopStation(scenario, load_estimate=known[0], load_covariance=known[1])
         result = simulate(station, scenario.simulation)
         states = result["load_state"][:, 0]
