@@ -254,6 +254,9 @@ def linearize(
         DrakeTeleopError: if the rates have no common period that a cut can be made at, or if the
             slave does not come to rest.
     """
+    if load_estimate is not None:
+        # The sensor has no offset here, so there is none to subtract.
+        load_estimate = np.concatenate([np.zeros(6), load_estimate[6:]])
     period = _Period(scenario, load_estimate)
     x, A, C = period.rest(np.asarray(displacement, dtype=float))
     B = period.input_derivative(x)

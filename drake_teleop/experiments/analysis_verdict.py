@@ -54,10 +54,9 @@ def verdict(figures: dict[str, Any]) -> list[str]:
         lacking = absolute["lacking_damping_Ns_per_m"]
         remedy = "no amount of" if lacking is None else f"{lacking:.3g} N s/m more"
         said.append(
-            "It is not absolutely stable, as no position-force station behind a servo is: some "
-            f"passive hand and environment would oscillate, most of all at {absolute['at_Hz']:.3g} "
-            f"Hz; {remedy} damping of the device would prevent it. For hands and walls that there "
-            "are, the limits above count."
+            "It is not absolutely stable, as position-force stations behind a servo hardly ever "
+            f"are: some passive hand and environment would oscillate; {remedy} damping of the "
+            "device would prevent it. For hands and walls that there are, the limits above count."
         )
     free, wall = figures["transparency"]["free"], figures["transparency"]["wall"]
     felt, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]

@@ -9,8 +9,8 @@ scenario     its name, direction, grip, passivity method, delay_s (one way), wal
 axis         the numbers of `analysis.one_axis.OneAxis`, and tool_coupling
 diagram      list: operating point, states, stable, decay_1_per_s (of what dies last),
              frequency_Hz (of its oscillation); one_axis: the same of the sampled one-axis model
-two_port     greatest deviation of the Diagram's H from closed form up to 30 Hz: closed_form with
-             the exact delay, sampled with the station's rates as well
+two_port     greatest deviation of the Diagram's H, hand's mass included, up to 30 Hz: closed_form
+             with the exact delay, sampled with the station's rates as well
 margins      list: grip, wall_N_per_m, stable, gain, phase_deg, round_trip_s (null: without bound)
 absolute     absolutely_stable, least_parameter (>= 1 is stable) and at_Hz,
              lacking_damping_Ns_per_m, passive, scattering_norm
@@ -154,10 +154,8 @@ def analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str,
     progress(1.0)
 
     progress = stage("Two-port, margins, transparency")
-    H = absorb(
-        hybrid_along(held_elsewhere(free, linear, along), _OMEGA, along.hand, along.tool),
-        hand=-_S * axis.hand_mass,
-    )
+    with_hand = hybrid_along(held_elsewhere(free, linear, along), _OMEGA, along.hand, along.tool)
+    H = absorb(with_hand, hand=-_S * axis.hand_mass)
     closed_form = hybrid(axis, _S)
     progress(0.3)
     figures: dict[str, Any] = {
@@ -171,7 +169,7 @@ def analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str,
             diagram_figures(name, closed(system, linear), on_paper, sampling)
             for name, system, on_paper in points
         ],
-        "two_port": deviations(H, axis, sampling),
+        "two_port": deviations(with_hand, axis, sampling),
         "margins": margin_rows(axis, sampling, wall[0]),
         "absolute": absolute_figures(H, axis),
         "bounded": bounded_figures(H, axis, sampling),
@@ -297,18 +295,21 @@ def _dying(multiplier: complex, period: float) -> dict[str, Any]:
     }
 
 
-def deviations(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """How far the Diagram's two-port is from the closed form, and from the sampled one."""
+def deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
+    """How far the Diagram's two-port is from the closed form, and from the sampled one.
+
+    The hand's mass moves with the stylus and is compared as a part of the device.
+    """
     compared = _OMEGA <= BAND
-    omega, H = _OMEGA[compared], H[compared]
+    heavy = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
     def greatest(other: Complex) -> dict[str, float]:
-        found = np.abs(H - other).max(axis=0) / np.abs(other).max(axis=0)
+        found = np.abs(with_hand[compared] - other).max(axis=0) / np.abs(other).max(axis=0)
         return {f"h{i + 1}{j + 1}": float(found[i, j]) for i in range(2) for j in range(2)}
 
     return {
-        "closed_form": greatest(hybrid(axis, _S[compared])),
-        "sampled": greatest(sampled_two_port(axis, sampling, omega)),
+        "closed_form": greatest(hybrid(heavy, _S[compared])),
+        "sampled": greatest(sampled_two_port(heavy, sampling, _OMEGA[compared])),
     }
 
 

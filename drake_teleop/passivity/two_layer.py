@@ -14,8 +14,8 @@ are never overdrawn, whatever the network does, as long as |x''| <= a_max at bot
 
 A slave that is slower than a_max T might pay even for its brake: with an empty tank it would coast
 on for ever. So the slave keeps a reserve that is neither sent nor spent on the spring; only the
-brake may use it. And what a servo that is pulled harder than a_max has overdrawn is written off when
-energy arrives: else that would be swallowed, and the slave would stay where it is.
+brake may use it. And what a servo that is pulled harder than a_max has overdrawn is written off
+when energy arrives: else that would be swallowed, and the slave would stay where it is.
 
 Where the tank of the master is below its level, a damper on the hand fills it. Of what the tank
 holds the wrench may drain only a share in a step, which takes the edge off an empty tank; small

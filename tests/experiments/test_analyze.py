@@ -47,10 +47,8 @@ def test_it_writes_a_page_with_all_of_its_pictures(run):
 
 
 def test_the_diagram_is_the_sampled_model_of_one_axis(run):
-    """h12, h21 and h22 are decoupled at the scenario's posture; the device is turned a little."""
-    deviation = run[0]["two_port"]["sampled"]
-    assert max(deviation[name] for name in ("h12", "h21", "h22")) < 1e-4
-    assert deviation["h11"] < 0.01
+    """The hand holds all other directions; what couples with them is left in h11."""
+    assert max(run[0]["two_port"]["sampled"].values()) < 1e-4
 
 
 def test_what_dies_last_dies_as_on_one_axis(run):
