@@ -24,9 +24,9 @@ from drake_teleop.analysis.two_port import (
     transmitted_impedance,
 )
 from drake_teleop.html import embedded, render
-from drake_teleop.style import COLOURS, GREY, VERMILION, Picture, house_style
+from drake_teleop.style import BLACK, COLOURS, GREY, VERMILION, Picture, house_style
 
-_GRIP_COLOURS = {"light": COLOURS[3], "medium": COLOURS[0], "firm": COLOURS[2]}
+_GRIP_COLOURS = {"light": COLOURS[3], "medium": COLOURS[4], "firm": COLOURS[1]}
 #: Parameter of a map -> its name on an axis, and the factor to its unit there.
 _AXES = {
     "delay": ("round trip [ms]", 2e3),
@@ -168,7 +168,7 @@ def draw_nyquist(curves: Curves) -> Figure:
         for axes, adjusted in ((whole, "datalim"), (near, "box")):
             for grip, loop in curves.nyquist.items():
                 axes.plot(loop.real, loop.imag, color=_GRIP_COLOURS[grip], label=grip)
-            axes.plot(-1, 0, color=VERMILION, marker="+", ms=11, mew=2)
+            axes.plot(-1, 0, color=BLACK, marker="+", ms=11, mew=2)
             axes.set_xlabel("real part")
             axes.set_aspect("equal", adjustable=adjusted)
         whole.set_ylabel("imaginary part")
