@@ -191,7 +191,7 @@ class WristSensorConfig:
 
         Latency, and the group delay of the low-pass at zero frequency for the first two.
         """
-        delays: NDArray[np.float64] = self.latencies(period) * period
+        delays = self.latencies(period) * np.float64(period)
         if not self.ideal and self.low_pass != "none":
             for b0, b1, b2, a1, a2 in butterworth_sections(self.bandwidth_hz, 1 / period):
                 lag = (b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)
@@ -250,21 +250,21 @@ PRESETS: dict[str, WristSensorConfig] = {
 """Sensors by name.
 
 jr3_85m35a3: JR3 85M35A3-I40-D 200N12, the paper's. Ranges of force and torque: its name and data
-sheet. S lies on the flange, the middle of the 35 mm high housing above it. Noise, quantum, ranges of
-acceleration: estimates. Filter and drift (0.5 N in 10 min): selectable, and seen in the records
-below. Walks: estimates, as much in 10 min as half of the drift. No latency: force and acceleration
-go through the same converter, filter and line.
+sheet. S lies on the flange, and the acceleration part in the middle of the housing, 35 mm high.
+Noise, quantum, ranges of acceleration: estimates. Filter: one of those that can be selected. Drift:
+0.5 N in 10 min, as in the records below. Walks: estimates, as much in 10 min as half of the drift.
+No latency: force and acceleration go through the same converter, filter and line.
 
 ati_gamma_imu: ATI Gamma with NetBox and MPU6886 IMU on an end effector, as recorded by A. Skrede
 (doi 10.5281/zenodo.11075229). The white noise is what the record at rest has from one sample to the
 next (Allan deviation at one sample, 698 Hz and 254 Hz; the standard deviation would count the arm's
 vibration): force 0.018, 0.019, 0.018 N, torque 0.0012, 0.0010, 0.0003 N m, specific force 0.061,
 0.060, 0.031 m/s^2, here their root mean squares. The spectra of the torques are white up to 349 Hz,
-so the low-pass, 300 Hz for the mechanics, stands before the noise. Offsets, axes of the IMU and
-its lag of 6 ms: fits to the same records. Quantum and range of the IMU: steps of 2.44e-4 g in its
-record, 16 bits of +-8 g. Ranges of the Gamma: SI-130-10, an estimate, as are the IMU's place and its
-angular acceleration (differences of a gyroscope's samples). The record at rest lasts 1 s: walks and
-drift are the other preset's.
+so the low-pass, 300 Hz for the mechanics, stands before the noise. Offsets, axes of the IMU and its
+lag of 6 ms: fits to the same records. Quantum and range of the IMU: steps of 2.44e-4 g in its
+record, 16 bits of +-8 g. Ranges of the Gamma: SI-130-10, an estimate, as are the place of the IMU
+and its angular acceleration (differences of a gyroscope's samples). The record at rest lasts 1 s:
+walks and drift are the other preset's.
 """
 
 #: The parts by name, and the fields that turn each of them off.
