@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -409,7 +410,8 @@ def excite(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs the command line and exits: 0, 2 for unusable input, 130 for Ctrl-C."""
+    """Runs the command line and exits: 0, 2 for unusable input, 130 for Ctrl-C or `kill`."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         status = cli.main(arguments, prog_name="drake-teleop", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -419,8 +421,9 @@ def main(arguments: list[str] | None = None) -> None:
         status = _fail(error.format_message())
     except DrakeTeleopError as error:
         status = _fail(str(error))
-    except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted", err=True)
+    except (click.Abort, KeyboardInterrupt) as interrupt:
+        # click makes an Abort of a KeyboardInterrupt; what was kept is told by its cause.
+        click.echo(f"interrupted: {interrupt.__cause__ or ''}".removesuffix(": "), err=True)
         status = 130
     except OSError as error:
         status = _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))

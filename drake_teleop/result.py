@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 _METADATA_KEY = "drake_teleop.signals"
+# A part of a log is named after the number of its first row.
+_PART_NAME = "row_{:010d}.parquet"
+_PART_NAMES = _PART_NAME.format(0).replace("0", "?")
+# More points than this on a line are drawn as the least and the largest of their neighbours.
+_DRAWN = 20_000
 # The canonical log (README, "Logs"): which signal fills which columns.
 _CANONICAL = {
     "measured_wrench_S": ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"),
@@ -59,6 +64,11 @@ class Signal:
                 f"signal {self.name}: {len(self.components)} components, {len(units)} units"
             )
 
+    @property
+    def columns(self) -> list[str]:
+        """Its columns' names in a table: "measured_wrench_S.f_x" and so on."""
+        return [f"{self.name}.{component}" for component in self.components]
+
 
 class SimulationResult:
     """Sampled signals of one simulation, on one time base.
@@ -83,7 +93,11 @@ class SimulationResult:
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
             raise ValueError(f"signals and specs differ in {', '.join(odd)}")
-        self._values = {name: self._checked(name, signals[name]) for name in self._specs}
+        self._values: Mapping[str, NDArray[np.float64]]
+        if isinstance(signals, _SignalsOnDisk):
+            self._values = signals
+        else:
+            self._values = {name: self._checked(name, signals[name]) for name in self._specs}
 
     def _checked(self, name: str, values: ArrayLike) -> NDArray[np.float64]:
         array = np.asarray(values, dtype=float)
@@ -141,8 +155,7 @@ class SimulationResult:
 
         columns = {"t": self._t}
         for spec in self.specs:
-            for index, component in enumerate(spec.components):
-                columns[f"{spec.name}.{component}"] = self._values[spec.name][:, index]
+            columns |= dict(zip(spec.columns, self._values[spec.name].T, strict=True))
         return pl.DataFrame(columns)
 
     def sensor_log(self) -> pl.DataFrame:
@@ -165,7 +178,7 @@ class SimulationResult:
             )
         columns = {"t": self._t}
         for name, names in _CANONICAL.items():
-            columns |= {column: self[name][:, index] for index, column in enumerate(names)}
+            columns |= dict(zip(names, self[name].T, strict=True))
         return pl.DataFrame(columns)
 
     def write_parquet(self, path: str | Path) -> None:
@@ -187,32 +200,63 @@ class SimulationResult:
             path, metadata={_METADATA_KEY: json.dumps(specs)}, row_group_size=2**16
         )
 
+    def write_part(self, folder: Path, first_row: int) -> None:
+        """Writes these rows of a longer log into its folder; `write_parquet` has the format.
+
+        The folder is one table for polars, DuckDB and others, whenever a process dies: a part is
+        complete or absent. The same rows written again replace themselves.
+
+        Args:
+            folder: that `remove_log` has seen.
+            first_row: number of the first of these rows in the whole log.
+        """
+        part = folder / _PART_NAME.format(first_row)
+        if len(self.t) or not part.exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            # Beside the folder, since what reads folders reads all that is in them.
+            self.write_parquet(_unfinished(folder))
+            _unfinished(folder).replace(part)
+
     @classmethod
     def read_parquet(cls, path: str | Path) -> SimulationResult:
-        """Reads what `write_parquet` wrote.
+        """Reads what `write_parquet` or `simulate` wrote.
+
+        Args:
+            path: a file, or a folder of parts.
 
         Raises:
-            DrakeTeleopError: if the file is absent or was not written by `write_parquet`.
+            DrakeTeleopError: if it is something else, or absent.
+        """
+        on_disk = cls.scan_parquet(path)
+        return cls(on_disk.t, {name: on_disk[name] for name in on_disk}, on_disk.specs)
+
+    @classmethod
+    def scan_parquet(cls, path: str | Path) -> SimulationResult:
+        """Opens what `write_parquet` or `simulate` wrote, for logs that would fill the memory.
+
+        Only the times are read now. A signal is read each time it is asked for and not kept here.
+
+        Args:
+            path: a file, or a folder of parts.
+
+        Raises:
+            DrakeTeleopError: if it is something else, or absent.
         """
         import polars as pl
 
+        path = Path(path)
+        part = min(path.glob(_PART_NAMES), default=path)
         try:
-            text = pl.read_parquet_metadata(path)[_METADATA_KEY]
-            table = pl.read_parquet(path)
+            text = pl.read_parquet_metadata(part)[_METADATA_KEY]
+            t = pl.read_parquet(path, columns=["t"])["t"].to_numpy()
         except (OSError, KeyError, pl.exceptions.PolarsError) as error:
             raise DrakeTeleopError(
                 "is not a simulation result",
                 where=str(path),
-                remedy="give a file written by SimulationResult.write_parquet or drake-teleop run",
+                remedy="give what SimulationResult.write_parquet or drake-teleop run wrote",
             ) from error
         specs = [Signal(**entry) for entry in json.loads(text)]
-        signals = {
-            spec.name: table.select(
-                f"{spec.name}.{component}" for component in spec.components
-            ).to_numpy()
-            for spec in specs
-        }
-        return cls(table["t"].to_numpy(), signals, specs)
+        return cls(t, _SignalsOnDisk(path, specs), specs)
 
     def plot(self, *names: str, contact: ArrayLike | None = None) -> Figure:
         """Draws signals over time, one subplot for each signal and unit.
@@ -231,9 +275,9 @@ class SimulationResult:
             figure = Picture(figsize=(8.0, 0.6 + 1.9 * len(panels)))
             rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
             for axes, (name, unit, indices) in zip(rows, panels, strict=True):
-                components = self._specs[name].components
+                components, values = self._specs[name].components, self._values[name]
                 for index in indices:
-                    axes.plot(self._t, self._values[name][:, index], label=components[index])
+                    axes.plot(*_drawn(self._t, values[:, index]), label=components[index])
                 if contact is not None:
                     shade_contact(axes, self._t, contact)
                 axes.set_title(name)
@@ -245,7 +289,8 @@ class SimulationResult:
 
     def _panels(self, name: str) -> list[tuple[str, str, list[int]]]:
         """The subplots of a signal: its components, neighbours of the same unit together."""
-        self[name]  # an unknown name is a KeyError with a suggestion
+        if name not in self:
+            self[name]  # a KeyError with a suggestion
         units = self._specs[name].units
         groups = groupby(range(len(units)), key=lambda index: units[index])
         return [(name, unit, list(indices)) for unit, indices in groups]
@@ -276,6 +321,64 @@ class SimulationResult:
             f"<b>SimulationResult</b>: {self._span()}"
             f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
         )
+
+
+class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
+    """Arrays by the signal's name, read when they are asked for."""
+
+    def __init__(self, path: Path, specs: Sequence[Signal]) -> None:
+        self._path, self._columns = path, {spec.name: spec.columns for spec in specs}
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        import polars as pl
+
+        return _read_only(pl.read_parquet(self._path, columns=self._columns[name]).to_numpy())
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._columns
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+
+def remove_log(path: Path) -> None:
+    """Removes a log that `write_part` or `write_parquet` wrote, if there is one.
+
+    Raises:
+        DrakeTeleopError: if it is a folder that holds something else.
+    """
+    _unfinished(path).unlink(missing_ok=True)
+    if not path.is_dir():
+        path.unlink(missing_ok=True)
+        return
+    parts = sorted(path.glob(_PART_NAMES))
+    if others := sorted(set(path.iterdir()) - set(parts)):
+        raise DrakeTeleopError(
+            f"holds {others[0].name}, which is no part of a log",
+            where=str(path),
+            remedy="give another folder for the log",
+        )
+    for part in reversed(parts):  # from its end: what remains if we die here has no gap
+        part.unlink()
+
+
+def _unfinished(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.unfinished")
+
+
+def _drawn(
+    t: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A line of N points, or of about _DRAWN that look the same: no peak is lost."""
+    length = 2 * len(t) // _DRAWN
+    if length < 2:
+        return t, values
+    starts = np.arange(0, len(t), length)
+    extremes = [ufunc.reduceat(values, starts) for ufunc in (np.minimum, np.maximum)]
+    return np.repeat(t[starts], 2), np.ravel(extremes, order="F")
 
 
 def _components(spec: Signal) -> str:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.result import SimulationResult
+from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.scenario import Simulation
 from drake_teleop.signals import LOG, SIGNALS
 
 # Long enough to keep progress cheap, short enough to look alive.
 _PROGRESS_STEP = 0.02
+# A part of a log on disk: some seconds of a station, some MB.
+_PART_ROWS = 8192
 
 
 def simulate(
@@ -23,6 +26,7 @@ def simulate(
     simulation: Simulation,
     *,
     progress: Callable[[float], None] | None = None,
+    log: str | Path | None = None,
 ) -> SimulationResult:
     """Runs a station through its settling time and its duration.
 
@@ -30,21 +34,60 @@ def simulate(
         diagram: a station, as `MakeTeleopStation` makes it.
         simulation: duration, settling time, integrator and seed.
         progress: called with the fraction done, 0 to 1.
+        log: a folder that the log goes to while the station runs, in parts of some seconds
+            (`SimulationResult.scan_parquet`): a long run then needs no more memory than a short
+            one. What was recorded before Ctrl-C or an error is in it, and all but the last part
+            if the process is killed. A log that is there already is replaced.
 
     Returns:
-        The recorded signals; t = 0 is the end of the settling time.
+        The recorded signals; t = 0 is the end of the settling time. With `log` they are read
+        when they are asked for.
 
     Raises:
-        DrakeTeleopError: if a joint of the slave leaves its range.
+        DrakeTeleopError: if a joint of the slave leaves its range, or the folder holds other files.
     """
     simulator = MakeSimulator(diagram, simulation)
     end = simulation.settle + simulation.duration
+    on_disk = None if log is None else _LogOnDisk(Path(log), simulator, simulation.settle)
     simulator.Initialize()
-    for time in np.append(np.arange(_PROGRESS_STEP, end, _PROGRESS_STEP), end):
-        advance(simulator, time)
-        if progress is not None:
-            progress(time / end)
+    try:
+        for time in np.append(np.arange(_PROGRESS_STEP, end, _PROGRESS_STEP), end):
+            advance(simulator, time)
+            if on_disk is not None and on_disk.waiting() >= _PART_ROWS:
+                on_disk.take()
+            if progress is not None:
+                progress(time / end)
+    finally:
+        if on_disk is not None:
+            on_disk.take()
+    if log is not None:
+        return SimulationResult.scan_parquet(log)
     return read_log(simulator, simulation.settle)
+
+
+class _LogOnDisk:
+    """Moves the log of a running station into a folder of parts."""
+
+    def __init__(self, folder: Path, simulator: Simulator, start: float) -> None:
+        remove_log(folder)
+        self._folder, self._simulator, self._start, self._rows = folder, simulator, start, 0
+        sink = simulator.get_system().GetSubsystemByName(LOG)
+        self._sink = sink.FindMutableLog(simulator.get_mutable_context())
+
+    def waiting(self) -> int:
+        """The rows that are in memory."""
+        return int(self._sink.num_samples())
+
+    def take(self) -> None:
+        """Writes them as the next part and forgets them.
+
+        After an interrupt anywhere in here it may be called once more: that replaces the part by
+        the same rows, or has none to write.
+        """
+        part = read_log(self._simulator, self._start)
+        part.write_part(self._folder, self._rows)
+        self._sink.Clear()
+        self._rows += len(part.t)
 
 
 def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +92,11 @@ def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
 
 
 def identify_load(
-    scenario: Scenario, stage: Stage = silent, *, trajectory: FourierTrajectory | None = None
+    scenario: Scenario,
+    stage: Stage = silent,
+    *,
+    trajectory: FourierTrajectory | None = None,
+    log: Path | None = None,
 ) -> LoadIdentification:
     """Runs an excitation trajectory, and identifies.
 
@@ -99,6 +104,7 @@ def identify_load(
         scenario: with the load estimator enabled.
         stage: where progress is shown.
         trajectory: to run, of the scenario's duration; a new one is designed if there is none.
+        log: as `simulate` has it.
 
     Raises:
         DrakeTeleopError: if no trajectory respects the limits of arm and sensor, or the one that
@@ -110,7 +116,7 @@ def identify_load(
     else:
         _check_given(robot, trajectory, scenario.simulation.duration)
     station = MakeIdentificationStation(scenario, trajectory)
-    result, factor = timed(station, scenario.simulation, stage("Identify the load"))
+    result, factor = timed(station, scenario.simulation, stage("Identify the load"), log)
     usable = result["saturated"][:, 0] == 0
     batch = identify(
         *(signal[usable] for signal in sensor_samples(result)),
@@ -148,11 +154,11 @@ def _check_given(robot: Robot, trajectory: FourierTrajectory, duration: float) -
 
 
 def timed(
-    station: Diagram, simulation: Simulation, progress: Progress
+    station: Diagram, simulation: Simulation, progress: Progress, log: Path | None = None
 ) -> tuple[SimulationResult, float]:
     """`simulate`, and its real-time factor: simulated over elapsed time, compilation included."""
     start = time.perf_counter()
-    result = simulate(station, simulation, progress=progress)
+    result = simulate(station, simulation, progress=progress, log=log)
     elapsed = time.perf_counter() - start
     return result, (simulation.settle + simulation.duration) / elapsed
 

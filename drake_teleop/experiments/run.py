@@ -30,7 +30,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +47,7 @@ from drake_teleop.experiments.identification import (
 from drake_teleop.experiments.progress import Stage, progress_bars, silent
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
-from drake_teleop.result import SimulationResult
+from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.slave.inverse_kinematics import IkStatus
 from drake_teleop.station import MakeTeleopStation
@@ -83,7 +82,8 @@ def run_command(
     """Runs one scenario.
 
     Writes log.parquet, sensor_log.parquet (canonical, for `drake-teleop identify`), overview.png,
-    identification.json (unless the scenario learnt while it ran) and summary.json into `out`.
+    identification.json (unless the scenario learnt while it ran) and summary.json into `out`. The
+    log is a folder, written while the station runs; the others follow at the end, the summary last.
 
     Args:
         scenario: the name of a shipped one, or a YAML file.
@@ -96,15 +96,21 @@ def run_command(
 
     Raises:
         DrakeTeleopError: if the scenario cannot be used or a joint leaves its range.
+        KeyboardInterrupt: saying what was recorded until then.
     """
     setup = LoadScenario(scenario)
     if seed is not None:
         setup = replace(setup, simulation__seed=seed)
-    with progress_bars(quiet) as stage:
-        run = run_scenario(setup, stage)
+    log = out / "log.parquet"
+    # What stays of an earlier run must not be taken for this one's, should this one be interrupted.
+    remove_log(log)
+    (out / "summary.json").unlink(missing_ok=True)
+    try:
+        with progress_bars(quiet) as stage:
+            run = run_scenario(setup, stage, log)
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt(_kept(log)) from interrupt
     summary = {"scenario": str(scenario)} | summarise(run)
-    out.mkdir(parents=True, exist_ok=True)
-    run.result.write_parquet(out / "log.parquet")
     run.result.sensor_log().write_parquet(out / "sensor_log.parquet")
     if run.identification is not None:
         run.identification.save(out / "identification.json")
@@ -116,16 +122,17 @@ def run_command(
     return summary
 
 
-def run_scenario(scenario: Scenario, stage: Stage = silent) -> ScenarioRun:
+def run_scenario(scenario: Scenario, stage: Stage = silent, log: Path | None = None) -> ScenarioRun:
     """Runs a scenario by the rule at the top of this module.
 
     Args:
         scenario: what to run.
         stage: where progress is shown.
+        log: as `simulate` has it.
     """
     learns = scenario.load_estimator.enabled
     if learns and not scenario.operator.intent:
-        found = identify_load(scenario, stage)
+        found = identify_load(scenario, stage, log=log)
         return ScenarioRun(scenario, found.result, found.identification, found.real_time_factor)
     identification, estimate = None, None
     if not learns:
@@ -134,7 +141,7 @@ def run_scenario(scenario: Scenario, stage: Stage = silent) -> ScenarioRun:
         found = identify_load(before, stage)
         identification, estimate = found.identification, found.estimate
     station = MakeTeleopStation(scenario, load_estimate=estimate)
-    result, factor = timed(station, scenario.simulation, stage("Run the scenario"))
+    result, factor = timed(station, scenario.simulation, stage("Run the scenario"), log)
     return ScenarioRun(scenario, result, identification, factor)
 
 
@@ -146,11 +153,8 @@ def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
-    times = result.t[touching]
-    for before, after in pairwise(times):
-        if after - before < FILTER_TAIL:
-            touching |= (result.t > before) & (result.t < after)
-    return touching
+    to_next = _time_since(touching[::-1], -result.t[::-1])[::-1]
+    return _time_since(touching, result.t) + to_next < FILTER_TAIL
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
@@ -167,7 +171,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     measured = result["measured_wrench_S"] - estimate[:6]
     calculated = calculated_contact_wrench(result)
     contact = in_contact(result)
-    free = ~_widened(contact, result.t)
+    free = _time_since(contact, result.t) > FILTER_TAIL
     mass, com = _mass_and_com(estimate[6:])
     true_mass, true_com = _mass_and_com(arm.phi_load)
     n = arm.num_joints
@@ -235,11 +239,16 @@ def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
     return {name: float(norm) for name, norm in zip(names, norms, strict=True)}
 
 
-def _widened(contact: NDArray[np.bool_], t: Array) -> NDArray[np.bool_]:
-    wide = contact.copy()
-    for start, stop in contact_spans(t, contact):
-        wide |= (t >= start) & (t <= stop + FILTER_TAIL)
-    return wide
+def _time_since(contact: NDArray[np.bool_], t: Array) -> Array:
+    """(N,) time since the last sample in contact; 0 in contact, inf before the first."""
+    last = np.maximum.accumulate(np.where(contact, np.arange(len(t)), -1))
+    return np.where(last < 0, np.inf, t - t[last])
+
+
+def _kept(log: Path) -> str:
+    if not log.exists():
+        return ""
+    return f"{log} has the {len(SimulationResult.scan_parquet(log).t)} samples until then"
 
 
 def _mass_and_com(phi: Array) -> tuple[float, Array]:
