@@ -2,9 +2,9 @@
 
 A reading at rest is a constant, a drift, and three random parts: white noise of variance sigma^2 in
 each raw sample; rounding to a quantum q, which adds q^2/12 and is as white, as long as the noise
-moves the readings over the steps (sigma above about q/2; without noise it is a constant error); and
-a random walk that grows by K sqrt(t). With the sampling period T and the low-pass H, if it stands
-after the converter, the one-sided spectral density is
+moves the readings over the steps (sigma of q/2 or more: at q/2 it is 1 % less than said; without
+noise it is a constant error); and a random walk that grows by K sqrt(t). With the sampling period
+T, and the low-pass H if it stands after the converter, the one-sided spectral density is
 
     S(f) = |H(f)|^2 (2 T (sigma^2 + q^2/12) + 2 K^2 T^2 / (2 sin(pi f T))^2)
 
