@@ -53,7 +53,7 @@ def main() -> None:
 def repeated_contact(seconds: float) -> Scenario:
     """The movement of Fig. 8 for as long as that, with a touch at every lower turn."""
     up_down = Sine(
-        t_start=0.1, duration=seconds + 10, ramp=1.8, frequency=2.63, translation=[0, 0, 0.066]
+        t_start=0.1, duration=seconds + 10, ramp=1.8, frequency=2.63, translation=[0, 0, 0.062]
     )
     return replace(
         LoadScenario("contact_transition"),
