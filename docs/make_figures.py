@@ -1,4 +1,6 @@
-"""Draws the README's pictures into docs/figures: the station, and Fig. 8 as `reproduce` makes it.
+"""Draws the pictures of README and docs into docs/figures.
+
+The station, Fig. 8 as `reproduce` makes it, and the noise of the wrist sensor.
 
 Run it as `python docs/make_figures.py`.
 """
@@ -7,13 +9,23 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyBboxPatch
+from scipy.signal import welch
 
 from drake_teleop.experiments.reproduce import reproduce_command
+from drake_teleop.slave.sensor_chain import PRESETS, without
+from drake_teleop.slave.sensor_noise import (
+    allan_deviation,
+    predicted_allan_deviation,
+    rest_record,
+    spectral_density,
+)
 from drake_teleop.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, house_style
 
 FIGURES = Path(__file__).parent / "figures"
@@ -162,11 +174,44 @@ def _line(
     axes.annotate("", xy=stop, xytext=start, arrowprops=arrow, zorder=2)
 
 
+def noise_figure() -> Picture:
+    """Spectrum and Allan deviation of fx at rest: predicted (lines), simulated for 5 min (dots)."""
+    period, count = 125e-6, 300 * 8000
+    lengths = np.unique(np.logspace(0, np.log10(count // 8), 31).astype(int))
+    with house_style():
+        figure = Picture(figsize=(8.2, 3.2), facecolor="white")
+        spectrum, allan = figure.subplots(1, 2)
+        for name, colour in (("jr3_85m35a3", BLUE), ("ati_gamma_imu", VERMILION)):
+            config = without(PRESETS[name], "drift")
+            record = rest_record(config, count, period, seed=1)[:, :1]
+            f, density = welch(record[:, 0], 1 / period, nperseg=2**19)
+            edges = np.logspace(np.log10(0.05), np.log10(3000), 32)
+            places = np.sqrt(edges[1:] * edges[:-1])
+            means = [density[(f >= a) & (f < b)].mean() for a, b in pairwise(edges)]
+            grid = np.logspace(np.log10(0.05), np.log10(3000), 200)
+            spectrum.plot(grid, spectral_density(config, grid, period)[0], color=colour, label=name)
+            spectrum.plot(places, means, ".", color=colour)
+            predicted = predicted_allan_deviation(config, lengths, period)[0]
+            allan.plot(lengths * period, predicted, color=colour, label=name)
+            allan.plot(lengths * period, allan_deviation(record, lengths)[0], ".", color=colour)
+        spectrum.set(
+            xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=r"density of $f_x$ [N²/Hz]"
+        )
+        spectrum.set_ylim(1e-9, None)
+        allan.set(
+            xscale="log", yscale="log", xlabel="averaging time [s]",
+            ylabel=r"Allan deviation of $f_x$ [N]",
+        )  # fmt: skip
+        spectrum.legend(loc="lower left")
+    return figure
+
+
 def main() -> None:
     FIGURES.mkdir(exist_ok=True)
     # Without date and random ids, so that the same script draws the same file.
     with mpl.rc_context({"svg.hashsalt": "drake_teleop"}):
         station_figure().savefig(FIGURES / "station.svg", metadata={"Date": None})
+        noise_figure().savefig(FIGURES / "sensor_noise.svg", metadata={"Date": None})
     with tempfile.TemporaryDirectory() as folder:
         reproduce_command(Path(folder))
         shutil.copy(Path(folder) / "fig8.png", FIGURES / "result.png")

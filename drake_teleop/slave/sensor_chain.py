@@ -18,7 +18,7 @@ rate, the signal processor filters what comes out, noise and quantisation steps 
 electronics that make the noise (`before_noise`).
 
 Each part is a group of fields of `WristSensorConfig` that is off when it is zero; `without` turns
-parts off by name. Calibration errors are off in every preset: what a makers' calibration sheet
+parts off by name. Calibration errors are off in every preset: what a maker's calibration sheet
 leaves is far below the bound of 1 % that is stated for such sensors, an error that is constant can
 be calibrated away, and a study of errors wants to see this one on its own.
 """
@@ -259,12 +259,12 @@ ati_gamma_imu: ATI Gamma with NetBox and MPU6886 IMU on an end effector, as reco
 (doi 10.5281/zenodo.11075229). The white noise is what the record at rest has from one sample to the
 next (Allan deviation at one sample, 698 Hz and 254 Hz; the standard deviation would count the arm's
 vibration): force 0.018, 0.019, 0.018 N, torque 0.0012, 0.0010, 0.0003 N m, specific force 0.061,
-0.060, 0.031 m/s^2, here their root mean squares. The spectra of the torques are white up to 349 Hz,
-so the low-pass, 300 Hz for the mechanics, stands before the noise. Offsets, axes of the IMU and its
-lag of 6 ms: fits to the same records. Quantum and range of the IMU: steps of 2.44e-4 g in its
-record, 16 bits of +-8 g. Ranges of the Gamma: SI-130-10, an estimate, as are the place of the IMU
-and its angular acceleration (differences of a gyroscope's samples). The record at rest lasts 1 s:
-walks and drift are the other preset's.
+0.060, 0.031 m/s^2, here their root mean squares. The spectrum of tz is white up to 349 Hz, so the
+low-pass, 300 Hz for the mechanics (an estimate), stands before the noise. Offsets, axes of the IMU
+and its lag of 6 ms: fits to the same records. Quantum and range of the IMU: steps of 2.44e-4 g in
+its record, 16 bits of +-8 g. Ranges of the Gamma: SI-130-10, an estimate, as are the place of the
+IMU and its angular acceleration (differences of a gyroscope's samples). The record at rest lasts
+1 s: walks and drift are the other preset's.
 """
 
 #: The parts by name, and the fields that turn each of them off.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import time
 from pathlib import Path
 
@@ -456,3 +457,35 @@ def test_a_sample_takes_little_time(name):
         _read_often(constants, memory, noise, truth, reading, 2000)
         times.append(time.thread_time() - start)
     assert min(times) / 2000 < 2.5e-6
+
+
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "sensor.md").read_text(encoding="utf-8")
+
+
+def test_the_document_names_every_part_with_its_fields():
+    rows = re.findall(r"^\| (\w+) \| (`.*?) \|", DOCUMENT, re.MULTILINE)
+    assert [name for name, _ in rows] == list(PARTS)
+    fields = {field.name for field in dataclasses.fields(WristSensorConfig)}
+    for name, text in rows:
+        named = re.findall(r"`(\w+)`", text)
+        assert set(named) <= fields
+        assert set(PARTS[name]) <= set(named) or "…" in text
+
+
+def test_the_documents_figures_are_those_of_the_presets():
+    rows = re.findall(r"^\| `(\w+)` \|[^|]*\| ([^|]*) \| ([^|]*) \|", DOCUMENT, re.MULTILINE)
+    assert len(rows) == 18
+    for field, *values in rows:
+        for name, value in zip(("jr3_85m35a3", "ati_gamma_imu"), values, strict=True):
+            stated = getattr(PRESETS[name], field)
+            if isinstance(stated, str):
+                assert value == stated, (field, name)
+            else:
+                numbers = [float(number) for number in value.split(",")]
+                assert numbers == np.atleast_1d(stated).tolist(), (field, name)
+
+
+def test_the_documents_script_runs(capsys):
+    script = re.search(r"```python\n(.*?)```", DOCUMENT, re.DOTALL).group(1)
+    exec(compile(script, "sensor.md", "exec"), {})
+    assert capsys.readouterr().out.strip() == script.rpartition("# ")[2].strip()
