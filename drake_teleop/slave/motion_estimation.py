@@ -134,7 +134,8 @@ def steady_state(
     scale = max(np.sqrt(white), np.cbrt(walk))
     u = scale * np.roots([1.0, 0.0, white / scale**2, walk / scale**3]).astype(complex)
     root = np.sqrt(u * u - 4.0 * u)
-    delta = np.where((u + root).real > (u - root).real, u + root, u - root) / 2.0
+    # Each root u belongs to two numbers delta = 1 - z; the stable pole is inside the unit circle.
+    delta = np.where(abs(2.0 - u - root) < abs(2.0 - u + root), u + root, u - root) / 2.0
     z = 1.0 - delta
     keeps = np.prod(z).real
     d = -delta / z
