@@ -86,10 +86,10 @@ class WristSensorConfig:
     torque_noise: float = quantity(0.012, "N m", 0.0, 10.0, "white, 1 sigma of each raw sample")
     acceleration_noise: float = quantity(0.06, "m/s^2", 0.0, 100.0, "white, 1 sigma")
     angular_acceleration_noise: float = quantity(1.5, "rad/s^2", 0.0, 1e3, "white, 1 sigma")
-    force_walk: float = quantity(0.01, "N/sqrt(s)", 0.0, 10.0, "random walk")
-    torque_walk: float = quantity(5e-4, "N m/sqrt(s)", 0.0, 1.0, "random walk")
-    acceleration_walk: float = quantity(2.4e-3, "m/s^2/sqrt(s)", 0.0, 10.0, "random walk")
-    angular_acceleration_walk: float = quantity(0.06, "rad/s^2/sqrt(s)", 0.0, 100.0, "random walk")
+    force_walk: float = quantity(0.002, "N/sqrt(s)", 0.0, 10.0, "random walk")
+    torque_walk: float = quantity(4e-5, "N m/sqrt(s)", 0.0, 1.0, "random walk")
+    acceleration_walk: float = quantity(6e-4, "m/s^2/sqrt(s)", 0.0, 10.0, "random walk")
+    angular_acceleration_walk: float = quantity(0.015, "rad/s^2/sqrt(s)", 0.0, 100.0, "random walk")
 
     offset: list[float] = quantity(
         [6.2, -3.9, 8.1, 0.31, -0.42, 0.12], "N, N m", -100.0, 100.0, "offset, Eq. (7)"
@@ -237,6 +237,7 @@ PRESETS: dict[str, WristSensorConfig] = {
         torque_noise=9e-4,
         acceleration_noise=0.053,
         angular_acceleration_noise=0.3,
+        angular_acceleration_walk=0.0,
         offset=[9.08, -1.02, 9.98, 0.433, -0.692, -0.157],
         acceleration_offset=[-0.036, 0.086, 0.757, 0.0, 0.0, 0.0],
         resolution=3.05e-5,
@@ -252,8 +253,11 @@ PRESETS: dict[str, WristSensorConfig] = {
 jr3_85m35a3: JR3 85M35A3-I40-D 200N12, the paper's. Ranges of force and torque: its name and data
 sheet. S lies on the flange, and the acceleration part in the middle of the housing, 35 mm high.
 Noise, quantum, ranges of acceleration: estimates. Filter: one of those that can be selected. Drift:
-0.5 N in 10 min, as in the records below. Walks: estimates, as much in 10 min as half of the drift.
-No latency: force and acceleration go through the same converter, filter and line.
+0.5 N in 10 min, between the records of the ATI. Walks of force and torque: the Allan deviation at 1
+to 2.5 s of a force sensor on a UR5 at rest (kkufieta/ur5_modeling_force_estimate, No10); of the
+specific force: 0.2 mg at 30 s, what MEMS accelerometers have; of the angular acceleration: in the
+ratio of the noises, as it is made of accelerometers a few centimetres apart. No latency: force and
+acceleration go through the same converter, filter and line.
 
 ati_gamma_imu: ATI Gamma with NetBox and MPU6886 IMU on an end effector, as recorded by A. Skrede
 (doi 10.5281/zenodo.11075229). The white noise is what the record at rest has from one sample to the
@@ -263,8 +267,8 @@ vibration): force 0.018, 0.019, 0.018 N, torque 0.0012, 0.0010, 0.0003 N m, spec
 low-pass, 300 Hz for the mechanics (an estimate), stands before the noise. Offsets, axes of the IMU
 and its lag of 6 ms: fits to the same records. Quantum and range of the IMU: steps of 2.44e-4 g in
 its record, 16 bits of +-8 g. Ranges of the Gamma: SI-130-10, an estimate, as are the place of the
-IMU and its angular acceleration (differences of a gyroscope's samples). The record at rest lasts
-1 s: walks and drift are the other preset's.
+IMU and its angular acceleration: differences of a gyroscope's samples, without a walk. The record
+at rest lasts 1 s: the other walks and the drift are those of the other preset.
 """
 
 #: The parts by name, and the fields that turn each of them off.

@@ -42,7 +42,9 @@ from drake_teleop.slave.sensor_noise import (
 RATE, PERIOD, JOINTS = 8000.0, 125e-6, 3
 BARE = without(WristSensorConfig(), *PARTS)
 QUIET = ("noise", "random_walk")
-RECORDS = Path(__file__).parents[2] / ".." / "shared" / "data" / "ntnu_fts_imu_contact"
+RECORDS = Path(__file__).parents[2] / ".." / "shared" / "data"
+ATI_AT_REST = RECORDS / "ntnu_fts_imu_contact"
+UR5_AT_REST = RECORDS / "ur5_imu_fts_contact"
 
 
 def readings(config, truths, noise=None, period=PERIOD):
@@ -384,18 +386,34 @@ def test_the_same_seed_gives_the_same_bytes():
     assert first.tobytes() != rest_record(WristSensorConfig(), 1000, PERIOD, 6).tobytes()
 
 
-@pytest.mark.skipif(not RECORDS.is_dir(), reason="the recordings are not here")
+@pytest.mark.skipif(not ATI_AT_REST.is_dir(), reason="the recordings are not here")
 @pytest.mark.parametrize(
     ("file", "figures", "unit"),
     [("wrench", {"force": slice(0, 3), "torque": slice(3, 6)}, 1.0),
      ("accel", {"acceleration": slice(0, 3)}, 9.80665)],
 )  # fmt: skip
 def test_the_ati_gamma_is_as_noisy_as_it_was_recorded(file, figures, unit):
-    record = pl.read_csv(RECORDS / f"0-steady-state_{file}.csv").to_numpy() * unit
+    record = pl.read_csv(ATI_AT_REST / f"0-steady-state_{file}.csv").to_numpy() * unit
     step = allan_deviation(record, [1])[:, 0]
     for name, axes in figures.items():
         stated = getattr(PRESETS["ati_gamma_imu"], f"{name}_noise")
         assert stated == pytest.approx(np.sqrt(np.mean(step[axes] ** 2)), rel=0.03)
+
+
+@pytest.mark.skipif(not UR5_AT_REST.is_dir(), reason="the recordings are not here")
+def test_the_force_wanders_as_it_was_recorded():
+    """Two averaging times only, and drift in them: to 30 %."""
+    file = UR5_AT_REST / "No10_Standstill_ForceSensor_All2__log_force_sensor.csv"
+    record = pl.read_csv(file, has_header=False).to_numpy()
+    quiet = record[record[:, 0] < 8.7]  # until the first push
+    lengths = np.array([256, 512])
+    found = allan_deviation(quiet[:, 1:], lengths)
+    third = np.sqrt(lengths * np.median(np.diff(quiet[:, 0])) / 3)
+    for stated, axes in (
+        (WristSensorConfig().force_walk, slice(0, 3)),
+        (WristSensorConfig().torque_walk, slice(3, 6)),
+    ):
+        np.testing.assert_allclose(np.sqrt(np.mean(found[axes] ** 2, 0)), stated * third, rtol=0.3)
 
 
 # Configuration
