@@ -143,8 +143,8 @@ def steady_state(
     second = third + keeps * (d[0] * d[1] + d[0] * d[2] + d[1] * d[2]).real
     return SteadyState(
         gains=np.array([1.0 - keeps, second / period, third / period**2]),
-        innovation_std=position_std / np.sqrt(keeps),
-        position_std=position_std * np.sqrt(1.0 - keeps),
+        innovation_std=float(position_std / np.sqrt(keeps)),
+        position_std=float(position_std * np.sqrt(1.0 - keeps)),
         crossover_hz=float(np.cbrt(np.prod(np.abs(delta)))) / (2 * np.pi * period),
     )
 
@@ -158,7 +158,8 @@ def path_delays(config: MotionEstimationConfig, sensor: WristSensorConfig, perio
     encoders += _lag(_filters(config, sensor, period)) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
     waits = np.ceil((max(sources) - wrench) / period - 1e-6)
-    return Delays(wrench, acceleration, encoders, wrench + max(waits, 0.0) * period)
+    sample = wrench + max(waits, 0.0) * period
+    return Delays(float(wrench), float(acceleration), float(encoders), float(sample))
 
 
 def motion_gains(

@@ -1,0 +1,190 @@
+"""What does elimination leave of the paper's 100 N, by source of the motion and by mismatch?
+
+The tool goes up and down at 2.63 Hz without turning, as in the scenario free_motion_force; truth ->
+sensor -> estimation of the motion -> F - F_o - V phi with the true phi. The baseline is the same
+record with nothing, or with the weight alone, taken away.
+
+    python benchmarks/motion_estimation.py [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydrake.systems.framework import DiagramBuilder
+from rich.console import Console
+from rich.table import Table
+from scipy.interpolate import make_interp_spline
+
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.slave.arm import sensor_motion
+from drake_teleop.slave.inverse_kinematics import nearest_branch
+from drake_teleop.slave.motion_estimation import (
+    MotionEstimationConfig,
+    estimate_into,
+    motion_estimator,
+    path_delays,
+)
+from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, home_position
+from drake_teleop.slave.sensor_chain import (
+    NOISE_SIZE,
+    PRESETS,
+    WristSensorConfig,
+    read_into,
+    sensor_chain,
+    without,
+)
+
+Array = NDArray[np.float64]
+
+T = 1 / 8000
+SECONDS, SETTLED = 5.0, 8000
+SOURCES = ("encoders", "accelerometer", "fused")
+MISMATCHES = (0.0, 0.125e-3, 0.5e-3, 1e-3, 2e-3, 6e-3)
+START = (0.55, 0.0, 0.45)
+AMPLITUDE = 0.078
+
+
+def motion(arm: Any, frequency: float, amplitude: float) -> tuple[Array, Array, Array]:
+    """q, v, vdot (N, n) of the vertical sine, which grows for 0.6 s."""
+    coarse = np.arange(0.0, SECONDS + 0.02, min(4e-3, 0.02 / frequency))
+    x = np.clip(coarse / 0.6, 0.0, 1.0)
+    swing = x**3 * (10 - 15 * x + 6 * x**2) * np.sin(2 * np.pi * frequency * coarse)
+    path, q = [], home_position(arm, list(START))
+    for z in START[2] + amplitude * swing:
+        place = np.array([START[0], START[1], z])
+        q, _ = nearest_branch(R_WS_HOME.matrix(), place, q, arm.lower, arm.upper)
+        path.append(q)
+    spline = make_interp_spline(coarse, np.array(path), k=5)
+    t = np.arange(round(SECONDS / T)) * T
+    return spline(t), spline(t, 1), spline(t, 2)
+
+
+@njit
+def true_samples(table, phi, q, v, vdot, truth):  # type: ignore[no-untyped-def]
+    x = np.empty(21)
+    for k in range(q.shape[0]):
+        sensor_motion(table, q[k], v[k], vdot[k], x)
+        truth[k, 6:15] = x[:9]
+        truth[k, 15:] = q[k]
+        non_contact_wrench_into(x[:3], x[3:6], x[6:9], phi, truth[k, :6])
+
+
+@njit
+def read(chain, memory, noise, truth, readings):  # type: ignore[no-untyped-def]
+    for k in range(truth.shape[0]):
+        read_into(chain, memory, noise[k // 32], truth[k], readings[k])
+
+
+@njit
+def estimate(constants, memory, table, readings, samples):  # type: ignore[no-untyped-def]
+    for k in range(readings.shape[0]):
+        estimate_into(constants, memory, table, readings[k], samples[k])
+
+
+class Record:
+    """A true motion, and what is left of its wrench by way of a sensor and an estimation."""
+
+    def __init__(self, frequency: float, amplitude: float) -> None:
+        self.arm = AddSlavePlant(DiagramBuilder(), list(START), None).arm
+        q, v, vdot = motion(self.arm, frequency, amplitude)
+        self.truth, still = np.empty((len(q), 15 + q.shape[1])), np.empty((len(q), 15 + q.shape[1]))
+        true_samples(self.arm.table, self.arm.phi_load, q, v, vdot, self.truth)
+        true_samples(self.arm.table, self.arm.phi_load, q, 0.0 * v, 0.0 * v, still)
+        self.nothing = rms(self.truth[SETTLED:, :3])
+        self.weight = rms((self.truth - still)[SETTLED:, :3])
+
+    def left(
+        self,
+        sensor: WristSensorConfig,
+        config: MotionEstimationConfig,
+        believed: WristSensorConfig | None = None,
+    ) -> dict[str, float]:
+        """Force [N] and torque [N m] that stay; microseconds that an estimate takes."""
+        n = self.truth.shape[1] - 15
+        noise = np.random.default_rng(0).standard_normal((len(self.truth) // 32 + 1, NOISE_SIZE))
+        readings = np.empty((len(self.truth), 13 + n))
+        samples = np.empty((len(self.truth), 16 + n))
+        read(*sensor_chain(sensor, n, T), noise, self.truth, readings)
+        constants, memory = motion_estimator(config, believed or sensor, n, T)
+        begin = time.thread_time()
+        estimate(constants, memory, self.arm.table, readings, samples)
+        microseconds = (time.thread_time() - begin) / len(samples) * 1e6
+        late = samples[SETTLED:]
+        s, omega, alpha = late[:, 6:9], late[:, 9:12], late[:, 12:15]
+        wrench = contact_wrench(late[:, :6], sensor.offset, s, omega, alpha, self.arm.phi_load)
+        force = np.linalg.norm(wrench[:, :3], axis=1)
+        return {
+            "rms": rms(wrench[:, :3]),
+            "peak": float(force.max()),
+            "torque_rms": rms(wrench[:, 3:]),
+            "delay_ms": 1e3 * path_delays(config, sensor, T).sample,
+            "microseconds": microseconds,
+        }
+
+
+def rms(rows: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(rows**2, axis=1))))
+
+
+def by_source(record: Record) -> dict[str, dict[str, float]]:
+    jr3, ati = (without(PRESETS[name], "drift") for name in ("jr3_85m35a3", "ati_gamma_imu"))
+    wrong = replace(jr3, acceleration_gain_error=0.01, acceleration_misalignment=0.01)
+    sensors = {"JR3": jr3, "JR3, accelerometer 1 % wrong": wrong, "ATI with IMU": ati}
+    record.left(jr3, MotionEstimationConfig())  # compiles
+    return {
+        f"{name}: {source}": record.left(sensor, MotionEstimationConfig(source=source))
+        for name, sensor in sensors.items()
+        for source in SOURCES
+    }
+
+
+def by_mismatch(record: Record) -> dict[str, dict[str, float]]:
+    """The accelerometer is late, and the estimation does not know."""
+    jr3 = without(PRESETS["jr3_85m35a3"], "drift")
+    return {
+        source: {
+            f"{1e3 * late:g} ms": record.left(
+                replace(jr3, acceleration_latency=late), MotionEstimationConfig(source=source), jr3
+            )["rms"]
+            for late in MISMATCHES
+        }
+        for source in ("accelerometer", "fused")
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    arguments = parser.parse_args()
+    papers = Record(2.63, AMPLITUDE)
+    sources = by_source(papers)
+    mismatches = {}
+    for frequency in (2.63, 10.0, 20.0, 40.0):
+        # The same acceleration at every frequency.
+        record = Record(frequency, AMPLITUDE * (2.63 / frequency) ** 2)
+        for source, row in by_mismatch(record).items():
+            baseline = {"nothing": record.nothing, "weight": record.weight}
+            mismatches[f"{frequency:g} Hz: {source}"] = baseline | row
+    console = Console()
+    for title, rows in (("by source", sources), ("force [N rms] by mismatch", mismatches)):
+        table = Table("", *next(iter(rows.values())), title=title)
+        for name, row in rows.items():
+            table.add_row(name, *(f"{value:.3f}" for value in row.values()))
+        console.print(table)
+    if arguments.json:
+        figures = {"by_source": sources, "by_mismatch": mismatches}
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
