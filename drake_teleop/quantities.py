@@ -152,6 +152,8 @@ def _check_kind(hint: Any, value: Any, place: str) -> None:
         raise DrakeTeleopError(f"expected a whole number, found '{value}'", where=place)
     elif options[0] is bool and not isinstance(value, bool):
         raise DrakeTeleopError(f"expected true or false, found '{value}'", where=place)
+    elif options[0] is str and not isinstance(value, str):
+        raise DrakeTeleopError(f"expected a word, found {value!r}", where=place)
 
 
 def _is_number(value: Any) -> bool:

@@ -23,6 +23,12 @@ SCENARIOS = {
     "unknown word": ("operator: {grip: iron}", "operator.grip"),
     "unknown variant": ("operator: {intent: [!Circle {radius: 1}]}", "operator.intent[0]"),
     "bandwidth beyond the rate": ("rates: {sensor_hz: 1000}", "wrist_sensor.bandwidth_hz"),
+    "unknown preset": ("wrist_sensor: {preset: jr3}", "wrist_sensor.preset"),
+    "number for a word": ("wrist_sensor: {preset: 3}", "wrist_sensor.preset"),
+    "axes that are no rotation": (
+        "wrist_sensor: {R_SA: [1, 0, 0, 0, 1, 0, 0, 0, -1]}",
+        "wrist_sensor.R_SA",
+    ),
     "eta without a gripper": ("force_scaling: {sigma: 0, eta: 0.5}", "force_scaling.eta"),
     "out of reach": ("slave: {position: [1.4, 0, 0.4]}", "slave.position"),
     "master out of reach": ("master: {position: [0.0, 0.0, 0.45]}", "master"),
