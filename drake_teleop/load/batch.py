@@ -30,10 +30,15 @@ noise and the three torques one; weights of their own would make mass and centre
 10 to 30 % (simulated gain errors of 0.3 % and tilts of 4 mrad).
 
 The covariance is that of `identification.NormalEquations` with the same weights of the rows, so
-coloured noise is accounted for. Errors in variables enlarge it: with G theta_LS = b and
-(G - lambda C) theta = b it is K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of
-`consistent` is of the same fit without the constraint, which is cautious. A prior adds its
-information to that of the record, and parameters that it says most about are named.
+coloured noise is accounted for. Offsets that wander are no stationary noise, and a record is too
+short to show how much they do: if the noise says so (`Noise.walk`, which Allan deviations of a
+record at rest give), the effects of all steps of the walk on the solution are added up. The offsets
+that the covariance is about are then those at the end of the record. A walk that goes as far as the
+noise within a record counts twice, since it is in the residuals too: that is cautious. Errors in
+variables enlarge the covariance: with G theta_LS = b and (G - lambda C) theta = b it is
+K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of `consistent` is of the same fit
+without the constraint, which is cautious. A prior adds its information to that of the record, and
+parameters that it says most about are named.
 """
 
 from __future__ import annotations
@@ -57,7 +62,7 @@ from drake_teleop.load.moments import (
     normal_equations,
     residual_covariance,
 )
-from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.regressor import non_contact_wrench, regressor
 from drake_teleop.load.total_least_squares import NormalForm, total_least_squares
 from drake_teleop.load.uncertainty import prior_dominated
 
@@ -276,7 +281,8 @@ def identify_batch(
         s, omega, alpha: (N, 3) specific force a - g [m/s^2], angular velocity [rad/s] and angular
             acceleration [rad/s^2] of S in S, in the order of time.
         method: one of `METHODS`.
-        noise: of wrench and motion; default: that of the wrench is estimated, the motion is exact.
+        noise: of wrench and motion; default: that of the wrench is estimated, the motion is exact
+            and offsets do not wander.
         offsets: whether to estimate the sensor's; otherwise they were subtracted before.
         shared_noise: whether the three forces have one estimated noise, and the three torques one,
             as is right for averages over poses at rest (module docstring).
@@ -303,7 +309,9 @@ def identify_batch(
     equations.add(*(rows if kept.all() else [table[kept] for table in rows]))
     plain = equations.solve(delay_s)
     theta, Z = fit.form.theta, fit.moments.mean
-    covariance = _covariance(plain.covariance, fit.form, offsets)
+    walk = np.broadcast_to(np.asarray((noise or Noise()).walk, float), 6)
+    wandering = plain.covariance + _walk_covariance(record, kept, equations, walk)
+    covariance = _covariance(wandering, fit.form, offsets)
     dominated = np.zeros(16, bool)
     if prior is not None:
         covariance, dominated = _with_prior(covariance, prior.information(plain.samples))
@@ -384,6 +392,33 @@ def _distances(record: Record, theta: Array, shared: bool) -> Array:
         part = slice(start, start + _CHUNK)
         out[part] = (np.abs(record.residual(theta, part)) / scale).max(axis=1)
     return out
+
+
+def _walk_covariance(
+    record: Record, kept: NDArray[np.bool_], equations: NormalEquations, walk: Array
+) -> Array:
+    """(16, 16) covariance of least squares from offsets that wander, about their values at the end.
+
+    Seen from the end, a step of the walk of channel c changes the wrench of all samples before it,
+    and the solution by G^+ times their share of the right-hand side. The steps are independent.
+    """
+    covariance = np.zeros((16, 16))
+    if not walk.any():
+        return covariance
+    heads = np.zeros((6, 16))
+    for start in range(0, len(kept), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        used = kept[part].astype(float)
+        V = regressor(*(table[part] for table in record.arrays[1:]))
+        for c in range(6):
+            rows = np.zeros((len(V), 16))
+            rows[:, c], rows[:, 6:] = used, used[:, None] * V[:, c]
+            rows *= walk[c] * equations.weights[c]
+            before = heads[c] + np.cumsum(rows, axis=0) - rows
+            heads[c] = before[-1] + rows[-1]
+            covariance += before.T @ before
+    root = inverse_root(equations.normal_equations()[0], ~equations.unexcited)
+    return np.asarray(root @ root.T @ covariance @ root @ root.T)
 
 
 def _covariance(plain: Array, form: NormalForm, offsets: bool) -> Array:

@@ -42,15 +42,20 @@ class Noise:
     Attributes:
         wrench: (6,) of [f; tau] [N, N m]; None to estimate them from the residual.
         s, omega, alpha: (3,), or a number for all axes, of the motion [m/s^2, rad/s, rad/s^2].
+        walk: (6,), or 0, of the steps from one sample to the next by which the wrench's offsets
+            wander, a random walk [N, N m].
     """
 
     wrench: ArrayLike | None = None
     s: ArrayLike = 0.0
     omega: ArrayLike = 0.0
     alpha: ArrayLike = 0.0
+    walk: ArrayLike = 0.0
     motion: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        if not (checked("noise.walk", np.broadcast_to(self.walk, 6), 6) >= 0.0).all():
+            raise DrakeTeleopError("is negative", where="noise.walk")
         rows = []
         for name in ("s", "omega", "alpha"):
             std = checked(f"noise.{name}", np.broadcast_to(getattr(self, name), 3), 3)

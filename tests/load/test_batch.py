@@ -23,7 +23,7 @@ from drake_teleop.load.inertia import (
     transform_phi,
 )
 from drake_teleop.load.moments import Noise
-from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 TRUTH = np.concatenate([OFFSETS, TOOL])
 WRENCH_NOISE = np.array([0.3, 0.3, 0.5, 0.01, 0.01, 0.005])
@@ -362,3 +362,52 @@ def test_utias_protocol(utias):
         assert (np.array(errors) <= utias.TARGETS[level][:3]).all(), (level, errors)
         assert consistent == 100.0
         assert (np.array(errors[1:]) < np.array(methods["ordinary"][1:3]) / 2.5).all()
+
+
+def test_intervals_hold_when_offsets_wander():
+    """40 records whose low-frequency noise is the walk of the offsets for the most part."""
+    motion = rich_motion(1500)
+    clean = non_contact_wrench(*motion, TOOL)
+    steps = WRENCH_NOISE / 120
+    errors = {0.0: [], 1.0: []}
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        offsets = OFFSETS + np.cumsum(steps * rng.normal(size=clean.shape), axis=0)
+        F = clean + offsets + WRENCH_NOISE * rng.normal(size=clean.shape)
+        truth = np.concatenate([offsets[-1], TOOL])
+        for walk in errors:
+            noise = Noise(WRENCH_NOISE, walk=walk * steps)
+            result = identify_batch(F, *motion, method="whitened", noise=noise)
+            deviations = result.identification.standard_deviations
+            errors[walk].append((estimate(result) - truth) / deviations)
+    held = {walk: np.mean(np.abs(ratios) < 1.96) for walk, ratios in errors.items()}
+    assert held[0.0] < 0.7
+    assert 0.92 < held[1.0] < 0.98
+
+
+def test_the_covariance_of_wandering_offsets_is_a_double_sum():
+    """Against the covariance min(i, j) of a random walk, seen from the end; a rejected sample."""
+    F, *motion = record(60, noise=1.0)
+    F[20, 0] += 1e3
+    steps = np.array([0.3, 0.1, 0.2, 0.01, 0.02, 0.005])
+    with_walk, without = (
+        identify_batch(F, *motion, method="robust", noise=Noise(WRENCH_NOISE, walk=walk))
+        for walk in (steps, 0.0)
+    )
+    kept = ~with_walk.rejected
+    assert not kept[20]
+    ago = 59.0 - np.arange(60)[kept]
+    walked = np.minimum(ago[:, None], ago)
+    rows = np.zeros((kept.sum(), 6, 16))
+    rows[:, :, :6] = np.eye(6)
+    rows[:, :, 6:] = regressor(*(table[kept] for table in motion))
+    weighted = rows * with_walk.equations.weights[:, None]
+    inverse = np.linalg.inv(np.einsum("nci,ncj->ij", rows, weighted))
+    expected = np.einsum("nci,nm,mcj,c->ij", weighted, walked, weighted, steps**2)
+    added = with_walk.identification.covariance - without.identification.covariance
+    np.testing.assert_allclose(added, inverse @ expected @ inverse, rtol=1e-6, atol=1e-12)
+
+
+def test_a_negative_walk_is_refused():
+    with pytest.raises(DrakeTeleopError, match=r"noise\.walk: is negative"):
+        Noise(walk=[-1.0] * 6)
