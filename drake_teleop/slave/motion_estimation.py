@@ -31,9 +31,9 @@ from drake_teleop.slave.arm import MOTION_SIZE, sensor_motion
 from drake_teleop.slave.sensor_chain import WristSensorConfig, butterworth_sections
 
 _SOURCES = ("encoders", "accelerometer", "fused")
-#: Distance of So from the joints [m]: what an error of an encoder moves it. The gains depend on
-#: its square root at most.
-_REACH = 0.6
+#: How far an encoder's error moves So, root mean square over joints and directions [m/rad]: that of
+#: the RX90 where it works. The gains depend on its square root at most.
+_REACH = 0.4
 #: Encoders that do not round are known this well [rad], accelerometers this well [m/s^2, rad/s^2].
 _LEAST_ANGLE_STD, _LEAST_ACCELERATION_STD = 1e-8, 1e-6
 
@@ -70,10 +70,10 @@ class MotionEstimationConfig:
         50.0, "Hz", 1.0, 1e4, "low-pass of the angles, 4th-order Butterworth (source `encoders`)"
     )
     acceleration_drift: float = quantity(
-        0.1, "m/s^2/sqrt(s)", 1e-6, 1e3, "random walk of the error of s (source `fused`)"
+        0.05, "m/s^2/sqrt(s)", 1e-6, 1e3, "random walk of the error of s (source `fused`)"
     )
     angular_acceleration_drift: float = quantity(
-        1.0, "rad/s^2/sqrt(s)", 1e-6, 1e4, "random walk of the error of alpha (source `fused`)"
+        0.5, "rad/s^2/sqrt(s)", 1e-6, 1e4, "random walk of the error of alpha (source `fused`)"
     )
 
 
@@ -166,17 +166,57 @@ def motion_gains(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[SteadyState, SteadyState]:
     """The filters of source `fused`: of angles [rad], and of displacements of So [m]."""
-    std = np.maximum(sensor.motion_std(), _LEAST_ACCELERATION_STD)
-    s_std, alpha_std = std[:3].mean(), std[6:].mean()
-    arm = np.linalg.norm(sensor.accelerometer()[0])
-    # n axes of any direction: each direction of S gets a third of their variance.
-    rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _LEAST_ANGLE_STD)
-    angle_std = rounding * np.sqrt(num_joints / 3.0)
-    moved_std = np.hypot(s_std, alpha_std * arm * np.sqrt(2.0 / 3.0))
+    s_std, alpha_std = _accelerometer_std(sensor)
+    angle_std, drift = _angle_std(sensor, num_joints), config.angular_acceleration_drift
     return (
-        steady_state(angle_std, alpha_std, config.angular_acceleration_drift, period),
-        steady_state(angle_std * _REACH, moved_std, config.acceleration_drift, period),
+        steady_state(angle_std, alpha_std.mean(), drift, period),
+        steady_state(angle_std * _REACH, s_std.mean(), config.acceleration_drift, period),
     )
+
+
+def estimated_motion_std(
+    config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
+) -> NDArray[np.float64]:
+    """(9,) noise of s [m/s^2], omega [rad/s] and alpha [rad/s^2] in a sample.
+
+    Next to `WristSensorConfig.wrench_std`: if that is of raw samples, before the low-pass, so is
+    this. Nothing for omega, whose noise is small.
+    """
+    if config.source != "encoders":
+        s_std, alpha_std = _accelerometer_std(sensor)
+        return np.concatenate([s_std, np.zeros(3), alpha_std])
+    shift = np.exp(-1j * np.pi * (np.arange(1 << 14) + 0.5) / (1 << 14))
+    response = [
+        np.polyval([b2, b1, b0], shift) / np.polyval([a2, a1, 1.0], shift)
+        for b0, b1, b2, a1, a2 in _filters(config, sensor, period)
+    ]
+    differenced = np.polyval([-1.0, 4.0, -5.0, 2.0], shift) / period**2
+    power = np.mean(np.abs(np.prod(response, axis=0) * differenced) ** 2)
+    if sensor.low_pass == "after_converter":
+        power /= np.mean(np.abs(response[0] * response[1]) ** 2)
+    alpha = _angle_std(sensor, num_joints) * np.sqrt(power)
+    return np.repeat([alpha * _REACH, 0.0, alpha], 3)
+
+
+def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
+    """Rounding of the angles, as an angle about any axis of S [rad].
+
+    n axes of any direction: each direction gets a third of their variance.
+    """
+    rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _LEAST_ANGLE_STD)
+    return float(rounding * np.sqrt(num_joints / 3.0))
+
+
+def _accelerometer_std(
+    sensor: WristSensorConfig,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(3,) of s, moved to So, which adds alpha x r, and of alpha."""
+    std = np.maximum(sensor.motion_std(), _LEAST_ACCELERATION_STD)
+    p_SoAo_S, R_SA = sensor.accelerometer()
+    s_std, alpha_std = np.sqrt(R_SA**2 @ std[:3] ** 2), np.sqrt(R_SA**2 @ std[6:] ** 2)
+    x, y, z = p_SoAo_S**2
+    crossed = np.array([[0.0, z, y], [z, 0.0, x], [y, x, 0.0]]) @ alpha_std**2
+    return np.sqrt(s_std**2 + crossed), alpha_std
 
 
 def motion_estimator(
