@@ -2,7 +2,8 @@
 
 The tool goes up and down at 2.63 Hz without turning, as in the scenario free_motion_force; truth ->
 sensor -> estimation of the motion -> F - F_o - V phi with the true phi. The baseline is the same
-record with nothing, or with the weight alone, taken away.
+record with nothing, or with the weight alone, taken away. Then the load is identified, by least
+squares, from 6 s in which all joints turn.
 
     python benchmarks/motion_estimation.py [--json FILE]
 """
@@ -25,6 +26,7 @@ from rich.table import Table
 from scipy.interpolate import make_interp_spline
 
 from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.identification import identify
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.slave.arm import sensor_motion
 from drake_teleop.slave.inverse_kinematics import nearest_branch
@@ -91,25 +93,34 @@ def estimate(constants, memory, table, readings, samples):  # type: ignore[no-un
         estimate_into(constants, memory, table, readings[k], samples[k])
 
 
+def turning(arm: Any, seed: int) -> tuple[Array, Array, Array]:
+    """q, v, vdot (N, n): four sines in each joint, 8 rad/s^2 at most."""
+    random, n = np.random.default_rng(seed), arm.num_joints
+    w, phase = 2 * np.pi * random.uniform(0.5, 3.0, (4, n)), random.uniform(0, 2 * np.pi, (4, n))
+    angle = w * (np.arange(round(7.0 / T)) * T)[:, None, None] + phase
+    q = home_position(arm, list(START)) + np.sum(2.0 / w**2 * np.sin(angle), axis=1)
+    return q, np.sum(2.0 / w * np.cos(angle), axis=1), -np.sum(2.0 * np.sin(angle), axis=1)
+
+
 class Record:
     """A true motion, and what is left of its wrench by way of a sensor and an estimation."""
 
-    def __init__(self, frequency: float, amplitude: float) -> None:
-        self.arm = AddSlavePlant(DiagramBuilder(), list(START), None).arm
-        q, v, vdot = motion(self.arm, frequency, amplitude)
+    def __init__(self, arm: Any, moved: tuple[Array, Array, Array]) -> None:
+        self.arm = arm
+        q, v, vdot = moved
         self.truth, still = np.empty((len(q), 15 + q.shape[1])), np.empty((len(q), 15 + q.shape[1]))
         true_samples(self.arm.table, self.arm.phi_load, q, v, vdot, self.truth)
         true_samples(self.arm.table, self.arm.phi_load, q, 0.0 * v, 0.0 * v, still)
         self.nothing = rms(self.truth[SETTLED:, :3])
         self.weight = rms((self.truth - still)[SETTLED:, :3])
 
-    def left(
+    def samples(
         self,
         sensor: WristSensorConfig,
         config: MotionEstimationConfig,
         believed: WristSensorConfig | None = None,
-    ) -> dict[str, float]:
-        """Force [N] and torque [N m] that stay; microseconds that an estimate takes."""
+    ) -> tuple[Array, float]:
+        """The samples (N, 16 + n) after the start, and the microseconds that one takes."""
         n = self.truth.shape[1] - 15
         noise = np.random.default_rng(0).standard_normal((len(self.truth) // 32 + 1, NOISE_SIZE))
         readings = np.empty((len(self.truth), 13 + n))
@@ -118,34 +129,81 @@ class Record:
         constants, memory = motion_estimator(config, believed or sensor, n, T)
         begin = time.thread_time()
         estimate(constants, memory, self.arm.table, readings, samples)
-        microseconds = (time.thread_time() - begin) / len(samples) * 1e6
-        late = samples[SETTLED:]
-        s, omega, alpha = late[:, 6:9], late[:, 9:12], late[:, 12:15]
-        wrench = contact_wrench(late[:, :6], sensor.offset, s, omega, alpha, self.arm.phi_load)
-        force = np.linalg.norm(wrench[:, :3], axis=1)
+        return samples[SETTLED:], (time.thread_time() - begin) / len(samples) * 1e6
+
+    def left(
+        self,
+        sensor: WristSensorConfig,
+        config: MotionEstimationConfig,
+        believed: WristSensorConfig | None = None,
+    ) -> dict[str, float]:
+        """Force [N] and torque [N m] that stay, delay, and microseconds."""
+        samples, microseconds = self.samples(sensor, config, believed)
+        s, omega, alpha = samples[:, 6:9], samples[:, 9:12], samples[:, 12:15]
+        wrench = contact_wrench(samples[:, :6], sensor.offset, s, omega, alpha, self.arm.phi_load)
         return {
             "rms": rms(wrench[:, :3]),
-            "peak": float(force.max()),
+            "peak": float(np.linalg.norm(wrench[:, :3], axis=1).max()),
             "torque_rms": rms(wrench[:, 3:]),
             "delay_ms": 1e3 * path_delays(config, sensor, T).sample,
             "microseconds": microseconds,
         }
+
+    def identified(
+        self, sensor: WristSensorConfig, config: MotionEstimationConfig
+    ) -> dict[str, float]:
+        """Errors of the load by least squares at 1 kHz."""
+        samples = self.samples(sensor, config)[0][::8]
+        wrench, s, omega, alpha = np.split(samples[:, :15], [6, 9, 12], axis=1)
+        found = identify(wrench, s, omega, alpha, noise=sensor.wrench_std())
+        true = self.arm.phi_load
+        (m, c, J), (m_true, c_true, J_true) = principal(found.phi), principal(true)
+        return {
+            "mass %": 100 * abs(m / m_true - 1),
+            "com mm": 1e3 * float(np.linalg.norm(c - c_true)),
+            "inertia %": 100 * float(np.abs(J / J_true - 1).max()),
+            "force offset N": float(np.abs(found.offsets - sensor.offset)[:3].max()),
+            "torque offset N m": float(np.abs(found.offsets - sensor.offset)[3:].max()),
+        }
+
+
+def principal(phi: Array) -> tuple[float, Array, Array]:
+    """Mass, centre of mass, principal inertias about it."""
+    m, c = float(phi[0]), phi[1:4] / phi[0]
+    inertia = phi[[4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(3, 3)
+    return m, c, np.linalg.eigvalsh(inertia - m * (c @ c * np.eye(3) - np.outer(c, c)))
 
 
 def rms(rows: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(rows**2, axis=1))))
 
 
-def by_source(record: Record) -> dict[str, dict[str, float]]:
+def sensors() -> dict[str, WristSensorConfig]:
     jr3, ati = (without(PRESETS[name], "drift") for name in ("jr3_85m35a3", "ati_gamma_imu"))
     wrong = replace(jr3, acceleration_gain_error=0.01, acceleration_misalignment=0.01)
-    sensors = {"JR3": jr3, "JR3, accelerometer 1 % wrong": wrong, "ATI with IMU": ati}
-    record.left(jr3, MotionEstimationConfig())  # compiles
+    return {"JR3": jr3, "JR3, accelerometer 1 % wrong": wrong, "ATI with IMU": ati}
+
+
+def by_source(record: Record) -> dict[str, dict[str, float]]:
+    record.left(sensors()["JR3"], MotionEstimationConfig())  # compiles
     return {
         f"{name}: {source}": record.left(sensor, MotionEstimationConfig(source=source))
-        for name, sensor in sensors.items()
+        for name, sensor in sensors().items()
         for source in SOURCES
     }
+
+
+def identified(arm: Any) -> dict[str, dict[str, float]]:
+    """Medians over six motions."""
+    records, rows = [Record(arm, turning(arm, seed)) for seed in range(6)], {}
+    for name, sensor in sensors().items():
+        for source in SOURCES:
+            config = MotionEstimationConfig(source=source)
+            runs = [record.identified(sensor, config) for record in records]
+            rows[f"{name}: {source}"] = {
+                error: float(np.median([run[error] for run in runs])) for error in runs[0]
+            }
+    return rows
 
 
 def by_mismatch(record: Record) -> dict[str, dict[str, float]]:
@@ -166,23 +224,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
-    papers = Record(2.63, AMPLITUDE)
-    sources = by_source(papers)
+    arm = AddSlavePlant(DiagramBuilder(), list(START), None).arm
+    sources = by_source(Record(arm, motion(arm, 2.63, AMPLITUDE)))
     mismatches = {}
     for frequency in (2.63, 10.0, 20.0, 40.0):
         # The same acceleration at every frequency.
-        record = Record(frequency, AMPLITUDE * (2.63 / frequency) ** 2)
+        amplitude = AMPLITUDE * (2.63 / frequency) ** 2
+        record = Record(arm, motion(arm, frequency, amplitude))
         for source, row in by_mismatch(record).items():
             baseline = {"nothing": record.nothing, "weight": record.weight}
             mismatches[f"{frequency:g} Hz: {source}"] = baseline | row
-    console = Console()
-    for title, rows in (("by source", sources), ("force [N rms] by mismatch", mismatches)):
+    loads, console = identified(arm), Console()
+    for title, rows in (
+        ("by source", sources),
+        ("force [N rms] by mismatch", mismatches),
+        ("the load's errors", loads),
+    ):
         table = Table("", *next(iter(rows.values())), title=title)
         for name, row in rows.items():
             table.add_row(name, *(f"{value:.3f}" for value in row.values()))
         console.print(table)
     if arguments.json:
-        figures = {"by_source": sources, "by_mismatch": mismatches}
+        figures = {"by_source": sources, "by_mismatch": mismatches, "load": loads}
         arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
 
 
