@@ -30,14 +30,14 @@ class ParsedModel:
         instance: the arm's.
         sensor_frame: S.
         efforts: torque limits by joint [N m]; Drake drops them where a URDF has no transmission.
-        shapeless: links that lost all their shapes, because of their meshes.
+        lost: which meshes are missing in the shape of which links; by what is wrong with them.
         folder: of converted meshes; Drake reads them when it needs them.
     """
 
     instance: ModelInstanceIndex
     sensor_frame: Frame
     efforts: dict[str, float]
-    shapeless: list[str]
+    lost: dict[str, list[str]]
     folder: TemporaryDirectory[str]
 
 
@@ -63,7 +63,7 @@ def ParseModel(
         parser.package_map().Add(name, str(folder))
     kind = path.suffix.lower().removeprefix(".")
     efforts: dict[str, float] = {}
-    shapeless: list[str] = []
+    lost: dict[str, list[str]] = {}
     converted = TemporaryDirectory(prefix="drake_teleop_")
     log = logging.getLogger("drake")
     level = log.level
@@ -74,7 +74,7 @@ def ParseModel(
         if root is None:
             instances = parser.AddModels(str(path))
         else:
-            shapeless = _without_lost_meshes(root, packages, Path(converted.name))
+            lost = _without_lost_meshes(root, packages, Path(converted.name))
             efforts = _efforts(root)
             text = ElementTree.tostring(root, encoding="unicode")
             instances = parser.AddModelsFromString(text, kind)
@@ -94,6 +94,8 @@ def ParseModel(
             for instance in instances
             for index in plant.GetFrameIndices(instance)
         ]
+        # Drake's own, of joints.
+        frames = [name for name in frames if not name.endswith("_parent")]
         raise DrakeTeleopError(
             f"{len(having) or 'no'} frames are named {sensor_frame!r}",
             where=str(path),
@@ -101,7 +103,7 @@ def ParseModel(
         )
     frame = plant.GetFrameByName(sensor_frame, having[0])
     _weld_base(plant, frame)
-    return ParsedModel(having[0], frame, efforts, shapeless, converted)
+    return ParsedModel(having[0], frame, efforts, lost, converted)
 
 
 def _xml(path: Path) -> ElementTree.Element | None:
@@ -133,7 +135,7 @@ class _Packages:
         self.found: dict[str, Path] = {}
         text = model.read_bytes().decode("utf-8", errors="replace")
         for name in set(re.findall(r"package://([^/\s\"'<]+)", text)):
-            for folder in (*package_paths, *self._folder.parents):
+            for folder in (*package_paths, self._folder, *self._folder.parents):
                 for candidate in (folder / name, folder):
                     if candidate.is_dir() and candidate.name == name:
                         self.found.setdefault(name, candidate.resolve())
@@ -149,36 +151,55 @@ class _Packages:
         return path if path is not None and path.is_file() else None
 
 
-def _without_lost_meshes(root: ElementTree.Element, packages: _Packages, folder: Path) -> list[str]:
+def _without_lost_meshes(
+    root: ElementTree.Element, packages: _Packages, folder: Path
+) -> dict[str, list[str]]:
     """Removes shapes whose mesh is missing or not readable, and makes the others' paths absolute.
 
     Instead of STL files, which Drake does not read, there stand their convex hulls.
 
     Returns:
-        The links that have no shape any more.
+        By what is wrong with a mesh, the links whose shape lacks it. What a link is seen with may
+        stand for what it collides with.
     """
-    shapeless: list[str] = []
+    lost: dict[str, list[str]] = {}
     for link in root.iter("link"):
-        shapes = link.findall("visual") + link.findall("collision")
-        kept = len(shapes)
-        for shape in shapes:
-            mesh = shape.find("geometry/mesh")
-            if mesh is None:
-                continue
-            address = mesh.get("filename") or mesh.findtext("uri") or ""
-            file = packages.file(address.strip())
-            if file is not None and file.suffix.lower() == ".stl":
-                file = _hull_of_stl(file, folder)
-            if file is None or file.suffix.lower() not in _READABLE:
-                link.remove(shape)
-                kept -= 1
-            elif mesh.get("filename"):
-                mesh.set("filename", file.as_uri())
-            else:
-                mesh.find("uri").text = file.as_uri()  # type: ignore[union-attr]
-        if shapes and kept == 0:
-            shapeless.append(link.get("name", ""))
-    return shapeless
+        faults = {"collision": set[str](), "visual": set[str]()}
+        for kind, of_kind in faults.items():
+            for shape in link.findall(kind):
+                if fault := _fault(shape, packages, folder):
+                    link.remove(shape)
+                    of_kind.add(fault)
+        if link.find("collision") is not None:
+            counting = faults["collision"]
+        elif link.find("visual") is not None:
+            counting = set()
+        else:
+            counting = faults["collision"] | faults["visual"]
+        for fault in sorted(counting):
+            lost.setdefault(fault, []).append(link.get("name", ""))
+    return lost
+
+
+def _fault(shape: ElementTree.Element, packages: _Packages, folder: Path) -> str | None:
+    """What is wrong with the mesh of a shape; if nothing is, its path becomes absolute."""
+    mesh = shape.find("geometry/mesh")
+    if mesh is None:
+        return None
+    address = mesh.get("filename") or mesh.findtext("uri") or ""
+    file = packages.file(address.strip())
+    if file is None:
+        return "meshes were not found (--package-path)"
+    if file.suffix.lower() == ".stl":
+        file = _hull_of_stl(file, folder)
+    if file is None or file.suffix.lower() not in _READABLE:
+        suffix = Path(address.strip()).suffix
+        return f"{suffix} meshes cannot be read (convert them to .obj or .stl)"
+    if mesh.get("filename"):
+        mesh.set("filename", file.as_uri())
+    else:
+        mesh.find("uri").text = file.as_uri()  # type: ignore[union-attr]
+    return None
 
 
 def _hull_of_stl(path: Path, folder: Path) -> Path | None:

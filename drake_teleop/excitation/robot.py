@@ -45,7 +45,7 @@ from drake_teleop.load.inertia import inertia_about_origin, phi_from_mass_com_in
 from drake_teleop.scenario import Scenario
 from drake_teleop.slave.arm import ArmModel, ArmModelFromPlant
 from drake_teleop.slave.plant import ParseSlave, finalize, home_position
-from drake_teleop.slave.wrist_sensor import WristSensorConfig
+from drake_teleop.slave.sensor_chain import WristSensorConfig
 
 Array = NDArray[np.float64]
 
@@ -64,11 +64,12 @@ _RANGE, _SPEED, _TIME_TO_SPEED = np.pi, np.pi, 0.4
 #: What the arm keeps between its links, and from everything else [m]. The flange of the RX90 passes
 #: its forearm at 6 mm.
 CLEARANCE = 0.005
-# Pairs of shapes nearer than that in this share of random postures are neighbours by design.
-_NEIGHBOURS, _POSTURES = 0.95, 1000
-# Distances at which shapes are about to touch [m], and the share of such postures in which capsules
-# may be too small by what is allowed for.
-_BAND, _LEAST = (-0.02, 0.05), 0.25
+# Pairs of shapes nearer than that in this share of random postures are neighbours by design, and so
+# are those whose distance varies by less than this [m].
+_NEIGHBOURS, _POSTURES, _STILL = 0.95, 1000, 1e-3
+# Distances at which shapes are about to touch [m], the share of such postures in which capsules may
+# be too small by what is allowed for, and the share of free postures that they may block.
+_BAND, _LEAST, _BLOCKED = (-0.02, 0.05), 0.25, 0.1
 # With fewer such postures nothing is allowed for.
 _FEW = 5
 # Capsules that are near in less than this share of the postures may be so; in more, only if their
@@ -167,13 +168,13 @@ def RobotFromModel(
         DrakeTeleopError: if the model cannot be read or is no such arm.
     """
     efforts: dict[str, float] = {}
-    shapeless: list[str] = []
+    lost: dict[str, list[str]] = {}
     folders: list[TemporaryDirectory[str]] = []
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
         efforts.update(model.efforts)
-        shapeless[:] = model.shapeless
+        lost.update(model.lost)
         folders.append(model.folder)
         return model.instance, model.sensor_frame
 
@@ -193,9 +194,9 @@ def RobotFromModel(
             )
         reserve = _payload(mass - load[0])
     scene = _Scene(parse, reserve, visuals_count=False)
-    if shapeless:
-        links = ", ".join(shapeless)
-        assumptions.append(f"no shape for {links}: meshes not found or not readable")
+    assumptions += [
+        f"shapes are missing of {', '.join(links)}: {what}" for what, links in lost.items()
+    ]
     scene.arm, completed = _completed(scene.arm, efforts, acceleration, str(path))
     return scene.robot(
         path.name,
@@ -312,7 +313,8 @@ class _Scene:
     ) -> dict[_Pair, Array]:
         """Pairs of shapes that may collide, with their distance in each posture (inf: far).
 
-        Those on one link and those that are always near no longer count.
+        Those on one link, those that are always near, and those whose distance does not vary no
+        longer count.
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(rows.values()):
@@ -335,8 +337,11 @@ class _Scene:
             query = self.scene_graph.get_query_output_port().Eval(of_scene)
             for found in query.ComputeSignedDistancePairwiseClosestPoints(_BAND[1]):
                 distances[found.id_A, found.id_B][k] = found.distance
+        # Another one: what a manager from before the context declares, no context gets to know.
+        manager = self.scene_graph.collision_filter_manager()
         for (a, b), of_pair in list(distances.items()):
-            if np.mean(of_pair < CLEARANCE) >= _NEIGHBOURS:
+            still = of_pair.max() < of_pair.min() + _STILL
+            if still or np.mean(of_pair < CLEARANCE) >= _NEIGHBOURS:
                 exclude = CollisionFilterDeclaration().ExcludeBetween
                 manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
                 del distances[a, b]
@@ -350,9 +355,9 @@ class _Scene:
     ) -> tuple[NDArray[np.int64], list[Capsule], NDArray[np.int64], Array]:
         """Rows, capsules, pairs of them, and which distance each pair keeps.
 
-        Left out are pairs that others stand for, and those whose capsules are often near though
-        their shapes never are. Capsules are larger than their shapes; where the shapes are about to
-        touch, the least by which most are too large is allowed for. The check looks at the shapes.
+        Left out are pairs that others stand for, those whose capsules are often near though their
+        shapes never are, and those whose capsules are near more often when their shapes are not.
+        The check looks at the shapes.
         """
         inspector = self.scene_graph.model_inspector()
         motions = empty_motions(1, self.arm.num_joints)
@@ -384,20 +389,31 @@ class _Scene:
         ends = np.array([capsule.ends for capsule in shapes]).reshape(-1, 2, 3)
         radii = np.array([capsule.radius for capsule in shapes])
         of_capsules = capsule_distances(motions, of_rows, ends, radii, pairs)
-        of_shapes = [true[a, b] for a, b in pairs]
-        are_near = np.array([distances.min() < CLEARANCE for distances in of_shapes], dtype=bool)
-        seem_near = np.mean(of_capsules < CLEARANCE, axis=0)
-        used = np.flatnonzero(are_near | ((seem_near > 0) & (seem_near < _SELDOM)))
-        allowed = [_allowance(of_shapes[k], of_capsules[:, k]) for k in used]
-        return of_rows, shapes, pairs[used], CLEARANCE - np.array(allowed)
+        used, distances = [], []
+        for k, (a, b) in enumerate(pairs):
+            distance = _kept_distance(true[a, b], of_capsules[:, k])
+            near, seem_near = true[a, b] < CLEARANCE, of_capsules[:, k] < distance
+            if near.sum() >= _FEW:
+                useful = np.mean(seem_near[near]) > np.mean(seem_near[~near])
+            else:
+                useful = near.any() or 0 < np.mean(of_capsules[:, k] < CLEARANCE) < _SELDOM
+            if useful:
+                used.append(k)
+                distances.append(distance)
+        return of_rows, shapes, pairs[used], np.array(distances)
 
 
-def _allowance(of_shapes: Array, of_capsules: Array) -> float:
-    """By how much capsules are too near where their shapes are about to touch [m]."""
+def _kept_distance(of_shapes: Array, of_capsules: Array) -> float:
+    """The distance that two capsules keep, of (T,) distances in random postures [m].
+
+    Capsules are larger than their shapes. Where the shapes are about to touch, the least by which
+    most are is allowed for; but so much that the capsules are free in most postures in which the
+    shapes are.
+    """
     touching = (of_shapes > _BAND[0]) & (of_shapes < _BAND[1])
-    if touching.sum() < _FEW:
-        return 0.0
-    return float(np.quantile((of_shapes - of_capsules)[touching], _LEAST))
+    excess = (of_shapes - of_capsules)[touching] if touching.sum() >= _FEW else np.zeros(1)
+    free = of_capsules[of_shapes > CLEARANCE]
+    return float(min(CLEARANCE - np.quantile(excess, _LEAST), np.quantile(free, _BLOCKED)))
 
 
 def _number(shape: GeometryId) -> int:
