@@ -40,7 +40,7 @@ from drake_teleop.analysis.sampled_loop import (
     sampled_two_port,
 )
 from drake_teleop.master.operator import GRIPS
-from drake_teleop.slave.wrist_sensor import butterworth_sections
+from drake_teleop.slave.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,8 @@ from drake_teleop.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.slave.joint_control import JointControlConfig
 from drake_teleop.slave.load_estimator import LoadEstimatorConfig
-from drake_teleop.slave.wrist_sensor import WristSensorConfig
+from drake_teleop.slave.motion_estimation import MotionEstimationConfig
+from drake_teleop.slave.sensor_chain import WristSensorConfig, preset_of
 
 
 @dataclass
@@ -49,8 +50,8 @@ class Simulation:
     duration: float = quantity(1.0, "s", 1e-3, 36000.0, "logged time")
     settle: float = quantity(0.5, "s", 0.0, 60.0, "time before the log starts, at t < 0")
     integrator: str = choice(
-        "runge_kutta2",
-        ("runge_kutta2", "runge_kutta3", "semi_explicit_euler"),
+        "runge_kutta3",
+        ("runge_kutta3", "runge_kutta2", "semi_explicit_euler"),
         "Drake's name of the integration scheme",
     )
     max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
@@ -90,6 +91,7 @@ class Scenario:
     slave: Slave = field(default_factory=Slave)
     joint_control: JointControlConfig = field(default_factory=JointControlConfig)
     wrist_sensor: WristSensorConfig = field(default_factory=WristSensorConfig)
+    motion_estimation: MotionEstimationConfig = field(default_factory=MotionEstimationConfig)
     load_estimator: LoadEstimatorConfig = field(default_factory=LoadEstimatorConfig)
     force_scaling: ForceScalingConfig = field(default_factory=ForceScalingConfig)
     sheet_spring: SheetSpring | None = None
@@ -103,7 +105,7 @@ class Scenario:
         check_ranges(self, where)
         self.force_scaling.scales(f"{where}:force_scaling")
         self.load_estimator.check(f"{where}:load_estimator")
-        _check_rates(self, where)
+        self.wrist_sensor.check(f"{where}:wrist_sensor", self.rates.sensor_hz)
         _check_channel(self, where)
 
 
@@ -134,7 +136,8 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise DrakeTeleopError(f"is not YAML ({error})", where=str(path)) from None
     check_structure(Scenario, data, str(path))
-    scenario = yaml_load_typed(schema=Scenario, data=text, defaults=Scenario())
+    defaults = Scenario(wrist_sensor=preset_of(data.get("wrist_sensor")))
+    scenario = yaml_load_typed(schema=Scenario, data=text, defaults=defaults)
     scenario.check(str(path))
     return scenario
 
@@ -151,17 +154,6 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
             value = dataclasses.replace(getattr(scenario, block), **{inner: value})
         scenario = dataclasses.replace(scenario, **{block: value})  # type: ignore[arg-type]
     return scenario
-
-
-def _check_rates(scenario: Scenario, where: str) -> None:
-    sensor, rates = scenario.wrist_sensor, scenario.rates
-    if not sensor.ideal and sensor.bandwidth_hz >= 0.45 * rates.sensor_hz:
-        raise DrakeTeleopError(
-            f"{sensor.bandwidth_hz:g} Hz is too near to half of rates.sensor_hz "
-            f"({rates.sensor_hz:g} Hz)",
-            where=f"{where}:wrist_sensor.bandwidth_hz",
-            remedy="lower the bandwidth below 0.45 of the sensor's rate",
-        )
 
 
 def _check_channel(scenario: Scenario, where: str) -> None:

@@ -40,9 +40,10 @@ _SLAVE_WIRES = (
     ("slave_plant.rx90_state", "monitor.slave_state"),
     ("slave_plant.rx90_state", "wrist_sensor.slave_state"),
     ("slave_plant.rx90_generalized_acceleration", "wrist_sensor.slave_acceleration"),
+    ("joint_control.joint_torque", "wrist_sensor.joint_torque"),
 )
 # Only when it learns or watches: at 8 kHz even a wire that nobody reads costs time.
-_LEARNING_WIRES = (("wrist_sensor.sample", "load_estimator.sample"),)
+_LEARNING_WIRES = (("wrist_sample.sample", "load_estimator.sample"),)
 _CONTACT_WIRES = (("slave_plant.contact_results", "tool_contact.contact_results"),)
 _TELEOP_WIRES = (
     # The operator holds the master.
@@ -55,7 +56,7 @@ _TELEOP_WIRES = (
     ("inverse_kinematics.joint_command", "joint_control.joint_command"),
     ("inverse_kinematics.ik_status", "monitor.ik_status"),
     # Force, slave to master.
-    ("wrist_sensor.sample", "force_scaling.sample"),
+    ("wrist_sample.sample", "force_scaling.sample"),
     ("load_estimator.load_estimate", "force_scaling.load_estimate"),
     ("master_device.state", "force_display.master_state"),
     ("force_display.motor_torque", "master_device.motor_torque"),
@@ -70,7 +71,7 @@ _CHANNEL_WIRES = (
     ("channel.pose_received", "inverse_kinematics.pose_command"),
     ("force_scaling.wrench_B", "channel.wrench_B"),
     ("operator.hand_wrench_E", "channel.hand_wrench_E"),
-    ("wrist_sensor.sample", "channel.sample"),
+    ("wrist_sample.sample", "channel.sample"),
     ("channel.wrench_received", "force_display.wrench_command"),
 )
 
@@ -109,7 +110,8 @@ _CHANNEL_SIGNALS = {"pose_received": "channel.pose_received", "ports": "channel.
 
 #: How often the clutch and the monitor are looked at [s]; an event at 2 kHz would cost time.
 _HUMAN_PERIOD = 0.01
-_SAMPLE_PARTS = list(sample_parts(6))
+#: Drake numbers these ports.
+_DIVIDED = {"sample_parts": list(sample_parts(6)), "wrist_sample": ["sample"]}
 _SAMPLE_SIZE = sum(sample_parts(6).values())
 
 
@@ -286,17 +288,14 @@ def AddSlave(
     }
     for name, block in blocks.items():
         builder.AddNamedSystem(name, block)
-    contact = slave.sheet is not None
-    AddWristSensor(
-        builder, slave.plant, slave.arm, sensor, 1 / rates.sensor_hz, start, contact=contact
-    )
+    AddWristSensor(builder, slave, sensor, scenario.motion_estimation, 1 / rates.sensor_hz, start)
     _connect(builder, _SLAVE_WIRES)
     signals = _SLAVE_SIGNALS
     if scenario.load_estimator.enabled or scenario.load_estimator.watch:
         _connect(builder, _LEARNING_WIRES)
     if scenario.load_estimator.watch:
         signals = signals | _WATCHING_SIGNALS
-    if not contact:
+    if slave.sheet is None:
         return slave, signals
     builder.AddNamedSystem("tool_contact", ToolContact(slave.tool))
     _connect(builder, _CONTACT_WIRES)
@@ -311,8 +310,8 @@ def _connect(builder: DiagramBuilder, wires: Iterable[tuple[str, ...]]) -> None:
 
 def _output(builder: DiagramBuilder, name: str) -> OutputPort:
     system, _, port = name.partition(".")
-    if system == "sample_parts":
-        return builder.GetSubsystemByName(system).get_output_port(_SAMPLE_PARTS.index(port))
+    if system in _DIVIDED:
+        return builder.GetSubsystemByName(system).get_output_port(_DIVIDED[system].index(port))
     return builder.GetSubsystemByName(system).GetOutputPort(port)
 
 
@@ -329,7 +328,7 @@ def _finish(
         builder.ExportOutput(_output(builder, port), signal)
     # The parts of a sample lie side by side in it: one port instead of six.
     recorded = dict.fromkeys(
-        "wrist_sensor.sample" if port.startswith("sample_parts.") else port
+        "wrist_sample.sample" if port.startswith("sample_parts.") else port
         for port in signals.values()
     )
     ports = [_output(builder, port) for port in recorded]

@@ -40,14 +40,15 @@ from pydrake.systems.framework import Diagram
 from drake_teleop.analysis.one_axis import Complex
 from drake_teleop.analysis.two_port import two_port
 from drake_teleop.channel.channel import Channel
+from drake_teleop.environment.point_contact import FRICTION
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.master import device
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.simulation import MakeSimulator
-from drake_teleop.slave.arm import ArmModelFromPlant, forward_kinematics, jacobian
-from drake_teleop.slave.wrist_sensor import NOISE_BLOCK
+from drake_teleop.slave.arm import ArmModelFromPlant, jacobian
+from drake_teleop.slave.sensor_chain import without
 from drake_teleop.station import MakeTeleopStation
 
 Array = NDArray[np.float64]
@@ -364,7 +365,7 @@ class _States:
 
     system: str
     group: int | None
-    part: slice
+    part: slice | NDArray[np.intp]
     steps: Array  # displacements for the differences
 
 
@@ -385,7 +386,7 @@ class _Period:
         self._arm = ArmModelFromPlant(plant, plant.GetModelInstanceByName("rx90")).table
         self._push = ExternallyAppliedSpatialForce()
         self._push.body_index = plant.GetBodyByName("tool").index()
-        self._sensor = None if smooth.wrist_sensor.ideal else self._system("wrist_sensor")
+        self._sensor = self._system("wrist_sensor")
         servo = smooth.joint_control
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
         largest = _ANGLE if smooth.sheet_spring is None else _IN_CONTACT
@@ -423,21 +424,16 @@ class _Period:
             return _States(system, group, slice(None), np.concatenate(steps))
 
         joints = self._context("slave_plant").num_continuous_states() // 2
-        sample = self._context("wrist_sensor").get_discrete_state(0).size()
-        groups = [
+        # Angles, as the sensor remembers some of them, must stay small.
+        remembered = np.full(len(self._sensor.remembered), _ANGLE)
+        return [
             whole("master_device", 0, np.full(6, _ANGLE), np.full(6, _RATE)),
             whole("master_device", 1, np.full(7, _ANGLE)),
             whole("master_device", 2, np.full(6, _RATE)),
             whole("joint_control", 0, np.full(6, _OTHER)),
             _States("slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE], joints)),
-            whole("wrist_sensor", 0, np.full(16, _OTHER), np.full(sample - 16, _ANGLE)),
+            _States("wrist_sensor", 0, self._sensor.remembered, remembered),
         ]
-        if self._sensor is not None:
-            # The last reading of the encoders and the filter: between the counter and the noise.
-            end = self._context("wrist_sensor").get_discrete_state(1).size() - 12 * NOISE_BLOCK
-            steps = np.concatenate([np.full(6, _ANGLE), np.full(end - 7, _OTHER)])
-            groups.append(_States("wrist_sensor", 1, slice(1, end), steps))
-        return groups
 
     def get(self) -> Array:
         """The states now."""
@@ -459,6 +455,7 @@ class _Period:
             else:
                 state = context.get_mutable_discrete_state(group.group)
                 state.get_mutable_value()[group.part] = values
+        self._sensor.bring_up_to_date(self._context("wrist_sensor"))
 
     def _apply(self, u: Array) -> None:
         """Sets the cut inputs: `u` (24,) is what they are more than at the operating point."""
@@ -468,15 +465,7 @@ class _Period:
         push = u[18:24]
         self._push.F_Bq_W = SpatialForce(push[3:], push[:3])
         self._fix("slave_plant", "applied_spatial_force", [self._push])
-        if self._sensor is not None:
-            # It sees contacts, not this; and what pushes the tool is missing in what holds it.
-            R_WS, _ = self._pose_WS()
-            self._sensor.offset[:] = -np.concatenate([R_WS.T @ push[:3], R_WS.T @ push[3:]])
-
-    def _pose_WS(self) -> tuple[Array, Array]:
-        q, R, p = self._slave_state()[:6], np.empty((3, 3)), np.empty(3)
-        forward_kinematics(self._arm, q, R, p)
-        return R, p
+        self._fix("wrist_sensor", "applied_wrench_W", push)
 
     def _slave_state(self) -> Array:
         return self._eval("slave_plant", "rx90_state")
@@ -486,8 +475,10 @@ class _Period:
         # The sample of noise, which is 0, and the log have other instants.
         context = self._simulator.get_mutable_context()
         context.SetTime(self.dt)
+        self._sensor.bring_up_to_date(self._context("wrist_sensor"))
         self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         self._simulator.AdvanceTo(2 * self.dt)
+        self._sensor.take_samples(self._context("wrist_sensor"))
         return self.get()
 
     def _outputs(self) -> Array:
@@ -599,16 +590,7 @@ def _difference(pose: Array, other: Array) -> Array:
 
 def _smooth(scenario: Scenario) -> Scenario:
     """The scenario's linear part at rest, without what the cuts replace."""
-    sensor = dataclasses.replace(
-        scenario.wrist_sensor,
-        force_noise=0.0,
-        torque_noise=0.0,
-        acceleration_noise=0.0,
-        angular_acceleration_noise=0.0,
-        resolution=0.0,
-        encoder_resolution=0.0,
-        offset=[0.0] * 6,
-    )
+    parts = ("noise", "random_walk", "offset", "drift", "quantisation", "saturation")
     return replace(
         scenario,
         simulation__integrator="runge_kutta3",
@@ -617,7 +599,7 @@ def _smooth(scenario: Scenario) -> Scenario:
         operator__intent=[],
         channel=Channel(),
         passivity=PassivityConfig(),
-        wrist_sensor=sensor,
+        wrist_sensor=without(scenario.wrist_sensor, *parts),
         master__friction=dataclasses.replace(scenario.master.friction, coulomb=[0.0] * 6),
         load_estimator__enabled=False,
     )
@@ -631,6 +613,7 @@ def _remove_friction(diagram: Diagram) -> None:
         properties = inspector.GetProximityProperties(geometry)
         properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(0.0, 0.0))
         scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
+    diagram.GetSubsystemByName("wrist_sensor").contact_pairs[:, FRICTION] = 0.0
 
 
 def _check_rates(scenario: Scenario) -> None:

@@ -84,8 +84,13 @@ class ArmModel:
 
     @property
     def phi_load(self) -> Array:
-        """(10,) the load that inverse dynamics carries, about the origin of S, in S."""
-        return self.table[-1, _PHI:_ROTOR].copy()
+        """(10,) the load that the dynamics carry, about the origin of S, in S."""
+        return self.load.copy()
+
+    @property
+    def load(self) -> Array:
+        """The same, a view into the table."""
+        return self.table[-1, _PHI:_ROTOR]
 
     def with_load(self, phi: Array) -> ArmModel:
         """The same arm carrying ``phi`` (10,) beyond S instead; zeros for the bare arm."""
@@ -432,6 +437,24 @@ def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
 
 
 @njit(cache=True)
+def _to_the_joints(link: Array, tau: Array) -> None:
+    """Torques (n,) of the joints for the links' wrenches, see `_link_wrench`; sums them inboard."""
+    n = tau.shape[0]
+    for row in range(n, 0, -1):
+        for k in range(6, 12):
+            link[row - 1, k] += link[row, k]
+    for row in range(n):
+        z0, z1, z2 = link[row, 0], link[row, 1], link[row, 2]
+        p0, p1, p2 = link[row, 3], link[row, 4], link[row, 5]
+        f0, f1, f2 = link[row, 6], link[row, 7], link[row, 8]
+        tau[row] = (
+            z0 * (link[row, 9] - p1 * f2 + p2 * f1)
+            + z1 * (link[row, 10] - p2 * f0 + p0 * f2)
+            + z2 * (link[row, 11] - p0 * f1 + p1 * f0)
+        )
+
+
+@njit(cache=True)
 def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Array) -> None:
     """Joint torques of a motion, recursive Newton-Euler (Luh, Walker, Paul 1980).
 
@@ -456,17 +479,129 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
         else:
             _advance(table, row, 0.0, 0.0, 0.0, x)
         _link_wrench(table, row, x, link)
-    for row in range(n, 0, -1):
-        for k in range(6, 12):
-            link[row - 1, k] += link[row, k]
+    _to_the_joints(link, tau_out)
     for row in range(n):
+        tau_out[row] += table[row, _ROTOR] * vdot[row] + table[row, _DAMPING] * v[row]
+
+
+@njit(cache=True)
+def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
+    """Adds a link's inertia about Wo in W: m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
+    m, h0, h1, h2 = table[row, 12], table[row, 13], table[row, 14], table[row, 15]
+    p0, p1, p2 = x[9], x[10], x[11]
+    u0 = x[12] * h0 + x[13] * h1 + x[14] * h2
+    u1 = x[15] * h0 + x[16] * h1 + x[17] * h2
+    u2 = x[18] * h0 + x[19] * h1 + x[20] * h2
+    inertia[0] += m
+    inertia[1] += u0 + m * p0
+    inertia[2] += u1 + m * p1
+    inertia[3] += u2 + m * p2
+    # From Lo to Wo: 2 p.h 1 - p h' - h p' + m (p.p 1 - p p')
+    across = 2.0 * (p0 * u0 + p1 * u1 + p2 * u2) + m * (p0 * p0 + p1 * p1 + p2 * p2)
+    k = 4
+    for i in range(3):
+        a, b, c = x[12 + 3 * i], x[13 + 3 * i], x[14 + 3 * i]
+        r0 = a * table[row, 16] + b * table[row, 17] + c * table[row, 18]
+        r1 = a * table[row, 17] + b * table[row, 19] + c * table[row, 20]
+        r2 = a * table[row, 18] + b * table[row, 20] + c * table[row, 21]
+        u_i = u0 if i == 0 else (u1 if i == 1 else u2)
+        for j in range(i, 3):
+            u_j = u0 if j == 0 else (u1 if j == 1 else u2)
+            value = r0 * x[12 + 3 * j] + r1 * x[13 + 3 * j] + r2 * x[14 + 3 * j]
+            value -= x[9 + i] * u_j + u_i * x[9 + j] + m * x[9 + i] * x[9 + j]
+            if i == j:
+                value += across
+            inertia[k] += value
+            k += 1
+
+
+@njit(cache=True)
+def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
+    """M (n, n) from the joints' axes in `link` and the links' inertias; sums them inboard.
+
+    Composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 6.2).
+    """
+    n = M.shape[0]
+    for row in range(n - 1, -1, -1):
+        for k in range(10):
+            inertia[row, k] += inertia[row + 1, k]
+        c = inertia[row]
         z0, z1, z2 = link[row, 0], link[row, 1], link[row, 2]
         p0, p1, p2 = link[row, 3], link[row, 4], link[row, 5]
-        f0, f1, f2 = link[row, 6], link[row, 7], link[row, 8]
-        tau_out[row] = (
-            z0 * (link[row, 9] - p1 * f2 + p2 * f1)
-            + z1 * (link[row, 10] - p2 * f0 + p0 * f2)
-            + z2 * (link[row, 11] - p0 * f1 + p1 * f0)
-            + table[row, _ROTOR] * vdot[row]
-            + table[row, _DAMPING] * v[row]
-        )
+        v0, v1, v2 = p1 * z2 - p2 * z1, p2 * z0 - p0 * z2, p0 * z1 - p1 * z0
+        # Momentum about Wo of all that is outboard, for a unit of this joint's speed.
+        l0 = c[0] * v0 + z1 * c[3] - z2 * c[2]
+        l1 = c[0] * v1 + z2 * c[1] - z0 * c[3]
+        l2 = c[0] * v2 + z0 * c[2] - z1 * c[1]
+        a0 = c[4] * z0 + c[5] * z1 + c[6] * z2 + c[2] * v2 - c[3] * v1
+        a1 = c[5] * z0 + c[7] * z1 + c[8] * z2 + c[3] * v0 - c[1] * v2
+        a2 = c[6] * z0 + c[8] * z1 + c[9] * z2 + c[1] * v1 - c[2] * v0
+        M[row, row] = z0 * a0 + z1 * a1 + z2 * a2 + v0 * l0 + v1 * l1 + v2 * l2
+        M[row, row] += table[row, _ROTOR]
+        # Only the lower half is needed; the axis of joint i moves along z_i through p_i.
+        for i in range(row):
+            z0, z1, z2 = link[i, 0], link[i, 1], link[i, 2]
+            p0, p1, p2 = link[i, 3], link[i, 4], link[i, 5]
+            M[row, i] = (
+                z0 * a0 + z1 * a1 + z2 * a2
+                + (p1 * z2 - p2 * z1) * l0 + (p2 * z0 - p0 * z2) * l1 + (p0 * z1 - p1 * z0) * l2
+            )  # fmt: skip
+
+
+@njit(cache=True)
+def _solve_spd(M: Array, x: Array) -> None:
+    """x := M^-1 x by Cholesky in M's lower half: so small that LAPACK's calls would cost more."""
+    n = x.shape[0]
+    for j in range(n):
+        for k in range(j):
+            for i in range(j, n):
+                M[i, j] -= M[i, k] * M[j, k]
+        pivot = np.sqrt(M[j, j])
+        for i in range(j, n):
+            M[i, j] /= pivot
+        for k in range(j):
+            x[j] -= M[j, k] * x[k]
+        x[j] /= M[j, j]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= M[k, i] * x[k]
+        x[i] /= M[i, i]
+
+
+@njit(cache=True)
+def forward_dynamics(
+    table: Array, q: Array, v: Array, tau: Array, wrench_W: Array, vdot_out: Array
+) -> None:
+    """Accelerations under joint torques and a wrench on what is beyond S.
+
+    With rotor inertia, joint damping and gravity, as `inverse_dynamics`, of which it is the
+    inverse: M(q) vdot = tau + J^T F - h(q, v).
+
+    Args:
+        table: `ArmModel.table`.
+        q: (n,) joint positions [rad].
+        v: (n,) joint velocities [rad/s].
+        tau: (n,) joint torques [N m].
+        wrench_W: (6,) [f; tau] on the load, about the world's origin, in W [N, N m].
+        vdot_out: (n,) filled with the accelerations [rad/s^2].
+    """
+    n = table.shape[0] - 1
+    x = np.empty(21)
+    link = np.empty((n + 1, 12))
+    inertia = np.zeros((n + 1, 10))
+    M = np.empty((n, n))
+    _start(table, x)
+    for row in range(n + 1):
+        if row < n:
+            _advance(table, row, q[row], v[row], 0.0, x)
+        else:
+            _advance(table, row, 0.0, 0.0, 0.0, x)
+        _link_wrench(table, row, x, link)
+        _composite_inertia(table, row, x, inertia[row])
+    for k in range(6):
+        link[n, 6 + k] -= wrench_W[k]
+    _to_the_joints(link, vdot_out)
+    for row in range(n):
+        vdot_out[row] = tau[row] - vdot_out[row] - table[row, _DAMPING] * v[row]
+    _mass_matrix(table, link, inertia, M)
+    _solve_spd(M, vdot_out)

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.quantities import choice, quantity
 from drake_teleop.slave.arm import MOTION_SIZE, sensor_motion
-from drake_teleop.slave.sensor_chain import WristSensorConfig, butterworth_sections
+from drake_teleop.slave.sensor_chain import WristSensorConfig, butterworth_sections, shift
 
 _SOURCES = ("encoders", "accelerometer", "fused")
 #: How far an encoder's error moves So, root mean square over joints and directions [m/rad]: that of
@@ -355,26 +355,26 @@ def _wait(constants, memory, n, reading, sample):
 
     The flag stays for as long as any part of the reading waits.
     """
-    angles, count, width = sample[16:], int(memory[0]), 12 + n
+    angles, width = sample[16:], 12 + n
     line = memory[_JOINTS + _PER_JOINT * n :]
     rows = line.shape[0] // width
-    now = (count % rows) * width
+    shift(line, width)
     for i in range(12):
-        line[now + i] = reading[i]
+        line[i] = reading[i]
     for i in range(n):
-        line[now + 12 + i] = angles[i]
-    if count == 0:
+        line[12 + i] = angles[i]
+    if memory[0] == 0.0:
         for k in range(1, rows):
             line[k * width : (k + 1) * width] = line[:width]
-    wrench = ((count - int(constants[_WAITS])) % rows) * width
-    acceleration = ((count - int(constants[_WAITS + 1])) % rows) * width
+    wrench = int(constants[_WAITS]) * width
+    acceleration = int(constants[_WAITS + 1]) * width
     for i in range(6):
         sample[i] = line[wrench + i]
         sample[6 + i] = line[acceleration + 6 + i]
     wait = int(constants[_WAITS + 2])
     older = constants[_WAITS + 2] - wait
-    encoders = ((count - wait) % rows) * width + 12
-    before = ((count - wait - 1) % rows) * width + 12
+    encoders = wait * width + 12
+    before = min(wait + 1, rows - 1) * width + 12
     for i in range(n):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
     memory[_HELD] = float(rows) if reading[12] != 0.0 else max(memory[_HELD] - 1.0, 0.0)

@@ -13,6 +13,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, M
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, WeldJoint
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.environment.point_contact import STICTION, ContactPairs
 from drake_teleop.environment.sheet_spring import AddSheetSpring, SheetSpring
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.resources import models_dir
@@ -35,6 +36,9 @@ class SlavePlant:
         tool: the tool's body.
         arm: kinematics and dynamics up to S, with the tool as its load.
         sheet: the leaf's model instance, if there is one.
+        contact_pairs: (k, 26) what may touch, see `ContactPairs`.
+        leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] of the leaf, and its acceleration by
+            gravity [m/s^2]; without one, a mass that nothing moves.
     """
 
     plant: MultibodyPlant
@@ -42,6 +46,8 @@ class SlavePlant:
     tool: BodyIndex
     arm: ArmModel
     sheet: ModelInstanceIndex | None
+    contact_pairs: NDArray[np.float64]
+    leaf: NDArray[np.float64]
 
 
 def AddSlavePlant(
@@ -69,15 +75,20 @@ def AddSlavePlant(
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
         plant.set_name("slave_plant")
         plant.set_contact_model(ContactModel.kPoint)
+        plant.set_stiction_tolerance(STICTION)
     instance, tool = ParseSlave(plant)
     sheet = None if sheet_spring is None else AddSheetSpring(plant, sheet_spring)
     finalize(plant)
-    if sheet is not None:
+    pairs, leaf = np.zeros((0, 26)), np.array([1.0, 0.0, 0.0, 0.0])
+    if sheet_spring is not None and sheet is not None:
         _remove_visuals(plant, scene_graph)
+        pairs = ContactPairs(plant, scene_graph.model_inspector(), tool, sheet)
+        law = [sheet_spring.effective_mass, sheet_spring.stiffness, sheet_spring.damping]
+        leaf = np.array([*law, plant.gravity_field().gravity_vector()[2]])
     arm = ArmModelFromPlant(plant, instance, "sensor")
     start = home_position(arm, position) if q_start is None else q_start
     plant.SetDefaultPositions(instance, start)
-    return SlavePlant(plant, instance, tool, arm, sheet)
+    return SlavePlant(plant, instance, tool, arm, sheet, pairs, leaf)
 
 
 def ParseSlave(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, BodyIndex]:

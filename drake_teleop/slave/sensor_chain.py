@@ -398,8 +398,8 @@ _BEFORE, _AFTER = 1.0, 2.0  # as in _LOW_PASS
 # Memory: samples taken, 12 random walks, the filter (2, 2, 12), then the delay line, a row for each
 # of the last samples: 12 channels, whether force or acceleration is saturated, angles.
 _WALKS = 1
-_FILTERED = _WALKS + _CHANNELS
-_LINE = _FILTERED + 2 * _SECTIONS * _CHANNELS
+FILTERED = _WALKS + _CHANNELS
+_LINE = FILTERED + 2 * _SECTIONS * _CHANNELS
 _ROW = _CHANNELS + 2
 
 
@@ -469,9 +469,10 @@ def read_into(constants, memory, noise, truth, reading):
     count = int(memory[0])
     width = _ROW + truth.shape[0] - 15
     rows = (memory.shape[0] - _LINE) // width
-    row = memory[_LINE + (count % rows) * width :][:width]
+    shift(memory[_LINE:], width)
+    row = memory[_LINE:][:width]
     channels = row[:_CHANNELS]
-    walks, filtered = memory[_WALKS:_FILTERED], memory[_FILTERED:_LINE]
+    walks, filtered = memory[_WALKS:FILTERED], memory[FILTERED:_LINE]
     sections, low_pass = constants[_FILTER:_LOW_PASS_PLACE], constants[_LOW_PASS_PLACE]
     if count % NOISE_BLOCK == 0:
         for i in range(_CHANNELS):
@@ -503,15 +504,25 @@ def read_into(constants, memory, noise, truth, reading):
             memory[_LINE + k * width :][:width] = row
     memory[0] += 1.0
     late = constants[_LATENCIES:_ENCODER]
-    force = _LINE + ((count + rows - int(late[0])) % rows) * width
-    acceleration = _LINE + ((count + rows - int(late[1])) % rows) * width
-    encoders = _LINE + ((count + rows - int(late[2])) % rows) * width
+    force = _LINE + int(late[0]) * width
+    acceleration = _LINE + int(late[1]) * width
+    encoders = _LINE + int(late[2]) * width
     for i in range(6):
         reading[i] = memory[force + i]
         reading[6 + i] = memory[acceleration + 6 + i]
     reading[12] = max(memory[force + _CHANNELS], memory[acceleration + _CHANNELS + 1])
     for i in range(_ROW, width):
         reading[13 + i - _ROW] = memory[encoders + i]
+
+
+@njit(cache=True)
+def shift(line, width):
+    """Makes room for a new row at the start of a delay line, whose rows stand by age.
+
+    A ring would be no faster, and what is remembered would not be the same after a period.
+    """
+    for i in range(line.shape[0] - 1, width - 1, -1):
+        line[i] = line[i - width]
 
 
 @njit(cache=True)

@@ -1,45 +1,67 @@
-"""The wrist sensor: force, torque and acceleration in one housing, and the arm's encoders.
+"""The wrist sensor in the station: when it samples, what is true then, and what it makes of it.
 
-The numbers of the default sensor are those of the JR3 85M35A3-I40-D 200N12 of the paper (sources
-in the README of the models). The truth is rigid-body mechanics: the wrench that the sensor exerts
-on the tool is V phi of the tool minus what the environment exerts on it (Eqs. 1, 2), the
-acceleration is the specific force a - g of the origin of S. Each sample then passes
+    truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
-    offset + noise -> saturation -> quantisation (converter) -> low-pass filter (digital)
+The truth is rigid-body mechanics: the wrench that the sensor exerts on the tool is V phi of the
+tool minus what the environment exerts on it (Eqs. 1, 2), and the motion is that of S.
 
-The angular velocity is not measured by the JR3: it is the difference of two encoder readings
-through the arm's Jacobian, put through the same filter so that it stays aligned with the rest.
+The plant takes steps of its own, cut only where something drives it. When a step is over the sensor
+looks back: at each instant in it at which it samples, position and velocity are interpolated
+(Hermite), and the accelerations follow from the dynamics under the torque that the motors held. So
+8 kHz need no events, and what is sampled is exact for the state it belongs to.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
-from dataclasses import dataclass
+from __future__ import annotations
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from pydrake.common import RandomDistribution
-from pydrake.common.value import Value
-from pydrake.multibody.plant import ContactResults, MultibodyPlant
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import (
+    BasicVector,
     Context,
     DiagramBuilder,
     DiscreteValues,
+    EventStatus,
     LeafSystem,
 )
 from pydrake.systems.primitives import Demultiplexer, RandomSource
 
-from drake_teleop.environment.contact import contact_wrench
+from drake_teleop.environment.point_contact import contact_force, indentation
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.quantities import quantity
-from drake_teleop.slave.arm import MOTION_SIZE, ArmModel, sensor_motion
+from drake_teleop.slave.arm import (
+    MOTION_SIZE,
+    ArmModel,
+    forward_dynamics,
+    forward_kinematics,
+    jacobian,
+    sensor_motion,
+)
+from drake_teleop.slave.motion_estimation import (
+    MotionEstimationConfig,
+    estimate_into,
+    motion_estimator,
+)
+from drake_teleop.slave.plant import SlavePlant
+from drake_teleop.slave.sensor_chain import (
+    FILTERED,
+    NOISE_BLOCK,
+    NOISE_SIZE,
+    OFFSET,
+    WristSensorConfig,
+    read_into,
+    sensor_chain,
+)
 
-_CHANNELS = 15
+Array = NDArray[np.float64]
+
 _SAMPLE = 16
-#: Samples that share one event of the noise source: an event at 8 kHz costs 5 us, mostly its own.
-NOISE_BLOCK = 32
-_SECTIONS = 2  # second-order sections of the fourth-order low-pass
-_FILTER = _CHANNELS * _SECTIONS * 2
+#: A part of a period, within which two instants are one.
+_SAME = 1e-3
+#: How often the plant is asked whether it moves as the dynamics here say [s], and how alike they
+#: have to be: rounding is 1e-12, in a stiff contact 1e-9.
+_CHECK_PERIOD, _ALIKE = 0.05, 1e-6
 
 
 def sample_parts(num_joints: int) -> dict[str, int]:
@@ -52,91 +74,6 @@ def sample_parts(num_joints: int) -> dict[str, int]:
         "saturated": 1,
         "joint_position": num_joints,
     }
-
-
-@dataclass
-class WristSensorConfig:
-    """A sampled force/torque and acceleration sensor; the defaults are the paper's JR3."""
-
-    ideal: bool = False
-    """The truth at the sampling instant: no noise, offset, quantisation, filter or range."""
-    bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
-    force_noise: float = quantity(0.25, "N", 0.0, 100.0, "1 sigma, full band before the filter")
-    torque_noise: float = quantity(0.012, "N m", 0.0, 10.0, "1 sigma, full band before the filter")
-    acceleration_noise: float = quantity(0.06, "m/s^2", 0.0, 100.0, "1 sigma, full band")
-    angular_acceleration_noise: float = quantity(1.5, "rad/s^2", 0.0, 1e3, "1 sigma, full band")
-    force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "fx, fy, fz")
-    torque_range: list[float] = quantity([12.0, 12.0, 12.0], "N m", 0.01, 1e4, "about So")
-    acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "specific force")
-    angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "each axis")
-    resolution: float = quantity(2.5e-4, "1", 0.0, 0.1, "quantum as a fraction of the range")
-    offset: list[float] = quantity(
-        [6.2, -3.9, 8.1, 0.31, -0.42, 0.12], "N, N m", -100.0, 100.0, "offset, Eq. (7)"
-    )
-    encoder_resolution: float = quantity(1.745e-5, "rad", 0.0, 0.1, "resolver step, 0.001 deg")
-
-    def noise_std(self) -> NDArray[np.float64]:
-        """The 12 standard deviations [N, N m, m/s^2, rad/s^2] before the filter."""
-        return np.repeat(
-            [
-                self.force_noise,
-                self.torque_noise,
-                self.acceleration_noise,
-                self.angular_acceleration_noise,
-            ],
-            3,
-        )
-
-    def wrench_std(self) -> NDArray[np.float64]:
-        """(6,) weights for an estimator: noise and quantisation, never quite zero [N, N m]."""
-        quantum = self.resolution * self.ranges()[:6]
-        return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
-
-    def motion_std(self) -> NDArray[np.float64]:
-        """(9,) noise and quantisation of s [m/s^2], omega [rad/s], alpha [rad/s^2].
-
-        Before the filter, as the wrench's. Nothing for omega: the rounding of the encoders is
-        differentiated, and the filter takes its high frequencies away; what is left is small.
-        """
-        quantum = self.resolution * self.ranges()[6:]
-        std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
-        return np.concatenate([std[:3], np.zeros(3), std[3:]])
-
-    def ranges(self) -> NDArray[np.float64]:
-        """The 12 ranges in the order of the noise."""
-        return np.concatenate(
-            [
-                self.force_range,
-                self.torque_range,
-                np.full(3, self.acceleration_range),
-                np.full(3, self.angular_acceleration_range),
-            ]
-        )
-
-
-def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
-    """Fourth-order Butterworth low-pass as two second-order sections, bilinear, prewarped.
-
-    Args:
-        cutoff_hz: -3 dB frequency [Hz], below half the rate.
-        rate_hz: sampling rate [Hz].
-
-    Returns:
-        (2, 5) rows [b0, b1, b2, a1, a2], each of unit gain at zero frequency.
-    """
-    warped = np.tan(np.pi * cutoff_hz / rate_hz)
-    sections = np.empty((_SECTIONS, 5))
-    for row, angle in enumerate((np.pi / 8, 3 * np.pi / 8)):
-        damping = 2 * np.cos(angle) * warped
-        a0 = 1 + damping + warped**2
-        sections[row] = (
-            warped**2 / a0,
-            2 * warped**2 / a0,
-            warped**2 / a0,
-            2 * (warped**2 - 1) / a0,
-            (1 - damping + warped**2) / a0,
-        )
-    return sections
 
 
 @njit(cache=True)
@@ -161,110 +98,313 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
 
 
 @njit(cache=True)
-def _convert(truth, offset, noise, noise_std, limits, resolution, out):
-    """The converter's 12 channels; returns 1.0 if one of them is saturated."""
-    saturated = 0.0
-    for i in range(12):
-        value = truth[i if i < 9 else i + 3] + noise_std[i] * noise[i]
-        if i < 6:
-            value += offset[i]
-        if abs(value) >= limits[i]:
-            value = np.copysign(limits[i], value)
-            saturated = 1.0
-        quantum = resolution * limits[i]
-        if quantum > 0.0:
-            value = quantum * np.rint(value / quantum)
-        out[i if i < 9 else i + 3] = value
-    return saturated
+def environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W):
+    """What acts on the tool besides the sensor and gravity, about the world's origin, in W.
 
-
-@njit(cache=True)
-def _low_pass(sections, raw, memory, out):
-    """Transposed direct form II, channel by channel; `memory` (15, 2, 2) is updated."""
-    for channel in range(raw.shape[0]):
-        value = raw[channel]
-        for k in range(sections.shape[0]):
-            filtered = sections[k, 0] * value + memory[channel, k, 0]
-            memory[channel, k, 0] = (
-                sections[k, 1] * value - sections[k, 3] * filtered + memory[channel, k, 1]
-            )
-            memory[channel, k, 1] = sections[k, 2] * value - sections[k, 4] * filtered
-            value = filtered
-        out[channel] = value
-
-
-@njit(cache=True)
-def _settle(sections, raw, memory):
-    """Puts the filter's memory where it would be after a long time at `raw`."""
-    for channel in range(raw.shape[0]):
-        for k in range(sections.shape[0]):
-            value = raw[channel]
-            memory[channel, k, 1] = (sections[k, 2] - sections[k, 4]) * value
-            memory[channel, k, 0] = (
-                sections[k, 1] - sections[k, 3] + sections[k, 2] - sections[k, 4]
-            ) * value
-
-
-@njit(cache=True)
-def _angular_velocity_from_encoders(arm, q, resolution, period, last_q, work, out):
-    """omega_S from two successive encoder readings; `last_q` becomes this reading."""
-    n = q.shape[0]
-    velocity, none, motion = work[:n], work[n : 2 * n], work[2 * n :]
-    for i in range(n):
-        reading = resolution * np.rint(q[i] / resolution) if resolution > 0.0 else q[i]
-        velocity[i] = (reading - last_q[i]) / period
-        last_q[i] = reading
-        none[i] = 0.0
-    sensor_motion(arm, last_q, velocity, none, motion)
-    out[:] = motion[3:6]
-
-
-@njit(cache=True)
-def sample_into(arm, phi, state, vdot, contact_W, constants, memory, work, sample):
-    """One sample of the sensor; `memory` and `sample` (16 + n,) are updated.
-
-    `state` is [q; v]; `constants` comes from `pack_constants`; `memory` is [samples taken, last
-    encoder readings (n), filter (15 x 2 x 2), the noise of this block of samples (32 x 12)];
-    `work` is scratch.
+    Args:
+        arm: `ArmModel.table`.
+        pairs: (k, 26) of `ContactPairs`.
+        applied_W: (6,) [f; tau] about So, in W, on top of the contacts [N, N m].
+        q, v: (n,) of the arm.
+        sheet: (2,) deflection and its rate [m, m/s].
+        wrench_W: (6,) filled [N, N m].
     """
-    n = vdot.shape[0]
-    q, v = state[:n], state[n:]
-    offset, noise_std, limits = constants[:6], constants[6:18], constants[18:30]
-    sections = constants[30:40].reshape(_SECTIONS, 5)
-    resolution, encoder_resolution, period = constants[40], constants[41], constants[42]
-    last_q = memory[1 : 1 + n]
-    filter_memory = memory[1 + n : 1 + n + _FILTER].reshape(_CHANNELS, _SECTIONS, 2)
-    first = 1 + n + _FILTER + 12 * (int(memory[0]) % NOISE_BLOCK)
-    noise = memory[first : first + 12]
-    truth, raw, rest = work[:15], work[15:30], work[30 : 30 + 2 * n + MOTION_SIZE]
-    true_sample(arm, phi, q, v, vdot, contact_W, rest[:MOTION_SIZE], truth)
-    saturated = _convert(truth, offset, noise, noise_std, limits, resolution, raw)
-    starts = memory[0] == 0.0
-    if starts:
-        last_q[:] = q - period * v
-    _angular_velocity_from_encoders(arm, q, encoder_resolution, period, last_q, rest, raw[9:12])
-    if starts:
-        _settle(sections, raw, filter_memory)
-    memory[0] += 1.0
-    _low_pass(sections, raw, filter_memory, sample[:15])
-    sample[15] = saturated
-    sample[16:] = last_q
+    wrench_W[:] = applied_W
+    if pairs.shape[0] == 0 and not applied_W.any():
+        return
+    R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
+    forward_kinematics(arm, q, R_WS, p_WS)
+    _add_moment(wrench_W[3:], p_WS, applied_W[:3])
+    for pair in pairs:
+        depth = indentation(pair, p_WS, R_WS, sheet[0], normal)
+        if depth <= 0.0:
+            continue
+        twist = np.empty((6, q.shape[0]))
+        jacobian(arm, q, twist)
+        velocity = twist @ v
+        r = normal[3:] - p_WS
+        _add_moment(velocity[:3], velocity[3:], r)
+        for i in range(3):
+            velocity[i] -= pair[19 + i] * sheet[1]
+        contact_force(pair, depth, normal[:3], velocity[:3], force)
+        for i in range(3):
+            wrench_W[i] += force[i]
+        _add_moment(wrench_W[3:], normal[3:], force)
 
 
-def pack_constants(config: WristSensorConfig, period: float) -> NDArray[np.float64]:
-    """What `sample_into` needs to know, in one array: passing ten costs a microsecond."""
-    return np.concatenate(
-        [
-            config.offset,
-            config.noise_std(),
-            config.ranges(),
-            butterworth_sections(config.bandwidth_hz, 1 / period).ravel(),
-            [config.resolution, config.encoder_resolution, period],
-        ]
-    )
+@njit(cache=True)
+def _add_moment(out, p, f):
+    """out += p x f."""
+    out[0] += p[1] * f[2] - p[2] * f[1]
+    out[1] += p[2] * f[0] - p[0] * f[2]
+    out[2] += p[0] * f[1] - p[1] * f[0]
 
 
-def sample_at_rest(arm: ArmModel, q: NDArray[np.float64]) -> NDArray[np.float64]:
+@njit(cache=True)
+def _accelerations(physics, x, tau, applied_W, wrench_W, xdot):
+    """Time derivative of x = [q, sheet's deflection, v, its rate], and the environment's wrench."""
+    arm, _, pairs, leaf = physics
+    n = tau.shape[0]
+    half = n + 1
+    q, v = x[:n], x[half : half + n]
+    sheet = x[n::half]
+    environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W)
+    forward_dynamics(arm, q, v, tau, wrench_W, xdot[half : half + n])
+    xdot[:half] = x[half:]
+    push = 0.0
+    if pairs.shape[0] > 0:  # which all are of one body, the leaf
+        for i in range(3):
+            push -= pairs[0, 19 + i] * (wrench_W[i] - applied_W[i])
+    xdot[-1] = (push - leaf[1] * sheet[0] - leaf[2] * sheet[1]) / leaf[0] + leaf[3]
+
+
+@njit(cache=True)
+def _interpolate(h, u, x, xdot, end, end_dot, out):
+    """Hermite: positions from values and two derivatives, velocities from values and one."""
+    half = x.shape[0] // 2
+    for i in range(half):
+        q, v, a = x[i], x[half + i], xdot[half + i]
+        dq = end[i] - q - h * v - 0.5 * h * h * a
+        dv = h * (end[half + i] - v) - h * h * a
+        da = h * h * (end_dot[half + i] - a)
+        c3 = 10.0 * dq - 4.0 * dv + 0.5 * da
+        c4 = -15.0 * dq + 7.0 * dv - da
+        c5 = 6.0 * dq - 3.0 * dv + 0.5 * da
+        out[i] = q + u * (h * v + u * (0.5 * h * h * a + u * (c3 + u * (c4 + u * c5))))
+        d2, d3 = 3.0 * dv - da, da - 2.0 * dv
+        out[half + i] = v + u * (h * h * a + u * (d2 + u * d3)) / h
+
+
+@njit(cache=True)
+def _take(physics, sensor, x, tau, applied_W, noise, memory):
+    """One sample of the state x, into `memory`, see `sample_step`."""
+    arm, phi, _, _ = physics
+    constants, motion_constants, middle, end, ideal = sensor
+    n = tau.shape[0]
+    half = n + 1
+    truth, wrench_W, xdot = np.empty(15 + n), np.empty(6), np.empty(2 * half)
+    _accelerations(physics, x, tau, applied_W, wrench_W, xdot)
+    v, vdot = x[half : half + n], xdot[half : half + n]
+    true_sample(arm, phi, x[:n], v, vdot, wrench_W, np.empty(MOTION_SIZE), truth[:15])
+    truth[15:] = x[:n]
+    sample = memory[: _SAMPLE + n]
+    if ideal:
+        sample[:15], sample[15], sample[16:] = truth[:15], 0.0, truth[15:]
+        return
+    reading = np.empty(13 + n)
+    read_into(constants, memory[_SAMPLE + n : middle], noise, truth, reading)
+    estimate_into(motion_constants, memory[middle:end], arm, reading, sample)
+
+
+@njit(cache=True)
+def _join(state, sheet, x):
+    """x = [q, sheet's deflection, v, its rate] of [q; v] and [deflection, rate]."""
+    n = state.shape[0] // 2
+    x[:n], x[n] = state[:n], sheet[0]
+    x[n + 1 : -1], x[-1] = state[n:], sheet[1]
+
+
+@njit(cache=True)
+def sample_step(
+    physics, sensor, period, time, state, sheet, tau, applied_W, noise, memory, until_now, result
+):  # fmt: skip
+    """Takes the samples that have become due since the end of the last step.
+
+    Args:
+        physics: (arm's table, phi of the tool, contact pairs, leaf (4,): mass, stiffness, damping,
+            acceleration by gravity).
+        sensor: (chain's constants, estimator's, where its memory begins, where `last` does, ideal).
+        period: of the sensor [s].
+        time: now [s].
+        state: (2 n,) [q; v] now.
+        sheet: (2,) deflection and its rate now.
+        tau: (n,) torque that was held since then.
+        applied_W: (6,), see `environment_wrench`.
+        noise: for the chain.
+        memory: [sample (16 + n) | chain's | estimator's | last: time of the last step's end,
+            samples taken, x then].
+        until_now: whether the sample that may be due this very instant is taken.
+        result: filled: [last sample before now (16 + n) | memory after this step].
+    """
+    half = tau.shape[0] + 1
+    size = _SAMPLE + tau.shape[0]
+    after = result[size:]
+    after[:] = memory
+    last = after[sensor[3] :]
+    count, h, start = last[1], time - last[0], last[2:]
+    x, between = np.empty(2 * half), np.empty(2 * half)
+    _join(state, sheet, x)
+    if (count + _SAME) * period < time:
+        xdot, end_dot, wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
+        _accelerations(physics, start, tau, applied_W, wrench_W, xdot)
+        _accelerations(physics, x, tau, applied_W, wrench_W, end_dot)
+        while (count + _SAME) * period < time:
+            _interpolate(h, (count * period - last[0]) / h, start, xdot, x, end_dot, between)
+            _take(physics, sensor, between, tau, applied_W, noise, after)
+            count += 1.0
+    result[:size] = after[:size]
+    if until_now and (count - _SAME) * period < time:
+        _take(physics, sensor, x, tau, applied_W, noise, after)
+        count += 1.0
+    last[0], last[1] = time, count
+    start[:] = x
+
+
+class WristSensor(LeafSystem):
+    """Samples force, torque, motion of S and joint angles at the sensor's rate.
+
+    .. pydrake_system::
+
+        name: WristSensor
+        input_ports:
+        - slave_state: [q; v] of the arm
+        - joint_torque: (n,) that the motors hold [N m]
+        - slave_acceleration: vdot of the arm, to see that nothing else moves it
+        - sheet_state: [z; v_z] of the sheet spring (only if there is one)
+        - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
+        - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, of whatever pushes it besides
+          contacts [N, N m] (may be left unconnected)
+        output_ports:
+        - step: [the last sample before now: the parts of `sample_parts` (16 + n) | memory]
+
+    Args:
+        slave: the plant, for its numbers: the tool's true inertial parameters, shapes that touch.
+        config: the sensor.
+        motion: how the motion of S is estimated from its readings.
+        period: sampling period [s].
+        q_start: (n,) where the arm rests before the first sample [rad].
+
+    Raises:
+        DrakeTeleopError: from the simulation, if something moves the arm that the sensor is not
+            told of: its samples would be wrong.
+    """
+
+    def __init__(
+        self,
+        slave: SlavePlant,
+        config: WristSensorConfig,
+        motion: MotionEstimationConfig,
+        period: float,
+        q_start: Array,
+    ) -> None:
+        super().__init__()
+        arm = slave.arm
+        n = self._n = arm.num_joints
+        constants, chain = sensor_chain(config, n, period)
+        motion_constants, estimator = motion_estimator(motion, config, n, period)
+        self._offset = constants[OFFSET]
+        # A copy, because something may be grasped; the joint control knows nothing of that.
+        carried = arm.with_load(arm.phi_load)
+        self._physics = (carried.table, carried.load, slave.contact_pairs, slave.leaf)
+        first = sample_at_rest(arm, q_start)
+        if not config.ideal:
+            first[:6] += config.offset
+        memory = np.concatenate([first, chain, estimator, np.zeros(2 + 2 * n + 2)])
+        ends = np.cumsum([len(first), len(chain), len(estimator)])
+        self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
+        self._period = period
+        self._no_noise, self._nothing = np.zeros(NOISE_SIZE), np.zeros(6)
+
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
+        self._torque = self.DeclareVectorInputPort("joint_torque", n)
+        self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
+        self._applied = self.DeclareVectorInputPort("applied_wrench_W", 6)
+        self._sheet = self._noise = None
+        if slave.sheet is not None:
+            self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
+        if not config.ideal:
+            self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
+        self.DeclareDiscreteState(memory)
+        self._result = np.zeros(len(first) + len(memory))
+        self._step = self.DeclareVectorOutputPort("step", len(self._result), self._calc_step)
+        self.DeclarePerStepDiscreteUpdateEvent(self._update)
+        self.DeclarePeriodicPublishEvent(_CHECK_PERIOD, 0.0, self._check)
+
+    @property
+    def offset(self) -> Array:
+        """(6,) of force and torque [N, N m], a view: an offset may drift during a simulation."""
+        return self._offset
+
+    @property
+    def phi(self) -> Array:
+        """(10,) of what hangs on the sensor, a view: something may be grasped in a simulation."""
+        return self._physics[1]
+
+    @property
+    def contact_pairs(self) -> Array:
+        """(k, 26) what may touch, see `ContactPairs`, a view."""
+        return self._physics[2]
+
+    @property
+    def remembered(self) -> NDArray[np.intp]:
+        """Where in the discrete state stands what the motion has left there.
+
+        Not counters and flags, nor random walks.
+        """
+        _, _, chain_end, end, _ = self._sensor
+        chain, flag = _SAMPLE + self._n, 15
+        others = [flag, *range(chain, chain + FILTERED), chain_end, chain_end + 1]
+        return np.delete(np.arange(end), others)
+
+    def take_samples(self, context: Context) -> None:
+        """Takes the samples before now, for who wants to see the state that results."""
+        sample_step(*self._inputs(context), False, self._result)
+        context.SetDiscreteState(self._result[_SAMPLE + self._n :])
+
+    def bring_up_to_date(self, context: Context) -> None:
+        """Makes now the end of the last step, with the samples before now taken.
+
+        For who sets states by hand: as if the simulation had arrived here.
+        """
+        memory = context.get_mutable_discrete_state_vector().get_mutable_value()
+        last = memory[self._sensor[3] :]
+        time = context.get_time()
+        last[0], last[1] = time, np.ceil(time / self._period - _SAME)
+        _join(self._state.Eval(context), self._sheet_state(context), last[2:])
+
+    def _sheet_state(self, context: Context) -> Array:
+        return self._nothing[:2] if self._sheet is None else self._sheet.Eval(context)
+
+    def _applied_W(self, context: Context) -> Array:
+        return self._applied.Eval(context) if self._applied.HasValue(context) else self._nothing
+
+    def _inputs(self, context: Context) -> tuple[object, ...]:
+        return (
+            self._physics,
+            self._sensor,
+            self._period,
+            context.get_time(),
+            self._state.Eval(context),
+            self._sheet_state(context),
+            self._torque.Eval(context),
+            self._applied_W(context),
+            self._no_noise if self._noise is None else self._noise.Eval(context),
+            context.get_discrete_state_vector().value(),
+        )
+
+    def _calc_step(self, context: Context, output: BasicVector) -> None:
+        sample_step(*self._inputs(context), True, output.get_mutable_value())
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(0, self._step.Eval(context)[_SAMPLE + self._n :])
+
+    def _check(self, context: Context) -> EventStatus:
+        n = self._n
+        x, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2)
+        _join(self._state.Eval(context), self._sheet_state(context), x)
+        torque, applied = self._torque.Eval(context), self._applied_W(context)
+        _accelerations(self._physics, x, torque, applied, np.empty(6), xdot)
+        vdot = self._acceleration.Eval(context)
+        if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ALIKE * (1.0 + np.abs(vdot).max()):
+            raise DrakeTeleopError(
+                f"at {context.get_time():g} s something moves the slave that it knows nothing of",
+                where="wrist_sensor.applied_wrench_W",
+                remedy="connect whatever pushes the tool to this port too",
+            )
+        return EventStatus.Succeeded()
+
+
+def sample_at_rest(arm: ArmModel, q: Array) -> Array:
     """The true sample (16 + n,) of the arm that rests at q (n,) [rad]: what stands before t = 0."""
     sample, still = np.zeros(_SAMPLE + len(q)), np.zeros(len(q))
     touching, motion = np.zeros(6), np.zeros(MOTION_SIZE)
@@ -273,169 +413,42 @@ def sample_at_rest(arm: ArmModel, q: NDArray[np.float64]) -> NDArray[np.float64]
     return sample
 
 
-class WristSensor(LeafSystem):
-    """Samples force, torque, acceleration and angular velocity of S at the sensor's rate.
-
-    .. pydrake_system::
-
-        name: WristSensor
-        input_ports:
-        - slave_state: [q; v] of the arm
-        - slave_acceleration: vdot of the arm
-        - noise: 12 standard normal numbers for each of NOISE_BLOCK samples
-        - contact_results: the plant's (only with `contact`)
-        output_ports:
-        - sample: the parts of `sample_parts`, one after the other
-
-    Args:
-        arm: kinematics up to S, and the tool's true inertial parameters as its load (the plant's,
-            not an estimate: this is the physics).
-        tool: index of the tool's body in the plant.
-        config: the sensor.
-        period: sampling period [s].
-        q_start: (n,) where the arm rests before the first sample [rad].
-        contact: whether there is anything to touch.
-    """
-
-    def __init__(
-        self,
-        arm: ArmModel,
-        tool: BodyIndex,
-        config: WristSensorConfig,
-        period: float,
-        q_start: NDArray[np.float64],
-        *,
-        contact: bool,
-    ) -> None:
-        super().__init__()
-        n = arm.num_joints
-        self._arm, self._phi, self._tool = arm.table, arm.phi_load, tool
-        self._constants = pack_constants(config, period)
-        self._work, self._contact_W = np.zeros(30 + 2 * n + MOTION_SIZE), np.zeros(6)
-        self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
-        self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
-        self._noise = self.DeclareVectorInputPort("noise", 12 * NOISE_BLOCK)
-        self._contact = None
-        if contact:
-            results = Value(ContactResults())
-            self._contact = self.DeclareAbstractInputPort("contact_results", results)
-        first = sample_at_rest(arm, q_start)
-        first[:6] += config.offset
-        self.DeclareStateOutputPort("sample", self.DeclareDiscreteState(first))
-        self.DeclareDiscreteState(1 + n + _FILTER + 12 * NOISE_BLOCK)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-
-    @property
-    def offset(self) -> NDArray[np.float64]:
-        """(6,) of force and torque [N, N m], a view: an offset may drift during a simulation."""
-        return self._constants[:6]
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        memory = discrete_state.get_mutable_value(1)
-        if memory[0] % NOISE_BLOCK == 0:
-            memory[-12 * NOISE_BLOCK :] = self._noise.Eval(context)
-        if self._contact is not None:
-            contact_wrench(self._contact.Eval(context), self._tool, self._contact_W)
-        sample_into(
-            self._arm,
-            self._phi,
-            self._state.Eval(context),
-            self._acceleration.Eval(context),
-            self._contact_W,
-            self._constants,
-            memory,
-            self._work,
-            discrete_state.get_mutable_value(0),
-        )
-
-
-class IdealWristSensor(LeafSystem):
-    """The truth, sampled: the wrench is the plant's own reaction force in the sensor's joint.
-
-    .. pydrake_system::
-
-        name: IdealWristSensor
-        input_ports:
-        - slave_state: [q; v] of the arm
-        - slave_acceleration: vdot of the arm
-        - reaction_forces: the plant's
-        output_ports:
-        - sample: the parts of `sample_parts`, one after the other
-
-    Args:
-        arm: kinematics up to S.
-        plant: the plant, with the joint "sensor_weld" between S and the tool.
-        period: sampling period [s].
-        q_start: (n,) where the arm rests before the first sample [rad].
-    """
-
-    def __init__(
-        self, arm: ArmModel, plant: MultibodyPlant, period: float, q_start: NDArray[np.float64]
-    ) -> None:
-        super().__init__()
-        n = arm.num_joints
-        self._arm, self._n, self._motion = arm.table, n, np.zeros(MOTION_SIZE)
-        weld = plant.GetJointByName("sensor_weld")
-        self._joint = list(plant.GetJointIndices()).index(weld.index())
-        self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
-        self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
-        forces = plant.get_reaction_forces_output_port().Allocate()
-        self._reaction = self.DeclareAbstractInputPort("reaction_forces", forces)
-        first = self.DeclareDiscreteState(sample_at_rest(arm, q_start))
-        self.DeclareStateOutputPort("sample", first)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        sample, state = discrete_state.get_mutable_value(0), self._state.Eval(context)
-        q, v = state[: self._n], state[self._n :]
-        # On the child, the tool, in its frame, which is S: the sign of Eq. (1).
-        F_Tool_S = self._reaction.Eval(context)[self._joint]
-        sensor_motion(self._arm, q, v, self._acceleration.Eval(context), self._motion)
-        sample[:3], sample[3:6] = F_Tool_S.translational(), F_Tool_S.rotational()
-        sample[6:15], sample[16:] = self._motion[:9], q
-
-
 def AddWristSensor(
     builder: DiagramBuilder,
-    plant: MultibodyPlant,
-    arm: ArmModel,
+    slave: SlavePlant,
     config: WristSensorConfig,
+    motion: MotionEstimationConfig,
     period: float,
-    q_start: NDArray[np.float64],
-    *,
-    contact: bool,
+    q_start: Array,
 ) -> None:
-    """Adds "wrist_sensor", its noise, and "sample_parts" with a port for every part of a sample.
+    """Adds "wrist_sensor" and its noise, and what divides its port: for each part of a sample
+    "sample_parts" has a port, for all of them "wrist_sample".
+
+    What remains to be connected is the state and the torque of the arm.
 
     Args:
         builder: the diagram that holds the plant.
-        plant: the plant, with the body "tool" on the joint "sensor_weld".
-        arm: kinematics up to S, and the tool as its load.
+        slave: the plant.
         config: the sensor.
+        motion: how the motion of S is estimated.
         period: sampling period [s].
         q_start: (n,) where the arm rests before the first sample [rad].
-        contact: whether there is anything to touch.
     """
-    sensor: LeafSystem
-    if config.ideal:
-        sensor = IdealWristSensor(arm, plant, period, q_start)
-        builder.AddNamedSystem("wrist_sensor", sensor)
-        builder.Connect(
-            plant.get_reaction_forces_output_port(), sensor.GetInputPort("reaction_forces")
-        )
-    else:
-        tool = plant.GetBodyByName("tool").index()
-        sensor = WristSensor(arm, tool, config, period, q_start, contact=contact)
-        builder.AddNamedSystem("wrist_sensor", sensor)
+    sensor = WristSensor(slave, config, motion, period, q_start)
+    builder.AddNamedSystem("wrist_sensor", sensor)
+    if not config.ideal:
         noise = builder.AddNamedSystem(
             "wrist_sensor_noise",
-            RandomSource(RandomDistribution.kGaussian, 12 * NOISE_BLOCK, NOISE_BLOCK * period),
+            RandomSource(RandomDistribution.kGaussian, NOISE_SIZE, NOISE_BLOCK * period),
         )
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-        if contact:
-            builder.Connect(
-                plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")
-            )
-    sizes = sample_parts(arm.num_joints)
-    parts = builder.AddNamedSystem("sample_parts", Demultiplexer(list(sizes.values())))
-    builder.Connect(sensor.GetOutputPort("sample"), parts.get_input_port())
+    if slave.sheet is not None:
+        builder.Connect(
+            slave.plant.get_state_output_port(slave.sheet), sensor.GetInputPort("sheet_state")
+        )
+    sizes = list(sample_parts(slave.arm.num_joints).values())
+    step = sensor.GetOutputPort("step")
+    rest = step.size() - sum(sizes)
+    for name, split in (("wrist_sample", [sum(sizes), rest]), ("sample_parts", [*sizes, rest])):
+        splitter = builder.AddNamedSystem(name, Demultiplexer(split))
+        builder.Connect(step, splitter.get_input_port())

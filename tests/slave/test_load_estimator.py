@@ -13,7 +13,7 @@ from drake_teleop.load.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.quantities import check_ranges
 from drake_teleop.slave.load_estimator import LoadEstimator, LoadEstimatorConfig
-from drake_teleop.slave.wrist_sensor import WristSensorConfig, butterworth_sections
+from drake_teleop.slave.sensor_chain import WristSensorConfig, butterworth_sections
 
 SENSOR = WristSensorConfig()
 PHI = phi_from_mass_com_inertia(3.13, [0.004, -0.003, 0.085], np.diag([0.012, 0.0115, 0.0045]))

@@ -73,7 +73,7 @@ def grasp(station, simulator):
     inertia = body.CalcSpatialInertiaInBodyFrame(context)
     inertia += SpatialInertia.MakeFromCentralInertia(MASS, COM, RotationalInertia(*INERTIA))
     body.SetSpatialInertiaInBodyFrame(context, inertia)
-    station.GetSubsystemByName("wrist_sensor")._phi += OBJECT
+    station.GetSubsystemByName("wrist_sensor").phi[:] += OBJECT
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,205 @@
+"""Drake's compliant point contact between the tool's spheres and boxes, compiled.
+
+The wrist sensor samples at instants between the steps of the plant, where the plant's own contact
+results are not to be had. The law is that of Drake for continuous plants (Hunt and Crossley 1975
+along the normal, regularised Coulomb friction across it); a test ties it to the plant.
+
+    f_n = k x (1 + d x'), never pulling;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydrake.geometry import Box, GeometryId, ProximityProperties, SceneGraphInspector, Sphere
+from pydrake.multibody.plant import CalcContactFrictionFromSurfaceProperties, MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, PrismaticJoint, RigidBody
+from pydrake.systems.framework import Context
+
+from drake_teleop.errors import DrakeTeleopError
+
+Array = NDArray[np.float64]
+
+#: Slip at which friction is complete [m/s], to be set in the plant too.
+STICTION = 1e-4
+#: Columns of the table of pairs: static and dynamic friction.
+FRICTION = slice(24, 26)
+_WIDTH = 26
+_STIFFNESS, _DISSIPATION = "point_contact_stiffness", "hunt_crossley_dissipation"
+_NO_SLIP = 1e-14  # m/s, as in Drake: a point at rest has a direction
+
+
+def ContactPairs(
+    plant: MultibodyPlant,
+    inspector: SceneGraphInspector,
+    tool: BodyIndex,
+    environment: ModelInstanceIndex,
+) -> Array:
+    """The pairs of a sphere of the tool and a box of the environment, as a table for the kernel.
+
+    Args:
+        plant: finalized; the environment has one degree of freedom at most, prismatic, 0 by
+            default.
+        inspector: of the scene graph, with the shapes and their compliance.
+        tool: its body.
+        environment: what it may touch.
+
+    Returns:
+        (pairs, 26): 0-2 centre of the sphere in the tool's frame [m], 3 its radius, 4-12 R_WBox by
+        rows and 13-15 p_WBox at rest, 16-18 half the box's edges, 19-21 direction in W in which it
+        moves (zero if it does not), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25 static
+        and dynamic friction.
+
+    Raises:
+        DrakeTeleopError: for other shapes.
+    """
+    context = plant.CreateDefaultContext()
+    rows = []
+    for body in map(plant.get_body, plant.GetBodyIndices(environment)):
+        X_WBody = plant.EvalBodyPoseInWorld(context, body)
+        for box in plant.GetCollisionGeometriesForBody(body):
+            for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
+                sphere, edges = _sphere_and_box(inspector, ball, box)
+                X_WBox = X_WBody @ inspector.GetPoseInFrame(box)
+                row = [
+                    inspector.GetPoseInFrame(ball).translation(),
+                    [sphere.radius()],
+                    X_WBox.rotation().matrix().ravel(),
+                    X_WBox.translation(),
+                    np.array(edges.size()) / 2,
+                    _direction(plant, context, body),
+                    _law(*map(inspector.GetProximityProperties, (ball, box))),
+                ]
+                rows.append(np.concatenate(row))
+    return np.array(rows).reshape(len(rows), _WIDTH)
+
+
+def _sphere_and_box(
+    inspector: SceneGraphInspector, ball: GeometryId, box: GeometryId
+) -> tuple[Sphere, Box]:
+    sphere, edges = inspector.GetShape(ball), inspector.GetShape(box)
+    if isinstance(sphere, Sphere) and isinstance(edges, Box):
+        return sphere, edges
+    raise DrakeTeleopError(
+        f"the wrist sensor feels spheres on boxes only, not a {type(sphere).__name__} on a "
+        f"{type(edges).__name__}",
+        where=inspector.GetName(box),
+        remedy="build the tool's tip of spheres and the environment of boxes",
+    )
+
+
+def _direction(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
+    """In which the body moves for a unit of the environment's one speed, in W."""
+    plant.SetVelocities(context, np.zeros(plant.num_velocities()))
+    direction = np.zeros(3)
+    for joint in map(plant.get_joint, plant.GetJointIndices()):
+        if joint.child_body().index() == body.index() and isinstance(joint, PrismaticJoint):
+            R_WJ = joint.frame_on_parent().CalcPoseInWorld(context).rotation()
+            direction = R_WJ @ joint.translation_axis()
+    return direction
+
+
+def _law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
+    """k, d and friction of a pair: springs in series, harmonic mean of friction, as in Drake."""
+    k_1, k_2 = (float(shape.GetProperty("material", _STIFFNESS)) for shape in (ball, box))
+    d_1, d_2 = (float(shape.GetProperty("material", _DISSIPATION)) for shape in (ball, box))
+    if k_1 != k_2:
+        # The point of contact would not be halfway between the surfaces.
+        raise DrakeTeleopError(
+            "tool and environment differ in their contact's stiffness",
+            where=_STIFFNESS,
+            remedy="give both the same",
+        )
+    both = CalcContactFrictionFromSurfaceProperties(
+        *(shape.GetProperty("material", "coulomb_friction") for shape in (ball, box))
+    )
+    return [k_1 / 2, (d_1 + d_2) / 2, both.static_friction(), both.dynamic_friction()]
+
+
+@njit(cache=True)
+def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal: Array) -> float:
+    """How deep a sphere is in its box [m], below 0 if it is not.
+
+    Args:
+        pair: (26,) row of `ContactPairs`.
+        p_WS: (3,) origin of the tool's frame in W [m].
+        R_WS: (3, 3) its rotation.
+        deflection: of the environment [m].
+        normal: (6,) filled, if the result is not below 0: out of the box in W (3), and the point
+            of contact in W [m] (3).
+    """
+    radius = pair[3]
+    # The sphere's centre, from the box's, in the box.
+    w0 = p_WS[0] + R_WS[0, 0] * pair[0] + R_WS[0, 1] * pair[1] + R_WS[0, 2] * pair[2]
+    w1 = p_WS[1] + R_WS[1, 0] * pair[0] + R_WS[1, 1] * pair[1] + R_WS[1, 2] * pair[2]
+    w2 = p_WS[2] + R_WS[2, 0] * pair[0] + R_WS[2, 1] * pair[1] + R_WS[2, 2] * pair[2]
+    w0 -= pair[13] + deflection * pair[19]
+    w1 -= pair[14] + deflection * pair[20]
+    w2 -= pair[15] + deflection * pair[21]
+    d = (
+        pair[4] * w0 + pair[7] * w1 + pair[10] * w2,
+        pair[5] * w0 + pair[8] * w1 + pair[11] * w2,
+        pair[6] * w0 + pair[9] * w1 + pair[12] * w2,
+    )
+    outside, deepest, face = 0.0, -np.inf, 0
+    for i in range(3):
+        beyond = abs(d[i]) - pair[16 + i]
+        if beyond > radius:
+            return -1.0
+        if beyond > 0.0:
+            outside += beyond * beyond
+        if beyond > deepest:
+            deepest, face = beyond, i
+    distance = np.sqrt(outside) if outside > 0.0 else deepest
+    if distance >= radius:
+        return radius - distance
+    # The normal in the box: from its nearest point, or through its nearest face.
+    for i in range(3):
+        normal[3 + i] = 0.0
+        beyond = abs(d[i]) - pair[16 + i]
+        if (outside > 0.0 and beyond > 0.0) or (outside == 0.0 and i == face):
+            normal[3 + i] = np.copysign(beyond / distance if outside > 0.0 else 1.0, d[i])
+    n0, n1, n2 = normal[3], normal[4], normal[5]
+    # Halfway between the sphere's deepest point and the box's surface.
+    inwards = (radius + distance) / 2
+    w = (w0, w1, w2)
+    for i in range(3):
+        normal[i] = pair[4 + 3 * i] * n0 + pair[5 + 3 * i] * n1 + pair[6 + 3 * i] * n2
+        origin = pair[13 + i] + deflection * pair[19 + i] + w[i]
+        normal[3 + i] = origin - inwards * normal[i]
+    return radius - distance
+
+
+@njit(cache=True)
+def _friction(static: float, dynamic: float, slip: float) -> float:
+    """The regularised coefficient at a slip in units of v_s (Drake's StribeckModel)."""
+    if slip < 1.0:
+        return static * slip**3 * (10.0 + slip * (6.0 * slip - 15.0))
+    if slip < 3.0:
+        u = (slip - 1.0) / 2.0
+        return static - (static - dynamic) * u**3 * (10.0 + u * (6.0 * u - 15.0))
+    return dynamic
+
+
+@njit(cache=True)
+def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
+    """The force on the sphere that is `x` [m] deep in its box.
+
+    Args:
+        pair: (26,) row of `ContactPairs`.
+        x: its indentation [m].
+        normal: (3,) out of the box.
+        velocity: (3,) of the sphere at the point of contact, relative to the box [m/s].
+        force: (3,) filled [N].
+    """
+    out = velocity[0] * normal[0] + velocity[1] * normal[1] + velocity[2] * normal[2]
+    f_n = max(pair[22] * x * (1.0 - pair[23] * out), 0.0)
+    speed = 0.0
+    for i in range(3):
+        force[i] = velocity[i] - out * normal[i]
+        speed += force[i] * force[i]
+    speed = np.sqrt(speed + _NO_SLIP * _NO_SLIP)
+    mu = _friction(pair[24], pair[25], speed / STICTION)
+    for i in range(3):
+        force[i] = f_n * (normal[i] - mu * force[i] / speed)
