@@ -1,10 +1,24 @@
-"""Two arms that are not the station's, as people find them."""
+"""Two arms that are not the station's, as people find them, and what they do with a trajectory."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import polars as pl
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import PdControllerGains, SpatialInertia, WeldJoint
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_teleop.excitation.models import ParseModel
+
+# Of the simulation [s]; rest before the motion, without and with recording, and after it [s].
+_STEP, _SETTLING, _RESTING = 2e-4, 0.5, 0.2
 
 
 def write_urdf(folder: Path) -> Path:
@@ -107,3 +121,108 @@ def write_sdf(folder: Path) -> Path:
         f"{''.join(links + joints)}{frame}</model></sdf>"
     )
     return path
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What an arm did, at 1 kHz.
+
+    Attributes:
+        t: (N,) [s], from 0.2 s before the trajectory to 0.2 s after it.
+        q: (N, n) joint angles [rad].
+        truth: (N, 15 + n) what a sensor at S is given: `sensor_chain.read_into`.
+        pose: (N, 7) [quaternion wxyz, position] of S in the world.
+        phi: (10,) the load, about the origin of S.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    truth: np.ndarray
+    pose: np.ndarray
+    phi: np.ndarray
+
+
+def execute(path: Path, frame: str, table: pl.DataFrame, load: SpatialInertia) -> Recording:
+    """Lets an arm run an exported trajectory in Drake, with one more body on its sensor frame.
+
+    Motors with stiff servos follow the angles and speeds of the table, with tracking errors; they
+    hold what is beyond the sensor.
+    """
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(MultibodyPlant(_STEP))
+    model = ParseModel(plant, path, frame)
+    frame_S = model.sensor_frame
+    body = plant.AddRigidBody("load", model.instance, load)
+    plant.AddJoint(WeldJoint("load", frame_S, body.body_frame(), RigidTransform.Identity()))
+    joints = [plant.get_joint(k) for k in plant.GetJointIndices(model.instance)]
+    moving = [joint for joint in joints if joint.num_positions() == 1]
+    for joint in moving:
+        if not plant.HasJointActuatorNamed(joint.name(), model.instance):
+            plant.AddJointActuator(joint.name(), joint)
+        actuator = plant.GetJointActuatorByName(joint.name(), model.instance)
+        actuator.set_controller_gains(PdControllerGains(p=2e4, d=2e2))
+    plant.Finalize()
+    order = [plant.get_joint_actuator(k).joint() for k in plant.GetJointActuatorIndices()]
+    commanded = np.zeros((table.height, 2, len(order)))
+    for k, joint in enumerate(order):
+        if f"q_{joint.name()}" in table.columns:
+            commanded[:, 0, k] = table[f"q_{joint.name()}"]
+            commanded[:, 1, k] = table[f"qd_{joint.name()}"]
+    # Held at rest before and after.
+    start, period = _SETTLING + _RESTING, table["t"][-1]
+    times = np.concatenate([[0.0], start + table["t"].to_numpy(), [start + period + 1.0]])
+    commanded = commanded[[0, *range(table.height), -1]]
+    commands = builder.AddSystem(
+        TrajectorySource(
+            PiecewisePolynomial.FirstOrderHold(times, commanded.reshape(len(times), -1).T)
+        )
+    )
+    builder.Connect(commands.get_output_port(), plant.get_desired_state_input_port(model.instance))
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    q = plant.GetPositions(context)
+    q[[joint.position_start() for joint in order]] = commanded[0, 0]
+    plant.SetPositions(context, q)
+    chain = [joint for joint in order if f"q_{joint.name()}" in table.columns]
+    outboard = [joint for joint in joints if joint.parent_body() == frame_S.body()]
+    t = np.arange(round((period + 2 * _RESTING) * 1e3) + 1) * 1e-3
+    truth, pose = np.empty((len(t), 15 + len(chain))), np.empty((len(t), 7))
+    for k, moment in enumerate(t):
+        simulator.AdvanceTo(_SETTLING + moment)
+        truth[k, :15] = _at_sensor(plant, context, frame_S, outboard)
+        truth[k, 15:] = [joint.GetOnePosition(context) for joint in chain]
+        X_WS = frame_S.CalcPoseInWorld(context)
+        pose[k] = [*X_WS.rotation().ToQuaternion().wxyz(), *X_WS.translation()]
+    bodies = [body.index() for body in _beyond(joints, frame_S.body())]
+    M_S = plant.CalcSpatialInertia(context, frame_S, bodies)
+    inertia = M_S.CalcRotationalInertia().CopyToFullMatrix3()
+    phi = np.array([M_S.get_mass(), *M_S.CalcComMoment(), *inertia[np.triu_indices(3)]])
+    return Recording(t - _RESTING, truth[:, 15:], truth, pose, phi)
+
+
+def _beyond(joints, body):
+    found = [joint.child_body() for joint in joints if joint.parent_body() == body]
+    return found + [far for near in found for far in _beyond(joints, near)]
+
+
+def _at_sensor(plant, context, frame_S, outboard):
+    """(15,) the plant's reaction forces in the joints on S's body, about So; motion of S."""
+    reactions = plant.get_reaction_forces_output_port().Eval(context)
+    X_WS = frame_S.CalcPoseInWorld(context)
+    wrench = np.zeros(6)
+    for joint in outboard:
+        F_J = reactions[joint.index()]
+        X_SJ = X_WS.InvertAndCompose(joint.frame_on_child().CalcPoseInWorld(context))
+        force = X_SJ.rotation().multiply(F_J.translational())
+        moment = X_SJ.rotation().multiply(F_J.rotational())
+        wrench += [*force, *(moment + np.cross(X_SJ.translation(), force))]
+    vdot = plant.get_generalized_acceleration_output_port(frame_S.model_instance()).Eval(context)
+    body, X_BS = frame_S.body(), frame_S.GetFixedPoseInBodyFrame()
+    A_WB = plant.CalcSpatialAccelerationsFromVdot(context, vdot)[body.index()]
+    omega = plant.EvalBodySpatialVelocityInWorld(context, body).rotational()
+    R_WB = plant.EvalBodyPoseInWorld(context, body).rotation()
+    A_WS = A_WB.Shift(R_WB.multiply(X_BS.translation()), omega)
+    s = A_WS.translational() - plant.gravity_field().gravity_vector()
+    R_SW = X_WS.rotation().inverse()
+    return np.concatenate([wrench, *(R_SW.multiply(x) for x in (s, omega, A_WS.rotational()))])

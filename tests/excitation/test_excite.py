@@ -8,7 +8,8 @@ import json
 import numpy as np
 import polars as pl
 import pytest
-from arms import write_sdf, write_urdf
+from arms import execute, write_sdf, write_urdf
+from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
 from drake_teleop.cli import main
 from drake_teleop.errors import DrakeTeleopError
@@ -16,13 +17,22 @@ from drake_teleop.excitation.check import check
 from drake_teleop.excitation.criteria import predicted_deviations
 from drake_teleop.excitation.excite import excite, sensor_motion
 from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
-from drake_teleop.experiments.excite import excite_command
 from drake_teleop.experiments.identification import identify_load
 from drake_teleop.load.excitation import FourierTrajectory
-from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.load.regressor import regressor
+from drake_teleop.load.uncertainty import intervals
 from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.slave.wrist_sensor import WristSensorConfig
+from drake_teleop.slave.sensor_chain import (
+    NOISE_BLOCK,
+    NOISE_SIZE,
+    PRESETS,
+    WristSensorConfig,
+    read_into,
+    sensor_chain,
+    without,
+)
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +112,11 @@ def test_the_check_finds_every_kind_of_violation(slave, short):
     """The same motion in a world where each limit in turn is a little less than what it uses."""
     uses = {use.limit: use.share for use in short.uses}
     limits = slave.limits
+    # Nothing may be so near that the check looks at it; with this clearance it does.
+    wide = dataclasses.replace(slave, limits=limits._replace(clearance=0.2))
+    distance = (
+        0.2 / next(use for use in check(wide, short.trajectory) if use.limit == "clearance").share
+    )
     less = {
         "position": {"q_half": 0.99 * uses["position"] * limits.q_half},
         "velocity": {"velocity": 0.99 * uses["velocity"] * limits.velocity},
@@ -109,7 +124,7 @@ def test_the_check_finds_every_kind_of_violation(slave, short):
         "torque": {"effort": 0.99 * uses["torque"] * limits.effort},
         "sensor": {"sensor": 0.99 * uses["sensor"] * limits.sensor},
         "workspace": {"box_half": 0.99 * uses["workspace"] * limits.box_half},
-        "clearance": {"clearance": 1.01 * limits.clearance / uses["clearance"]},
+        "clearance": {"clearance": 1.01 * distance},
     }
     for name, changes in less.items():
         tight = dataclasses.replace(slave, limits=limits._replace(**changes))
@@ -177,7 +192,7 @@ def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
     assert "a range of +-3.142 rad for j4" in words
     assert "a speed limit of 3.142 rad/s for j5" in words
     assert "acceleration limits that reach full speed in 0.4 s (--acceleration) for all" in words
-    assert "no shape for l3, l4, l5: meshes not found" in words
+    assert "shapes are missing of l3, l4, l5: meshes were not found (--package-path)" in words
     # 80 % of what the model says; the gripper with its finger is the load, and 30 % more.
     np.testing.assert_allclose(robot.limits.effort, 0.8 * np.array([200, 200, 150, 30, 30, 15]))
     np.testing.assert_allclose(robot.limits.acceleration[:2], [7.5, 6.25])
@@ -186,7 +201,7 @@ def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
         urdf, "l6", WristSensorConfig(), package_paths=(urdf.parent / "somewhere",),
         acceleration=(5.0,), payload=3.0,
     )  # fmt: skip
-    assert "no shape for l4: meshes" in "; ".join(found.assumptions)
+    assert "shapes are missing of l4: meshes" in "; ".join(found.assumptions)
     np.testing.assert_array_equal(found.limits.acceleration, np.full(6, 5.0))
     assert found.limits.phi[0] == pytest.approx(3.0)
 
@@ -231,41 +246,100 @@ def test_options_of_models_need_one(capsys, tmp_path):
     assert (stop.value.code, capsys.readouterr().err) == (2, "error: --payload: needs --model\n")
 
 
-@pytest.mark.parametrize(
-    ("write", "frame", "joints"), [(write_urdf, "l6", 6), (write_sdf, "wrist", 7)]
+@pytest.fixture(
+    scope="module", params=[(write_urdf, "l6", 6), (write_sdf, "wrist", 7)], ids=["urdf", "sdf"]
 )
-def test_any_arm_gets_its_motion_and_identify_closes_the_loop(write, frame, joints, tmp_path):
-    path, out = write(tmp_path), tmp_path / "out"
-    summary = excite_command(
-        "identification", out, model=path, sensor_frame=frame, period=4.0, harmonics=4, quiet=True
+def foreign(request, tmp_path_factory):
+    """An arm, its trajectory by the command line, and how it ran it with 1.2 kg on the sensor."""
+    write, frame, joints = request.param
+    folder = tmp_path_factory.mktemp("arm")
+    path, out = write(folder), folder / "excite"
+    options = ["--sensor-frame", frame, "--payload", "2.5", "--period", "4", "--harmonics", "4"]
+    with pytest.raises(SystemExit) as stop:
+        main(["excite", "--model", str(path), *options, "--quiet", "--out", str(out)])
+    assert stop.value.code == 0
+    load = SpatialInertia(
+        1.2, [0.02, -0.01, 0.09], UnitInertia(0.0135, 0.0125, 0.004, 2e-4, -1e-3, 5e-4)
     )
+    return out, joints, execute(path, frame, pl.read_csv(out / "trajectory.csv"), load)
+
+
+def test_what_is_written_for_any_arm(foreign):
+    out, joints, recording = foreign
+    summary = json.loads((out / "summary.json").read_text())
     assert all(use["share"] <= 1 for use in summary["limit_use"].values())
-    assert json.loads((out / "summary.json").read_text()) == summary
     assert (out / "excitation.png").stat().st_size > 20_000
     table = pl.read_csv(out / "trajectory.csv")
     assert table.shape == (4001, 1 + 3 * joints)
+    q = table.select([f"q_j{k + 1}" for k in range(joints)]).to_numpy()
     trajectory = FourierTrajectory.load(out / "excitation.yaml")
-    np.testing.assert_allclose(
-        trajectory.evaluate(table["t"].to_numpy())[0],
-        table.select([f"q_j{k + 1}" for k in range(joints)]).to_numpy(),
-        atol=1e-12,
+    np.testing.assert_allclose(trajectory.evaluate(table["t"].to_numpy())[0], q, atol=1e-12)
+    # It was run, but not exactly.
+    executed = recording.q[200:-200]
+    assert 1e-4 < np.abs(executed - q).max() < 0.01
+
+
+def write_canonical(folder, t, readings, recording):
+    """Wrench and IMU by one clock."""
+    rng = np.random.default_rng(1)
+    omega = recording.truth[:, 9:12] + 2e-3 * rng.standard_normal((len(t), 3))
+    parts = {
+        "f": readings[:, :3], "tau": readings[:, 3:6],
+        "s": readings[:, 6:9], "omega": omega, "alpha": readings[:, 9:12],
+    }  # fmt: skip
+    columns = {
+        f"{name}_{axis}": values[:, k]
+        for name, values in parts.items()
+        for k, axis in enumerate("xyz")
+    }
+    pl.DataFrame({"t": t} | columns).write_csv(folder / "log.csv")
+    return folder / "log.csv"
+
+
+def write_described(folder, t, readings, recording):
+    """Wrench of the other sign, and the pose that the arm's controller gives, at 500 Hz."""
+    names = ["fx", "fy", "fz", "tx", "ty", "tz"]
+    pl.DataFrame({"t": t} | dict(zip(names, -readings[:, :6].T, strict=True))).write_csv(
+        folder / "wrench.csv"
     )
-    robot = RobotFromModel(path, frame, WristSensorConfig())
-    motion = sensor_motion(robot, trajectory)
-    phi = phi_from_mass_com_inertia(0.8, [0.01, 0.02, 0.05], np.diag([2e-3, 2.2e-3, 1e-3]))
+    names = ["qw", "qx", "qy", "qz", "x", "y", "z"]
+    pose = recording.pose[::2] + 2e-6 * np.random.default_rng(1).standard_normal((len(t[::2]), 7))
+    pl.DataFrame({"t": t[::2]} | dict(zip(names, pose.T, strict=True))).write_csv(
+        folder / "pose.csv"
+    )
+    (folder / "log.yaml").write_text(
+        "gravity: 9.81\n"
+        "wrench: {file: wrench.csv, time: {column: t}, force: {columns: [fx, fy, fz]},"
+        " torque: {columns: [tx, ty, tz]}, sign: -1}\n"
+        "pose: {file: pose.csv, time: {column: t}, position: {columns: [x, y, z]},"
+        " orientation: {columns: [qw, qx, qy, qz], form: quaternion_wxyz}}\n"
+    )
+    return folder / "log.yaml"
+
+
+@pytest.mark.parametrize("write_log", [write_canonical, write_described])
+def test_identify_closes_the_loop_on_any_arm(foreign, write_log, tmp_path):
+    """Excited, executed, measured with a noisy sensor, written as a log, identified."""
+    _, joints, recording = foreign
+    sensor = dataclasses.replace(
+        without(PRESETS["ati_gamma_imu"], "place", "latency"), acceleration_offset=[0.0] * 6
+    )
+    constants, memory = sensor_chain(sensor, joints, 1e-3)
     rng = np.random.default_rng(0)
-    sigma = np.repeat([0.25, 0.012], 3)
-    wrench = regressor(*motion) @ phi + [1, 2, 3, 0.1, 0.2, 0.3]
-    wrench += sigma * rng.standard_normal(wrench.shape)
-    names = ["f", "tau", "s", "omega", "alpha"]
-    columns = {"t": np.arange(len(wrench)) * 1e-3}
-    for name, values in zip(names, [wrench[:, :3], wrench[:, 3:], *motion], strict=True):
-        columns |= {f"{name}_{axis}": values[:, k] for k, axis in enumerate("xyz")}
-    pl.DataFrame(columns).write_csv(tmp_path / "log.csv")
+    readings = np.empty((len(recording.t), 13 + joints))
+    for k, truth in enumerate(recording.truth):
+        if k % NOISE_BLOCK == 0:
+            noise = rng.standard_normal(NOISE_SIZE)
+        read_into(constants, memory, noise, truth, readings[k])
+    log = write_log(tmp_path, recording.t, readings, recording)
     with pytest.raises(SystemExit) as stop:
-        main(["identify", str(tmp_path / "log.csv"), "--out", str(tmp_path / "load"), "--quiet"])
+        main(["identify", str(log), "--out", str(tmp_path / "load"), "--quiet"])
     assert stop.value.code == 0
-    found = json.loads((tmp_path / "load" / "identification.json").read_text())
-    np.testing.assert_allclose(found["phi"], phi, atol=5 * max(summary["predicted_std"].values()))
-    assert found["phi"][0] == pytest.approx(0.8, rel=0.01)
-    assert found["phi"][4] == pytest.approx(phi[4], rel=0.1)
+    found = Identification.load(tmp_path / "load" / "identification.json")
+    assert found.identifiable.all()
+    lower, upper = intervals(found, 0.999)
+    assert np.all((lower[6:] < recording.phi) & (recording.phi < upper[6:]))
+    mass, com, inertia = mass_com_inertia(recording.phi)
+    assert found.mass == pytest.approx(mass, rel=2e-3)
+    np.testing.assert_allclose(found.com, com, atol=3e-4)
+    np.testing.assert_allclose(found.inertia_com, inertia, atol=0.05 * np.trace(inertia) / 2)
