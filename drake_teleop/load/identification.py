@@ -35,6 +35,10 @@ of n samples whose sums were kept (batch means):
   miss what correlates across their borders; for an AR(1) process that is T / (2 n) of v_c, which is
   put back. If no length with `_FEWEST_DEGREES` degrees of freedom is long enough (drift), the
   largest v_c of all lengths is taken: it is then still a lower bound.
+- Noise may also be weaker at low frequencies than from sample to sample, as that of accelerations
+  that were fused with encoders. Short blocks do not see that. The longest blocks are therefore
+  looked at that leave `_MANY_DEGREES` and still see the motion (`_SEEN` of what the fit took away):
+  if their v_c is smaller by three of its standard deviations, it is the one.
 - v_c has about B - w_c tr(H_c G^+) degrees of freedom, few if the noise is slow. The variance of a
   parameter is a weighted sum of the six v_c; Satterthwaite's formula gives its degrees of freedom
   nu, and an interval is +- t_nu times the standard deviation (`uncertainty.intervals`).
@@ -83,6 +87,8 @@ _RANK, _NULL_COMPONENT, _NO_EXCITATION = 1e-12, 1e-6, 1e-9
 _WEAK, _SMALLEST_SIZE, _GRAVITY = 0.5, 0.03, 9.81
 # Blocks kept, least length of a block in memories of the noise, degrees of freedom to be trusted.
 _MOST_BLOCKS, _WINDOW, _FEWEST_DEGREES = 1024, 4.0, 8.0
+# For noise that is weaker at low frequencies: degrees of freedom, share of the motion that is seen.
+_MANY_DEGREES, _SEEN = 20.0, 0.9
 _FEWEST_SAMPLES = 3
 # Residual over wrench that rounding of the sums may leave.
 _ROUNDING = 1e-6
@@ -425,6 +431,8 @@ class NormalEquations:
         # Rounding in the sums is no noise of the wrench.
         wrench = self._moments[:, _WRENCH, _WRENCH]
         found, slow = np.zeros(6, dtype=bool), np.zeros(6, dtype=bool)
+        absorbed_by_samples = self._absorbed(grams, inverse)
+        of_longest, degrees_of_longest = variances, degrees
         blocks, length = self._blocks[: self._state[0] + 1], float(self._state[1])
         # An unfinished last block would count as much as a full one.
         blocks = blocks[: len(blocks) - (blocks[-1, 0, 0] < length)]
@@ -446,11 +454,23 @@ class NormalEquations:
             variances = np.where(take, corrected, variances)
             degrees = np.where(take, trusted, degrees)
             found |= enough
+            sees = self._absorbed(between, inverse) >= _SEEN * absorbed_by_samples
+            longest = sees & (trusted >= _MANY_DEGREES)
+            of_longest = np.where(longest, now, of_longest)
+            degrees_of_longest = np.where(longest, trusted, degrees_of_longest)
             significant = memory > 1.0 + 3.0 * np.sqrt(2.0 / np.maximum(trusted, 1.0))
             slow = np.where(usable, significant & ~found, slow & ~found)
             even = len(blocks) // 2 * 2
             blocks, length = blocks[0:even:2] + blocks[1:even:2], 2.0 * length
+        # Logarithms of estimated variances scatter by sqrt(2 / degrees), and about normally.
+        weaker = found & (of_longest * np.exp(3.0 * np.sqrt(2.0 / degrees_of_longest)) < variances)
+        variances = np.where(weaker, of_longest, variances)
+        degrees = np.where(weaker, degrees_of_longest, degrees)
         return variances, degrees, slow & (n * of_samples > _ROUNDING**2 * wrench)
+
+    def _absorbed(self, between: Array, inverse: Array) -> Array:
+        """(6,) degrees of freedom that the fit takes from the residuals between blocks."""
+        return np.asarray(self._weights * np.einsum("cij,ji->c", between, inverse))
 
     def _unbiased(
         self, power: Array, count: float, between: Array, grams: Array, inverse: Array
@@ -462,7 +482,7 @@ class NormalEquations:
             between: (6, 16, 16) H_c; grams: (6, 16, 16) G_c; inverse: (16, 16) G^+.
         """
         w = self._weights
-        absorbed = w * np.einsum("cij,ji->c", between, inverse)
+        absorbed = self._absorbed(between, inverse)
         spread = inverse @ grams @ inverse
         shares = np.einsum("cij,kji->ck", between, spread) * w**2
         degrees = np.maximum(count - absorbed, 0.0)

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from load_cases import OFFSETS, TOOL, rich_motion, rotations
+from scipy.signal import butter, lfilter
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import (
@@ -112,6 +113,23 @@ def test_long_run_variance_of_known_noise():
     errors = (variances / NOISE**2 / 19.0 - 1.0) / np.sqrt(2.0 / degrees)
     assert np.abs(errors).max() < 4.0
     assert (degrees > 100.0).all()
+
+
+def test_intervals_are_not_too_wide_if_noise_is_weaker_at_low_frequencies():
+    """White noise without what is below 20 Hz, as of fused accelerations, and a third of white."""
+    motion = study.motion(1e3, 6.0)
+    ideal, n = OFFSETS + non_contact_wrench(*motion, TOOL), len(motion[0])
+    filter_ = butter(1, 20.0, "high", fs=1e3)
+    errors = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        fast, white = lfilter(*filter_, rng.normal(size=(n, 6)), axis=0), rng.normal(size=(n, 6))
+        load = identify(ideal + NOISE * (fast + white / 3), *motion, noise=NOISE)
+        error = np.concatenate([load.offsets, load.phi]) - TRUTH
+        errors.append(error / load.standard_deviations)
+    # 0.32 with the variance of a sample, 10 / 9 instead of 1 / 9; blocks of 0.1 s still see as much
+    # of the fast noise again.
+    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.1
 
 
 def test_few_seconds_of_slow_noise_leave_few_degrees_of_freedom():
