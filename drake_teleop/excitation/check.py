@@ -66,6 +66,25 @@ def check(
     t = np.linspace(0, trajectory.period, round(trajectory.period * RATE) + 1)
     before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP, 0.0, _STEP))
     qd, qdd = (after - before) / (2 * _STEP), (after - 2 * q + before) / _STEP**2
+    return check_motion(robot, t, q, qd, qdd, progress)
+
+
+def check_motion(
+    robot: Robot,
+    t: Array,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+    progress: Callable[[float], None] = lambda done: None,
+) -> list[Use]:
+    """Use of every limit by a motion that was sampled, or executed, the largest first.
+
+    Args:
+        robot: the arm in its surroundings.
+        t: (T,) [s].
+        q, qd, qdd: (T, n) [rad, s].
+        progress: called with the share done.
+    """
     names, limits = robot.arm.joint_names, robot.limits
     motion = _bodies(robot, q, qd, qdd, progress)
     uses = [
@@ -77,7 +96,7 @@ def check(
         _use("workspace", motion.workspace, t, ("x", "y", "z") * len(limits.points_S)),
         _use("clearance", motion.clearance[:, np.newaxis], t, ("",)),
     ]
-    nearest = motion.nearest[round(uses[-1].time * RATE)]
+    nearest = motion.nearest[int(np.argmax(motion.clearance))]
     uses[-1] = Use("clearance", uses[-1].share, uses[-1].time, nearest)
     if np.isinf(limits.box_half).all():
         del uses[LIMITS.index("workspace")]
