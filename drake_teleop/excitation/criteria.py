@@ -13,7 +13,8 @@ D16         geometric mean of the sixteen semi-axes of the predicted standard el
             proportions; 0.1 N and 0.005 N m would do for the offsets.
 =========== ====================================================================================
 
-A16 and D16 are of one period at 1 kHz in white noise.
+A16 and D16 are of one period at 1 kHz in white noise of the wrench, the motion known exactly; what
+a sensor lets one expect says `prediction.py`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ Array = NDArray[np.float64]
 
 CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
 
-#: Samples a second for which A16, D16 and standard deviations are predicted.
+#: Samples a second for which A16 and D16 are stated.
 RATE = 1000.0
 
 # What would do: of the mass, of the centre of mass [m], of the mean moment of inertia; of the
@@ -151,28 +152,6 @@ class Criterion:
         top, of_top = _smooth_max(logs, sharpness)
         bottom, of_bottom = _smooth_max(-logs, sharpness)
         return top + bottom, 0.5 * (of_top - of_bottom) / eigenvalues
-
-
-def predicted_deviations(
-    s: Array, omega: Array, alpha: Array, noise: tuple[float, float], duration: float
-) -> Array:
-    """(16,) standard deviations of offsets and phi after one period at 1 kHz in white noise.
-
-    With the motion known exactly. Errors of gain, delay and motion come on top, and are usually
-    larger for mass and centre of mass.
-
-    Args:
-        s, omega, alpha: (T, 3) samples of the period.
-        noise: (sigma_f [N], sigma_tau [N m]).
-        duration: of the period [s].
-    """
-    rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
-    rows = (rows / np.repeat(noise, 3)[:, np.newaxis]).reshape(-1, 16)
-    # Balanced before it is inverted: the columns have different units.
-    size = np.sqrt(np.mean(rows**2, axis=0))
-    rows /= size
-    covariance = np.linalg.inv(rows.T @ rows / len(s))
-    return np.sqrt(np.diag(covariance) / (RATE * duration)) / size
 
 
 @njit(cache=True)

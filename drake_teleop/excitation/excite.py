@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.check import RATE, Use, check
-from drake_teleop.excitation.criteria import CRITERIA, Criterion, predicted_deviations
+from drake_teleop.excitation.criteria import CRITERIA, Criterion
 from drake_teleop.excitation.design import Iterate, design
 from drake_teleop.excitation.limits import (
     LIMITS,
@@ -20,6 +20,7 @@ from drake_teleop.excitation.limits import (
     motions_of,
     sensor_vectors,
 )
+from drake_teleop.excitation.prediction import predicted_deviations
 from drake_teleop.excitation.problem import Task
 from drake_teleop.excitation.robot import Robot
 from drake_teleop.load.excitation import FourierTrajectory
@@ -39,8 +40,8 @@ class Excitation:
         trajectory: at rest at both ends.
         criterion: name of what was minimised.
         values: every criterion, by name, of one period at 1 kHz.
-        deviations: (16,) predicted standard deviations of offsets and phi, see
-            `predicted_deviations`.
+        deviations: (16,) predicted standard deviations of offsets and phi of the heaviest load,
+            see `predicted_deviations`.
         uses: of every limit, as checked, the largest first.
         history: (K, 2) thread CPU time [s] and best value of the criterion until then.
         starts: how many candidates led to something feasible.
@@ -153,7 +154,7 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
 
 def _deviations(robot: Robot, trajectory: FourierTrajectory) -> Array:
     motion = sensor_motion(robot, trajectory)
-    return predicted_deviations(*motion, robot.scales.noise, trajectory.period)
+    return predicted_deviations(*motion, 1 / RATE, robot.noise, robot.limits.phi)
 
 
 def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:

@@ -41,9 +41,11 @@ from drake_teleop.excitation.capsules import Capsule, bounding_capsule
 from drake_teleop.excitation.criteria import Scales, characteristic_length
 from drake_teleop.excitation.limits import Limits, capsule_distances, empty_motions, motions_of
 from drake_teleop.excitation.models import ParseModel
+from drake_teleop.excitation.prediction import SensorNoise, sensor_noise
 from drake_teleop.load.inertia import inertia_about_origin, phi_from_mass_com_inertia
 from drake_teleop.scenario import Scenario
 from drake_teleop.slave.arm import ArmModel, ArmModelFromPlant
+from drake_teleop.slave.motion_estimation import MotionEstimationConfig
 from drake_teleop.slave.plant import ParseSlave, finalize, home_position
 from drake_teleop.slave.sensor_chain import WristSensorConfig
 
@@ -99,6 +101,7 @@ class Robot:
         arm: the same as arrays.
         limits: what an excitation must respect.
         scales: what criteria divide by; with the heaviest load.
+        noise: of the sensor, for predictions.
         home: (n,) a posture to begin from [rad].
         assumptions: what was not in the model.
         folders: with converted meshes, which live as long as this.
@@ -112,6 +115,7 @@ class Robot:
     arm: ArmModel
     limits: Limits
     scales: Scales
+    noise: SensorNoise
     home: Array
     assumptions: tuple[str, ...]
     folders: tuple[TemporaryDirectory[str], ...] = ()
@@ -136,6 +140,8 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     return scene.robot(
         "the station's slave",
         scenario.wrist_sensor,
+        scenario.motion_estimation,
+        scenario.rates.sensor_hz,
         home=home_position(scene.arm, scenario.slave.position),
         points_S=np.array(_POINTS_S),
         box=((upper + lower) / 2, (upper - lower) / 2),
@@ -148,6 +154,8 @@ def RobotFromModel(
     sensor_frame: str,
     sensor: WristSensorConfig,
     *,
+    estimation: MotionEstimationConfig | None = None,
+    sensor_hz: float = 8000.0,
     package_paths: tuple[Path, ...] = (),
     acceleration: tuple[float, ...] = (),
     payload: float | None = None,
@@ -160,6 +168,8 @@ def RobotFromModel(
         path: of the model.
         sensor_frame: name of the frame or link at which the sensor measures.
         sensor: what it can measure.
+        estimation: from what the motion will be known; by default as in the station.
+        sensor_hz: rate of the sensor [Hz].
         package_paths: folders in which `package://` addresses are looked up.
         acceleration: limits [rad/s^2], one for all joints or one for each, if the model has none.
         payload: mass of the heaviest load [kg], if it is not in the model.
@@ -201,6 +211,8 @@ def RobotFromModel(
     return scene.robot(
         path.name,
         sensor,
+        estimation or MotionEstimationConfig(),
+        sensor_hz,
         home=(scene.arm.lower + scene.arm.upper) / 2,
         points_S=np.zeros((1, 3)),
         box=(np.zeros(3), np.full(3, np.inf)),
@@ -244,6 +256,8 @@ class _Scene:
         self,
         name: str,
         sensor: WristSensorConfig,
+        estimation: MotionEstimationConfig,
+        sensor_hz: float,
         *,
         home: Array,
         points_S: Array,
@@ -284,7 +298,7 @@ class _Scene:
             distances=distances,
             clearance=CLEARANCE,
         )
-        noise = sensor.noise_std()
+        std = sensor.wrench_std()
         return Robot(
             name=name,
             diagram=self.diagram,
@@ -293,7 +307,8 @@ class _Scene:
             sensor_frame=self.sensor_frame,
             arm=arm,
             limits=limits,
-            scales=Scales((float(noise[0]), float(noise[3])), characteristic_length(phi), phi),
+            scales=Scales((float(std[0]), float(std[3])), characteristic_length(phi), phi),
+            noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
             home=home,
             assumptions=tuple(assumptions),
             folders=tuple(folders),

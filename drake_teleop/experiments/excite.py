@@ -11,7 +11,8 @@ summary.json        the figures
 
 `summary.json` holds the criterion that was minimised and the value of every criterion (what each
 is: `excitation/criteria.py`), the use of every limit as checked by Drake at 1 kHz, the predicted
-standard deviation of each parameter after one period in white noise, and what was assumed.
+standard deviation of each parameter of the heaviest load after one period, from the noise of the
+sensor (`excitation/prediction.py`), and what was assumed.
 Nothing is written if no trajectory respects all limits.
 """
 
@@ -100,6 +101,8 @@ def excite_command(
                 model,
                 sensor_frame,
                 setup.wrist_sensor,
+                estimation=setup.motion_estimation,
+                sensor_hz=setup.rates.sensor_hz,
                 package_paths=package_paths,
                 acceleration=acceleration,
                 payload=payload,

@@ -9,22 +9,28 @@ import numpy as np
 import polars as pl
 import pytest
 from arms import execute, write_sdf, write_urdf
+from numba import njit
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
 from drake_teleop.cli import main
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.check import check, check_motion
-from drake_teleop.excitation.criteria import predicted_deviations
 from drake_teleop.excitation.excite import excite, sensor_motion
-from drake_teleop.excitation.limits import LIMITS
+from drake_teleop.excitation.limits import LIMITS, empty_motions, motions_of, sensor_vectors
+from drake_teleop.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
 from drake_teleop.experiments.identification import identify_load
 from drake_teleop.load.excitation import FourierTrajectory
-from drake_teleop.load.identification import Identification
+from drake_teleop.load.identification import Identification, identify
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.load.regressor import regressor
+from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.uncertainty import intervals
 from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.slave.motion_estimation import (
+    MotionEstimationConfig,
+    estimate_into,
+    motion_estimator,
+)
 from drake_teleop.slave.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
@@ -100,18 +106,59 @@ def test_the_executed_motion_keeps_the_limits(slave):
     assert not found.result["saturated"].any()
 
 
-def test_predicted_and_observed_scatter_agree(slave, designed):
-    """100 records of white noise at 1 kHz, weighted least squares with offsets."""
-    s, omega, alpha = sensor_motion(slave, designed.trajectory)
-    V = regressor(s, omega, alpha)
-    rows = np.concatenate([np.tile(np.eye(6), (len(V), 1, 1)), V], axis=2)
-    rows = (rows / np.repeat(slave.scales.noise, 3)[:, None]).reshape(-1, 16)
-    size = np.linalg.norm(rows, axis=0)
-    draws = np.random.default_rng(0).standard_normal((len(rows), 400))
-    observed = (np.linalg.pinv(rows / size) @ draws).std(axis=1) / size
-    predicted = predicted_deviations(s, omega, alpha, slave.scales.noise, 6.0)
-    np.testing.assert_allclose(observed, predicted, rtol=0.2)
+@njit
+def record(constants, memory, estimator, remembered, table, truth, noise, samples):
+    """The sensor's chain and the motion estimation, over a whole record."""
+    reading = np.empty(truth.shape[1] - 2)
+    for k in range(len(truth)):
+        read_into(constants, memory, noise[k // NOISE_BLOCK], truth[k], reading)
+        estimate_into(estimator, remembered, table, reading, samples[k])
+
+
+def test_predicted_and_observed_scatter_agree(slave, short):
+    """200 records of one motion: noise, walks, quantisation, filter, fused accelerations.
+
+    What the sensor is given is the same each time, so it is calculated once.
+    """
+    sensor, motion, period = WristSensorConfig(), MotionEstimationConfig(), 1 / 2000
+    table, phi = slave.arm.table, slave.limits.phi / 1.3
+    t = np.arange(0.0, 2.4, period)
+    joints = short.trajectory.evaluate(t)
+    motions = empty_motions(*joints[0].shape)
+    motions_of(table, *joints, motions)
+    vectors = np.empty((3, len(t), 3))
+    sensor_vectors(motions, vectors)
+    truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
+    constants, memory = sensor_chain(sensor, 6, period)
+    estimator, remembered = motion_estimator(motion, sensor, 6, period)
+    samples, found = np.empty((len(t), 22)), []
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        noise = rng.standard_normal((len(t) // NOISE_BLOCK + 1, NOISE_SIZE))
+        record(constants, memory.copy(), estimator, remembered.copy(), table, truth, noise, samples)
+        wrench, s, omega, alpha = (samples[::2, part] for part in np.split(np.r_[:15], [6, 9, 12]))
+        load = identify(wrench, s, omega, alpha, noise=sensor.wrench_std())
+        found.append([*load.offsets, *load.phi])
+    predicted = predicted_deviations(
+        *vectors[:, ::2], 2 * period, sensor_noise(sensor, motion, 6, period), phi
+    )
+    np.testing.assert_allclose(np.std(found, axis=0, ddof=1), predicted, rtol=0.2)
+
+
+def test_what_is_predicted_is_of_the_heaviest_load_and_of_the_sensor(slave, designed):
+    motion = sensor_motion(slave, designed.trajectory)
+    predicted = predicted_deviations(*motion, 1e-3, slave.noise, slave.limits.phi)
     np.testing.assert_allclose(designed.deviations, predicted, rtol=1e-12)
+    # An accelerometer that nothing corrects makes it worse, the encoders alone better.
+    noises = {
+        source: sensor_noise(WristSensorConfig(), MotionEstimationConfig(source), 6, 1 / 8000)
+        for source in ("encoders", "accelerometer")
+    }
+    encoders, accelerometer = (
+        predicted_deviations(*motion, 1e-3, noise, slave.limits.phi) for noise in noises.values()
+    )
+    assert np.all(encoders < predicted)
+    assert np.all(predicted < accelerometer)
 
 
 def test_the_check_finds_every_kind_of_violation(slave, short):

@@ -12,9 +12,9 @@ from drake_teleop.excitation.criteria import (
     Criterion,
     Scales,
     characteristic_length,
-    predicted_deviations,
 )
 from drake_teleop.excitation.limits import LIMITS, Limits, capsule_distances, empty_motions
+from drake_teleop.excitation.prediction import SensorNoise, predicted_deviations
 from drake_teleop.excitation.problem import Problem, Task
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import regressor
@@ -75,7 +75,9 @@ def test_predicted_deviations_are_those_of_white_noise():
     rows = np.concatenate([np.tile(np.eye(6), (200, 1, 1)), regressor(*samples)], axis=2)
     whitened = (rows / sigma[:, None]).reshape(-1, 16)
     errors = np.linalg.pinv(whitened) @ np.random.default_rng(3).standard_normal((1200, 400))
-    predicted = predicted_deviations(*samples, SCALES.noise, duration=0.2)
+    white = np.concatenate([sigma**2 * 1e-3, np.zeros(6)])
+    noise = SensorNoise(sigma, white, np.zeros(12), np.zeros(3), None)
+    predicted = predicted_deviations(*samples, 1e-3, noise, PHI)
     np.testing.assert_allclose(errors.std(axis=1), predicted, rtol=0.12)
 
     inertia = 0.1 * (PHI[4] + PHI[7] + PHI[9]) / 3
