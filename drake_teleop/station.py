@@ -31,6 +31,7 @@ from drake_teleop.slave.joint_control import JointControl
 from drake_teleop.slave.joint_trajectory import JointTrajectory
 from drake_teleop.slave.load_estimator import LoadEstimator
 from drake_teleop.slave.monitor import SlaveMonitor
+from drake_teleop.slave.motion_estimation import estimated_motion_std
 from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, SlavePlant
 from drake_teleop.slave.wrist_sensor import AddWristSensor, sample_parts
 
@@ -278,7 +279,9 @@ def AddSlave(
         "load_estimator": LoadEstimator(
             scenario.load_estimator,
             sensor.wrench_std(),
-            sensor.motion_std(),
+            estimated_motion_std(
+                scenario.motion_estimation, sensor, slave.arm.num_joints, 1 / rates.sensor_hz
+            ),
             1 / rates.estimator_hz,
             _SAMPLE_SIZE,
             np.zeros(16) if load_estimate is None else load_estimate,

@@ -19,12 +19,15 @@ from drake_teleop.excitation.check import check
 from drake_teleop.excitation.excite import criteria_of, excite
 from drake_teleop.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.experiments.progress import Progress, Stage, silent
+from drake_teleop.load.batch import identify_batch
 from drake_teleop.load.excitation import FourierTrajectory
-from drake_teleop.load.identification import Identification, identify
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.moments import Noise
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import ArmModel
+from drake_teleop.slave.motion_estimation import estimated_motion_std
 from drake_teleop.slave.plant import AddSlavePlant
 from drake_teleop.station import MakeIdentificationStation
 
@@ -32,6 +35,7 @@ Array = NDArray[np.float64]
 
 # The trajectory belongs to the arm, not to the run's seed.
 _DESIGN_SEED = 0
+_RECURSIVE = {"rls": "recursive least squares", "rtls": "recursive total least squares"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +46,10 @@ class LoadIdentification:
         trajectory: the joint trajectory that was run.
         result: the recorded signals.
         estimate: (16,) Eq. (7), [offsets; phi] of the recursive estimator in the loop at the end.
-        batch: the same record by batch least squares.
+        batch: the same record by batch total least squares, see `batch_identification`.
         kappa_w10: condition number of the motion, see `excitation/criteria.py`.
         real_time_factor: of the simulation.
+        method: of the recursive estimator, one of `load.identification.METHODS`.
     """
 
     trajectory: FourierTrajectory
@@ -53,18 +58,17 @@ class LoadIdentification:
     batch: Identification
     kappa_w10: float
     real_time_factor: float
+    method: str
 
     @property
     def identification(self) -> Identification:
         """The recursive estimate, with the batch's uncertainties and residuals.
 
-        Both estimators minimise the same sum; the batch judges its uncertainty from the residuals.
+        The batch judges its uncertainty from the residuals, the recursive estimator from what the
+        noise is said to be.
         """
         return dataclasses.replace(
-            self.batch,
-            offsets=self.estimate[:6],
-            phi=self.estimate[6:],
-            method="recursive least squares",
+            self.batch, offsets=self.estimate[:6], phi=self.estimate[6:], method=self.method
         )
 
     @property
@@ -88,6 +92,7 @@ def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
         slave=scenario.slave,
         joint_control=scenario.joint_control,
         wrist_sensor=scenario.wrist_sensor,
+        motion_estimation=scenario.motion_estimation,
     )
 
 
@@ -118,13 +123,40 @@ def identify_load(
     station = MakeIdentificationStation(scenario, trajectory)
     result, factor = timed(station, scenario.simulation, stage("Identify the load"), log)
     usable = result["saturated"][:, 0] == 0
-    batch = identify(
-        *(signal[usable] for signal in sensor_samples(result)),
-        noise=scenario.wrist_sensor.noise_std()[:6],
-    )
+    wrench, s, omega, alpha = (signal[usable] for signal in sensor_samples(result))
+    batch = batch_identification(scenario, wrench, s, omega, alpha, scenario.rates.log_hz)
     kappa = criteria_of(robot, trajectory)["kappa_w10"]
     estimate = result["load_estimate"][-1]
-    return LoadIdentification(trajectory, result, estimate, batch, kappa, factor)
+    method = _RECURSIVE[scenario.load_estimator.method]
+    return LoadIdentification(trajectory, result, estimate, batch, kappa, factor, method)
+
+
+def batch_identification(
+    scenario: Scenario, wrench: Array, s: Array, omega: Array, alpha: Array, rate_hz: float
+) -> Identification:
+    """The load and the offsets by total least squares, with the noise of the scenario's sensor.
+
+    White noise of wrench and motion as its data sheet has it, and its offsets' random walk: the
+    offsets are those at the end of the record.
+
+    Args:
+        scenario: with the sensor and the estimation of its motion.
+        wrench, s, omega, alpha: (N, 6), (N, 3) samples, as for `identify`.
+        rate_hz: of these samples.
+    """
+    sensor, rates = scenario.wrist_sensor, scenario.rates
+    motion = estimated_motion_std(
+        scenario.motion_estimation, sensor, slave_arm(scenario).num_joints, 1 / rates.sensor_hz
+    )
+    noise = Noise(
+        wrench=sensor.wrench_std(),
+        s=motion[:3],
+        omega=motion[3:6],
+        alpha=motion[6:],
+        walk=sensor.random_walk()[:6] / np.sqrt(rate_hz),
+    )
+    found = identify_batch(wrench, s, omega, alpha, method="total", noise=noise)
+    return found.identification
 
 
 def _designed(robot: Robot, period: float, stage: Stage) -> FourierTrajectory:

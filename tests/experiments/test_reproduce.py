@@ -103,7 +103,7 @@ def test_everything_is_written(run):
     assert (out / "replay.html").stat().st_size > 1e6
     load = Identification.load(out / "identification.json")
     assert load.mass == summary["identification"]["mass_kg"]
-    assert load.method == "recursive least squares"
+    assert load.method == "recursive total least squares"
 
 
 def test_the_bottom_plots_are_what_the_hand_gets(run):

@@ -61,7 +61,7 @@ def test_the_contact_is_run_with_an_identified_load(contact):
     load = Identification.load(out / "identification.json")
     assert load.mass == pytest.approx(3.13, rel=2e-3)
     assert load.identifiable.all()
-    assert load.method == "recursive least squares"
+    assert load.method == "recursive total least squares"
 
 
 def test_everything_is_written(contact):
