@@ -393,6 +393,10 @@ class _Period:
         self._joint_step = min(largest, _ACCELERATION / gain)
         self._groups = self._state_groups()
         self._steps = np.concatenate([group.steps for group in self._groups])
+        # What the sensor remembers follows from the rest; it is of order 1.
+        sensed = [group.system == "wrist_sensor" for group in self._groups]
+        counts = [len(group.steps) for group in self._groups]
+        self._sizes = np.where(np.repeat(sensed, counts), _OTHER, self._steps)
         self.states = tuple(
             f"{g.system} {'' if g.group is None else g.group}[{k}]"
             for g in self._groups
@@ -533,7 +537,7 @@ class _Period:
             free = slave & _acting(A, C)
             self._set(x)
             moved = self._run() - x
-            if (np.abs(moved) < _AT_REST * self._steps)[free].all():
+            if (np.abs(moved) < _AT_REST * self._sizes)[free].all():
                 return x, A, C
             moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
             x[slave] += moved[slave]

@@ -13,6 +13,9 @@ somewhere in the sensor's housing, which sees s and alpha but neither omega nor 
   (its drifting error, gain, misalignment): fast motion is the accelerometer's, slow motion the
   encoders'. A Kalman filter for each axis in its steady state; the gains are a closed form.
 
+The paper's sensor measures accelerations along with the wrench, so `accelerometer` is the default;
+`fused` is for one that is not calibrated well, or late.
+
 The delays of all paths are known. The encoders' angles pass the low-pass that the wrench has
 passed, and the faster paths wait for the slowest, so that what leaves in one sample belongs to one
 instant.
@@ -47,12 +50,12 @@ _SECTIONS = 4
 _ANGULAR_GAINS = _FILTERS + 5 * _SECTIONS
 _LINEAR_GAINS = _ANGULAR_GAINS + 3
 # Memory: samples taken, samples for which the flag stays; what `_track` keeps of angle and
-# displacement, each with the error of the accelerometer and the last omega in S or p_WS; scratch
+# displacement, each with the error of the accelerometer and the last R_WS or p_WS; scratch
 # for kinematics; then by joint: velocity, acceleration, the last three angles, the low-passes;
 # last the delay line.
 _HELD = 1
 _ANGULAR = 2
-_TRACK = 15
+_TRACK = 24
 _LINEAR = _ANGULAR + _TRACK
 _MOTION = _LINEAR + _TRACK
 _JOINTS = _MOTION + MOTION_SIZE
@@ -65,7 +68,9 @@ _GRAVITY = 22
 class MotionEstimationConfig:
     """From what the motion of the sensor is estimated."""
 
-    source: str = choice("fused", _SOURCES, "what angular velocity and accelerations come from")
+    source: str = choice(
+        "accelerometer", _SOURCES, "what angular velocity and accelerations come from"
+    )
     encoder_bandwidth_hz: float = quantity(
         50.0, "Hz", 1.0, 1e4, "low-pass of the angles, 4th-order Butterworth (source `encoders`)"
     )
@@ -412,32 +417,48 @@ def _accelerate(constants, memory, gravity, motion, sample):
 
     angular, linear = memory[_ANGULAR:_LINEAR], memory[_LINEAR:_MOTION]
     if fused:
+        if starts:
+            angular[3:6], angular[15:] = omega, R
+        _turned(angular[15:], R, motion)
+        angular[15:] = R
         for i in range(3):
-            if starts:
-                angular[3 + i] = angular[12 + i] = omega[i]
-            motion[i] = 0.5 * period * (omega[i] + angular[12 + i])
-            angular[12 + i] = omega[i]
-        _track(constants[_ANGULAR_GAINS:], period, motion, angular)
+            alpha[i] -= angular[12 + i]
+        _track(constants[_ANGULAR_GAINS:], period, motion, alpha, angular)
         for i in range(3):
-            angular[9 + i] -= motion[i]
-            alpha[i] -= angular[9 + i]
+            angular[12 + i] -= motion[i]
+            alpha[i] += motion[i]
             angular[6 + i] = alpha[i]
             omega[i] = angular[3 + i] + 0.5 * period * alpha[i]
 
     _move(constants[_PLACE:], omega, alpha, s)
     if fused:
+        if starts:
+            linear[15:18] = motion[9:12]
         for i in range(3):
-            if starts:
-                linear[12 + i] = motion[9 + i]
-            motion[i] = motion[9 + i] - linear[12 + i]
-            linear[12 + i] = motion[9 + i]
-        _track(constants[_LINEAR_GAINS:], period, motion, linear)
+            motion[i] = motion[9 + i] - linear[15 + i]
+            linear[15 + i] = motion[9 + i]
+            s[i] -= linear[12 + i]
+        a_W = motion[3:6]  # what the encoders said of omega is used up
+        _turn(R, s, a_W)
         for i in range(3):
-            linear[9 + i] -= R[i] * motion[0] + R[3 + i] * motion[1] + R[6 + i] * motion[2]
-            s[i] -= linear[9 + i]
-        _turn(R, s, linear[6:9])
+            a_W[i] += gravity[i]
+        _track(constants[_LINEAR_GAINS:], period, motion, a_W, linear)
         for i in range(3):
-            linear[6 + i] += gravity[i]
+            correction = R[i] * motion[0] + R[3 + i] * motion[1] + R[6 + i] * motion[2]
+            linear[12 + i] -= correction
+            s[i] += correction
+            linear[6 + i] = a_W[i] + motion[i]
+
+
+@njit(cache=True)
+def _turned(before, R, angle):
+    """The rotation vector from one R_WS (by rows) to the next, in S, as long as it is small."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        value = 0.0
+        for row in range(0, 9, 3):
+            value += before[row + k] * R[row + j] - before[row + j] * R[row + k]
+        angle[i] = 0.5 * value
 
 
 @njit(cache=True)
@@ -460,20 +481,26 @@ def _move(r, omega, alpha, s):
 
 
 @njit(cache=True)
-def _track(gains, period, moved, kept):
+def _track(gains, period, moved, acceleration, kept):
     """One step of the three filters of `steady_state`.
+
+    Between two samples the rate is that of their middle; the acceleration's mean around a sample is
+    Numerov's, so that the two integrations are exact to the fourth order.
 
     Args:
         gains: of `steady_state`.
         period: [s].
         moved: (3,) how far the encoders say that it went since the last sample; becomes the
             correction of the acceleration.
-        kept: by how much the estimated position is behind (3), the rate half a sample after the
-            last one (3), the last acceleration (3); the first two are updated.
+        acceleration: (3,) now.
+        kept: by how much the estimated position is behind (3), the rate half a sample ago (3), the
+            last acceleration and the one before (6); all are updated but the last acceleration.
     """
     for i in range(3):
-        rate = kept[3 + i] + period * kept[6 + i]
+        mean = (acceleration[i] + 10.0 * kept[6 + i] + kept[9 + i]) / 12.0
+        rate = kept[3 + i] + period * mean
         innovation = kept[i] + moved[i] - period * rate
         kept[i] = innovation - gains[0] * innovation
         kept[3 + i] = rate + gains[1] * innovation
+        kept[9 + i] = kept[6 + i]
         moved[i] = gains[2] * innovation
