@@ -109,6 +109,11 @@ _TELEOP_SIGNALS = {
 _CHANNEL_SIGNALS = {"pose_received": "channel.pose_received", "ports": "channel.ports"}
 
 
+_TOGETHER = dict.fromkeys(
+    ("force_scaling.scaled_wrench_S", "force_scaling.contact_wrench_S"),
+    "force_scaling.scaled_and_contact_S",
+)
+
 #: How often the clutch and the monitor are looked at [s]; an event at 2 kHz would cost time.
 _HUMAN_PERIOD = 0.01
 #: Drake numbers these ports.
@@ -329,9 +334,9 @@ def _finish(
     """Exports the signals, records them in that order, and builds."""
     for signal, port in signals.items():
         builder.ExportOutput(_output(builder, port), signal)
-    # The parts of a sample lie side by side in it: one port instead of six.
+    # What lies side by side in one port is read at once: a port in Python takes time.
     recorded = dict.fromkeys(
-        "wrist_sample.sample" if port.startswith("sample_parts.") else port
+        "wrist_sample.sample" if port.startswith("sample_parts.") else _TOGETHER.get(port, port)
         for port in signals.values()
     )
     ports = [_output(builder, port) for port in recorded]

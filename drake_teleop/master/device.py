@@ -352,6 +352,14 @@ def twist_into(q, v, J, twist):
             twist[i] += J[i, k] * v[k]
 
 
+@njit(cache=True)
+def _advance(state, pose, twist, hand_wrench, motor_torque, parameters, period, work, stages):
+    """`step`, and the pose and twist that follow: one call of compiled code instead of three."""
+    step(state, hand_wrench, motor_torque, parameters, period, work, stages)
+    pose_into(state[:6], pose)
+    twist_into(state[:6], state[6:], work[0], twist)
+
+
 def closed_form_mass_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """The three main axes' mass matrix (3, 3) [kg m^2] without wrist, motors or hand."""
     M = np.empty((6, 6))
@@ -538,9 +546,10 @@ class MasterDevice(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state, pose, twist = (discrete_state.get_mutable_value(i) for i in range(3))
-        step(
-            state,
+        _advance(
+            discrete_state.get_mutable_value(0),
+            discrete_state.get_mutable_value(1),
+            discrete_state.get_mutable_value(2),
             self._hand_wrench.Eval(context),
             self._motor_torque.Eval(context),
             self._parameters,
@@ -548,5 +557,3 @@ class MasterDevice(LeafSystem):
             self._work,
             self._stages,
         )
-        pose_into(state[:6], pose)
-        twist_into(state[:6], state[6:], self._work[0], twist)

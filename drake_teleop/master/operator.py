@@ -206,6 +206,13 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     _limit(wrench[3:], _TORQUE_LIMIT)
 
 
+@njit(cache=True)
+def _wrench_now(packed, start, time, impedance, wanted, wanted_twist, pose, twist, wrench):
+    """`intent_into` and `hand_wrench_into` in one call of compiled code."""
+    intent_into(packed, start, time, wanted, wanted_twist)
+    hand_wrench_into(impedance, wanted, wanted_twist, pose, twist, wrench)
+
+
 class Operator(LeafSystem):
     """Holds the stylus and moves it towards the intended pose; feels what pushes back.
 
@@ -239,9 +246,10 @@ class Operator(LeafSystem):
         self.DeclareVectorOutputPort("intent", 7, self._calc_intent, {self.time_ticket()})
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        time = context.get_time()
-        intent_into(self._intent, self._start, time, self._wanted, self._wanted_twist)
-        hand_wrench_into(
+        _wrench_now(
+            self._intent,
+            self._start,
+            context.get_time(),
             self._impedance,
             self._wanted,
             self._wanted_twist,

@@ -90,6 +90,13 @@ def _scaled_now_into(sample, estimate, phi_gripper, change, time, out):
 
 
 @njit(cache=True)
+def _both_into(sample, estimate, phi_gripper, change, time, elimination, out):
+    """F' with the scales of this time, and the contact wrench."""
+    _scaled_now_into(sample, estimate, phi_gripper, change, time, out[:6])
+    _scaled_into(sample, estimate, phi_gripper, elimination, out[6:])
+
+
+@njit(cache=True)
 def _felt_into(sample, estimate, phi_gripper, change, time, arm, R_WB, out):
     """What the hand shall feel of F'; the orientation of S comes from the same sample."""
     scales, scaled_S, R_WS, p_WS = np.empty(4), np.empty(6), np.empty((3, 3)), np.empty(3)
@@ -115,6 +122,7 @@ class ForceScaling(LeafSystem):
         output_ports:
         - scaled_wrench_S: F' of Fig. 2
         - contact_wrench_S: Eq. (13)
+        - scaled_and_contact_S: both of them, one after the other, for a log
         - non_contact_wrench_S: Eq. (12)
         - wrench_B: F_E_B, what the hand shall feel: -force_scale F', in the master's base B
 
@@ -145,6 +153,7 @@ class ForceScaling(LeafSystem):
             ("wrench_B", self._calc_wrench_B),
         ):
             self.DeclareVectorOutputPort(name, 6, calc, inputs)
+        self.DeclareVectorOutputPort("scaled_and_contact_S", 12, self._calc_both, inputs)
 
     def SetScales(
         self,
@@ -176,6 +185,10 @@ class ForceScaling(LeafSystem):
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
         _scaled_now_into(*self._inputs(context), *self._now(context), output.get_mutable_value())
+
+    def _calc_both(self, context: Context, output: BasicVector) -> None:
+        inputs = (*self._inputs(context), *self._now(context))
+        _both_into(*inputs, _ELIMINATION, output.get_mutable_value())
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
         _scaled_into(*self._inputs(context), _ELIMINATION, output.get_mutable_value())

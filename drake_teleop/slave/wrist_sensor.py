@@ -176,14 +176,13 @@ def _interpolate(h, u, x, xdot, end, end_dot, out):
 
 
 @njit(cache=True)
-def _take(physics, sensor, x, tau, applied_W, noise, memory):
-    """One sample of the state x, into `memory`, see `sample_step`."""
+def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
+    """One sample of the state x and what follows from it, into `memory`, see `sample_step`."""
     arm, phi, _, _ = physics
     constants, motion_constants, middle, end, ideal = sensor
-    n = tau.shape[0]
-    half = n + 1
-    truth, wrench_W, xdot = np.empty(15 + n), np.empty(6), np.empty(2 * half)
-    _accelerations(physics, x, tau, applied_W, wrench_W, xdot)
+    half = x.shape[0] // 2
+    n = half - 1
+    truth = np.empty(15 + n)
     v, vdot = x[half : half + n], xdot[half : half + n]
     true_sample(arm, phi, x[:n], v, vdot, wrench_W, np.empty(MOTION_SIZE), truth[:15])
     truth[15:] = x[:n]
@@ -233,18 +232,21 @@ def sample_step(
     last = after[sensor[3] :]
     count, h, start = last[1], time - last[0], last[2:]
     x, between = np.empty(2 * half), np.empty(2 * half)
+    xdot, start_dot, end_dot = np.empty(2 * half), np.empty(2 * half), np.empty(2 * half)
+    wrench_W, end_wrench_W = np.empty(6), np.empty(6)
     _join(state, sheet, x)
+    _accelerations(physics, x, tau, applied_W, end_wrench_W, end_dot)
     if (count + _SAME) * period < time:
-        xdot, end_dot, wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
-        _accelerations(physics, start, tau, applied_W, wrench_W, xdot)
-        _accelerations(physics, x, tau, applied_W, wrench_W, end_dot)
+        _accelerations(physics, start, tau, applied_W, wrench_W, start_dot)
         while (count + _SAME) * period < time:
-            _interpolate(h, (count * period - last[0]) / h, start, xdot, x, end_dot, between)
-            _take(physics, sensor, between, tau, applied_W, noise, after)
+            u = (count * period - last[0]) / h
+            _interpolate(h, u, start, start_dot, x, end_dot, between)
+            _accelerations(physics, between, tau, applied_W, wrench_W, xdot)
+            _take(physics, sensor, between, xdot, wrench_W, noise, after)
             count += 1.0
     result[:size] = after[:size]
     if until_now and (count - _SAME) * period < time:
-        _take(physics, sensor, x, tau, applied_W, noise, after)
+        _take(physics, sensor, x, end_dot, end_wrench_W, noise, after)
         count += 1.0
     last[0], last[1] = time, count
     start[:] = x

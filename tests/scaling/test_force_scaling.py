@@ -31,7 +31,11 @@ def outputs(config: ForceScalingConfig, arm, contact=(0.0,) * 6) -> dict[str, np
     block.GetInputPort("sample").FixValue(context, sample)
     block.GetInputPort("load_estimate").FixValue(context, np.concatenate([offsets, arm.phi_load]))
     names = ("scaled_wrench_S", "contact_wrench_S", "non_contact_wrench_S", "wrench_B")
-    return {name: block.GetOutputPort(name).Eval(context) for name in names}
+    found = {name: block.GetOutputPort(name).Eval(context) for name in names}
+    both = block.GetOutputPort("scaled_and_contact_S").Eval(context)
+    np.testing.assert_array_equal(both[:6], found["scaled_wrench_S"])
+    np.testing.assert_array_equal(both[6:], found["contact_wrench_S"])
+    return found
 
 
 def test_the_four_cases_of_section_v(arm):
