@@ -259,6 +259,26 @@ def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
     assert found.limits.phi[0] == pytest.approx(3.0)
 
 
+def test_a_mesh_that_cannot_be_read_is_named(urdf):
+    parts = urdf.parent / "somewhere" / "parts"
+    (parts / "forearm.obj").rename(parts / "forearm.dae")
+    urdf.write_text(urdf.read_text().replace("forearm.obj", "forearm.dae"))
+    robot = RobotFromModel(urdf, "l6", WristSensorConfig(), package_paths=(parts.parent,))
+    words = "; ".join(robot.assumptions)
+    assert "shapes are missing of l3: .dae meshes cannot be read (convert them to .obj" in words
+
+
+def test_links_that_always_touch_are_neighbours(urdf):
+    """Not next to each other in the chain, so that it is not Drake that leaves them out."""
+    large = '<sphere radius="0.15"/>'
+    text = urdf.read_text().replace('<mesh filename="package://absent/wrist.stl"/>', large)
+    urdf.write_text(text.replace('<cylinder radius="0.03" length="0.04"/>', large))
+    robot = RobotFromModel(urdf, "l6", WristSensorConfig(), payload=2.0)
+    still = np.zeros((6, 2))
+    uses = check(robot, FourierTrajectory(robot.home, still, still, 1.0))
+    assert next(use for use in uses if use.limit == "clearance").share <= 1
+
+
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
