@@ -27,7 +27,7 @@ MARGIN = 0.985
 _FEASIBLE = 0.9885
 
 # Candidates drawn at once, and how many of them are followed.
-_CANDIDATES, _FOLLOWED = 64, 8
+_CANDIDATES, _FOLLOWED = 128, 8
 # (sharpness of the criterion, of the maxima, weight of the penalty, iterations) of L-BFGS.
 _APPROACH = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
 # (sharpness of the criterion, of the maxima, iterations) of SLSQP.

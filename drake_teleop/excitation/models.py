@@ -102,7 +102,7 @@ def ParseModel(
             remedy=f"--sensor-frame with one of {', '.join(sorted(set(frames)))}",
         )
     frame = plant.GetFrameByName(sensor_frame, having[0])
-    _weld_base(plant, frame)
+    _weld_base(plant, frame, {} if root is None else _peculiar_joints(root), str(path))
     return ParsedModel(having[0], frame, efforts, lost, converted)
 
 
@@ -117,14 +117,37 @@ def _xml(path: Path) -> ElementTree.Element | None:
         return None
 
 
-def _weld_base(plant: MultibodyPlant, frame: Frame) -> None:
+def _weld_base(plant: MultibodyPlant, frame: Frame, peculiar: dict[str, str], where: str) -> None:
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    inboard = {joint.child_body().index(): joint.parent_body() for joint in joints}
-    body = frame.body()
+    inboard = {joint.child_body().index(): joint for joint in joints}
+    body, chain = frame.body(), []
     while body.index() in inboard:
-        body = inboard[body.index()]
+        chain.append(inboard[body.index()].name())
+        body = inboard[body.index()].parent_body()
+    for name in (*chain, body.name()):
+        if name in peculiar:
+            raise DrakeTeleopError(
+                f"{name} {peculiar[name]}",
+                where=where,
+                remedy="the arm up to the sensor has to be a chain of independent revolute joints",
+            )
     if body.index() != plant.world_body().index():
         plant.WeldFrames(plant.world_frame(), body.body_frame())
+
+
+def _peculiar_joints(root: ElementTree.Element) -> dict[str, str]:
+    """Joints that move with another one, and links that float on another link: Drake ignores both.
+
+    By the name of joint or link, what it does.
+    """
+    found = {}
+    for joint in root.iter("joint"):
+        if joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
+            found[joint.get("name", "")] = "moves with another joint (mimic)"
+        for parent, child in zip(joint.findall("parent"), joint.findall("child"), strict=False):
+            if joint.get("type") == "floating" and parent.get("link") != "world":
+                found[child.get("link", "")] = f"floats on {parent.get('link')}"
+    return found
 
 
 class _Packages:
