@@ -15,8 +15,8 @@ from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.scenario import Simulation
 from drake_teleop.signals import LOG, SIGNALS
 
-# Long enough to keep progress cheap, short enough to look alive.
-_PROGRESS_STEP = 0.02
+# In milliseconds; long enough to keep progress cheap, short enough to look alive.
+_PROGRESS_STEP = 20
 # A part of a log on disk: some seconds of a station, some MB.
 _PART_ROWS = 8192
 
@@ -51,7 +51,10 @@ def simulate(
     on_disk = None if log is None else _LogOnDisk(Path(log), simulator, simulation.settle)
     simulator.Initialize()
     try:
-        for time in np.append(np.arange(_PROGRESS_STEP, end, _PROGRESS_STEP), end):
+        # Products, as Drake's event times are: what differs by rounding alone would be a step of
+        # its own, of 1e-17 s, with samples that are due at its start or at its end.
+        milliseconds = np.arange(_PROGRESS_STEP, 1e3 * end - 1, _PROGRESS_STEP)
+        for time in np.append(1e-3 * milliseconds, end):
             advance(simulator, time)
             if on_disk is not None and on_disk.waiting() >= _PART_ROWS:
                 on_disk.take()

@@ -136,8 +136,8 @@ def batch_identification(
 ) -> Identification:
     """The load and the offsets by total least squares, with the noise of the scenario's sensor.
 
-    White noise of wrench and motion as its data sheet has it, and its offsets' random walk: the
-    offsets are those at the end of the record.
+    White noise of wrench and motion as its data sheet has it, and its random walks: the offsets are
+    those at the start of the record.
 
     Args:
         scenario: with the sensor and the estimation of its motion.
@@ -148,12 +148,15 @@ def batch_identification(
     motion = estimated_motion_std(
         scenario.motion_estimation, sensor, slave_arm(scenario).num_joints, 1 / rates.sensor_hz
     )
+    walk = sensor.random_walk()
+    if scenario.motion_estimation.source != "accelerometer":  # the encoders do not wander
+        walk[6:] = 0.0
     noise = Noise(
         wrench=sensor.wrench_std(),
         s=motion[:3],
         omega=motion[3:6],
         alpha=motion[6:],
-        walk=sensor.random_walk()[:6] / np.sqrt(rate_hz),
+        walk=walk / np.sqrt(rate_hz),
     )
     found = identify_batch(wrench, s, omega, alpha, method="total", noise=noise)
     return found.identification

@@ -33,9 +33,9 @@ The covariance is that of `identification.NormalEquations` with the same weights
 coloured noise is accounted for. Offsets that wander are no stationary noise, and a record is too
 short to show how much they do: if the noise says so (`Noise.walk`, which Allan deviations of a
 record at rest give), the effects of all steps of the walk on the solution are added up. The offsets
-that the covariance is about are then those at the end of the record. A walk that goes as far as the
-noise within a record counts twice, since it is in the residuals too: that is cautious. Errors in
-variables enlarge the covariance: with G theta_LS = b and (G - lambda C) theta = b it is
+that the covariance is about are then those at the start of the record. A walk that goes as far as
+the noise within a record counts twice, since it is in the residuals too: that is cautious. Errors
+in variables enlarge the covariance: with G theta_LS = b and (G - lambda C) theta = b it is
 K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of `consistent` is of the same fit
 without the constraint, which is cautious. A prior adds its information to that of the record, and
 parameters that it says most about are named.
@@ -309,8 +309,8 @@ def identify_batch(
     equations.add(*(rows if kept.all() else [table[kept] for table in rows]))
     plain = equations.solve(delay_s)
     theta, Z = fit.form.theta, fit.moments.mean
-    walk = np.broadcast_to(np.asarray((noise or Noise()).walk, float), 6)
-    wandering = plain.covariance + _walk_covariance(record, kept, equations, walk)
+    steps = residual_covariance(Moments.walk_covariance(noise or Noise()), theta)
+    wandering = plain.covariance + _walk_covariance(record, kept, equations, steps)
     covariance = _covariance(wandering, fit.form, offsets)
     dominated = np.zeros(16, bool)
     if prior is not None:
@@ -395,28 +395,29 @@ def _distances(record: Record, theta: Array, shared: bool) -> Array:
 
 
 def _walk_covariance(
-    record: Record, kept: NDArray[np.bool_], equations: NormalEquations, walk: Array
+    record: Record, kept: NDArray[np.bool_], equations: NormalEquations, steps: Array
 ) -> Array:
-    """(16, 16) covariance of least squares from offsets that wander, about their values at the end.
+    """(16, 16) covariance of least squares from offsets that wander, about those at the start.
 
-    Seen from the end, a step of the walk of channel c changes the wrench of all samples before it,
-    and the solution by G^+ times their share of the right-hand side. The steps are independent.
+    A step of the walk changes the wrench of all samples after it, and the solution by G^+ times
+    their share of the right-hand side. The steps are independent; `steps` (6, 6) is their
+    covariance, those of the motion's channels as changes of V phi.
     """
     covariance = np.zeros((16, 16))
-    if not walk.any():
+    if not steps.any():
         return covariance
-    heads = np.zeros((6, 16))
-    for start in range(0, len(kept), _CHUNK):
+    backwards, used = record.every(-1), kept[::-1]
+    after = np.zeros((6, 16))
+    for start in range(0, len(used), _CHUNK):
         part = slice(start, start + _CHUNK)
-        used = kept[part].astype(float)
-        V = regressor(*(table[part] for table in record.arrays[1:]))
-        for c in range(6):
-            rows = np.zeros((len(V), 16))
-            rows[:, c], rows[:, 6:] = used, used[:, None] * V[:, c]
-            rows *= walk[c] * equations.weights[c]
-            before = heads[c] + np.cumsum(rows, axis=0) - rows
-            heads[c] = before[-1] + rows[-1]
-            covariance += before.T @ before
+        rows = np.zeros((len(used[part]), 6, 16))
+        rows[:, np.arange(6), np.arange(6)] = 1.0
+        rows[:, :, 6:] = regressor(*(table[part] for table in backwards.arrays[1:]))
+        rows *= equations.weights[:, None] * used[part, None, None]
+        sums = after + np.cumsum(rows, axis=0)
+        after = sums[-1]
+        sums -= rows
+        covariance += np.einsum("nci,cd,ndj->ij", sums, steps, sums, optimize=True)
     root = inverse_root(equations.normal_equations()[0], ~equations.unexcited)
     return np.asarray(root @ root.T @ covariance @ root @ root.T)
 

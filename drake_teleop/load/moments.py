@@ -42,8 +42,8 @@ class Noise:
     Attributes:
         wrench: (6,) of [f; tau] [N, N m]; None to estimate them from the residual.
         s, omega, alpha: (3,), or a number for all axes, of the motion [m/s^2, rad/s, rad/s^2].
-        walk: (6,), or 0, of the steps from one sample to the next by which the wrench's offsets
-            wander, a random walk [N, N m].
+        walk: (12,), or 0, of the steps from one sample to the next by which the offsets of
+            [wrench, s, alpha] wander: random walks.
     """
 
     wrench: ArrayLike | None = None
@@ -54,7 +54,8 @@ class Noise:
     motion: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not (checked("noise.walk", np.broadcast_to(self.walk, 6), 6) >= 0.0).all():
+        walk = checked("noise.walk", np.broadcast_to(self.walk, 12), 12)
+        if (walk < 0.0).any():
             raise DrakeTeleopError("is negative", where="noise.walk")
         rows = []
         for name in ("s", "omega", "alpha"):
@@ -131,6 +132,13 @@ class Moments:
                 jacobian[j, i, _PRODUCTS[i, j]] += 1.0 + (i == j)
         for k in range(3):
             Q += noise.motion[1, k] ** 2 * jacobian[k].T @ products @ jacobian[k]
+        return Q
+
+    @staticmethod
+    def walk_covariance(noise: Noise) -> Array:
+        """(19, 19) covariance of the steps of z's random walks."""
+        Q = np.zeros((19, 19))
+        Q[np.arange(1, 13), np.arange(1, 13)] = np.square(noise.walk)
         return Q
 
 

@@ -369,15 +369,18 @@ def test_intervals_hold_when_offsets_wander():
     motion = rich_motion(1500)
     clean = non_contact_wrench(*motion, TOOL)
     steps = WRENCH_NOISE / 120
+    bent = np.array([4e-4, 4e-4, 4e-4, 4e-3, 4e-3, 4e-3])  # of s and alpha
     errors = {0.0: [], 1.0: []}
     for seed in range(40):
         rng = np.random.default_rng(seed)
         offsets = OFFSETS + np.cumsum(steps * rng.normal(size=clean.shape), axis=0)
         F = clean + offsets + WRENCH_NOISE * rng.normal(size=clean.shape)
-        truth = np.concatenate([offsets[-1], TOOL])
+        truth = np.concatenate([offsets[0], TOOL])
+        wandering = np.cumsum(bent * rng.normal(size=(1500, 6)), axis=0)
+        seen = motion[0] + wandering[:, :3], motion[1], motion[2] + wandering[:, 3:]
         for walk in errors:
-            noise = Noise(WRENCH_NOISE, walk=walk * steps)
-            result = identify_batch(F, *motion, method="whitened", noise=noise)
+            noise = Noise(WRENCH_NOISE, walk=walk * np.concatenate([steps, bent]))
+            result = identify_batch(F, *seen, method="total", noise=noise)
             deviations = result.identification.standard_deviations
             errors[walk].append((estimate(result) - truth) / deviations)
     held = {walk: np.mean(np.abs(ratios) < 1.96) for walk, ratios in errors.items()}
@@ -386,28 +389,36 @@ def test_intervals_hold_when_offsets_wander():
 
 
 def test_the_covariance_of_wandering_offsets_is_a_double_sum():
-    """Against the covariance min(i, j) of a random walk, seen from the end; a rejected sample."""
+    """Against the covariance min(i, j) of a random walk; with a rejected sample."""
     F, *motion = record(60, noise=1.0)
     F[20, 0] += 1e3
-    steps = np.array([0.3, 0.1, 0.2, 0.01, 0.02, 0.005])
+    steps = np.array([0.3, 0.1, 0.2, 0.01, 0.02, 0.005, 0.1, 0.2, 0.1, 0.3, 1.0, 2.0])
     with_walk, without = (
         identify_batch(F, *motion, method="robust", noise=Noise(WRENCH_NOISE, walk=walk))
         for walk in (steps, 0.0)
     )
     kept = ~with_walk.rejected
     assert not kept[20]
-    ago = 59.0 - np.arange(60)[kept]
-    walked = np.minimum(ago[:, None], ago)
+    count = np.arange(60.0)[kept]
+    walked = np.minimum(count[:, None], count)
+    # What steps of s and alpha do to the wrench of this load.
+    found = with_walk.identification.phi
+    still, units = np.zeros((3, 3)), np.eye(3)
+    by_s, by_alpha = (
+        non_contact_wrench(*m, found) for m in ((units, still, still), (still, still, units))
+    )
+    covariance = np.diag(steps[:6] ** 2)
+    covariance += by_s.T * steps[6:9] ** 2 @ by_s + by_alpha.T * steps[9:] ** 2 @ by_alpha
     rows = np.zeros((kept.sum(), 6, 16))
     rows[:, :, :6] = np.eye(6)
     rows[:, :, 6:] = regressor(*(table[kept] for table in motion))
     weighted = rows * with_walk.equations.weights[:, None]
     inverse = np.linalg.inv(np.einsum("nci,ncj->ij", rows, weighted))
-    expected = np.einsum("nci,nm,mcj,c->ij", weighted, walked, weighted, steps**2)
+    expected = np.einsum("nci,nm,mdj,cd->ij", weighted, walked, weighted, covariance)
     added = with_walk.identification.covariance - without.identification.covariance
     np.testing.assert_allclose(added, inverse @ expected @ inverse, rtol=1e-6, atol=1e-12)
 
 
 def test_a_negative_walk_is_refused():
     with pytest.raises(DrakeTeleopError, match=r"noise\.walk: is negative"):
-        Noise(walk=[-1.0] * 6)
+        Noise(walk=[-1.0] * 12)
