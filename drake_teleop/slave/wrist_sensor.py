@@ -186,12 +186,14 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
     v, vdot = x[half : half + n], xdot[half : half + n]
     true_sample(arm, phi, x[:n], v, vdot, wrench_W, np.empty(MOTION_SIZE), truth[:15])
     truth[15:] = x[:n]
-    sample = memory[: _SAMPLE + n]
+    size = _SAMPLE + n
+    sample = memory[:size]
+    memory[size : 2 * size] = sample
     if ideal:
         sample[:15], sample[15], sample[16:] = truth[:15], 0.0, truth[15:]
         return
     reading = np.empty(13 + n)
-    read_into(constants, memory[_SAMPLE + n : middle], noise, truth, reading)
+    read_into(constants, memory[2 * size : middle], noise, truth, reading)
     estimate_into(motion_constants, memory[middle:end], arm, reading, sample)
 
 
@@ -220,8 +222,8 @@ def sample_step(
         tau: (n,) torque that was held since then.
         applied_W: (6,), see `environment_wrench`.
         noise: for the chain.
-        memory: [sample (16 + n) | chain's | estimator's | last: time of the last step's end,
-            samples taken, x then].
+        memory: [last sample (16 + n) | the one before (16 + n) | chain's | estimator's | last: time
+            of the last step's end, samples taken, x then].
         until_now: whether the sample that may be due this very instant is taken.
         result: filled: [last sample before now (16 + n) | memory after this step].
     """
@@ -244,7 +246,9 @@ def sample_step(
             _accelerations(physics, between, tau, applied_W, wrench_W, xdot)
             _take(physics, sensor, between, xdot, wrench_W, noise, after)
             count += 1.0
-    result[:size] = after[:size]
+    # A step that is all rounding may have ended a little before, and have taken this sample.
+    taken = (count - 1.0 + _SAME) * period > time
+    result[:size] = after[size : 2 * size] if taken else after[:size]
     if until_now and (count - _SAME) * period < time:
         _take(physics, sensor, x, end_dot, end_wrench_W, noise, after)
         count += 1.0
@@ -301,8 +305,8 @@ class WristSensor(LeafSystem):
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
             first[:6] += config.offset
-        memory = np.concatenate([first, chain, estimator, np.zeros(2 + 2 * n + 2)])
-        ends = np.cumsum([len(first), len(chain), len(estimator)])
+        memory = np.concatenate([first, first, chain, estimator, np.zeros(2 + 2 * n + 2)])
+        ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
         self._period = period
         self._no_noise, self._nothing = np.zeros(NOISE_SIZE), np.zeros(6)
@@ -341,11 +345,12 @@ class WristSensor(LeafSystem):
     def remembered(self) -> NDArray[np.intp]:
         """Where in the discrete state stands what the motion has left there.
 
-        Not counters and flags, nor random walks.
+        Not counters and flags, nor random walks, nor the sample before the last one.
         """
         _, _, chain_end, end, _ = self._sensor
-        chain, flag = _SAMPLE + self._n, 15
-        others = [flag, *range(chain, chain + FILTERED), chain_end, chain_end + 1]
+        size, flag = _SAMPLE + self._n, 15
+        before_and_walks = range(size, 2 * size + FILTERED)
+        others = [flag, *before_and_walks, chain_end, chain_end + 1]
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
