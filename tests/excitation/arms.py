@@ -16,6 +16,7 @@ from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_teleop.excitation.models import ParseModel
+from drake_teleop.load.regressor import non_contact_wrench
 
 # Of the simulation [s]; rest before the motion, without and with recording, and after it [s].
 _STEP, _SETTLING, _RESTING = 2e-4, 0.5, 0.2
@@ -163,18 +164,23 @@ def execute(path: Path, frame: str, table: pl.DataFrame, load: SpatialInertia) -
         actuator.set_controller_gains(PdControllerGains(p=2e4, d=2e2))
     plant.Finalize()
     order = [plant.get_joint_actuator(k).joint() for k in plant.GetJointActuatorIndices()]
-    commanded = np.zeros((table.height, 2, len(order)))
+    commanded = np.zeros((table.height, 3, len(order)))
     for k, joint in enumerate(order):
         if f"q_{joint.name()}" in table.columns:
-            commanded[:, 0, k] = table[f"q_{joint.name()}"]
-            commanded[:, 1, k] = table[f"qd_{joint.name()}"]
+            for row, symbol in enumerate(("q", "qd", "qdd")):
+                commanded[:, row, k] = table[f"{symbol}_{joint.name()}"]
     # Held at rest before and after.
     start, period = _SETTLING + _RESTING, table["t"][-1]
     times = np.concatenate([[0.0], start + table["t"].to_numpy(), [start + period + 1.0]])
     commanded = commanded[[0, *range(table.height), -1]]
     commands = builder.AddSystem(
         TrajectorySource(
-            PiecewisePolynomial.FirstOrderHold(times, commanded.reshape(len(times), -1).T)
+            # Without corners, which would alias into samples at the same rate.
+            PiecewisePolynomial.CubicHermite(
+                times,
+                commanded[:, :2].reshape(len(times), -1).T,
+                commanded[:, 1:].reshape(len(times), -1).T,
+            )
         )
     )
     builder.Connect(commands.get_output_port(), plant.get_desired_state_input_port(model.instance))
@@ -185,12 +191,11 @@ def execute(path: Path, frame: str, table: pl.DataFrame, load: SpatialInertia) -
     q[[joint.position_start() for joint in order]] = commanded[0, 0]
     plant.SetPositions(context, q)
     chain = [joint for joint in order if f"q_{joint.name()}" in table.columns]
-    outboard = [joint for joint in joints if joint.parent_body() == frame_S.body()]
     t = np.arange(round((period + 2 * _RESTING) * 1e3) + 1) * 1e-3
     truth, pose = np.empty((len(t), 15 + len(chain))), np.empty((len(t), 7))
     for k, moment in enumerate(t):
         simulator.AdvanceTo(_SETTLING + moment)
-        truth[k, :15] = _at_sensor(plant, context, frame_S, outboard)
+        truth[k, 6:15] = _motion_of(plant, context, frame_S)
         truth[k, 15:] = [joint.GetOnePosition(context) for joint in chain]
         X_WS = frame_S.CalcPoseInWorld(context)
         pose[k] = [*X_WS.rotation().ToQuaternion().wxyz(), *X_WS.translation()]
@@ -198,6 +203,7 @@ def execute(path: Path, frame: str, table: pl.DataFrame, load: SpatialInertia) -
     M_S = plant.CalcSpatialInertia(context, frame_S, bodies)
     inertia = M_S.CalcRotationalInertia().CopyToFullMatrix3()
     phi = np.array([M_S.get_mass(), *M_S.CalcComMoment(), *inertia[np.triu_indices(3)]])
+    truth[:, :6] = non_contact_wrench(*np.split(truth[:, 6:15], 3, axis=1), phi)
     return Recording(t - _RESTING, truth[:, 15:], truth, pose, phi)
 
 
@@ -206,23 +212,21 @@ def _beyond(joints, body):
     return found + [far for near in found for far in _beyond(joints, near)]
 
 
-def _at_sensor(plant, context, frame_S, outboard):
-    """(15,) the plant's reaction forces in the joints on S's body, about So; motion of S."""
-    reactions = plant.get_reaction_forces_output_port().Eval(context)
-    X_WS = frame_S.CalcPoseInWorld(context)
-    wrench = np.zeros(6)
-    for joint in outboard:
-        F_J = reactions[joint.index()]
-        X_SJ = X_WS.InvertAndCompose(joint.frame_on_child().CalcPoseInWorld(context))
-        force = X_SJ.rotation().multiply(F_J.translational())
-        moment = X_SJ.rotation().multiply(F_J.rotational())
-        wrench += [*force, *(moment + np.cross(X_SJ.translation(), force))]
-    vdot = plant.get_generalized_acceleration_output_port(frame_S.model_instance()).Eval(context)
-    body, X_BS = frame_S.body(), frame_S.GetFixedPoseInBodyFrame()
-    A_WB = plant.CalcSpatialAccelerationsFromVdot(context, vdot)[body.index()]
-    omega = plant.EvalBodySpatialVelocityInWorld(context, body).rotational()
-    R_WB = plant.EvalBodyPoseInWorld(context, body).rotation()
+def _motion_of(plant, context, frame_S):
+    """(9,) specific force, angular velocity and acceleration of S, in S.
+
+    With the speeds in the middle of the step in which the accelerations act.
+    """
+    v = plant.GetVelocities(context)
+    port = plant.get_generalized_acceleration_output_port(frame_S.model_instance())
+    vdot = port.Eval(context)
+    plant.SetVelocities(context, v + 0.5 * _STEP * vdot)
+    X_WS, X_BS = frame_S.CalcPoseInWorld(context), frame_S.GetFixedPoseInBodyFrame()
+    A_WB = plant.CalcSpatialAccelerationsFromVdot(context, vdot)[frame_S.body().index()]
+    omega = plant.EvalBodySpatialVelocityInWorld(context, frame_S.body()).rotational()
+    R_WB = plant.EvalBodyPoseInWorld(context, frame_S.body()).rotation()
+    plant.SetVelocities(context, v)
     A_WS = A_WB.Shift(R_WB.multiply(X_BS.translation()), omega)
     s = A_WS.translational() - plant.gravity_field().gravity_vector()
     R_SW = X_WS.rotation().inverse()
-    return np.concatenate([wrench, *(R_SW.multiply(x) for x in (s, omega, A_WS.rotational()))])
+    return np.concatenate([R_SW.multiply(x) for x in (s, omega, A_WS.rotational())])

@@ -120,7 +120,7 @@ def test_predicted_and_observed_scatter_agree(slave, short):
 
     What the sensor is given is the same each time, so it is calculated once.
     """
-    sensor, motion, period = WristSensorConfig(), MotionEstimationConfig(), 1 / 2000
+    sensor, motion, period = WristSensorConfig(), MotionEstimationConfig("fused"), 1 / 2000
     table, phi = slave.arm.table, slave.limits.phi / 1.3
     t = np.arange(0.0, 2.4, period)
     joints = short.trajectory.evaluate(t)
@@ -149,16 +149,18 @@ def test_what_is_predicted_is_of_the_heaviest_load_and_of_the_sensor(slave, desi
     motion = sensor_motion(slave, designed.trajectory)
     predicted = predicted_deviations(*motion, 1e-3, slave.noise, slave.limits.phi)
     np.testing.assert_allclose(designed.deviations, predicted, rtol=1e-12)
-    # An accelerometer that nothing corrects makes it worse, the encoders alone better.
-    noises = {
-        source: sensor_noise(WristSensorConfig(), MotionEstimationConfig(source), 6, 1 / 8000)
-        for source in ("encoders", "accelerometer")
-    }
-    encoders, accelerometer = (
-        predicted_deviations(*motion, 1e-3, noise, slave.limits.phi) for noise in noises.values()
+    # The accelerometer alone makes it worse than corrected by the encoders, these alone better.
+    encoders, fused, accelerometer = (
+        predicted_deviations(
+            *motion,
+            1e-3,
+            sensor_noise(WristSensorConfig(), MotionEstimationConfig(source), 6, 1 / 8000),
+            slave.limits.phi,
+        )
+        for source in ("encoders", "fused", "accelerometer")
     )
-    assert np.all(encoders < predicted)
-    assert np.all(predicted < accelerometer)
+    assert np.all(encoders < fused)
+    assert np.all(fused < accelerometer)
 
 
 def test_the_check_finds_every_kind_of_violation(slave, short):
@@ -269,14 +271,34 @@ def test_a_mesh_that_cannot_be_read_is_named(urdf):
 
 
 def test_links_that_always_touch_are_neighbours(urdf):
-    """Not next to each other in the chain, so that it is not Drake that leaves them out."""
-    large = '<sphere radius="0.15"/>'
-    text = urdf.read_text().replace('<mesh filename="package://absent/wrist.stl"/>', large)
-    urdf.write_text(text.replace('<cylinder radius="0.03" length="0.04"/>', large))
-    robot = RobotFromModel(urdf, "l6", WristSensorConfig(), payload=2.0)
+    """Two pairs, not next to each other in the chain: it is not Drake that leaves them out."""
+    text = urdf.read_text()
+    for shape in (
+        '<mesh filename="package://absent/wrist.stl"/>',
+        '<mesh filename="package://parts/wrist.stl"/>',
+        '<cylinder radius="0.03" length="0.04"/>',
+    ):
+        text = text.replace(shape, '<sphere radius="0.15"/>')
+    urdf.write_text(text)
+    packages = (urdf.parent / "somewhere",)
+    robot = RobotFromModel(urdf, "l6", WristSensorConfig(), package_paths=packages, payload=2.0)
     still = np.zeros((6, 2))
     uses = check(robot, FourierTrajectory(robot.home, still, still, 1.0))
     assert next(use for use in uses if use.limit == "clearance").share <= 1
+
+
+@pytest.mark.parametrize(
+    ("joint", "expected"),
+    [
+        ('"revolute"><mimic joint="j2"/>', "j3 moves with another joint"),
+        ('"floating">', "l3 floats on l2"),
+    ],
+)
+def test_a_chain_that_drake_would_cut_is_refused(urdf, joint, expected):
+    text = urdf.read_text().replace('name="j3" type="revolute">', f'name="j3" type={joint}')
+    urdf.write_text(text)
+    with pytest.raises(DrakeTeleopError, match=expected):
+        RobotFromModel(urdf, "l6", WristSensorConfig())
 
 
 @pytest.mark.parametrize(
