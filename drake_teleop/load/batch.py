@@ -30,12 +30,13 @@ noise and the three torques one; weights of their own would make mass and centre
 10 to 30 % (simulated gain errors of 0.3 % and tilts of 4 mrad).
 
 The covariance is that of `identification.NormalEquations` with the same weights of the rows, so
-coloured noise is accounted for. Offsets that wander are no stationary noise, and a record is too
-short to show how much they do: if the noise says so (`Noise.walk`, which Allan deviations of a
-record at rest give), the effects of all steps of the walk on the solution are added up. The offsets
-that the covariance is about are then those at the start of the record. A walk that goes as far as
-the noise within a record counts twice, since it is in the residuals too: that is cautious. Errors
-in variables enlarge the covariance: with G theta_LS = b and (G - lambda C) theta = b it is
+coloured noise is accounted for; where noise of the motion couples the channels, with the
+correlation that it predicts. Offsets that wander are no stationary noise, and a record is too short
+to show how much they do: if the noise says so (`Noise.walk`, which Allan deviations of a record at
+rest give), the effects of all steps of the walk on the solution are added up. The offsets that the
+covariance is about are then those at the start of the record. A walk that goes as far as the noise
+within a record counts twice, since it is in the residuals too: that is cautious. Errors in
+variables enlarge the covariance: with G theta_LS = b and (G - lambda C) theta = b it is
 K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of `consistent` is of the same fit
 without the constraint, which is cautious. A prior adds its information to that of the record, and
 parameters that it says most about are named.
@@ -310,8 +311,8 @@ def identify_batch(
     plain = equations.solve(delay_s)
     theta, Z = fit.form.theta, fit.moments.mean
     steps = residual_covariance(Moments.walk_covariance(noise or Noise()), theta)
-    wandering = plain.covariance + _walk_covariance(record, kept, equations, steps)
-    covariance = _covariance(wandering, fit.form, offsets)
+    white = _white_covariance(plain.covariance, equations, fit)
+    covariance = _covariance(white + _walk_covariance(record, kept, fit, steps), fit.form, offsets)
     dominated = np.zeros(16, bool)
     if prior is not None:
         covariance, dominated = _with_prior(covariance, prior.information(plain.samples))
@@ -394,9 +395,34 @@ def _distances(record: Record, theta: Array, shared: bool) -> Array:
     return out
 
 
-def _walk_covariance(
-    record: Record, kept: NDArray[np.bool_], equations: NormalEquations, steps: Array
-) -> Array:
+def _white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Array:
+    """(16, 16) of least squares with weights W that couple the channels, if they do.
+
+    Noise of the motion is in several channels of the wrench at once, which `plain`, of
+    `NormalEquations`, does not know. Their correlation is the predicted one, that of W^-1.
+    """
+    W, Z = fit.form.weights, fit.moments.mean
+    predicted = np.linalg.inv(W)
+    if np.array_equal(W, np.diag(np.diag(W))):
+        return plain
+    scale = np.sqrt(equations.long_run_variances(fit.form.theta)[0] / np.diag(predicted))
+    of_sums = W @ (predicted * np.outer(scale, scale)) @ W
+    inverse = _inverse_gram(fit)
+    covariance = inverse @ (fit.moments.samples * normal_equations(Z, of_sums)[0]) @ inverse
+    unknown = np.isinf(np.diag(plain))
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = np.inf
+    return covariance
+
+
+def _inverse_gram(fit: Fit) -> Array:
+    """(16, 16) pseudo-inverse of the sum of [E V]^T W [E V] over the samples."""
+    Z = fit.moments.mean
+    root = inverse_root(normal_equations(Z, fit.form.weights)[0], excited_columns(Z))
+    return np.asarray(root @ root.T / fit.moments.samples)
+
+
+def _walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
     """(16, 16) covariance of least squares from offsets that wander, about those at the start.
 
     A step of the walk changes the wrench of all samples after it, and the solution by G^+ times
@@ -413,13 +439,13 @@ def _walk_covariance(
         rows = np.zeros((len(used[part]), 6, 16))
         rows[:, np.arange(6), np.arange(6)] = 1.0
         rows[:, :, 6:] = regressor(*(table[part] for table in backwards.arrays[1:]))
-        rows *= equations.weights[:, None] * used[part, None, None]
+        rows = fit.form.weights @ (rows * used[part, None, None])
         sums = after + np.cumsum(rows, axis=0)
         after = sums[-1]
         sums -= rows
         covariance += np.einsum("nci,cd,ndj->ij", sums, steps, sums, optimize=True)
-    root = inverse_root(equations.normal_equations()[0], ~equations.unexcited)
-    return np.asarray(root @ root.T @ covariance @ root @ root.T)
+    inverse = _inverse_gram(fit)
+    return inverse @ covariance @ inverse
 
 
 def _covariance(plain: Array, form: NormalForm, offsets: bool) -> Array:
