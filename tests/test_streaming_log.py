@@ -18,7 +18,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.master.operator import OperatorConfig, Sine
 from drake_teleop.result import Signal, SimulationResult
 from drake_teleop.scenario import Scenario, replace
-from drake_teleop.simulation import simulate
+from drake_teleop.simulation import MakeSimulator, advance, read_log, simulate
 from drake_teleop.station import MakeTeleopStation
 
 SCENARIO = replace(
@@ -70,6 +70,16 @@ def test_the_parts_are_the_log_that_is_kept_in_memory(tmp_path, in_memory):
     assert_same(SimulationResult.read_parquet(folder), in_memory)
     assert pl.scan_parquet(folder).collect().equals(in_memory.to_dataframe())
     assert [path.name for path in tmp_path.iterdir()] == ["log.parquet"]
+
+
+def test_looking_at_the_progress_changes_nothing():
+    """Not even at 0.14 s, which is not 7 times 0.02 s in floating point."""
+    often = replace(SCENARIO, rates__log_hz=8000.0, simulation__duration=0.25)
+    simulator = MakeSimulator(MakeTeleopStation(often), often.simulation)
+    simulator.Initialize()
+    advance(simulator, 0.3)
+    at_once = read_log(simulator, often.simulation.settle)
+    assert_same(simulate(MakeTeleopStation(often), often.simulation), at_once)
 
 
 def test_one_file_can_be_opened_without_reading_it_too(tmp_path, in_memory):

@@ -9,10 +9,14 @@ import polars as pl
 import pytest
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.experiments.identification import slave_arm
 from drake_teleop.experiments.run import in_contact, run_command
 from drake_teleop.load.identification import Identification
+from drake_teleop.load.inertia import mass_com_inertia
+from drake_teleop.load.uncertainty import intervals
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.result import Signal, SimulationResult
+from drake_teleop.scenario import LoadScenario
 
 # Learns while it moves, so that no identification comes first.
 QUICK = """
@@ -86,6 +90,24 @@ def test_the_shipped_identification_is_the_identification(identification):
     from_log = np.concatenate([again.offsets, again.phi])
     # One weights the channels by their noise, the other does not know it.
     assert np.all(np.abs(found - from_log) < 5 * again.standard_deviations)
+
+
+def test_the_load_is_known_as_well_as_it_says(identification):
+    _, out = identification
+    load = Identification.load(out / "identification.json")
+    scenario = LoadScenario("identification")
+    mass, com, inertia = mass_com_inertia(slave_arm(scenario).phi_load)
+    _, found_com, found_inertia = mass_com_inertia(load.phi)
+    assert abs(load.mass / mass - 1) < 1e-3
+    assert np.linalg.norm(found_com - com) < 3e-4
+    principal = np.linalg.eigvalsh(found_inertia) / np.linalg.eigvalsh(inertia)
+    assert np.abs(principal - 1).max() < 0.05
+    error = np.abs(load.offsets - scenario.wrist_sensor.offset)
+    assert np.all(error < [0.1, 0.1, 0.1, 0.005, 0.005, 0.005])
+    low, high = intervals(load)
+    truth = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
+    # Of 16 intervals of 95 % four or more miss once in a hundred times.
+    assert np.sum((low <= truth) & (truth <= high)) >= 13
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(quick):
