@@ -296,7 +296,15 @@ def AddSlave(
     }
     for name, block in blocks.items():
         builder.AddNamedSystem(name, block)
-    AddWristSensor(builder, slave, sensor, scenario.motion_estimation, 1 / rates.sensor_hz, start)
+    AddWristSensor(
+        builder,
+        slave,
+        sensor,
+        scenario.motion_estimation,
+        1 / rates.sensor_hz,
+        1 / rates.joint_control_hz,
+        start,
+    )
     _connect(builder, _SLAVE_WIRES)
     signals = _SLAVE_SIGNALS
     if scenario.load_estimator.enabled or scenario.load_estimator.watch:

@@ -59,6 +59,8 @@ Array = NDArray[np.float64]
 _SAMPLE = 16
 #: A part of a period, within which two instants are one.
 _SAME = 1e-3
+#: Steps of the plant that wait to be sampled, at most.
+_LONGEST = 16
 #: How often the plant is asked whether it moves as the dynamics here say [s], and how alike they
 #: have to be: rounding is 1e-12, in a stiff contact 1e-9.
 _CHECK_PERIOD, _ALIKE = 0.05, 1e-6
@@ -206,54 +208,73 @@ def _join(state, sheet, x):
 
 
 @njit(cache=True)
+def remember_step(tail, time, state, sheet):
+    """Puts a step's end into the queue that `sample_step` works off; see its `memory`."""
+    width = state.shape[0] + 3
+    entry = tail[2 + int(tail[1]) * width :][:width]
+    entry[0] = time
+    _join(state, sheet, entry[1:])
+    tail[1] += 1.0
+
+
+@njit(cache=True)
 def sample_step(
     physics, sensor, period, time, state, sheet, tau, applied_W, noise, memory, until_now, result
 ):  # fmt: skip
-    """Takes the samples that have become due since the end of the last step.
+    """Takes the samples that have become due in the steps since the last call.
 
     Args:
         physics: (arm's table, phi of the tool, contact pairs, leaf (4,): mass, stiffness, damping,
             acceleration by gravity).
-        sensor: (chain's constants, estimator's, where its memory begins, where `last` does, ideal).
+        sensor: (chain's constants, estimator's, where its memory begins, where the tail does,
+            ideal).
         period: of the sensor [s].
-        time: now [s].
+        time: now [s], the end of a step.
         state: (2 n,) [q; v] now.
         sheet: (2,) deflection and its rate now.
-        tau: (n,) torque that was held since then.
+        tau: (n,) torque that was held during these steps.
         applied_W: (6,), see `environment_wrench`.
         noise: for the chain.
-        memory: [last sample (16 + n) | the one before (16 + n) | chain's | estimator's | last: time
-            of the last step's end, samples taken, x then].
+        memory: [last sample (16 + n) | the one before (16 + n) | chain's | estimator's | tail:
+            samples taken, length of the queue, time and x of each step's end in it].
         until_now: whether the sample that may be due this very instant is taken.
-        result: filled: [last sample before now (16 + n) | memory after this step].
+        result: filled: [last sample before now (16 + n) | memory, its queue now's end alone].
     """
-    half = tau.shape[0] + 1
-    size = _SAMPLE + tau.shape[0]
+    size, width, half = _SAMPLE + tau.shape[0], state.shape[0] + 3, tau.shape[0] + 1
     after = result[size:]
     after[:] = memory
-    last = after[sensor[3] :]
-    count, h, start = last[1], time - last[0], last[2:]
-    x, between = np.empty(2 * half), np.empty(2 * half)
-    xdot, start_dot, end_dot = np.empty(2 * half), np.empty(2 * half), np.empty(2 * half)
-    wrench_W, end_wrench_W = np.empty(6), np.empty(6)
-    _join(state, sheet, x)
-    _accelerations(physics, x, tau, applied_W, end_wrench_W, end_dot)
-    if (count + _SAME) * period < time:
-        _accelerations(physics, start, tau, applied_W, wrench_W, start_dot)
-        while (count + _SAME) * period < time:
-            u = (count * period - last[0]) / h
-            _interpolate(h, u, start, start_dot, x, end_dot, between)
-            _accelerations(physics, between, tau, applied_W, wrench_W, xdot)
-            _take(physics, sensor, between, xdot, wrench_W, noise, after)
+    tail = after[sensor[3] :]
+    count, queued = tail[0], int(tail[1])
+    now, between = np.empty(2 * half), np.empty(2 * half)
+    start_dot, between_dot, end_dot = np.empty(2 * half), np.empty(2 * half), np.empty(2 * half)
+    wrench_W = np.empty(6)
+    _join(state, sheet, now)
+    for k in range(queued):
+        start = tail[2 + k * width :][:width]
+        until, end = time, now
+        if k < queued - 1:
+            following = tail[2 + (k + 1) * width :][:width]
+            until, end = following[0], following[1:]
+        if (count + _SAME) * period >= until:
+            continue
+        _accelerations(physics, start[1:], tau, applied_W, wrench_W, start_dot)
+        _accelerations(physics, end, tau, applied_W, wrench_W, end_dot)
+        h = until - start[0]
+        while (count + _SAME) * period < until:
+            u = (count * period - start[0]) / h
+            _interpolate(h, u, start[1:], start_dot, end, end_dot, between)
+            _accelerations(physics, between, tau, applied_W, wrench_W, between_dot)
+            _take(physics, sensor, between, between_dot, wrench_W, noise, after)
             count += 1.0
     # A step that is all rounding may have ended a little before, and have taken this sample.
     taken = (count - 1.0 + _SAME) * period > time
     result[:size] = after[size : 2 * size] if taken else after[:size]
     if until_now and (count - _SAME) * period < time:
-        _take(physics, sensor, x, end_dot, end_wrench_W, noise, after)
+        _accelerations(physics, now, tau, applied_W, wrench_W, end_dot)
+        _take(physics, sensor, now, end_dot, wrench_W, noise, after)
         count += 1.0
-    last[0], last[1] = time, count
-    start[:] = x
+    tail[0], tail[1] = count, 0.0
+    remember_step(tail, time, state, sheet)
 
 
 class WristSensor(LeafSystem):
@@ -278,6 +299,7 @@ class WristSensor(LeafSystem):
         config: the sensor.
         motion: how the motion of S is estimated from its readings.
         period: sampling period [s].
+        held: for how long the motors hold a torque [s].
         q_start: (n,) where the arm rests before the first sample [rad].
 
     Raises:
@@ -291,6 +313,7 @@ class WristSensor(LeafSystem):
         config: WristSensorConfig,
         motion: MotionEstimationConfig,
         period: float,
+        held: float,
         q_start: Array,
     ) -> None:
         super().__init__()
@@ -305,10 +328,14 @@ class WristSensor(LeafSystem):
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
             first[:6] += config.offset
-        memory = np.concatenate([first, first, chain, estimator, np.zeros(2 + 2 * n + 2)])
+        # Contact takes many steps for one torque, and to work off the queue takes longer than them.
+        self._longest = 1 if slave.sheet is None else _LONGEST
+        tail = np.zeros(2 + self._longest * (2 * n + 3))
+        memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
         self._period = period
+        self._holds = (held, NOISE_BLOCK * period)
         self._no_noise, self._nothing = np.zeros(NOISE_SIZE), np.zeros(6)
 
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
@@ -364,10 +391,9 @@ class WristSensor(LeafSystem):
         For who sets states by hand: as if the simulation had arrived here.
         """
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
-        last = memory[self._sensor[3] :]
-        time = context.get_time()
-        last[0], last[1] = time, np.ceil(time / self._period - _SAME)
-        _join(self._state.Eval(context), self._sheet_state(context), last[2:])
+        tail, time = memory[self._sensor[3] :], context.get_time()
+        tail[0], tail[1] = np.ceil(time / self._period - _SAME), 0.0
+        remember_step(tail, time, self._state.Eval(context), self._sheet_state(context))
 
     def _sheet_state(self, context: Context) -> Array:
         return self._nothing[:2] if self._sheet is None else self._sheet.Eval(context)
@@ -393,7 +419,18 @@ class WristSensor(LeafSystem):
         sample_step(*self._inputs(context), True, output.get_mutable_value())
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        tail = discrete_state.value(0)[self._sensor[3] :]
+        if tail[1] < self._longest and not self._is_due(context.get_time()):
+            tail = discrete_state.get_mutable_value(0)[self._sensor[3] :]
+            state, sheet = self._state.Eval(context), self._sheet_state(context)
+            remember_step(tail, context.get_time(), state, sheet)
+            return
         discrete_state.set_value(0, self._step.Eval(context)[_SAMPLE + self._n :])
+
+    def _is_due(self, time: float) -> bool:
+        """Whether now the torque may change, or the noise."""
+        margin = _SAME * self._period
+        return any(abs(time - hold * round(time / hold)) < margin for hold in self._holds)
 
     def _check(self, context: Context) -> EventStatus:
         n = self._n
@@ -426,6 +463,7 @@ def AddWristSensor(
     config: WristSensorConfig,
     motion: MotionEstimationConfig,
     period: float,
+    held: float,
     q_start: Array,
 ) -> None:
     """Adds "wrist_sensor" and its noise, and what divides its port: for each part of a sample
@@ -439,9 +477,10 @@ def AddWristSensor(
         config: the sensor.
         motion: how the motion of S is estimated.
         period: sampling period [s].
+        held: for how long the motors hold a torque [s].
         q_start: (n,) where the arm rests before the first sample [rad].
     """
-    sensor = WristSensor(slave, config, motion, period, q_start)
+    sensor = WristSensor(slave, config, motion, period, held, q_start)
     builder.AddNamedSystem("wrist_sensor", sensor)
     if not config.ideal:
         noise = builder.AddNamedSystem(
