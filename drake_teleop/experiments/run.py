@@ -153,8 +153,7 @@ def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
-    to_next = _time_since(touching[::-1], -result.t[::-1])[::-1]
-    return _time_since(touching, result.t) + to_next < FILTER_TAIL
+    return _time_since(touching, result.t) + _time_until(touching, result.t) < FILTER_TAIL
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
@@ -171,7 +170,9 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     measured = result["measured_wrench_S"] - estimate[:6]
     calculated = calculated_contact_wrench(result)
     contact = in_contact(result)
+    # Of the bounces that a touch begins with, the first may have been between two samples.
     free = _time_since(contact, result.t) > FILTER_TAIL
+    free &= _time_until(contact, result.t) > FILTER_TAIL
     mass, com = _mass_and_com(estimate[6:])
     true_mass, true_com = _mass_and_com(arm.phi_load)
     n = arm.num_joints
@@ -243,6 +244,11 @@ def _time_since(contact: NDArray[np.bool_], t: Array) -> Array:
     """(N,) time since the last sample in contact; 0 in contact, inf before the first."""
     last = np.maximum.accumulate(np.where(contact, np.arange(len(t)), -1))
     return np.where(last < 0, np.inf, t - t[last])
+
+
+def _time_until(contact: NDArray[np.bool_], t: Array) -> Array:
+    """(N,) time until the next sample in contact; 0 in contact, inf after the last."""
+    return _time_since(contact[::-1], -t[::-1])[::-1]
 
 
 def _kept(log: Path) -> str:
