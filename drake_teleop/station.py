@@ -15,7 +15,6 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from drake_teleop.channel.channel import TeleopChannel
 from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.environment.contact import ToolContact
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.excitation import FourierTrajectory
 from drake_teleop.master import device
@@ -33,6 +32,7 @@ from drake_teleop.slave.load_estimator import LoadEstimator
 from drake_teleop.slave.monitor import SlaveMonitor
 from drake_teleop.slave.motion_estimation import estimated_motion_std
 from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, SlavePlant
+from drake_teleop.slave.tool_contact import ToolContact
 from drake_teleop.slave.wrist_sensor import AddWristSensor, sample_parts
 
 _SLAVE_WIRES = (
@@ -45,7 +45,10 @@ _SLAVE_WIRES = (
 )
 # Only when it learns or watches: at 8 kHz even a wire that nobody reads costs time.
 _LEARNING_WIRES = (("wrist_sample.sample", "load_estimator.sample"),)
-_CONTACT_WIRES = (("slave_plant.contact_results", "tool_contact.contact_results"),)
+_CONTACT_WIRES = (
+    ("slave_plant.rx90_state", "tool_contact.slave_state"),
+    ("slave_plant.sheet_spring_state", "tool_contact.sheet_state"),
+)
 _TELEOP_WIRES = (
     # The operator holds the master.
     ("operator.hand_wrench_E", "master_device.hand_wrench_E"),
@@ -313,7 +316,7 @@ def AddSlave(
         signals = signals | _WATCHING_SIGNALS
     if slave.sheet is None:
         return slave, signals
-    builder.AddNamedSystem("tool_contact", ToolContact(slave.tool))
+    builder.AddNamedSystem("tool_contact", ToolContact(slave.arm, slave.contact_pairs))
     _connect(builder, _CONTACT_WIRES)
     return slave, signals | _CONTACT_SIGNALS
 

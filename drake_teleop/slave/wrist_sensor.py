@@ -27,15 +27,12 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import Demultiplexer, RandomSource
 
-from drake_teleop.environment.point_contact import contact_force, indentation
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.slave.arm import (
     MOTION_SIZE,
     ArmModel,
     forward_dynamics,
-    forward_kinematics,
-    jacobian,
     sensor_motion,
 )
 from drake_teleop.slave.motion_estimation import (
@@ -53,6 +50,7 @@ from drake_teleop.slave.sensor_chain import (
     read_into,
     sensor_chain,
 )
+from drake_teleop.slave.tool_contact import environment_wrench
 
 Array = NDArray[np.float64]
 
@@ -97,49 +95,6 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
         x, y, z = motion[12 + i], motion[15 + i], motion[18 + i]
         out[i] -= x * f[0] + y * f[1] + z * f[2]
         out[3 + i] -= x * tx + y * ty + z * tz
-
-
-@njit(cache=True)
-def environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W):
-    """What acts on the tool besides the sensor and gravity, about the world's origin, in W.
-
-    Args:
-        arm: `ArmModel.table`.
-        pairs: (k, 26) of `ContactPairs`.
-        applied_W: (6,) [f; tau] about So, in W, on top of the contacts [N, N m].
-        q, v: (n,) of the arm.
-        sheet: (2,) deflection and its rate [m, m/s].
-        wrench_W: (6,) filled [N, N m].
-    """
-    wrench_W[:] = applied_W
-    if pairs.shape[0] == 0 and not applied_W.any():
-        return
-    R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
-    forward_kinematics(arm, q, R_WS, p_WS)
-    _add_moment(wrench_W[3:], p_WS, applied_W[:3])
-    for pair in pairs:
-        depth = indentation(pair, p_WS, R_WS, sheet[0], normal)
-        if depth <= 0.0:
-            continue
-        twist = np.empty((6, q.shape[0]))
-        jacobian(arm, q, twist)
-        velocity = twist @ v
-        r = normal[3:] - p_WS
-        _add_moment(velocity[:3], velocity[3:], r)
-        for i in range(3):
-            velocity[i] -= pair[19 + i] * sheet[1]
-        contact_force(pair, depth, normal[:3], velocity[:3], force)
-        for i in range(3):
-            wrench_W[i] += force[i]
-        _add_moment(wrench_W[3:], normal[3:], force)
-
-
-@njit(cache=True)
-def _add_moment(out, p, f):
-    """out += p x f."""
-    out[0] += p[1] * f[2] - p[2] * f[1]
-    out[1] += p[2] * f[0] - p[0] * f[2]
-    out[2] += p[0] * f[1] - p[1] * f[0]
 
 
 @njit(cache=True)
@@ -245,20 +200,22 @@ def sample_step(
     after[:] = memory
     tail = after[sensor[3] :]
     count, queued = tail[0], int(tail[1])
-    now, between = np.empty(2 * half), np.empty(2 * half)
-    start_dot, between_dot, end_dot = np.empty(2 * half), np.empty(2 * half), np.empty(2 * half)
-    wrench_W = np.empty(6)
+    now, now_dot, now_wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
+    between, between_dot, wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
+    start_dot, end_dot = np.empty(2 * half), now_dot
     _join(state, sheet, now)
+    _accelerations(physics, now, tau, applied_W, now_wrench_W, now_dot)
     for k in range(queued):
         start = tail[2 + k * width :][:width]
-        until, end = time, now
+        until, end, end_dot = time, now, now_dot
         if k < queued - 1:
             following = tail[2 + (k + 1) * width :][:width]
-            until, end = following[0], following[1:]
+            until, end, end_dot = following[0], following[1:], np.empty(2 * half)
         if (count + _SAME) * period >= until:
             continue
         _accelerations(physics, start[1:], tau, applied_W, wrench_W, start_dot)
-        _accelerations(physics, end, tau, applied_W, wrench_W, end_dot)
+        if k < queued - 1:
+            _accelerations(physics, end, tau, applied_W, wrench_W, end_dot)
         h = until - start[0]
         while (count + _SAME) * period < until:
             u = (count * period - start[0]) / h
@@ -270,8 +227,7 @@ def sample_step(
     taken = (count - 1.0 + _SAME) * period > time
     result[:size] = after[size : 2 * size] if taken else after[:size]
     if until_now and (count - _SAME) * period < time:
-        _accelerations(physics, now, tau, applied_W, wrench_W, end_dot)
-        _take(physics, sensor, now, end_dot, wrench_W, noise, after)
+        _take(physics, sensor, now, now_dot, now_wrench_W, noise, after)
         count += 1.0
     tail[0], tail[1] = count, 0.0
     remember_step(tail, time, state, sheet)
@@ -419,12 +375,12 @@ class WristSensor(LeafSystem):
         sample_step(*self._inputs(context), True, output.get_mutable_value())
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        tail = discrete_state.value(0)[self._sensor[3] :]
-        if tail[1] < self._longest and not self._is_due(context.get_time()):
+        if self._longest > 1 and not self._is_due(context.get_time()):
             tail = discrete_state.get_mutable_value(0)[self._sensor[3] :]
-            state, sheet = self._state.Eval(context), self._sheet_state(context)
-            remember_step(tail, context.get_time(), state, sheet)
-            return
+            if tail[1] < self._longest:
+                state, sheet = self._state.Eval(context), self._sheet_state(context)
+                remember_step(tail, context.get_time(), state, sheet)
+                return
         discrete_state.set_value(0, self._step.Eval(context)[_SAMPLE + self._n :])
 
     def _is_due(self, time: float) -> bool:

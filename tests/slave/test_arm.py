@@ -14,6 +14,7 @@ from drake_teleop.resources import models_dir
 from drake_teleop.slave.arm import (
     MOTION_SIZE,
     ArmModelFromPlant,
+    forward_dynamics,
     forward_kinematics,
     inverse_dynamics,
     jacobian,
@@ -189,6 +190,23 @@ def test_inverse_dynamics_equals_the_plant(case):
         np.testing.assert_allclose(
             tau, expected[arm.velocity_index], atol=1e-10 * np.linalg.norm(expected)
         )
+
+
+def test_forward_dynamics_is_the_inverse_of_inverse_dynamics(case):
+    """With a wrench on the load: J^T F on top of the torques."""
+    _, _, arm = case
+    n, random = arm.num_joints, np.random.default_rng(5)
+    tau, found, J = np.zeros(n), np.zeros(n), np.zeros((6, n))
+    R_WS, p_WS = np.zeros((3, 3)), np.zeros(3)
+    for q, v, vdot in random_states(arm):
+        wrench_W = 50 * random.normal(size=6)
+        inverse_dynamics(arm.table, q, v, vdot, tau)
+        jacobian(arm.table, q, J)
+        forward_kinematics(arm.table, q, R_WS, p_WS)
+        about_So = wrench_W[3:] - np.cross(p_WS, wrench_W[:3])
+        tau -= J.T @ np.concatenate([wrench_W[:3], about_So])
+        forward_dynamics(arm.table, q, v, tau, wrench_W, found)
+        np.testing.assert_allclose(found, vdot, atol=1e-9 * np.linalg.norm(vdot))
 
 
 def test_acceleration_from_the_torques_is_the_one_asked_for():

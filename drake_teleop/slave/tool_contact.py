@@ -1,0 +1,90 @@
+"""What the environment exerts on the tool: contacts of its ball with boxes, and what is applied."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_teleop.environment.point_contact import contact_force, indentation
+from drake_teleop.slave.arm import ArmModel, forward_kinematics, jacobian
+
+
+@njit(cache=True)
+def environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W):
+    """What acts on the tool besides the sensor and gravity, about the world's origin, in W.
+
+    Args:
+        arm: `ArmModel.table`.
+        pairs: (k, 26) of `ContactPairs`.
+        applied_W: (6,) [f; tau] about So, in W, on top of the contacts [N, N m].
+        q, v: (n,) of the arm.
+        sheet: (2,) deflection and its rate [m, m/s].
+        wrench_W: (6,) filled [N, N m].
+    """
+    wrench_W[:] = applied_W
+    if pairs.shape[0] == 0 and not applied_W.any():
+        return
+    R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
+    forward_kinematics(arm, q, R_WS, p_WS)
+    _add_moment(wrench_W[3:], p_WS, applied_W[:3])
+    for pair in pairs:
+        depth = indentation(pair, p_WS, R_WS, sheet[0], normal)
+        if depth <= 0.0:
+            continue
+        twist = np.empty((6, q.shape[0]))
+        jacobian(arm, q, twist)
+        velocity = twist @ v
+        r = normal[3:] - p_WS
+        _add_moment(velocity[:3], velocity[3:], r)
+        for i in range(3):
+            velocity[i] -= pair[19 + i] * sheet[1]
+        contact_force(pair, depth, normal[:3], velocity[:3], force)
+        for i in range(3):
+            wrench_W[i] += force[i]
+        _add_moment(wrench_W[3:], normal[3:], force)
+
+
+@njit(cache=True)
+def _add_moment(out, p, f):
+    """out += p x f."""
+    out[0] += p[1] * f[2] - p[2] * f[1]
+    out[1] += p[2] * f[0] - p[0] * f[2]
+    out[2] += p[0] * f[1] - p[1] * f[0]
+
+
+class ToolContact(LeafSystem):
+    """The true contact wrench for the log; no controller sees it.
+
+    .. pydrake_system::
+
+        name: ToolContact
+        input_ports:
+        - slave_state: [q; v] of the arm
+        - sheet_state: [z; v_z] of the sheet spring
+        output_ports:
+        - true_contact_wrench_W: on the tool, [f; tau] about the world's origin, in W
+
+    Args:
+        arm: kinematics up to the tool.
+        pairs: (k, 26) what may touch, see `ContactPairs`.
+    """
+
+    def __init__(self, arm: ArmModel, pairs: NDArray[np.float64]) -> None:
+        super().__init__()
+        self._n = arm.num_joints
+        self._contact = (arm.table, pairs, np.zeros(6))
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
+        self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
+        self.DeclareVectorOutputPort("true_contact_wrench_W", 6, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        state = self._state.Eval(context)
+        environment_wrench(
+            *self._contact,
+            state[: self._n],
+            state[self._n :],
+            self._sheet.Eval(context),
+            output.get_mutable_value(),
+        )

@@ -1,0 +1,80 @@
+"""The compiled contact law is Drake's, wherever ball and leaf meet."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.geometry import Box, Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.environment.point_contact import ContactPairs
+from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.tool_contact import environment_wrench
+
+
+def drakes(plant, context, tool) -> np.ndarray:
+    """[f; tau] on the tool about the world's origin, from the plant's own contact results."""
+    results, wrench = plant.get_contact_results_output_port().Eval(context), np.zeros(6)
+    for i in range(results.num_point_pair_contacts()):
+        info = results.point_pair_contact_info(i)
+        sign = 1.0 if info.bodyB_index() == tool else -1.0
+        force = sign * info.contact_force()
+        wrench += np.concatenate([force, np.cross(info.contact_point(), force)])
+    return wrench
+
+
+@pytest.mark.parametrize(
+    ("place", "most"),
+    [([0.55, 0.0, 0.158], 0.02), ([0.575, 0.028, 0.155], 0.04)],
+    ids=["face", "edge"],
+)
+def test_it_is_drakes_law(place, most):
+    builder = DiagramBuilder()
+    slave = AddSlavePlant(builder, [0.55, 0.0, 0.36], SheetSpring(position=place))
+    root = builder.Build().CreateDefaultContext()
+    plant, context = slave.plant, slave.plant.GetMyMutableContextFromRoot(root)
+    random, home = np.random.default_rng(0), slave.plant.GetPositions(context, slave.instance)
+    found, touching = np.zeros(6), 0
+    for _ in range(400):
+        q = home + most * random.uniform(-1, 1, 6)
+        # From sticking to sliding: the friction has three pieces.
+        v = random.normal(size=6) * 10.0 ** random.uniform(-5, 0)
+        sheet = np.array([0.01 * random.uniform(-1, 1), 0.1 * random.normal()])
+        plant.SetPositions(context, slave.instance, q)
+        plant.SetVelocities(context, slave.instance, v)
+        plant.SetPositions(context, slave.sheet, sheet[:1])
+        plant.SetVelocities(context, slave.sheet, sheet[1:])
+        expected = drakes(plant, context, slave.tool)
+        environment_wrench(slave.arm.table, slave.contact_pairs, np.zeros(6), q, v, sheet, found)
+        # A stiffness of 2e5 N/m makes 1e-10 N of the rounding of a position.
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        touching += expected.any()
+    assert touching > 40
+
+
+def test_a_push_is_moved_to_the_worlds_origin():
+    slave = AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.36], None)
+    push, found = np.array([1.0, -2.0, 3.0, 0.1, 0.2, 0.3]), np.zeros(6)
+    q = slave.plant.GetPositions(slave.plant.CreateDefaultContext(), slave.instance)
+    environment_wrench(slave.arm.table, slave.contact_pairs, push, q, 0 * q, np.zeros(2), found)
+    np.testing.assert_array_equal(found[:3], push[:3])
+    expected = push[3:] + np.cross([0.55, 0.0, 0.36], push[:3])
+    np.testing.assert_allclose(found[3:], expected, atol=1e-12)
+
+
+def test_other_shapes_are_refused():
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    tool = plant.AddRigidBody("tool", SpatialInertia.SolidSphereWithMass(1.0, 0.01))
+    table = plant.AddModelInstance("table")
+    body = plant.AddRigidBody("body", table, SpatialInertia.SolidSphereWithMass(1.0, 0.01))
+    friction = CoulombFriction(0.2, 0.2)
+    plant.RegisterCollisionGeometry(tool, RigidTransform(), Box(1, 1, 1), "cube", friction)
+    plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(0.1), "ball", friction)
+    plant.Finalize()
+    with pytest.raises(DrakeTeleopError, match="spheres on boxes only, not a Box on a Sphere"):
+        ContactPairs(plant, scene_graph.model_inspector(), tool.index(), table)
