@@ -55,7 +55,7 @@ class Simulation:
         "Drake's name of the integration scheme",
     )
     max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
-    accuracy: float = quantity(1e-4, "1", 1e-12, 0.1, "of error-controlled integrators")
+    accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "of error-controlled integrators")
     seed: int = 0
 
 

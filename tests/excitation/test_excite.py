@@ -115,12 +115,13 @@ def record(constants, memory, estimator, remembered, table, truth, noise, sample
         estimate_into(estimator, remembered, table, reading, samples[k])
 
 
-def test_predicted_and_observed_scatter_agree(slave, short):
-    """200 records of one motion: noise, walks, quantisation, filter, fused accelerations.
+@pytest.mark.parametrize("source", ["accelerometer", "fused", "encoders"])
+def test_predicted_and_observed_scatter_agree(slave, short, source):
+    """200 records of one motion: noise, walks, quantisation, filter, estimated motion.
 
     What the sensor is given is the same each time, so it is calculated once.
     """
-    sensor, motion, period = WristSensorConfig(), MotionEstimationConfig("fused"), 1 / 2000
+    sensor, motion, period = WristSensorConfig(), MotionEstimationConfig(source), 1 / 2000
     table, phi = slave.arm.table, slave.limits.phi / 1.3
     t = np.arange(0.0, 2.4, period)
     joints = short.trajectory.evaluate(t)

@@ -25,7 +25,7 @@ def test_the_examples_of_the_page_are_valid(tmp_path: Path, example: str) -> Non
 
 def test_the_page_documents_every_field() -> None:
     page = PAGE.read_text(encoding="utf-8")
-    assert len(EXAMPLES) == 3
+    assert len(EXAMPLES) == 4
     schema = Description.model_json_schema()
     fields = {name for entry in schema["$defs"].values() for name in entry["properties"]}
     units = {
