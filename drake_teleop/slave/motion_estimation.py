@@ -31,7 +31,13 @@ from numpy.typing import NDArray
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.quantities import choice, quantity
 from drake_teleop.slave.arm import MOTION_SIZE, sensor_motion
-from drake_teleop.slave.sensor_chain import WristSensorConfig, butterworth_sections, shift
+from drake_teleop.slave.sensor_chain import (
+    WristSensorConfig,
+    butterworth_sections,
+    low_pass,
+    settle,
+    shift,
+)
 
 _SOURCES = ("encoders", "accelerometer", "fused")
 #: How far an encoder's error moves So, root mean square over joints and directions [m/rad]: that of
@@ -308,8 +314,8 @@ def estimate_into(constants, memory, arm, reading, sample):
     for i in range(n):
         angles[i] = reading[13 + i]
     if starts:
-        _settle(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
-    _low_pass(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
+        settle(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
+    low_pass(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
     _wait(constants, memory, n, reading, sample)
     if starts:
         for i in range(3 * n):
@@ -321,37 +327,6 @@ def estimate_into(constants, memory, arm, reading, sample):
     else:
         _accelerate(constants, memory, arm[n, _GRAVITY:], motion, sample)
     memory[0] += 1.0
-
-
-@njit(cache=True)
-def _low_pass(filters, memory, values):
-    """Transposed direct form II in place; `memory` (4 x 2 x n,) is updated."""
-    n = values.shape[0]
-    for k in range(_SECTIONS):
-        b0, b1, b2 = filters[5 * k], filters[5 * k + 1], filters[5 * k + 2]
-        a1, a2 = filters[5 * k + 3], filters[5 * k + 4]
-        if b0 == 1.0:
-            continue
-        first, second = 2 * k * n, (2 * k + 1) * n
-        for i in range(n):
-            value = values[i]
-            out = b0 * value + memory[first + i]
-            memory[first + i] = b1 * value - a1 * out + memory[second + i]
-            memory[second + i] = b2 * value - a2 * out
-            values[i] = out
-
-
-@njit(cache=True)
-def _settle(filters, memory, values):
-    """Puts the filters' memory where it would be after a long time at `values`."""
-    n = values.shape[0]
-    for k in range(_SECTIONS):
-        b1, b2 = filters[5 * k + 1], filters[5 * k + 2]
-        a1, a2 = filters[5 * k + 3], filters[5 * k + 4]
-        for i in range(n):
-            second = (b2 - a2) * values[i]
-            memory[(2 * k + 1) * n + i] = second
-            memory[2 * k * n + i] = (b1 - a1) * values[i] + second
 
 
 @njit(cache=True)

@@ -473,27 +473,27 @@ def read_into(constants, memory, noise, truth, reading):
     row = memory[_LINE:][:width]
     channels = row[:_CHANNELS]
     walks, filtered = memory[_WALKS:FILTERED], memory[FILTERED:_LINE]
-    sections, low_pass = constants[_FILTER:_LOW_PASS_PLACE], constants[_LOW_PASS_PLACE]
+    sections, place = constants[_FILTER:_LOW_PASS_PLACE], constants[_LOW_PASS_PLACE]
     if count % NOISE_BLOCK == 0:
         for i in range(_CHANNELS):
             walks[i] += constants[_WALK + i] * noise[_CHANNELS * NOISE_BLOCK + i]
 
     _calibrate(constants, truth, channels)
-    if low_pass == _BEFORE:
+    if place == _BEFORE:
         if count == 0:
-            _settle(sections, channels, filtered)
-        _low_pass(sections, filtered, channels)
+            settle(sections, filtered, channels)
+        low_pass(sections, filtered, channels)
     for i in range(_CHANNELS):
         channels[i] += constants[i] + count * constants[_DRIFT + i]
-    if low_pass == _AFTER and count == 0:
-        _settle(sections, channels, filtered)
+    if place == _AFTER and count == 0:
+        settle(sections, filtered, channels)
     first = _CHANNELS * (count % NOISE_BLOCK)
     for i in range(_CHANNELS):
         channels[i] += constants[_NOISE + i] * noise[first + i] + walks[i]
     row[_CHANNELS] = _convert(constants, 0, 6, channels)
     row[_CHANNELS + 1] = _convert(constants, 6, 12, channels)
-    if low_pass == _AFTER:
-        _low_pass(sections, filtered, channels)
+    if place == _AFTER:
+        low_pass(sections, filtered, channels)
     quantum = constants[_ENCODER]
     for i in range(_ROW, width):
         angle = truth[15 + i - _ROW]
@@ -562,28 +562,37 @@ def _convert(constants, first, end, channels):
 
 
 @njit(cache=True)
-def _low_pass(sections, memory, values):
-    """Transposed direct form II in place; `memory` (2 x 2 x 12,) is updated."""
-    for k in range(_SECTIONS):
+def low_pass(sections, memory, values):
+    """Second-order sections one after the other, transposed direct form II, `values` in place.
+
+    Args:
+        sections: (5 k,) [b0, b1, b2, a1, a2] of each; one with b0 = 1 does nothing.
+        memory: (2 k n,) updated.
+        values: (n,) channels.
+    """
+    n = values.shape[0]
+    for k in range(sections.shape[0] // 5):
         b0, b1, b2 = sections[5 * k], sections[5 * k + 1], sections[5 * k + 2]
         a1, a2 = sections[5 * k + 3], sections[5 * k + 4]
-        first = memory[2 * k * _CHANNELS :][:_CHANNELS]
-        second = memory[(2 * k + 1) * _CHANNELS :][:_CHANNELS]
-        for i in range(_CHANNELS):
+        if b0 == 1.0:
+            continue
+        first, second = 2 * k * n, (2 * k + 1) * n
+        for i in range(n):
             value = values[i]
-            out = b0 * value + first[i]
-            first[i] = b1 * value - a1 * out + second[i]
-            second[i] = b2 * value - a2 * out
+            out = b0 * value + memory[first + i]
+            memory[first + i] = b1 * value - a1 * out + memory[second + i]
+            memory[second + i] = b2 * value - a2 * out
             values[i] = out
 
 
 @njit(cache=True)
-def _settle(sections, values, memory):
-    """Puts the filter's memory where it would be after a long time at `values`."""
-    for k in range(_SECTIONS):
+def settle(sections, memory, values):
+    """Puts the memory of `low_pass` where it would be after a long time at `values`."""
+    n = values.shape[0]
+    for k in range(sections.shape[0] // 5):
         b1, b2 = sections[5 * k + 1], sections[5 * k + 2]
         a1, a2 = sections[5 * k + 3], sections[5 * k + 4]
-        for i in range(_CHANNELS):
+        for i in range(n):
             second = (b2 - a2) * values[i]
-            memory[(2 * k + 1) * _CHANNELS + i] = second
-            memory[2 * k * _CHANNELS + i] = (b1 - a1) * values[i] + second
+            memory[(2 * k + 1) * n + i] = second
+            memory[2 * k * n + i] = (b1 - a1) * values[i] + second
