@@ -35,6 +35,10 @@ SCENARIOS = {
     "not a mapping": ("- 1\n- 2", "mapping"),
     "not YAML": ("simulation: {duration: [", "YAML"),
     "true for a number": ("simulation: {duration: true}", "simulation.duration"),
+    "fixed steps too long for contact": (
+        "{sheet_spring: {}, simulation: {integrator: runge_kutta2}}",
+        "simulation.max_step",
+    ),
     "fraction for the seed": ("simulation: {seed: 0.5}", "simulation.seed"),
 }
 
