@@ -1,6 +1,7 @@
 """What does a method cost the station, over the same network without one?
 
-The contact scenario over `internet`; all stations interleaved in this process, thread CPU time.
+Free motion over `internet`, so that all take the same steps (in contact, the methods bounce
+differently); all stations interleaved in this process, thread CPU time.
 
     python benchmarks/channel.py [--json FILE]
 """
@@ -21,7 +22,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
-    direct = LoadScenario("contact_transition")
+    direct = LoadScenario("free_motion_force")
     stations = {"direct": MakeMovingStation(direct)}
     for method in METHODS:
         over = replace(
