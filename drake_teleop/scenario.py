@@ -27,7 +27,6 @@ from drake_teleop.slave.load_estimator import LoadEstimatorConfig
 from drake_teleop.slave.motion_estimation import MotionEstimationConfig
 from drake_teleop.slave.sensor_chain import WristSensorConfig, preset_of
 
-
 #: What fixed steps need in contact [s]: ball on leaf vibrate at up to 700 Hz.
 _CONTACT_STEP = 1.25e-4
 
