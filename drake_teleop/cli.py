@@ -231,6 +231,59 @@ def eliminate(
 
 @cli.command()
 @click.argument("log", type=_PATH)
+@click.option(
+    "--load",
+    type=_PATH,
+    help="The identification.json of the load.  [default: identified from LOG itself]",
+)
+@click.option(
+    "--free",
+    type=_PATH,
+    metavar="LOG",
+    help="Free motion with this load, which sets the threshold.  [default: what is quiet in LOG]",
+)
+@click.option(
+    "--statistic",
+    type=click.Choice(["level", "cusum", "glr"]),
+    default="level",
+    show_default=True,
+    help="Of the wrench over its noise floor: plain, its cumulative sum, likelihood ratio.",
+)
+@_out("detect")
+@_cutoff
+@_delay
+@_quiet
+def detect(
+    log: Path,
+    load: Path | None,
+    free: Path | None,
+    statistic: str,
+    out: Path,
+    cutoff_hz: float,
+    delay: float | str,
+    quiet: bool,
+) -> None:
+    """Find contact in a log.
+
+    LOG is a canonical log (.csv, .parquet) or a log description (.yaml). The load's own wrench is
+    eliminated; the noise floor of what is left rises when the motion is fast.
+    """
+    from drake_teleop.logs.detection import detect_command
+
+    detect_command(
+        log,
+        out,
+        load=load,
+        free=free,
+        statistic=statistic,
+        cutoff_hz=cutoff_hz,
+        delay=delay,
+        quiet=quiet,
+    )
+
+
+@cli.command()
+@click.argument("log", type=_PATH)
 @_out("inspect")
 @_quiet
 def inspect(log: Path, out: Path, quiet: bool) -> None:

@@ -120,7 +120,7 @@ def identify_command(
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
     alone = None if gripper_load is None else identified_object(result, gripper_load)
-    summary = _common(log, found, cutoff_hz, result.delay_s) | {
+    summary = common_figures(log, found, cutoff_hz, result.delay_s) | {
         "samples": result.samples,
         **_load_figures(result),
         "offsets": result.offsets,
@@ -143,7 +143,7 @@ def identify_command(
     if alone is not None:
         summary |= {"gripper": str(gripper), "object": _object_figures(alone)}
         summary["notes"] += _object_notes(alone)
-    summary = _plain(summary)
+    summary = plain(summary)
     from drake_teleop.logs.pictures import draw_fit, draw_knowledge, one_page
     from drake_teleop.logs.report import write_report
 
@@ -155,7 +155,7 @@ def identify_command(
     draw_knowledge(found).savefig(out / "knowledge.png")
     one_page(out / "fit.png", out / "knowledge.png", out / "report.png")
     write_report(out / "report.html", found, summary, alone)
-    _write_summary(out, summary)
+    write_summary(out, summary)
     if not quiet:
         _print_identification(summary, out)
     return summary
@@ -200,7 +200,7 @@ def eliminate_command(
         cutoff_hz=cutoff_hz,
         delay=delay,
     )
-    summary = _common(log, found, cutoff_hz, found.delay_s) | {
+    summary = common_figures(log, found, cutoff_hz, found.delay_s) | {
         "load": str(load),
         "gripper": None if gripper is None else str(gripper),
         "sigma": sigma,
@@ -220,19 +220,19 @@ def eliminate_command(
             "less than half of the record agrees on the sensor's offsets: if it is in contact most"
             " of the time, the contact wrench may be off by a constant"
         )
-    summary = _plain(summary | _rms_figures(found) | _contact_figures(found, causal_tare_s))
+    summary = plain(summary | _rms_figures(found) | _contact_figures(found, causal_tare_s))
     from drake_teleop.logs.pictures import draw_elimination
 
     out.mkdir(parents=True, exist_ok=True)
     _write_wrenches(found, out / "contact_wrench.parquet")
     draw_elimination(found).savefig(out / "contact_wrench.png")
-    _write_summary(out, summary)
+    write_summary(out, summary)
     if not quiet:
         _print_elimination(summary, out)
     return summary
 
 
-def _common(
+def common_figures(
     path: Path, found: IdentifiedLog | EliminatedLog, cutoff_hz: float | None, delay_s: float
 ) -> dict[str, Any]:
     log = found.log
@@ -365,18 +365,18 @@ def _reduced(
     return dict(zip(keys, [*norms, reduce(wrench)], strict=True))
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """The same with lists and numbers of Python instead of numpy's, and null for infinity."""
     if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
+        return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
     if isinstance(value, (np.ndarray, np.generic)):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     return None if value in (float("inf"), float("-inf")) else value
 
 
-def _write_summary(out: Path, summary: dict[str, Any]) -> None:
+def write_summary(out: Path, summary: dict[str, Any]) -> None:
     (out / "summary.json").write_text(
         json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8"
     )
@@ -421,7 +421,7 @@ def _print_identification(summary: dict[str, Any], out: Path) -> None:
     )
     if summary["rejected"] > 0:
         figures += f"; {summary['rejected']:.1%} of them rejected as disturbed"
-    _print(table, figures, summary, out)
+    print_results(table, figures, summary, out)
 
 
 _Row: TypeAlias = tuple[str, float, float, float, str, str]
@@ -477,10 +477,10 @@ def _print_elimination(summary: dict[str, Any], out: Path) -> None:
             f"\ncausal: {1e3 * causal['lag_s']:.1f} ms {late},"
             f" rms of |F| {causal['residual_rms']:.4g} N"
         )
-    _print(table, figures, summary, out)
+    print_results(table, figures, summary, out)
 
 
-def _print(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:
+def print_results(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:
     from rich.console import Console
 
     lines = [figures]

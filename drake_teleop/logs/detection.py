@@ -1,0 +1,334 @@
+"""What `drake-teleop detect` does: contact in a log, above the noise floor of free motion.
+
+Names in the summary (and in summary.json) beside those that it has in common with `eliminate`;
+forces in N, torques in N m, frame S:
+
+====================== ==========================================================================
+load                   the identification's file; null if it was identified from the log itself
+free                   the log of free motion that floor and threshold are of; null for the parts
+                       of the log itself in which nothing stands out
+                       (`drake_teleop.logs.contact.in_contact`)
+free_s                 how much free motion that was
+statistic, threshold   see `drake_teleop.load.detection`
+noise                  [f; tau], standard deviation at rest
+per_acceleration       (6, 2) how it grows per m/s^2 and per rad/s^2
+above_threshold        share of the samples whose statistic reaches the threshold
+in_contact             share of the samples in contact, with hysteresis
+force_threshold        a quarter above the largest |F_c| in the free motion: a threshold that is the
+                       same for all motions
+above_force_threshold  share of the samples above it: raw (tared at its first sample), gravity_only
+                       (null if no orientation is known) and eliminated
+contacts               list of start_s, stop_s, peak_N, peak_Nm; and at the peak of the force
+                       push (3), the direction in which the environment pushes, and point_m (3), of
+                       its line the point nearest to the origin of S; null if there is no force
+====================== ==========================================================================
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.detection import (
+    STATISTICS,
+    ContactDetector,
+    NoiseFloor,
+    finite_covariance,
+    fit_noise_floor,
+    free_threshold,
+    statistics,
+    wrench_axis,
+)
+from drake_teleop.load.identification import Identification
+from drake_teleop.logs.alignment import low_pass
+from drake_teleop.logs.commands import common_figures, plain, print_results, write_summary
+from drake_teleop.logs.contact import contacts_of
+from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
+
+# The largest value of free motion is reached about once in as long a record of more of it. Normal
+# noise reaches a quarter more about a hundred times less often (and the same for both thresholds).
+_MARGIN = 1.25
+# Where the orientation is not known, gravity is what is slower than this in the specific force.
+_GRAVITY_HZ = 0.5
+
+
+@dataclass(frozen=True)
+class DetectedLog:
+    """A log and where it is in contact, N samples.
+
+    Args:
+        eliminated: the log without its non-contact wrench.
+        floor: of the free motion.
+        statistic: one of `STATISTICS`.
+        threshold: of it.
+        statistics: (N, 3); 0 at the ends, which are not judged.
+        touched: (N,) contact, with hysteresis.
+        free_s: length of the free motion [s].
+        force_threshold: a quarter above the largest |F_c| of the free motion [N].
+    """
+
+    eliminated: EliminatedLog
+    floor: NoiseFloor
+    statistic: str
+    threshold: float
+    statistics: NDArray[np.float64]
+    touched: NDArray[np.bool_]
+    free_s: float
+    force_threshold: float
+
+    @property
+    def above(self) -> NDArray[np.bool_]:
+        """(N,) where the statistic reaches the threshold."""
+        return self.statistics[:, STATISTICS.index(self.statistic)] >= self.threshold
+
+
+def detect_log(
+    path: str | Path,
+    load: str | Path | Identification | None = None,
+    *,
+    free: str | Path | None = None,
+    statistic: str = "level",
+    cutoff_hz: float = 30.0,
+    delay: str | float = "auto",
+) -> DetectedLog:
+    """Finds contact in a log, after the zero-phase low-pass of `eliminate_log`.
+
+    The threshold is a quarter above what free motion reaches. It is worth as much as that motion:
+    it should be as fast, pass the same poses and be as long as what is judged by it.
+
+    Args:
+        path: canonical table or log description.
+        load: identification.json, or what is in it; None identifies it from the log itself, which
+            contact disturbs.
+        free: log of free motion with the same load; None takes the parts of the log itself in
+            which nothing stands out.
+        statistic: one of `STATISTICS`.
+        cutoff_hz: of the low-pass.
+        delay: as of `eliminate_log`.
+
+    Raises:
+        DrakeTeleopError: if a log or load file cannot be used or is of static poses, or for another
+            statistic.
+    """
+    if load is None:
+        load = identify_log(path, cutoff_hz=cutoff_hz, delay=delay).identification
+    elif not isinstance(load, Identification):
+        load = Identification.load(load)
+    found = eliminate_log(path, load, cutoff_hz=cutoff_hz, delay=delay)
+    calm = found
+    if free is not None:
+        calm = eliminate_log(free, load, cutoff_hz=cutoff_hz, delay=delay)
+    for log in (found.log, calm.log):
+        if log.static:
+            raise DrakeTeleopError("holds poses at rest, which have no contact", where=log.source)
+    if statistic not in STATISTICS:
+        raise DrakeTeleopError(
+            f"{statistic!r} is not a statistic",
+            where="statistic",
+            remedy=f"give one of {', '.join(STATISTICS)}",
+        )
+    column = STATISTICS.index(statistic)
+    inner = _judged(calm, cutoff_hz)
+    quiet = ~calm.touched[inner] if free is None else slice(None)
+    train = _Samples(*(x[inner][quiet] for x in _samples(calm, cutoff_hz)))
+    # What was held fades by e within a period of the low-pass.
+    fade = math.exp(-calm.log.dt * cutoff_hz)
+    covariance = finite_covariance(found.phi, load.covariance, tared=True)
+    floor = fit_noise_floor(*train, covariance, fade=fade)
+    threshold = _MARGIN * free_threshold(statistics(floor, *train)[:, column])
+
+    inner = _judged(found, cutoff_hz)
+    rows = _Samples(*(x[inner] for x in _samples(found, cutoff_hz)))
+    hold = round(1.0 / (cutoff_hz * found.log.dt))
+    detector = ContactDetector(floor, threshold, statistic=statistic, hold=hold)
+    values, touched = np.zeros((len(found.log), 3)), np.zeros(len(found.log), bool)
+    values[inner], touched[inner] = statistics(floor, *rows), detector.detect(*rows)
+    return DetectedLog(
+        eliminated=found,
+        floor=floor,
+        statistic=statistic,
+        threshold=threshold,
+        statistics=values,
+        touched=touched,
+        free_s=len(train.contact) * calm.log.dt,
+        force_threshold=_MARGIN * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
+    )
+
+
+def _judged(found: EliminatedLog, cutoff_hz: float) -> slice:
+    """All but a period of the low-pass at both ends, where it passes the noise as it is."""
+    ends = max(1, round(1.0 / (cutoff_hz * found.log.dt)))
+    return slice(ends, len(found.log) - ends)
+
+
+class _Samples(NamedTuple):
+    """What the detectors take, N samples each."""
+
+    contact: NDArray[np.float64]
+    s: NDArray[np.float64]
+    omega: NDArray[np.float64]
+    alpha: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+
+
+def _samples(found: EliminatedLog, cutoff_hz: float) -> _Samples:
+    """Contact wrench and motion after the low-pass."""
+    log = found.log
+    s, omega, alpha = (low_pass(x, log.dt, cutoff_hz) for x in log.motion)
+    if log.gravity is not None:
+        gravity = low_pass(log.gravity, log.dt, cutoff_hz)
+    else:
+        gravity = -low_pass(log.specific_force, log.dt, _GRAVITY_HZ)
+    return _Samples(found.contact, s, omega, alpha, s + gravity)
+
+
+def detect_command(
+    log: Path,
+    out: Path,
+    *,
+    load: Path | None = None,
+    free: Path | None = None,
+    statistic: str = "level",
+    cutoff_hz: float = 30.0,
+    delay: str | float = "auto",
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """`detect_log`, writing detection.parquet, detection.png and summary.json.
+
+    The Parquet table has `t`, the three statistics, `contact_f_x` and so on, and `in_contact`.
+
+    Returns:
+        the summary; its names are explained at the top of this module.
+    """
+    found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
+    eliminated = found.eliminated
+    summary = common_figures(log, eliminated, cutoff_hz, eliminated.delay_s) | {
+        "load": None if load is None else str(load),
+        "free": None if free is None else str(free),
+        "free_s": found.free_s,
+        "statistic": statistic,
+        "threshold": found.threshold,
+        "noise": found.floor.noise,
+        "per_acceleration": found.floor.per_acceleration,
+        "above_threshold": found.above.mean(),
+        "in_contact": found.touched.mean(),
+        "force_threshold": found.force_threshold,
+        "above_force_threshold": _above_force(eliminated, found.force_threshold),
+        "contacts": _contacts(found),
+    }
+    summary = plain(summary)
+    out.mkdir(parents=True, exist_ok=True)
+    _write_table(found, out / "detection.parquet")
+    draw_detection(found).savefig(out / "detection.png")
+    write_summary(out, summary)
+    if not quiet:
+        _print_detection(summary, out)
+    return summary
+
+
+def _above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
+    wrenches = {
+        "raw": found.measured - found.measured[0],
+        "gravity_only": found.gravity_only,
+        "eliminated": found.contact,
+    }
+    return {
+        name: None if wrench is None else (np.linalg.norm(wrench[:, :3], axis=1) > threshold).mean()
+        for name, wrench in wrenches.items()
+    }
+
+
+def _contacts(found: DetectedLog) -> list[dict[str, Any]]:
+    t, wrench = found.eliminated.log.t, found.eliminated.contact
+    rows = []
+    for touch in contacts_of(t, wrench, found.touched):
+        inside = np.flatnonzero((t >= touch.start_s) & (t <= touch.stop_s))
+        peak = inside[np.argmax(np.linalg.norm(wrench[inside, :3], axis=1))]
+        direction, point, _ = wrench_axis(wrench[peak])
+        known = bool(np.isfinite(direction).all())
+        rows.append(
+            {
+                "start_s": touch.start_s,
+                "stop_s": touch.stop_s,
+                "peak_N": touch.peak_force,
+                "peak_Nm": touch.peak_torque,
+                # Eq. (13) is what the sensor exerts on the load.
+                "push": -direction if known else None,
+                "point_m": point if known else None,
+            }
+        )
+    return rows
+
+
+def _write_table(found: DetectedLog, path: Path) -> None:
+    import polars as pl
+
+    from drake_teleop.logs.canonical import WRENCH
+
+    columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
+    columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTICS)}
+    columns |= {f"contact_{c}": found.eliminated.contact[:, i] for i, c in enumerate(WRENCH)}
+    pl.DataFrame(columns | {"in_contact": found.touched}).write_parquet(path)
+
+
+def draw_detection(found: DetectedLog) -> Any:
+    """|F| without and with the load's own on top; below, the statistic and its threshold."""
+    from drake_teleop.style import BLACK, BLUE, ORANGE, Picture, house_style, shade_contact
+
+    eliminated = found.eliminated
+    t = eliminated.log.t
+    with house_style():
+        figure = Picture(figsize=(10, 6))
+        top, below = figure.subplots(2, 1, sharex=True)
+        raw = np.linalg.norm((eliminated.measured - eliminated.measured[0])[:, :3], axis=1)
+        top.plot(t, raw, color="#A3AAB5", label="measured, tared at the start")
+        if eliminated.gravity_only is not None:
+            weightless = np.linalg.norm(eliminated.gravity_only[:, :3], axis=1)
+            top.plot(t, weightless, color=ORANGE, label="static weight removed")
+        top.plot(t, np.linalg.norm(eliminated.contact[:, :3], axis=1), color=BLUE, label="contact")
+        top.axhline(found.force_threshold, color=BLACK, linewidth=0.8, linestyle=":")
+        top.set_yscale("symlog", linthresh=1.0)
+        top.set_ylabel("$|F|$ [N]")
+        top.set_title("dotted: the same threshold for all motions")
+        below.plot(t, found.statistics[:, STATISTICS.index(found.statistic)], color=BLUE)
+        below.axhline(found.threshold, color=BLACK, linewidth=0.8, linestyle="--")
+        below.set_ylabel(f"{found.statistic} [standard deviations]")
+        below.set_xlabel("time [s]")
+        below.set_title(f"above the threshold {100 * found.above.mean():.2g} % of the time")
+        for axis in (top, below):
+            shade_contact(axis, t, found.touched)
+        figure.legend(loc="outside lower center", ncols=3)
+        figure.suptitle(Path(eliminated.log.source).name, x=0.01, ha="left", fontsize=11)
+    return figure
+
+
+def _print_detection(summary: dict[str, Any], out: Path) -> None:
+    from rich.table import Table
+
+    table = Table(title=f"Contact in {Path(summary['log']).name}", title_justify="left")
+    for heading in ("from [s]", "to [s]", "|F| [N]", "|tau| [N m]", "pushed along"):
+        table.add_column(heading, justify="right")
+    for c in summary["contacts"]:
+        push = "" if c["push"] is None else " ".join(f"{x:+.2f}" for x in c["push"])
+        table.add_row(
+            f"{c['start_s']:.3f}", f"{c['stop_s']:.3f}", f"{c['peak_N']:.3g}",
+            f"{c['peak_Nm']:.3g}", push,
+        )  # fmt: skip
+    shares = ", ".join(
+        f"{name.replace('_', ' ')} {100 * share:.2g} %"
+        for name, share in summary["above_force_threshold"].items()
+        if share is not None
+    )
+    figures = (
+        f"above the threshold ({summary['statistic']} {summary['threshold']:.3g})"
+        f" {100 * summary['above_threshold']:.2g} % of the time, in contact"
+        f" {100 * summary['in_contact']:.2g} %\n"
+        f"with {summary['force_threshold']:.3g} N for all motions: {shares}"
+    )
+    print_results(table, figures, summary, out)

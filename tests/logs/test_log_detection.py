@@ -1,0 +1,102 @@
+"""`drake-teleop detect`: contact is found in logs, and fast motion is not contact."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from click.testing import CliRunner
+from test_log_commands import GRAVITY, describe_poses, describe_record
+
+from drake_teleop.cli import cli
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.canonical import Log, write_log
+from drake_teleop.logs.detection import detect_command, detect_log
+from drake_teleop.logs.processing import identify_log
+
+TOOL = phi_from_mass_com_inertia(1.5, [0.01, -0.02, 0.1], np.diag([0.01, 0.009, 0.004]))
+OFFSETS = np.array([3.0, -2.0, 7.0, 0.1, 0.2, -0.3])
+
+
+def log_with_push(path: Path, push: np.ndarray, seed: int) -> Path:
+    """8 s of turning and shaking; the environment pushes the tool's tip from 5 s to 6 s."""
+    t = np.arange(0.0, 8.0, 2e-3)
+    rng = np.random.default_rng(seed)
+
+    def sines(low: float, high: float, size: float) -> np.ndarray:
+        angles = 2 * np.pi * rng.uniform(low, high, 3) * t[:, None] + rng.uniform(0, 6, 3)
+        return size * np.sin(angles)
+
+    s = sines(0.5, 3.0, 3.0) + sines(0.1, 0.3, 8.0)
+    omega, alpha = sines(0.3, 1.0, 1.5), sines(0.5, 3.0, 6.0)
+    wrench = OFFSETS + non_contact_wrench(s, omega, alpha, TOOL)
+    wrench += rng.normal(size=wrench.shape) * np.repeat([0.1, 0.004], 3)
+    pressed = (t >= 5.0) & (t < 6.0)
+    # What the environment exerts, the sensor need not: F_c = -F_env.
+    wrench[pressed] -= np.r_[push, np.cross([0.0, 0.0, 0.2], push)]
+    write_log(Log(t, wrench, s, omega, alpha), path)
+    return path
+
+
+@pytest.mark.parametrize("statistic", ["level", "cusum", "glr"])
+def test_a_push_is_found_with_its_direction_and_place(tmp_path: Path, statistic: str) -> None:
+    free = log_with_push(tmp_path / "free.parquet", np.zeros(3), 1)
+    load = tmp_path / "identification.json"
+    identify_log(free, delay=0.0).identification.save(load)
+    log = log_with_push(tmp_path / "log.parquet", np.array([0.0, 1.0, 0.0]), 2)
+    out = tmp_path / "out"
+    arguments = ["detect", str(log), "--load", str(load), "--free", str(free), "--delay", "0"]
+    result = CliRunner().invoke(cli, [*arguments, "--statistic", statistic, "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    summary = json.loads((out / "summary.json").read_text())
+    (touch,) = summary["contacts"]
+    assert touch["start_s"] == pytest.approx(5.0, abs=0.03)
+    assert touch["stop_s"] == pytest.approx(6.0, abs=0.1)
+    np.testing.assert_allclose(touch["push"], [0, 1, 0], atol=0.2)
+    assert touch["point_m"][2] == pytest.approx(0.2, abs=0.04)
+    table = pl.read_parquet(out / "detection.parquet")
+    assert table["in_contact"].mean() == pytest.approx(summary["in_contact"])
+    assert (out / "detection.png").stat().st_size > 10_000
+    assert f"{touch['start_s']:.3f}" in result.output
+
+
+def test_free_motion_of_the_log_itself_and_its_own_load(tmp_path: Path) -> None:
+    log = log_with_push(tmp_path / "log.parquet", np.array([3.0, 0.0, 0.0]), 3)
+    summary = detect_command(log, tmp_path, delay=0.0, quiet=True)
+    (touch,) = summary["contacts"]
+    assert touch["start_s"] == pytest.approx(5.0, abs=0.05)
+    assert summary["free"] is None
+    assert summary["load"] is None
+
+
+def test_poses_and_unknown_statistics_are_refused(ntnu: Path, tmp_path: Path) -> None:
+    poses = describe_poses(tmp_path, ntnu, GRAVITY)
+    with pytest.raises(DrakeTeleopError, match="at rest"):
+        detect_log(poses)
+    with pytest.raises(DrakeTeleopError, match="not a statistic"):
+        detect_log(describe_record(tmp_path, ntnu, "1-baseline"), statistic="sum")
+
+
+@pytest.mark.parametrize("statistic", ["level", "cusum", "glr"])
+def test_ntnu_hammer_is_not_taken_for_contact(ntnu: Path, tmp_path: Path, statistic: str) -> None:
+    """The threshold is of the calm record; in the other, the robot is hit with a hammer."""
+    load = tmp_path / "identification.json"
+    identify_log(describe_poses(tmp_path, ntnu, GRAVITY)).identification.save(load)
+    calm, shaken = (describe_record(tmp_path, ntnu, r) for r in ("1-baseline", "2-vibrations"))
+    options = {"load": load, "statistic": statistic, "quiet": True}
+    found = detect_command(shaken, tmp_path / "shaken", free=calm, **options)
+    assert found["above_threshold"] <= 0.009
+    assert found["above_force_threshold"]["raw"] > 0.85
+    # The same threshold for all motions is exceeded more often.
+    assert found["above_force_threshold"]["eliminated"] > 2 * found["above_threshold"]
+    # The other way round, so that the record is not judged by itself.
+    calm_again = detect_command(calm, tmp_path / "calm", free=shaken, **options)
+    assert calm_again["above_threshold"] == 0.0
+    itself = detect_command(calm, tmp_path / "itself", free=calm, **options)
+    assert itself["above_threshold"] == 0.0
+    assert itself["above_force_threshold"]["raw"] > 0.85
