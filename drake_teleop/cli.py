@@ -366,6 +366,29 @@ def compare_passivity(
     )
 
 
+@cli.command()
+@click.argument("study", type=_PATH)
+@click.option(
+    "--jobs", type=click.IntRange(min=1), help="Processes at once.  [default: one for each core]"
+)
+@click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    help="Of a Dask scheduler, which has the processes; or local, for one on this machine.",
+)
+@_out("study")
+@_quiet
+def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: bool) -> None:
+    """Run a scenario over a design of its fields.
+
+    STUDY is a YAML file: factors, design, repeats, measures. Writes one table with a row for each
+    run. If it was stopped or killed, the same command goes on where it was.
+    """
+    from drake_teleop.experiments.study import study_command
+
+    study_command(study, out, jobs=jobs or -1, cluster=cluster, quiet=quiet)
+
+
 class _Positive(click.ParamType):
     """Positive numbers with commas between them."""
 

@@ -8,9 +8,10 @@ message that names file and field. Times are in s, rates in Hz, lengths in m.
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
-from pydrake.common.yaml import yaml_load, yaml_load_typed
+from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
@@ -126,6 +127,16 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     Raises:
         DrakeTeleopError: if there is no such scenario, or naming file and field of what is wrong.
     """
+    data, where = ReadScenario(name_or_path)
+    return ScenarioFromData(data, where)
+
+
+def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
+    """What stands in the file of a scenario, not checked, and the file's name for messages.
+
+    Raises:
+        DrakeTeleopError: if there is no such scenario, or it is not YAML.
+    """
     path = scenarios_dir() / f"{name_or_path}.yaml"
     if str(name_or_path) not in ScenarioNames():
         path = Path(name_or_path)
@@ -135,14 +146,21 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
             remedy=f"give a YAML file or one of {', '.join(ScenarioNames())}",
         )
     try:
-        text = path.read_text()
-        data = yaml_load(data=text)
+        return yaml_load(data=path.read_text()), str(path)
     except (UnicodeDecodeError, yaml.YAMLError) as error:
         raise DrakeTeleopError(f"is not YAML ({error})", where=str(path)) from None
-    check_structure(Scenario, data, str(path))
+
+
+def ScenarioFromData(data: Any, where: str) -> Scenario:
+    """The scenario of a parsed YAML file; `where` is the place for messages.
+
+    Raises:
+        DrakeTeleopError: naming the field of what is wrong.
+    """
+    check_structure(Scenario, data, where)
     defaults = Scenario(wrist_sensor=preset_of(data.get("wrist_sensor")))
-    scenario = yaml_load_typed(schema=Scenario, data=text, defaults=defaults)
-    scenario.check(str(path))
+    scenario = yaml_load_typed(schema=Scenario, data=yaml_dump(data), defaults=defaults)
+    scenario.check(where)
     return scenario
 
 

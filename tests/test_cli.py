@@ -58,7 +58,8 @@ def test_no_command_shows_the_help(capsys):
     status, out, _ = run_main(capsys, "--help")
     assert status == 0
     for command in (
-        "reproduce", "run", "identify", "eliminate", "inspect", "detect", "compare-passivity", "excite"
+        "reproduce", "run", "identify", "eliminate", "inspect", "detect", "compare-passivity",
+        "study", "excite",
     ):  # fmt: skip
         assert f"  {command} " in out
     assert "..." not in out.split("Commands:")[1]  # every summary fits its line

@@ -1,0 +1,99 @@
+"""The rows of a study on disk: complete or absent, whenever a process dies.
+
+A folder `runs.parquet` of parts is one table for polars, DuckDB and others. A part holds the rows
+of one chunk of runs and is named after the first: a chunk that is run again replaces itself.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drake_teleop.errors import DrakeTeleopError
+
+if TYPE_CHECKING:
+    import polars as pl
+
+_PART = "run_{:08d}.parquet"
+
+
+@dataclass(frozen=True)
+class Store:
+    """The rows of one study.
+
+    Args:
+        folder: of the parts.
+    """
+
+    folder: Path
+
+    def finished(self) -> set[int]:
+        """The first runs of the chunks that are complete."""
+        pattern = _PART.format(0).replace("0", "?")
+        return {int(part.stem.removeprefix("run_")) for part in self.folder.glob(pattern)}
+
+    def write(self, rows: pl.DataFrame) -> None:
+        """Adds the rows of one chunk; column "run" of the first one gives the part's name."""
+        # Beside the folder, since what reads folders reads all that is in them.
+        unfinished = self.folder.with_name(f"{self.folder.name}.unfinished")
+        rows.write_parquet(unfinished)
+        unfinished.replace(self.folder / _PART.format(rows["run"][0]))
+
+    def read(self) -> pl.DataFrame:
+        """All rows, sorted by run."""
+        import polars as pl
+
+        return pl.read_parquet(self.folder).sort("run")
+
+
+@contextmanager
+def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
+    """The store in a folder, for this process alone, new or with the rows that it has.
+
+    Args:
+        out: the folder; gets study.json and runs.parquet.
+        identity: all that the rows depend on, for JSON.
+
+    Raises:
+        DrakeTeleopError: if the folder holds the rows of something else, or is in use.
+    """
+    store = Store(out / "runs.parquet")
+    store.folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(out, os.O_RDONLY)
+    try:
+        _lock(handle, out)
+        _check_identity(out, identity)
+        yield store
+    finally:
+        os.close(handle)
+
+
+def _lock(handle: int, out: Path) -> None:
+    """The kernel takes the lock back from a process that dies, however it dies."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise DrakeTeleopError(
+            "another process runs a study there", where=str(out), remedy="wait for it, or stop it"
+        ) from None
+
+
+def _check_identity(out: Path, identity: dict[str, Any]) -> None:
+    path = out / "study.json"
+    text = json.dumps(identity, indent=2) + "\n"
+    if not path.exists():
+        unfinished = path.with_name("study.json.unfinished")
+        unfinished.write_text(text, encoding="utf-8")
+        unfinished.replace(path)
+    elif path.read_text(encoding="utf-8") != text:
+        raise DrakeTeleopError(
+            "holds the runs of another study, or of another version of this one",
+            where=str(out),
+            remedy="give another folder, or remove this one",
+        )

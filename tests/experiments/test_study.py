@@ -1,0 +1,356 @@
+"""`drake-teleop study`: the design, the store that survives a kill, the same rows everywhere."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.experiments import study as studies
+from drake_teleop.experiments.study import (
+    MEASURES,
+    Factor,
+    LoadStudy,
+    Study,
+    run_study,
+    study_command,
+)
+from drake_teleop.experiments.study_store import open_store
+from drake_teleop.result import SimulationResult
+from drake_teleop.signals import SIGNALS
+
+# Learns while it moves, so that no identification comes first.
+SCENARIO = """
+simulation: {duration: 0.05, settle: 0.02}
+operator:
+  grip: firm
+  intent: [!Sine {duration: 10.0, ramp: 0.1, frequency: 3.0, translation: [0.01, 0.01, 0.02]}]
+load_estimator: {enabled: true}
+"""
+STUDY = """
+scenario: tiny.yaml
+factors:
+  - {field: force_scaling.sigma, values: [0, 0.5, 1]}
+  - {field: operator.grip, words: [light, firm]}
+  - {field: simulation.max_step, values: [1e-3]}
+repeats: 2
+"""
+# A study without a station, killed 20 times; its runs take 1 ms, and every seventh fails.
+FAKE = """
+import os, random, signal, sys, time
+from pathlib import Path
+import joblib, polars
+from drake_teleop.experiments.study import Factor, Study, run_study
+
+def work(values, seed):
+    time.sleep(pause)
+    if seed % 7 == 3:
+        raise ValueError("a seventh\\nof them")
+    return {"hand_work_J": values["a.b"] / (1 + seed)}
+
+def run(out):
+    factor = Factor("a.b", low=0.0, high=1.0, levels=100)
+    study = Study(factors=[factor], repeats=30, measures=["hand_work_J"])
+    return run_study(study, out, work, {}, jobs=1)
+
+killed, whole = map(Path, sys.argv[1:])
+pause = 0.001
+pauses = random.Random(0)
+for _ in range(20):
+    child = os.fork()
+    if not child:
+        run(killed)
+        os._exit(0)
+    time.sleep(pauses.uniform(0.0, 0.2))
+    os.kill(child, signal.SIGKILL)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL, "it has ended by itself"
+    print(len(list((killed / "runs.parquet").glob("*"))))
+pause = 0.0
+run(killed)
+run(whole)
+"""
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    (folder / "tiny.yaml").write_text(SCENARIO)
+    (folder / "study.yaml").write_text(STUDY)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def serial(files):
+    out = files / "serial"
+    return study_command(files / "study.yaml", out, jobs=1, quiet=True), out
+
+
+def parts(out: Path) -> dict[str, bytes]:
+    return {part.name: part.read_bytes() for part in (out / "runs.parquet").iterdir()}
+
+
+def test_a_row_for_each_run(serial):
+    summary, out = serial
+    rows = pl.read_parquet(out / "runs.parquet").sort("run")
+    assert rows["run"].to_list() == list(range(12))
+    assert rows.columns == [
+        *("run", "point", "repeat", "seed"),
+        *("force_scaling.sigma", "operator.grip", "simulation.max_step"),
+        *MEASURES,
+        "error",
+    ]
+    assert summary["runs"] == 12
+    assert summary["points"] == 6
+    assert summary["failed"] == rows["error"].count() == 0
+    # Seeds are those of the repeats, for every point; another one gives other noise.
+    assert rows["seed"].to_list() == [0, 2] * 6
+    assert rows["rms_force_to_master_N"].n_unique() == 12
+    # A load that is felt in full is heavier than one that is not.
+    mean = rows.group_by("force_scaling.sigma").agg(pl.col("rms_force_to_master_N").mean())
+    assert np.all(np.diff(mean.sort("force_scaling.sigma")["rms_force_to_master_N"]) > 0.1)
+
+
+def test_processes_give_the_same_bytes(serial, files):
+    out = files / "parallel"
+    summary = study_command(files / "study.yaml", out, jobs=2, quiet=True)
+    assert summary == serial[0]
+    assert parts(out) == parts(serial[1])
+
+
+def test_a_dask_cluster_gives_the_same_bytes(serial, files):
+    pytest.importorskip("distributed")
+    out = files / "dask"
+    summary = study_command(files / "study.yaml", out, jobs=2, cluster="local", quiet=True)
+    assert summary == serial[0]
+    assert parts(out) == parts(serial[1])
+
+
+def test_without_dask_the_extra_is_named(files, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(DrakeTeleopError, match=r"drake_teleop\[cluster\]"):
+        study_command(files / "study.yaml", files / "none", cluster="local", quiet=True)
+
+
+def test_a_killed_study_of_stations_goes_on(serial, files):
+    out = files / "killed"
+    command = "from drake_teleop.cli import main; main()"
+    arguments = ["study", str(files / "study.yaml"), "--jobs", "1", "--quiet", "--out", str(out)]
+    kill_after([sys.executable, "-c", command, *arguments], out, new_parts=4, pause=0.05)
+    kept = parts(out)
+    assert 4 <= len(kept) < 12
+    assert study_command(files / "study.yaml", out, jobs=1, quiet=True) == serial[0]
+    assert parts(out) == parts(serial[1])
+
+
+def test_kills_lose_and_double_no_row(tmp_path):
+    script, killed, whole = (tmp_path / name for name in ("fake.py", "killed", "whole"))
+    script.write_text(FAKE)
+    answer = subprocess.run(
+        [sys.executable, str(script), str(killed), str(whole)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert answer.returncode == 0, answer.stderr
+    kept = [int(line) for line in answer.stdout.split()]
+    assert kept == sorted(kept)
+    assert len(set(kept)) > 5  # most kills fell into the work, not before it
+    assert parts(killed) == parts(whole)
+    rows = pl.read_parquet(killed / "runs.parquet").sort("run")
+    assert rows["run"].to_list() == list(range(3000))
+    failed = rows.filter(pl.col("error").is_not_null())
+    assert set(failed["seed"] % 7) == {3}
+    assert set(failed["error"]) == {"ValueError: a seventh of them"}
+    assert rows["hand_work_J"].null_count() == failed["hand_work_J"].null_count() == failed.height
+
+
+def kill_after(command: list[str], out: Path, new_parts: int, pause: float) -> None:
+    """Kills a study when it has written some more parts, and a little later."""
+    folder = out / "runs.parquet"
+    before = len(list(folder.glob("*")))
+    process = subprocess.Popen(command, env=os.environ)
+    deadline = time.monotonic() + 120
+    while len(list(folder.glob("*"))) < before + new_parts:
+        assert process.poll() is None, "the study has ended by itself"
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    time.sleep(pause)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+
+
+def test_a_run_that_fails_is_a_row(files):
+    (files / "failing.yaml").write_text(
+        STUDY.replace(
+            "values: [1e-3]", "values: [1e-3]}\n  - {field: force_scaling.eta, values: [1]"
+        )
+    )
+    out = files / "failing"
+    summary = study_command(files / "failing.yaml", out, jobs=1, quiet=True)
+    rows = pl.read_parquet(out / "runs.parquet")
+    assert rows.height == summary["failed"] == 12
+    assert rows["error"].str.contains("tiny.yaml:force_scaling.eta: ").all()
+    assert summary["measures"]["hand_work_J"] == {"mean": None, "least": None, "largest": None}
+
+
+def test_another_study_does_not_mix_with_the_rows(serial, files):
+    before = parts(serial[1])
+    (files / "other.yaml").write_text(STUDY + "seed: 1\n")
+    with pytest.raises(DrakeTeleopError, match="another study"):
+        study_command(files / "other.yaml", serial[1], quiet=True)
+    assert parts(serial[1]) == before
+
+
+def test_two_processes_do_not_write_at_once(tmp_path):
+    with (
+        open_store(tmp_path, {}),
+        pytest.raises(DrakeTeleopError, match="another process"),
+        open_store(tmp_path, {}),
+    ):
+        pass
+    with open_store(tmp_path, {}):
+        pass
+
+
+def test_an_interrupt_says_what_is_kept(tmp_path):
+    calls = []
+
+    def work(values, seed):
+        calls.append(values)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return {}
+
+    study = Study(factors=[Factor("a.b", values=[1.0, 2.0, 3.0, 4.0])])
+    with pytest.raises(KeyboardInterrupt, match="keeps 2 of 4 runs"):
+        run_study(study, tmp_path, work, {}, jobs=1)
+    assert run_study(study, tmp_path, work, {}, jobs=1).height == 4
+    assert len(calls) == 5  # the third one again
+
+
+@dataclass(frozen=True)
+class Dies:
+    """A run that ends its process, unless that is the study's own."""
+
+    own: int
+
+    def __call__(self, values, seed):
+        if os.getpid() != self.own:
+            os._exit(1)
+        return {}
+
+
+def test_a_process_that_dies_costs_no_row_that_was_written(tmp_path):
+    study = Study(factors=[Factor("a.b", values=[1.0, 2.0, 3.0, 4.0])])
+    with pytest.raises(DrakeTeleopError, match="a process has died after 1 of 4 runs"):
+        run_study(study, tmp_path, Dies(os.getpid()), {}, jobs=2)
+    assert run_study(study, tmp_path, Dies(os.getpid()), {}, jobs=1).height == 4
+
+
+def test_sobol_points_are_balanced():
+    factors = [Factor("a.b", low=-1.0, high=3.0), Factor("a.c", words=["x", "y"])]
+    study = Study(factors=factors, design="sobol", samples=64, seed=5)
+    points = study.points()
+    numbers = np.array([point["a.b"] for point in points])
+    # One in each of 64 equal parts of the range, and every half has as many of both words.
+    np.testing.assert_array_equal(np.sort((numbers + 1) / 4 * 64 // 1), np.arange(64))
+    words = np.array([point["a.c"] for point in points])
+    assert [sum(words[numbers < 1] == word) for word in "xy"] == [16, 16]
+    assert points == study.points()
+    study.seed = 6
+    assert points != study.points()
+
+
+def test_a_factorial_design_has_every_combination_once():
+    factors = [Factor("a.b", low=0.0, high=1.0, levels=5), Factor("a.c", words=["x", "y"])]
+    points = Study(factors=factors).points()
+    assert len({tuple(point.values()) for point in points}) == len(points) == 10
+    assert {point["a.b"] for point in points} == {0.0, 0.25, 0.5, 0.75, 1.0}
+
+
+def test_measures_of_a_known_motion():
+    """A hand pulls with (3, 4, 0) N at 0.2 m/s along x; the display shows 2 sin t along z."""
+    t = np.linspace(0.0, 2 * math.pi, 20001)
+    signals = {name: np.zeros((len(t), 6)) for name in ("hand_wrench_E", "twist_master")}
+    signals |= {
+        name: np.zeros((len(t), 6)) for name in ("force_to_master", "true_contact_wrench_W")
+    }
+    signals["hand_wrench_E"][:, :2] = 3.0, 4.0
+    signals["hand_wrench_E"][:, 5] = 0.1
+    signals["twist_master"][:, 0], signals["twist_master"][:, 5] = 0.2, 0.5
+    signals["force_to_master"][:, 2] = 2 * np.sin(t)
+    signals["force_to_master"][:, 3] = 9.0  # torques do not count
+    signals["true_contact_wrench_W"][100, :3] = 2.0, -3.0, 6.0
+    result = SimulationResult(t, signals, [SIGNALS[name] for name in signals])
+    found = {name: measure(result, 1.0) for name, measure in MEASURES.items()}
+    assert found == pytest.approx(
+        {
+            "peak_force_to_master_N": 2.0,
+            "rms_force_to_master_N": math.sqrt(2.0),
+            "peak_contact_force_N": 7.0,
+            "hand_work_J": (3.0 * 0.2 + 0.1 * 0.5) * 2 * math.pi,
+            "time_above_force_s": 4 / 3 * math.pi,
+        },
+        rel=1e-3,
+    )
+
+
+def test_a_preset_brings_its_values(files):
+    """A factor acts as if it stood in the file: a preset is more than its name."""
+    work = studies.StationWork({}, "x", (), 1.0)
+    ideal = work.scenario({"wrist_sensor.preset": "ideal"}, 3)
+    assert ideal.simulation.seed == 3
+    assert ideal.wrist_sensor != work.scenario({}, 3).wrist_sensor
+    assert ideal.wrist_sensor.ideal
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            ("force_scaling.sigma", "force_scaling.sigm"),
+            "factors[0].force_scaling.sigm: there is no",
+        ),
+        (("[0, 0.5, 1]", "[0, -0.5]"), "factors[0].force_scaling.sigma: -0.5"),
+        (("[light, firm]", "[light, iron]"), "factors[1].operator.grip: 'iron' is not known"),
+        (("words", "values"), "factors[1].values[0]: expected a number"),
+        (("values: [0, 0.5, 1]", "low: 1"), "factors[0]: what it varies over"),
+        (("values: [0, 0.5, 1]", "values: []"), "factors[0]: what it varies over"),
+        (("values: [0, 0.5, 1]", "low: 1, high: 0"), "factors[0].high: the range ends at 0"),
+        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: a value stands there twice"),
+        (("operator.grip, words: [light, firm]", "force_scaling.sigma, values: [1]"), "twice"),
+        (("force_scaling.sigma", "simulation.seed"), "factors[0].field: the seed is no factor"),
+        (("tiny.yaml", "none.yaml"), "there is no scenario"),
+        (("repeats: 2", "repeats: 0"), "repeats: 0 1 is outside"),
+        (("repeats: 2", "repeat: 2"), "did you mean 'repeats'"),
+        (("repeats: 2", "design: taguchi"), "design: 'taguchi' is not known"),
+        (("repeats: 2", "{design: sobol, samples: 48}"), "is not YAML"),
+        (("repeats: 2", "design: sobol\nsamples: 48"), "samples: 48 Sobol points"),
+        (("repeats: 2", "measures: [joy]"), "there is no measure 'joy'"),
+        ((STUDY, "scenario: tiny.yaml"), "factors: nothing is varied"),
+        ((STUDY, "- 1"), "expected a mapping"),
+    ],
+)
+def test_a_bad_file_is_one_line_with_its_field(files, tmp_path, change, message):
+    path = files / "bad.yaml"
+    path.write_text(STUDY.replace(*change))
+    with pytest.raises(DrakeTeleopError) as error:
+        study_command(path, tmp_path / "out", quiet=True)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(OSError, match=r"none\.yaml"):
+        LoadStudy(tmp_path / "none.yaml")
