@@ -56,7 +56,7 @@ Array = NDArray[np.float64]
 
 _SAMPLE = 16
 #: A part of a period, within which two instants are one.
-_SAME = 1e-3
+_SAME = 1e-6
 #: Steps of the plant that wait to be sampled, at most.
 _LONGEST = 16
 #: How often the plant is asked whether it moves as the dynamics here say [s], and how alike they
