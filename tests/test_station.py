@@ -77,8 +77,7 @@ def test_the_wrist_wrench_is_the_reaction_force_of_the_sensors_joint(slave, shee
         error = max(error, np.abs(sample - expected).max())
     assert peak > 60.0
     assert (contacts > 50) == (sheet is not None)
-    # In contact, rounding of positions times a stiffness of 2e5 N/m.
-    assert error < (1e-12 if sheet is None else 1e-9)
+    assert error < 1e-12
 
 
 @pytest.mark.parametrize(

@@ -247,7 +247,7 @@ def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
     return min((a.effort_limit() for a in _actuators(plant, joint)), default=np.inf)
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
     """Moves the pose in x from the previous link to this one; returns p_PL_W."""
     r0 = r1 = r2 = 0.0
@@ -271,7 +271,7 @@ def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, fl
     return r0, r1, r2
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _advance(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
     """Moves the state x from the previous link to this one."""
     r0, r1, r2 = _advance_pose(table, row, q, x)
@@ -292,7 +292,7 @@ def _advance(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) 
     x[8] += z2 * qdd + (w0 * z1 - w1 * z0) * qd
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _start(table: Array, x: Array) -> None:
     """The state of the world's frame at rest: s = -g, identity pose."""
     x[:] = 0.0
@@ -395,7 +395,7 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
     _advance(table, n, 0.0, 0.0, 0.0, out[n])
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
     """Fills link[row]: axis z and origin p of L, then what moves the link (force; moment about Wo).
 
@@ -484,7 +484,7 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
         tau_out[row] += table[row, _ROTOR] * vdot[row] + table[row, _DAMPING] * v[row]
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
     """Adds a link's inertia about Wo in W: m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
     m, h0, h1, h2 = table[row, 12], table[row, 13], table[row, 14], table[row, 15]

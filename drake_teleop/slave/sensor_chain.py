@@ -38,7 +38,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.quantities import choice, quantity
 
 #: Samples that share one block of random numbers: one event of a noise source, one step of a walk.
-NOISE_BLOCK = 32
+NOISE_BLOCK = 128
 _CHANNELS = 12
 #: Standard normal numbers for NOISE_BLOCK samples: 12 for each, then 12 for the random walks.
 NOISE_SIZE = _CHANNELS * (NOISE_BLOCK + 1)

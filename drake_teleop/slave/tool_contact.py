@@ -41,9 +41,15 @@ def environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W):
         for i in range(3):
             velocity[i] -= pair[19 + i] * sheet[1]
         contact_force(pair, depth, normal[:3], velocity[:3], force)
-        for i in range(3):
-            wrench_W[i] += force[i]
-        _add_moment(wrench_W[3:], normal[3:], force)
+        add_force(wrench_W, normal[3:], force)
+
+
+@njit(cache=True)
+def add_force(wrench_W, p_WC, force_W):
+    """Adds a force (3,) at C [N] to a wrench (6,) about the world's origin, all in W."""
+    for i in range(3):
+        wrench_W[i] += force_W[i]
+    _add_moment(wrench_W[3:], p_WC, force_W)
 
 
 @njit(cache=True)

@@ -17,6 +17,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from pydrake.common import RandomDistribution
+from pydrake.common.value import Value
+from pydrake.multibody.plant import ContactResults
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -50,7 +52,7 @@ from drake_teleop.slave.sensor_chain import (
     read_into,
     sensor_chain,
 )
-from drake_teleop.slave.tool_contact import environment_wrench
+from drake_teleop.slave.tool_contact import add_force, environment_wrench
 
 Array = NDArray[np.float64]
 
@@ -100,19 +102,24 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
 @njit(cache=True)
 def _accelerations(physics, x, tau, applied_W, wrench_W, xdot):
     """Time derivative of x = [q, sheet's deflection, v, its rate], and the environment's wrench."""
+    half = tau.shape[0] + 1
+    q, v = x[: half - 1], x[half:-1]
+    environment_wrench(physics[0], physics[2], applied_W, q, v, x[half - 1 :: half], wrench_W)
+    _motion(physics, x, tau, applied_W, wrench_W, xdot)
+
+
+@njit(cache=True)
+def _motion(physics, x, tau, applied_W, wrench_W, xdot):
+    """Time derivative of x, see `_accelerations`, under the environment's wrench."""
     arm, _, pairs, leaf = physics
-    n = tau.shape[0]
-    half = n + 1
-    q, v = x[:n], x[half : half + n]
-    sheet = x[n::half]
-    environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W)
-    forward_dynamics(arm, q, v, tau, wrench_W, xdot[half : half + n])
+    half = tau.shape[0] + 1
+    forward_dynamics(arm, x[: half - 1], x[half:-1], tau, wrench_W, xdot[half:-1])
     xdot[:half] = x[half:]
     push = 0.0
     if pairs.shape[0] > 0:  # which all are of one body, the leaf
         for i in range(3):
             push -= pairs[0, 19 + i] * (wrench_W[i] - applied_W[i])
-    xdot[-1] = (push - leaf[1] * sheet[0] - leaf[2] * sheet[1]) / leaf[0] + leaf[3]
+    xdot[-1] = (push - leaf[1] * x[half - 1] - leaf[2] * x[-1]) / leaf[0] + leaf[3]
 
 
 @njit(cache=True)
@@ -174,7 +181,8 @@ def remember_step(tail, time, state, sheet):
 
 @njit(cache=True)
 def sample_step(
-    physics, sensor, period, time, state, sheet, tau, applied_W, noise, memory, until_now, result
+    physics, sensor, period, time, state, sheet, tau, applied_W, noise, memory, until_now,
+    touching_W, result,
 ):  # fmt: skip
     """Takes the samples that have become due in the steps since the last call.
 
@@ -193,6 +201,9 @@ def sample_step(
         memory: [last sample (16 + n) | the one before (16 + n) | chain's | estimator's | tail:
             samples taken, length of the queue, time and x of each step's end in it].
         until_now: whether the sample that may be due this very instant is taken.
+        touching_W: (6,) what contacts exert on the tool now, as the plant says, about the world's
+            origin, in W; used if `until_now`. A stiff contact multiplies the last digit of a
+            position by 2e5 N/m: what has the plant's own penetration is the plant's to 1e-12 N.
         result: filled: [last sample before now (16 + n) | memory, its queue now's end alone].
     """
     size, width, half = _SAMPLE + tau.shape[0], state.shape[0] + 3, tau.shape[0] + 1
@@ -204,7 +215,13 @@ def sample_step(
     between, between_dot, wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
     start_dot, end_dot = np.empty(2 * half), now_dot
     _join(state, sheet, now)
-    _accelerations(physics, now, tau, applied_W, now_wrench_W, now_dot)
+    if until_now:
+        none, n = physics[2][:0], half - 1
+        environment_wrench(physics[0], none, applied_W, state[:n], state[n:], sheet, now_wrench_W)
+        now_wrench_W += touching_W
+        _motion(physics, now, tau, applied_W, now_wrench_W, now_dot)
+    else:
+        _accelerations(physics, now, tau, applied_W, now_wrench_W, now_dot)
     for k in range(queued):
         start = tail[2 + k * width :][:width]
         until, end, end_dot = time, now, now_dot
@@ -244,6 +261,7 @@ class WristSensor(LeafSystem):
         - joint_torque: (n,) that the motors hold [N m]
         - slave_acceleration: vdot of the arm, to see that nothing else moves it
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
+        - contact_results: the plant's (only with a sheet spring)
         - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
         - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, of whatever pushes it besides
           contacts [N, N m] (may be left unconnected)
@@ -298,9 +316,12 @@ class WristSensor(LeafSystem):
         self._torque = self.DeclareVectorInputPort("joint_torque", n)
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
         self._applied = self.DeclareVectorInputPort("applied_wrench_W", 6)
-        self._sheet = self._noise = None
+        self._sheet = self._contacts = self._noise = None
         if slave.sheet is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
+            contacts = Value[ContactResults]()
+            self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
+            self._tool = slave.tool
         if not config.ideal:
             self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
         self.DeclareDiscreteState(memory)
@@ -338,7 +359,7 @@ class WristSensor(LeafSystem):
 
     def take_samples(self, context: Context) -> None:
         """Takes the samples before now, for who wants to see the state that results."""
-        sample_step(*self._inputs(context), False, self._result)
+        sample_step(*self._inputs(context), False, self._nothing, self._result)
         context.SetDiscreteState(self._result[_SAMPLE + self._n :])
 
     def bring_up_to_date(self, context: Context) -> None:
@@ -357,6 +378,22 @@ class WristSensor(LeafSystem):
     def _applied_W(self, context: Context) -> Array:
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._nothing
 
+    def _touching_W(self, context: Context) -> Array:
+        if self._contacts is None:
+            return self._nothing
+        results = self._contacts.Eval(context)
+        contacts = results.num_point_pair_contacts()
+        if contacts == 0:
+            return self._nothing
+        wrench_W = np.zeros(6)
+        for k in range(contacts):
+            contact = results.point_pair_contact_info(k)
+            force = contact.contact_force()  # on body B
+            if contact.bodyB_index() != self._tool:
+                force = -force
+            add_force(wrench_W, contact.contact_point(), force)
+        return wrench_W
+
     def _inputs(self, context: Context) -> tuple[object, ...]:
         return (
             self._physics,
@@ -372,7 +409,8 @@ class WristSensor(LeafSystem):
         )
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
-        sample_step(*self._inputs(context), True, output.get_mutable_value())
+        touching_W = self._touching_W(context)
+        sample_step(*self._inputs(context), True, touching_W, output.get_mutable_value())
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._longest > 1 and not self._is_due(context.get_time()):
@@ -447,6 +485,9 @@ def AddWristSensor(
     if slave.sheet is not None:
         builder.Connect(
             slave.plant.get_state_output_port(slave.sheet), sensor.GetInputPort("sheet_state")
+        )
+        builder.Connect(
+            slave.plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")
         )
     sizes = list(sample_parts(slave.arm.num_joints).values())
     step = sensor.GetOutputPort("step")

@@ -30,6 +30,7 @@ from drake_teleop.slave.motion_estimation import (
 )
 from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, home_position
 from drake_teleop.slave.sensor_chain import (
+    NOISE_BLOCK,
     NOISE_SIZE,
     PRESETS,
     WristSensorConfig,
@@ -75,12 +76,12 @@ def sampled(
 ) -> Array:
     """Truth through sensor and estimation; `believed` is what the estimation takes it for."""
     n = truth.shape[1] - 15
-    noise = np.random.default_rng(seed).standard_normal((len(truth) // 32 + 1, NOISE_SIZE))
+    noise = np.random.default_rng(seed).standard_normal((len(truth) // NOISE_BLOCK + 1, NOISE_SIZE))
     samples, reading = np.empty((len(truth), 16 + n)), np.empty(13 + n)
     chain, chain_memory = sensor_chain(sensor, n, T)
     constants, memory = motion_estimator(config, believed or sensor, n, T)
     for k in range(len(truth)):
-        read_into(chain, chain_memory, noise[k // 32], truth[k], reading)
+        read_into(chain, chain_memory, noise[k // NOISE_BLOCK], truth[k], reading)
         estimate_into(constants, memory, table, reading, samples[k])
     return samples
 
