@@ -24,7 +24,6 @@ from drake_teleop.load.excitation import FourierTrajectory
 from drake_teleop.load.identification import Identification, identify
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.uncertainty import intervals
 from drake_teleop.scenario import LoadScenario, replace
 from drake_teleop.slave.motion_estimation import (
     MotionEstimationConfig,
@@ -433,8 +432,9 @@ def test_identify_closes_the_loop_on_any_arm(foreign, write_log, tmp_path):
     assert stop.value.code == 0
     found = Identification.load(tmp_path / "load" / "identification.json")
     assert found.identifiable.all()
-    lower, upper = intervals(found, 1 - 0.001 / 10)  # all ten at once
-    assert np.all((lower[6:] < recording.phi) & (recording.phi < upper[6:]))
+    # A motion differentiated from poses has errors of its own, about as large as the stated ones.
+    deviations = found.standard_deviations[6:] * (1.0 if write_log is write_canonical else 2.0)
+    assert np.abs((found.phi - recording.phi) / deviations).max() < 3.9  # 99.9 % for all ten
     mass, com, inertia = mass_com_inertia(recording.phi)
     assert found.mass == pytest.approx(mass, rel=2e-3)
     np.testing.assert_allclose(found.com, com, atol=3e-4)
