@@ -26,6 +26,7 @@ from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.slave.joint_control import JointControlConfig
 from drake_teleop.slave.load_estimator import LoadEstimatorConfig
 from drake_teleop.slave.motion_estimation import MotionEstimationConfig
+from drake_teleop.slave.payload import Payload
 from drake_teleop.slave.sensor_chain import WristSensorConfig, preset_of
 
 #: What fixed steps need in contact [s]: ball on leaf vibrate at up to 700 Hz.
@@ -75,9 +76,10 @@ class Master:
 
 @dataclass
 class Slave:
-    """Where the tool starts: S points down at this position."""
+    """Where the tool starts: S points down at this position; and what it holds."""
 
     position: list[float] = quantity([0.55, 0.0, 0.45], "m", -1.5, 1.5, "p_WS at the start")
+    payload: Payload = field(default_factory=Payload)
 
 
 @dataclass

@@ -277,7 +277,8 @@ def AddSlave(
         The plant, and the signals that can be recorded: name -> "system.port".
     """
     rates, sensor = scenario.rates, scenario.wrist_sensor
-    slave = AddSlavePlant(builder, scenario.slave.position, scenario.sheet_spring, q_start)
+    held = scenario.slave.payload
+    slave = AddSlavePlant(builder, scenario.slave.position, scenario.sheet_spring, q_start, held)
     start = slave.plant.GetDefaultPositions(slave.instance)
     blocks = {
         "joint_control": JointControl(

@@ -103,7 +103,8 @@ def task_direction(
     moved_B = np.asarray(displacement, dtype=float)
     hand_B = np.concatenate([R_WB.T @ n_W, np.zeros(3)])
     device_mass, device_damping = _device(scenario, moved_B, hand_B)
-    arm = AddSlavePlant(DiagramBuilder(), scenario.slave.position, None).arm
+    slave = scenario.slave
+    arm = AddSlavePlant(DiagramBuilder(), slave.position, None, payload=slave.payload).arm
     moved_W = scaling.translation_scale * R_WB @ moved_B
     q = _slave_posture(arm, scenario.slave.position, moved_W)
     J, R_WS, p_WS = np.empty((6, 6)), np.empty((3, 3)), np.empty(3)

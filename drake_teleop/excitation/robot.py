@@ -46,6 +46,7 @@ from drake_teleop.load.inertia import inertia_about_origin, phi_from_mass_com_in
 from drake_teleop.scenario import Scenario
 from drake_teleop.slave.arm import ArmModel, ArmModelFromPlant
 from drake_teleop.slave.motion_estimation import MotionEstimationConfig
+from drake_teleop.slave.payload import AddPayload
 from drake_teleop.slave.plant import ParseSlave, finalize, home_position
 from drake_teleop.slave.sensor_chain import WristSensorConfig
 
@@ -129,7 +130,8 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     """
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
-        instance, _ = ParseSlave(plant)
+        instance, tool = ParseSlave(plant)
+        AddPayload(plant, tool, scenario.slave.payload)
         if scenario.sheet_spring is not None:
             AddSheetSpring(plant, scenario.sheet_spring)
         return instance, plant.GetFrameByName("sensor", instance)

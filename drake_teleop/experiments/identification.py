@@ -79,8 +79,9 @@ class LoadIdentification:
 
 
 def slave_arm(scenario: Scenario) -> ArmModel:
-    """The arm of a scenario's slave, with the tool as its load."""
-    return AddSlavePlant(DiagramBuilder(), scenario.slave.position, None).arm
+    """The arm of a scenario's slave, with tool and payload as its load."""
+    slave = scenario.slave
+    return AddSlavePlant(DiagramBuilder(), slave.position, None, payload=slave.payload).arm
 
 
 def identification_scenario(scenario: Scenario, seed: int) -> Scenario:

@@ -19,6 +19,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.resources import models_dir
 from drake_teleop.slave.arm import ArmModel, ArmModelFromPlant
 from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
+from drake_teleop.slave.payload import AddPayload, Payload
 
 #: S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
@@ -55,6 +56,7 @@ def AddSlavePlant(
     position: list[float],
     sheet_spring: SheetSpring | None,
     q_start: NDArray[np.float64] | None = None,
+    payload: Payload | None = None,
 ) -> SlavePlant:
     """Adds the slave's plant, at rest.
 
@@ -65,6 +67,7 @@ def AddSlavePlant(
         position: (3,) p_WS at the start [m]; the tool points down.
         sheet_spring: what there is to touch, or None.
         q_start: (6,) joint angles to start at instead [rad].
+        payload: what the tool holds, if anything.
 
     Raises:
         DrakeTeleopError: if the arm cannot reach the start.
@@ -77,6 +80,8 @@ def AddSlavePlant(
         plant.set_contact_model(ContactModel.kPoint)
         plant.set_stiction_tolerance(STICTION)
     instance, tool = ParseSlave(plant)
+    if payload is not None:
+        AddPayload(plant, tool, payload)
     sheet = None if sheet_spring is None else AddSheetSpring(plant, sheet_spring)
     finalize(plant)
     pairs, leaf = np.zeros((0, 26)), np.array([1.0, 0.0, 0.0, 0.0])
