@@ -15,6 +15,7 @@ from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.master.device import JointFriction
 from drake_teleop.master.operator import OperatorConfig
@@ -101,6 +102,12 @@ class Scenario:
     load_estimator: LoadEstimatorConfig = field(default_factory=LoadEstimatorConfig)
     force_scaling: ForceScalingConfig = field(default_factory=ForceScalingConfig)
     sheet_spring: SheetSpring | None = None
+    slot: Slot | None = None
+
+    @property
+    def environment(self) -> SheetSpring | Slot | None:
+        """What there is to touch."""
+        return self.sheet_spring if self.slot is None else self.slot
 
     def check(self, where: str = "scenario") -> None:
         """Checks every value.
@@ -112,6 +119,12 @@ class Scenario:
         self.force_scaling.scales(f"{where}:force_scaling")
         self.load_estimator.check(f"{where}:load_estimator")
         self.wrist_sensor.check(f"{where}:wrist_sensor", self.rates.sensor_hz)
+        if self.sheet_spring is not None and self.slot is not None:
+            raise DrakeTeleopError(
+                "there are a sheet_spring and a slot to touch",
+                where=f"{where}:slot",
+                remedy="leave one of them out",
+            )
         _check_steps(self, where)
         _check_channel(self, where)
 
@@ -183,9 +196,9 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
 def _check_steps(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
     controlled = simulation.integrator == "runge_kutta3"
-    if scenario.sheet_spring is not None and not controlled and simulation.max_step > _CONTACT_STEP:
+    if scenario.environment is not None and not controlled and simulation.max_step > _CONTACT_STEP:
         raise DrakeTeleopError(
-            f"steps of {simulation.max_step:g} s are too long for the contact with the leaf",
+            f"steps of {simulation.max_step:g} s are too long for contact",
             where=f"{where}:simulation.max_step",
             remedy=f"set it to {_CONTACT_STEP:g}, or integrator: runge_kutta3, which finds its own",
         )

@@ -45,10 +45,8 @@ _SLAVE_WIRES = (
 )
 # Only when it learns or watches: at 8 kHz even a wire that nobody reads costs time.
 _LEARNING_WIRES = (("wrist_sample.sample", "load_estimator.sample"),)
-_CONTACT_WIRES = (
-    ("slave_plant.rx90_state", "tool_contact.slave_state"),
-    ("slave_plant.sheet_spring_state", "tool_contact.sheet_state"),
-)
+_CONTACT_WIRES = (("slave_plant.rx90_state", "tool_contact.slave_state"),)
+_SHEET_WIRES = (("slave_plant.sheet_spring_state", "tool_contact.sheet_state"),)
 _TELEOP_WIRES = (
     # The operator holds the master.
     ("operator.hand_wrench_E", "master_device.hand_wrench_E"),
@@ -92,10 +90,8 @@ _SLAVE_SIGNALS = {
     "joint_torque": "joint_control.joint_torque",
 }
 _WATCHING_SIGNALS = {"load_state": "load_estimator.load_state"}
-_CONTACT_SIGNALS = {
-    "true_contact_wrench_W": "tool_contact.true_contact_wrench_W",
-    "sheet_state": "slave_plant.sheet_spring_state",
-}
+_CONTACT_SIGNALS = {"true_contact_wrench_W": "tool_contact.true_contact_wrench_W"}
+_SHEET_SIGNALS = {"sheet_state": "slave_plant.sheet_spring_state"}
 _TELEOP_SIGNALS = {
     "intent": "operator.intent",
     "hand_wrench_E": "operator.hand_wrench_E",
@@ -150,7 +146,7 @@ def MakeTeleopStation(
         - load_state (if the load is watched)
         - slave_state
         - joint_torque
-        - true_contact_wrench_W (with a sheet spring)
+        - true_contact_wrench_W (with something to touch)
         - sheet_state (with a sheet spring)
         - intent
         - hand_wrench_E
@@ -278,7 +274,7 @@ def AddSlave(
     """
     rates, sensor = scenario.rates, scenario.wrist_sensor
     held = scenario.slave.payload
-    slave = AddSlavePlant(builder, scenario.slave.position, scenario.sheet_spring, q_start, held)
+    slave = AddSlavePlant(builder, scenario.slave.position, scenario.environment, q_start, held)
     start = slave.plant.GetDefaultPositions(slave.instance)
     blocks = {
         "joint_control": JointControl(
@@ -315,11 +311,13 @@ def AddSlave(
         _connect(builder, _LEARNING_WIRES)
     if scenario.load_estimator.watch:
         signals = signals | _WATCHING_SIGNALS
-    if slave.sheet is None:
-        return slave, signals
-    builder.AddNamedSystem("tool_contact", ToolContact(slave.arm, slave.contact_pairs))
-    _connect(builder, _CONTACT_WIRES)
-    return slave, signals | _CONTACT_SIGNALS
+    if slave.can_touch:
+        moves = slave.sheet is not None
+        contact = ToolContact(slave.arm, slave.contact_pairs, moves=moves)
+        builder.AddNamedSystem("tool_contact", contact)
+        _connect(builder, _CONTACT_WIRES + (_SHEET_WIRES if moves else ()))
+        signals = signals | _CONTACT_SIGNALS | (_SHEET_SIGNALS if moves else {})
+    return slave, signals
 
 
 def _connect(builder: DiagramBuilder, wires: Iterable[tuple[str, ...]]) -> None:

@@ -39,6 +39,8 @@ SCENARIOS = {
         "{sheet_spring: {}, simulation: {integrator: runge_kutta2}}",
         "simulation.max_step",
     ),
+    "two things to touch": ("{sheet_spring: {}, slot: {}}", "scenario.yaml:slot"),
+    "a slot too deep": ("slot: {depth: 0.5}", "slot.depth"),
     "fraction for the seed": ("simulation: {seed: 0.5}", "simulation.seed"),
 }
 

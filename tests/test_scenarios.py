@@ -11,7 +11,7 @@ from drake_teleop.scenario import LoadScenario, ScenarioNames, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
 
-MOVEMENTS = ("free_motion_force", "free_motion_torque", "contact_transition")
+MOVEMENTS = ("free_motion_force", "free_motion_torque", "contact_transition", "peg_in_slot")
 
 
 def run(name: str, **changes):

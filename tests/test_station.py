@@ -9,6 +9,7 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.systems.framework import BasicVector, DiagramBuilder
 
 from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.compensation import scaled_wrench
 from drake_teleop.load.excitation import FourierTrajectory
@@ -52,10 +53,25 @@ def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
     return replace(scenario, **changes)
 
 
-@pytest.mark.parametrize("sheet", [None, SheetSpring(position=[0.55, 0.0, 0.246])])
-def test_the_wrist_wrench_is_the_reaction_force_of_the_sensors_joint(slave, sheet):
+@pytest.mark.parametrize(
+    ("touched", "at_once"),
+    [
+        ({}, 0),
+        ({"sheet_spring": SheetSpring(position=[0.55, 0.0, 0.246])}, 1),
+        # Down to the floor, along a wall; what it does to the hand is another question.
+        (
+            {
+                "slot": Slot(position=[0.55, 0.0013, 0.222]),
+                "force_scaling__force_scale": 0.0,
+            },
+            3,
+        ),
+    ],
+    ids=["free", "leaf", "slot"],
+)
+def test_the_wrist_wrench_is_the_reaction_force_of_the_sensors_joint(slave, touched, at_once):
     """What the sensor samples is what the plant says the weld transmits in the same state."""
-    scenario = vertical(0.07, 2.5, sheet_spring=sheet, simulation__settle=0.0)
+    scenario = vertical(0.07, 2.5, simulation__settle=0.0, **touched)
     simulator = MakeSimulator(MakeTeleopStation(scenario), scenario.simulation)
     simulator.Initialize()
     station, root = simulator.get_system(), simulator.get_mutable_context()
@@ -63,20 +79,22 @@ def test_the_wrist_wrench_is_the_reaction_force_of_the_sensors_joint(slave, shee
     context, sensed = plant.GetMyContextFromRoot(root), sensor.GetMyContextFromRoot(root)
     weld = plant.GetJointByName("sensor_weld")
     place = list(plant.GetJointIndices()).index(weld.index())
-    peak, contacts, error = 0.0, 0, 0.0
+    peak, contacts, most, error = 0.0, 0, 0, 0.0
     for k in range(1, 2001):
         simulator.AdvanceTo(k * 0.0005)
         reaction = plant.get_reaction_forces_output_port().Eval(context)[place]
         expected = np.concatenate([reaction.translational(), reaction.rotational()])
-        if sheet is not None:
+        if touched:
             results = plant.get_contact_results_output_port().Eval(context)
-            contacts += results.num_point_pair_contacts()
+            contacts += results.num_point_pair_contacts() > 0
+            most = max(most, results.num_point_pair_contacts())
         simulator.AdvancePendingEvents()
         sample = sensed.get_discrete_state_vector().value()[:6]
         peak = max(peak, np.linalg.norm(expected[:3]))
         error = max(error, np.abs(sample - expected).max())
     assert peak > 60.0
-    assert (contacts > 50) == (sheet is not None)
+    assert (contacts > 50) == bool(touched)
+    assert most >= at_once
     assert error < 1e-12
 
 

@@ -377,7 +377,7 @@ class _Period:
         self.dt = 1 / scenario.rates.hand_hz
         smooth = _smooth(scenario)
         self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
-        if smooth.sheet_spring is not None:
+        if smooth.environment is not None:
             _remove_friction(self._diagram)
         self._simulator = MakeSimulator(self._diagram, smooth.simulation)
         # Steps that followed the error would follow the displacements too.
@@ -389,7 +389,7 @@ class _Period:
         self._sensor = self._system("wrist_sensor")
         servo = smooth.joint_control
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
-        largest = _ANGLE if smooth.sheet_spring is None else _IN_CONTACT
+        largest = _ANGLE if smooth.environment is None else _IN_CONTACT
         self._joint_step = min(largest, _ACCELERATION / gain)
         self._groups = self._state_groups()
         self._steps = np.concatenate([group.steps for group in self._groups])

@@ -35,7 +35,6 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from drake_teleop.environment.sheet_spring import AddSheetSpring
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.capsules import Capsule, bounding_capsule
 from drake_teleop.excitation.criteria import Scales, characteristic_length
@@ -47,7 +46,7 @@ from drake_teleop.scenario import Scenario
 from drake_teleop.slave.arm import ArmModel, ArmModelFromPlant
 from drake_teleop.slave.motion_estimation import MotionEstimationConfig
 from drake_teleop.slave.payload import AddPayload
-from drake_teleop.slave.plant import ParseSlave, finalize, home_position
+from drake_teleop.slave.plant import AddEnvironment, ParseSlave, finalize, home_position
 from drake_teleop.slave.sensor_chain import WristSensorConfig
 
 Array = NDArray[np.float64]
@@ -123,7 +122,7 @@ class Robot:
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
-    """The station's slave with its tool, its sheet spring if it has one, and a table at z = 0.
+    """The station's slave with its tool, what it has to touch, and a table at z = 0.
 
     Raises:
         DrakeTeleopError: if the arm cannot reach the scenario's start.
@@ -132,8 +131,8 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         instance, tool = ParseSlave(plant)
         AddPayload(plant, tool, scenario.slave.payload)
-        if scenario.sheet_spring is not None:
-            AddSheetSpring(plant, scenario.sheet_spring)
+        if scenario.environment is not None:
+            AddEnvironment(plant, scenario.environment)
         return instance, plant.GetFrameByName("sensor", instance)
 
     load = _arm_of(parse).phi_load

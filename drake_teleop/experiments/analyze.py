@@ -145,7 +145,7 @@ def analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str,
     contact = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
 
     progress = stage("Linearise the Diagram")
-    free = linearize(replace(linear, sheet_spring=None), load_estimate=estimate)
+    free = linearize(replace(linear, sheet_spring=None, slot=None), load_estimate=estimate)
     progress(0.5)
     points = [("free motion", free, axis)]
     if scenario.sheet_spring is not None:
@@ -438,7 +438,7 @@ def measured_figures(
     The device's Coulomb friction is left out here too: what it does depends on the amplitude.
     """
     coulomb = dataclasses.replace(scenario.master.friction, coulomb=[0.0] * 6)
-    smooth = replace(scenario, sheet_spring=None, master__friction=coulomb)
+    smooth = replace(scenario, sheet_spring=None, slot=None, master__friction=coulomb)
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     if scenario.wrist_sensor.ideal:
         estimate[:6] = 0.0

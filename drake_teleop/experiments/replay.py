@@ -32,12 +32,11 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from drake_teleop.environment.sheet_spring import AddSheetSpring
 from drake_teleop.master.device import serial_joint_angles
 from drake_teleop.resources import models_dir
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario
-from drake_teleop.slave.plant import ParseSlave, finalize
+from drake_teleop.slave.plant import AddEnvironment, ParseSlave, finalize
 
 Array = NDArray[np.float64]
 
@@ -111,7 +110,7 @@ class ReplayScene:
     """Everything that is seen in a replay; shows one sample after the other.
 
     Attributes:
-        plant: slave, sheet spring and haptic device, for their shapes and kinematics only.
+        plant: slave, what it touches and haptic device, for their shapes and kinematics only.
         context: of the plant, in the posture that was shown last.
     """
 
@@ -119,8 +118,10 @@ class ReplayScene:
         builder = DiagramBuilder()
         self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
         self._slave, _ = ParseSlave(self.plant)
-        sheet = scenario.sheet_spring
-        self._sheet = None if sheet is None else AddSheetSpring(self.plant, sheet)
+        self._sheet = None
+        if scenario.environment is not None:
+            touched = AddEnvironment(self.plant, scenario.environment)
+            self._sheet = touched if scenario.slot is None else None
         self._master = _add_master(self.plant)
         finalize(self.plant)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
@@ -190,7 +191,7 @@ def _add_master(plant: MultibodyPlant) -> ModelInstanceIndex:
 
 
 def _furnish(meshcat: Meshcat, scenario: Scenario) -> None:
-    """Floor, table, the plinth below the sheet spring, light and camera."""
+    """Floor, table, the plinth below what is touched, light and camera."""
 
     def box(name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba):
         meshcat.SetObject(f"/room/{name}", Box(*size), colour)
@@ -207,6 +208,10 @@ def _furnish(meshcat: Meshcat, scenario: Scenario) -> None:
         height = sz - 0.15  # the model's bench ends there
         if height > 0:
             box("plinth", (0.34, 0.24, height), (sx + 0.065, sy, height / 2), _STEEL)
+    elif scenario.slot is not None:
+        (sx, sy, _), height = scenario.slot.position, scenario.slot.foot
+        if height > 0:
+            box("plinth", (0.16, 0.16, height), (sx, sy, height / 2), _STEEL)
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
     meshcat.SetProperty("/Background", "top_color", [0.97, 0.98, 1.0])

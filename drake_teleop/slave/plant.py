@@ -1,4 +1,4 @@
-"""The slave's rigid bodies: arm, tool and, if the scenario has one, the sheet spring."""
+"""The slave's rigid bodies: arm, tool and what the scenario has to touch."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.environment.point_contact import STICTION, ContactPairs
 from drake_teleop.environment.sheet_spring import AddSheetSpring, SheetSpring
+from drake_teleop.environment.slot import AddSlot, Slot, TouchAsSlot
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.resources import models_dir
 from drake_teleop.slave.arm import ArmModel, ArmModelFromPlant
@@ -36,8 +37,8 @@ class SlavePlant:
         instance: the arm with its tool.
         tool: the tool's body.
         arm: kinematics and dynamics up to S, with the tool as its load.
-        sheet: the leaf's model instance, if there is one.
-        contact_pairs: (k, 26) what may touch, see `ContactPairs`.
+        sheet: the leaf's model instance, if there is one: what moves when it is touched.
+        contact_pairs: (k, 26) what may touch, see `ContactPairs`; none without an environment.
         leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] of the leaf, and its acceleration by
             gravity [m/s^2]; without one, a mass that nothing moves.
     """
@@ -50,11 +51,16 @@ class SlavePlant:
     contact_pairs: NDArray[np.float64]
     leaf: NDArray[np.float64]
 
+    @property
+    def can_touch(self) -> bool:
+        """Whether there is something to touch."""
+        return len(self.contact_pairs) > 0
+
 
 def AddSlavePlant(
     builder: DiagramBuilder,
     position: list[float],
-    sheet_spring: SheetSpring | None,
+    environment: SheetSpring | Slot | None,
     q_start: NDArray[np.float64] | None = None,
     payload: Payload | None = None,
 ) -> SlavePlant:
@@ -65,14 +71,14 @@ def AddSlavePlant(
     Args:
         builder: the diagram.
         position: (3,) p_WS at the start [m]; the tool points down.
-        sheet_spring: what there is to touch, or None.
+        environment: what there is to touch, or None.
         q_start: (6,) joint angles to start at instead [rad].
         payload: what the tool holds, if anything.
 
     Raises:
         DrakeTeleopError: if the arm cannot reach the start.
     """
-    if sheet_spring is None:
+    if environment is None:
         plant = builder.AddNamedSystem("slave_plant", MultibodyPlant(time_step=0.0))
     else:
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
@@ -82,18 +88,30 @@ def AddSlavePlant(
     instance, tool = ParseSlave(plant)
     if payload is not None:
         AddPayload(plant, tool, payload)
-    sheet = None if sheet_spring is None else AddSheetSpring(plant, sheet_spring)
+    touched = None if environment is None else AddEnvironment(plant, environment)
     finalize(plant)
     pairs, leaf = np.zeros((0, 26)), np.array([1.0, 0.0, 0.0, 0.0])
-    if sheet_spring is not None and sheet is not None:
+    if touched is not None:
         _remove_visuals(plant, scene_graph)
-        pairs = ContactPairs(plant, scene_graph.model_inspector(), tool, sheet)
-        law = [sheet_spring.effective_mass, sheet_spring.stiffness, sheet_spring.damping]
+        if isinstance(environment, Slot):
+            TouchAsSlot(plant, scene_graph, environment)
+        pairs = ContactPairs(plant, scene_graph.model_inspector(), tool, touched)
+    sheet = None
+    if isinstance(environment, SheetSpring):
+        sheet = touched
+        law = [environment.effective_mass, environment.stiffness, environment.damping]
         leaf = np.array([*law, plant.gravity_field().gravity_vector()[2]])
     arm = ArmModelFromPlant(plant, instance, "sensor")
     start = home_position(arm, position) if q_start is None else q_start
     plant.SetDefaultPositions(instance, start)
     return SlavePlant(plant, instance, tool, arm, sheet, pairs, leaf)
+
+
+def AddEnvironment(plant: MultibodyPlant, environment: SheetSpring | Slot) -> ModelInstanceIndex:
+    """Adds what there is to touch to a plant that has the tool and is not finalized."""
+    if isinstance(environment, SheetSpring):
+        return AddSheetSpring(plant, environment)
+    return AddSlot(plant, environment)
 
 
 def ParseSlave(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, BodyIndex]:

@@ -1,4 +1,4 @@
-"""What the environment exerts on the tool: contacts of its ball with boxes, and what is applied."""
+"""What the environment exerts on the tool: contacts of balls with boxes, and what is applied."""
 
 from __future__ import annotations
 
@@ -20,27 +20,29 @@ def environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W):
         pairs: (k, 26) of `ContactPairs`.
         applied_W: (6,) [f; tau] about So, in W, on top of the contacts [N, N m].
         q, v: (n,) of the arm.
-        sheet: (2,) deflection and its rate [m, m/s].
+        sheet: (2,) deflection and its rate [m, m/s], of what moves.
         wrench_W: (6,) filled [N, N m].
     """
     wrench_W[:] = applied_W
     if pairs.shape[0] == 0 and not applied_W.any():
         return
     R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
+    twist, velocity, has_twist = np.empty(6), np.empty(3), False
     forward_kinematics(arm, q, R_WS, p_WS)
     _add_moment(wrench_W[3:], p_WS, applied_W[:3])
     for pair in pairs:
         depth = indentation(pair, p_WS, R_WS, sheet[0], normal)
         if depth <= 0.0:
             continue
-        twist = np.empty((6, q.shape[0]))
-        jacobian(arm, q, twist)
-        velocity = twist @ v
-        r = normal[3:] - p_WS
-        _add_moment(velocity[:3], velocity[3:], r)
+        if not has_twist:
+            J = np.empty((6, q.shape[0]))
+            jacobian(arm, q, J)
+            twist[:], has_twist = J @ v, True
+        velocity[:] = twist[:3]
+        _add_moment(velocity, twist[3:], normal[3:] - p_WS)
         for i in range(3):
             velocity[i] -= pair[19 + i] * sheet[1]
-        contact_force(pair, depth, normal[:3], velocity[:3], force)
+        contact_force(pair, depth, normal[:3], velocity, force)
         add_force(wrench_W, normal[3:], force)
 
 
@@ -68,21 +70,22 @@ class ToolContact(LeafSystem):
         name: ToolContact
         input_ports:
         - slave_state: [q; v] of the arm
-        - sheet_state: [z; v_z] of the sheet spring
+        - sheet_state: [z; v_z] of the sheet spring (only if there is one)
         output_ports:
         - true_contact_wrench_W: on the tool, [f; tau] about the world's origin, in W
 
     Args:
         arm: kinematics up to the tool.
         pairs: (k, 26) what may touch, see `ContactPairs`.
+        moves: whether that is a sheet spring.
     """
 
-    def __init__(self, arm: ArmModel, pairs: NDArray[np.float64]) -> None:
+    def __init__(self, arm: ArmModel, pairs: NDArray[np.float64], *, moves: bool) -> None:
         super().__init__()
         self._n = arm.num_joints
-        self._contact = (arm.table, pairs, np.zeros(6))
+        self._contact, self._at_rest = (arm.table, pairs, np.zeros(6)), np.zeros(2)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
-        self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
+        self._sheet = self.DeclareVectorInputPort("sheet_state", 2) if moves else None
         self.DeclareVectorOutputPort("true_contact_wrench_W", 6, self._calc)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
@@ -91,6 +94,6 @@ class ToolContact(LeafSystem):
             *self._contact,
             state[: self._n],
             state[self._n :],
-            self._sheet.Eval(context),
+            self._at_rest if self._sheet is None else self._sheet.Eval(context),
             output.get_mutable_value(),
         )

@@ -116,7 +116,7 @@ def _motion(physics, x, tau, applied_W, wrench_W, xdot):
     forward_dynamics(arm, x[: half - 1], x[half:-1], tau, wrench_W, xdot[half:-1])
     xdot[:half] = x[half:]
     push = 0.0
-    if pairs.shape[0] > 0:  # which all are of one body, the leaf
+    if pairs.shape[0] > 0:  # which all are of one body, the leaf, or of what does not move
         for i in range(3):
             push -= pairs[0, 19 + i] * (wrench_W[i] - applied_W[i])
     xdot[-1] = (push - leaf[1] * x[half - 1] - leaf[2] * x[-1]) / leaf[0] + leaf[3]
@@ -261,7 +261,7 @@ class WristSensor(LeafSystem):
         - joint_torque: (n,) that the motors hold [N m]
         - slave_acceleration: vdot of the arm, to see that nothing else moves it
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
-        - contact_results: the plant's (only with a sheet spring)
+        - contact_results: the plant's (only with something to touch)
         - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
         - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, of whatever pushes it besides
           contacts [N, N m] (may be left unconnected)
@@ -303,7 +303,7 @@ class WristSensor(LeafSystem):
         if not config.ideal:
             first[:6] += config.offset
         # Contact takes many steps for one torque, and to work off the queue takes longer than them.
-        self._longest = 1 if slave.sheet is None else _LONGEST
+        self._longest = _LONGEST if slave.can_touch else 1
         tail = np.zeros(2 + self._longest * (2 * n + 3))
         memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
@@ -319,6 +319,7 @@ class WristSensor(LeafSystem):
         self._sheet = self._contacts = self._noise = None
         if slave.sheet is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
+        if slave.can_touch:
             contacts = Value[ContactResults]()
             self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
             self._tool = slave.tool
@@ -486,6 +487,7 @@ def AddWristSensor(
         builder.Connect(
             slave.plant.get_state_output_port(slave.sheet), sensor.GetInputPort("sheet_state")
         )
+    if slave.can_touch:
         builder.Connect(
             slave.plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")
         )

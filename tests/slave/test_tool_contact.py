@@ -12,6 +12,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.environment.point_contact import ContactPairs
 from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.slave.plant import AddSlavePlant
 from drake_teleop.slave.tool_contact import environment_wrench
@@ -55,6 +56,29 @@ def test_it_is_drakes_law(place, most):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
         touching += expected.any()
     assert touching > 40
+
+
+def test_a_peg_in_a_slot_is_drakes_law_with_many_pairs_at_once():
+    """Near the floor, tilted: both balls on floor, walls and chamfers."""
+    builder = DiagramBuilder()
+    slot = Slot(position=[0.55, 0.0, 0.2], yaw=0.4, clearance=5e-4, friction=0.3)
+    slave = AddSlavePlant(builder, [0.55, 0.0, 0.362], slot)
+    root = builder.Build().CreateDefaultContext()
+    plant, context = slave.plant, slave.plant.GetMyMutableContextFromRoot(root)
+    random, home = np.random.default_rng(0), slave.plant.GetPositions(context, slave.instance)
+    found, most = np.zeros(6), 0
+    for _ in range(400):
+        q = home + 0.006 * random.uniform(-1, 1, 6)
+        v = random.normal(size=6) * 10.0 ** random.uniform(-5, 0)
+        plant.SetPositions(context, slave.instance, q)
+        plant.SetVelocities(context, slave.instance, v)
+        results = plant.get_contact_results_output_port().Eval(context)
+        most = max(most, results.num_point_pair_contacts())
+        environment_wrench(
+            slave.arm.table, slave.contact_pairs, np.zeros(6), q, v, np.zeros(2), found
+        )
+        np.testing.assert_allclose(found, drakes(plant, context, slave.tool), rtol=1e-9, atol=1e-9)
+    assert most >= 4
 
 
 def test_a_push_is_moved_to_the_worlds_origin():

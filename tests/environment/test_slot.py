@@ -1,0 +1,208 @@
+"""The slot against plane geometry and statics, and in the station."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydrake.geometry import Meshcat, MeshcatParams, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.environment.point_contact import ContactPairs, indentation
+from drake_teleop.environment.slot import PEG_RADIUS, TIP_BALL, UPPER_BALL, Slot, TouchAsSlot
+from drake_teleop.experiments.replay import ReplayScene
+from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.simulation import simulate
+from drake_teleop.slave.arm import forward_kinematics, jacobian
+from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
+from drake_teleop.slave.plant import R_WS_HOME, AddEnvironment, AddSlavePlant, ParseSlave
+from drake_teleop.slave.tool_contact import environment_wrench
+from drake_teleop.station import MakeTeleopStation
+
+
+def slave_at(slot: Slot):
+    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], slot)
+
+
+def pairs_of_a_ball(slot: Slot) -> np.ndarray:
+    """The contact pairs of a body that is one ball about its origin, without any arm."""
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    tool = plant.AddRigidBody("tool", SpatialInertia.SolidSphereWithMass(1.0, PEG_RADIUS))
+    friction = CoulombFriction(1.0, 1.0)
+    ball = Sphere(PEG_RADIUS)
+    plant.RegisterCollisionGeometry(tool, RigidTransform(), ball, "ball", friction)
+    environment = AddEnvironment(plant, slot)
+    plant.Finalize()
+    TouchAsSlot(plant, scene_graph, slot)
+    pairs = ContactPairs(plant, scene_graph.model_inspector(), tool.index(), environment)
+    return pairs[np.all(pairs[:, :3] == 0.0, axis=1)]
+
+
+def test_the_peg_is_the_tools_ball_and_another_of_its_size():
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    _, tool = ParseSlave(plant)
+    mass = plant.get_body(tool).default_mass()
+    AddEnvironment(plant, Slot())
+    plant.Finalize()
+    inspector = scene_graph.model_inspector()
+    balls = plant.GetCollisionGeometriesForBody(plant.get_body(tool))
+    centres = [inspector.GetPoseInFrame(ball).translation() for ball in balls]
+    np.testing.assert_array_equal(centres, [[0, 0, TIP_BALL], [0, 0, UPPER_BALL]])
+    for ball in balls:
+        assert isinstance(inspector.GetShape(ball), Sphere)
+        assert inspector.GetShape(ball).radius() == PEG_RADIUS
+    assert plant.get_body(tool).default_mass() == mass
+
+
+def test_both_sides_of_a_contact_together_are_what_the_slot_says():
+    slot = Slot(stiffness=3e3, dissipation=0.7, friction=0.45)
+    pairs = slave_at(slot).contact_pairs
+    assert len(pairs) == 2 * 7
+    np.testing.assert_allclose(pairs[:, 22:], np.tile([3e3, 0.7, 0.45, 0.45], (14, 1)), rtol=1e-12)
+
+
+def profile(slot: Slot) -> np.ndarray:
+    """Corners of the right half of the section [m]: (y, z) in M from the floor to far outside."""
+    edge, c = slot.width / 2, slot.chamfer
+    corners = [[0.0, -slot.depth], [edge, -slot.depth], [edge, -c], [edge + c, 0.0]]
+    return np.array([*corners, [edge + c + 0.03, 0.0]])
+
+
+def distance_to(corners: np.ndarray, point: np.ndarray) -> float:
+    """Of a point to a line through corners."""
+    start, along = corners[:-1], np.diff(corners, axis=0)
+    share = np.sum((point - start) * along, axis=1) / np.sum(along**2, axis=1)
+    nearest = start + np.clip(share, 0.0, 1.0)[:, np.newaxis] * along
+    return float(np.linalg.norm(point - nearest, axis=1).min())
+
+
+@given(
+    yaw=st.floats(-3.1, 3.1),
+    chamfer=st.floats(5e-4, 0.015),
+    clearance=st.floats(1e-6, 0.01),
+    depth=st.floats(0.02, 0.05),
+    x=st.floats(-0.04, 0.04),
+    y=st.floats(-1.0, 1.0),
+    z=st.floats(-1.0, 1.0),
+)
+def test_the_boxes_are_the_section(yaw, chamfer, clearance, depth, x, y, z):
+    """How deep a ball is in its deepest box is how near its centre is to the section's outline."""
+    slot = Slot(yaw=yaw, chamfer=chamfer, clearance=clearance, depth=depth)
+    corners = profile(slot)
+    # Anywhere above the outline: what is in the material is for no ball to reach.
+    across = y * (slot.width / 2 + chamfer + 0.01)
+    floor = np.interp(abs(across), corners[:, 0], corners[:, 1])
+    height = floor + 1e-4 + (z + 1.0) * 0.02
+    centre_W = slot.X_WM @ np.array([x, across, height])
+    expected = PEG_RADIUS - distance_to(corners, np.array([abs(across), height]))
+    normal = np.empty(6)
+    deepest = max(
+        indentation(pair, centre_W, np.eye(3), 0.0, normal) for pair in pairs_of_a_ball(slot)
+    )
+    if expected > 0.0:
+        assert deepest == pytest.approx(expected, abs=1e-9)
+    else:
+        assert deepest <= 1e-9
+
+
+#: Both balls are between the walls, and neither is on the floor or at the chamfers' edges.
+DEEP = Slot(position=[0.55, 0.0, 0.2], clearance=1e-3, stiffness=1e4, depth=0.05, chamfer=1e-3)
+
+
+def wrench_at(slave, angle: float, shift: float) -> np.ndarray:
+    """On the peg at rest, about the world's origin; tilted about the slot from the vertical.
+
+    Args:
+        slave: with the slot DEEP.
+        angle: of the tool about the middle between its balls [rad].
+        shift: of that middle from the middle of the slot along y_W [m]; it is 20 mm below the
+            mouth.
+    """
+    tilt = RotationMatrix.MakeXRotation(angle)
+    R_WS = tilt @ R_WS_HOME
+    middle_S = [0.0, 0.0, (TIP_BALL + UPPER_BALL) / 2]
+    p_WS = np.array([0.55, shift, 0.2 - 0.02]) - R_WS.matrix() @ middle_S
+    arm, wrench = slave.arm, np.empty(6)
+    near = slave.plant.GetDefaultPositions(slave.instance)
+    q, status = nearest_branch(R_WS.matrix(), p_WS, near, arm.lower, arm.upper)
+    assert status == IkStatus.OK
+    environment_wrench(arm.table, slave.contact_pairs, np.zeros(6), q, 0 * q, np.zeros(2), wrench)
+    return wrench
+
+
+def test_an_upright_peg_has_its_play_and_then_both_balls_touch():
+    slave = slave_at(DEEP)
+    assert not wrench_at(slave, 0.0, 0.499e-3).any()
+    assert not wrench_at(slave, 0.0, -0.499e-3).any()
+    force = wrench_at(slave, 0.0, 0.7e-3)[:3]
+    np.testing.assert_allclose(force, [0.0, -2 * 1e4 * 0.2e-3, 0.0], atol=1e-6)
+
+
+def test_a_peg_that_is_tilted_by_more_than_its_play_is_wedged():
+    """The walls push its balls apart: a couple against the tilt, and no force."""
+    slave, apart = slave_at(DEEP), TIP_BALL - UPPER_BALL
+    play = np.arcsin(DEEP.clearance / apart)
+    assert not wrench_at(slave, 0.99 * play, 0.0).any()
+    for angle in (1.5 * play, -1.5 * play):
+        push = 1e4 * (apart / 2 * np.sin(abs(angle)) - DEEP.clearance / 2)
+        wrench = wrench_at(slave, angle, 0.0)
+        np.testing.assert_allclose(wrench[:3], 0.0, atol=1e-6)
+        couple = -np.sign(angle) * push * apart * np.cos(angle)
+        np.testing.assert_allclose(wrench[3:], [couple, 0.0, 0.0], atol=1e-6)
+        assert push > 1.0
+
+
+@pytest.fixture(scope="module")
+def inserted():
+    scenario = replace(LoadScenario("peg_in_slot"), wrist_sensor__ideal=True)
+    station = MakeTeleopStation(
+        scenario, load_estimate=np.concatenate([np.zeros(6), slave_at(scenario.slot).arm.phi_load])
+    )
+    return scenario, simulate(station, scenario.simulation)
+
+
+def test_the_peg_finds_in_is_slid_down_and_stands_quietly_on_the_floor(inserted):
+    _, result = inserted
+    force = result["true_contact_wrench_W"][:, :3]
+    # It starts free; the chamfer on the side of the offset pushes it back and up.
+    first = np.flatnonzero(force.any(axis=1))[0]
+    assert 0.3 < result.t[first] < 1.0
+    assert force[first + 5, 1] < 0.0 < force[first + 5, 2]
+    at_the_end = force[result.t > 1.6]
+    assert np.all(at_the_end[:, 2] > 10.0)
+    assert np.ptp(at_the_end[:, 1]) < 1.0
+    assert np.linalg.norm(force, axis=1).max() < 40.0
+    assert "sheet_state" not in result
+
+
+def test_contact_only_takes_energy_from_the_tool(inserted):
+    """Springs of the contact give back at most what was put in; friction takes."""
+    scenario, result = inserted
+    arm, n = slave_at(scenario.slot).arm, 6
+    J, R, p, power = np.empty((6, n)), np.empty((3, 3)), np.empty(3), []
+    for state, wrench in zip(result["slave_state"], result["true_contact_wrench_W"], strict=True):
+        jacobian(arm.table, state[:n], J)
+        forward_kinematics(arm.table, state[:n], R, p)
+        twist = J @ state[n:]
+        about_So = wrench[3:] - np.cross(p, wrench[:3])
+        power.append(wrench[:3] @ twist[:3] + about_So @ twist[3:])
+    work = np.cumsum(power) * 1e-3
+    assert work.max() < 1e-4
+    assert work[-1] < -0.02
+
+
+def test_the_replay_shows_the_slot_where_it_is_and_the_peg_in_it(inserted):
+    scenario, result = inserted
+    scene = ReplayScene(Meshcat(MeshcatParams(host="localhost")), scenario)
+    scene.show(0.0, result, len(result.t) - 1)
+    slot = scene.plant.GetBodyByName("slot").EvalPoseInWorld(scene.context)
+    np.testing.assert_allclose(slot.translation(), scenario.slot.position)
+    assert len(scene.plant.GetVisualGeometriesForBody(scene.plant.GetBodyByName("slot"))) == 7
+    tip = scene.plant.GetFrameByName("tip").CalcPoseInWorld(scene.context).translation()
+    depth = scenario.slot.position[2] - tip[2]
+    assert depth == pytest.approx(scenario.slot.depth, abs=4e-3)
+    assert abs(tip[1]) < scenario.slot.clearance / 2 + 2e-3
