@@ -22,6 +22,7 @@ from drake_teleop.master.operator import OperatorConfig
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.quantities import check_ranges, check_structure, choice, quantity
 from drake_teleop.resources import scenarios_dir
+from drake_teleop.scaling.contact_detection import ContactDetectionConfig
 from drake_teleop.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.slave.joint_control import JointControlConfig
@@ -41,7 +42,7 @@ class Rates:
     sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
     hand_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "haptic device and channel")
     joint_control_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "slave's joint control")
-    estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "load estimator")
+    estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "load estimator, detection of contact")
     log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "log")
 
 
@@ -101,6 +102,7 @@ class Scenario:
     motion_estimation: MotionEstimationConfig = field(default_factory=MotionEstimationConfig)
     load_estimator: LoadEstimatorConfig = field(default_factory=LoadEstimatorConfig)
     force_scaling: ForceScalingConfig = field(default_factory=ForceScalingConfig)
+    contact_detection: ContactDetectionConfig | None = None
     sheet_spring: SheetSpring | None = None
     slot: Slot | None = None
 

@@ -41,6 +41,8 @@ SIGNALS = {
         ),
         _signal("scaled_wrench_S", *_WRENCH, "F' of Fig. 2, before the scale to the master"),
         _signal("contact_wrench_S", *_WRENCH, "Eq. (13), calculated contact wrench"),
+        _signal("contact", "contact", "1", "1 while the slave's detector notices a contact"),
+        _signal("contact_at_hand", "contact", "1", "the same as it has arrived at the hand"),
         _signal("true_contact_wrench_W", *_WRENCH, "environment on the tool, about the origin"),
         _signal("sheet_state", "z v_z", "m,m/s", "deflection of the sheet spring's end, upwards"),
         _signal("intent", *_POSE, "where the operator wants the stylus, X_BE"),

@@ -11,16 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort
-from pydrake.systems.primitives import LogVectorOutput, Multiplexer
+from pydrake.systems.primitives import LogVectorOutput, Multiplexer, PassThrough
 
 from drake_teleop.channel.channel import TeleopChannel
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.detection import NoiseFloor
 from drake_teleop.load.excitation import FourierTrajectory
 from drake_teleop.master import device
 from drake_teleop.master.device import MasterDevice
 from drake_teleop.master.force_display import ForceDisplay
 from drake_teleop.master.operator import Operator
+from drake_teleop.scaling.contact_detection import ContactDetection
 from drake_teleop.scaling.force_scaling import ForceScaling
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.scenario import Scenario
@@ -76,6 +78,15 @@ _CHANNEL_WIRES = (
     ("wrist_sample.sample", "channel.sample"),
     ("channel.wrench_received", "force_display.wrench_command"),
 )
+_DETECTION_WIRES = (
+    ("wrist_sample.sample", "contact_detection.sample"),
+    ("load_estimator.load_estimate", "contact_detection.load_estimate"),
+)
+_DIRECT_FLAG = (("contact_detection.contact", "contact_at_hand.u"),)
+_CHANNEL_FLAG = (
+    ("contact_detection.contact", "channel.contact"),
+    ("channel.contact_at_hand", "contact_at_hand.u"),
+)
 
 #: Signal -> port; `drake_teleop.signals` says what each one is.
 _SLAVE_SIGNALS = {
@@ -105,6 +116,10 @@ _TELEOP_SIGNALS = {
     "contact_wrench_S": "force_scaling.contact_wrench_S",
     "force_to_master": "force_display.force_to_master",
 }
+_DETECTION_SIGNALS = {
+    "contact": "contact_detection.contact",
+    "contact_at_hand": "contact_at_hand.y",
+}
 _CHANNEL_SIGNALS = {"pose_received": "channel.pose_received", "ports": "channel.ports"}
 
 
@@ -125,6 +140,7 @@ def MakeTeleopStation(
     *,
     load_estimate: NDArray[np.float64] | None = None,
     load_covariance: NDArray[np.float64] | None = None,
+    noise_floor: NoiseFloor | None = None,
 ) -> Diagram:
     """Builds the bilateral station: operator, master, channel, slave, sensor, elimination.
 
@@ -161,6 +177,8 @@ def MakeTeleopStation(
         - force_to_master
         - pose_received (with a channel)
         - ports (with a channel)
+        - contact (with contact detection)
+        - contact_at_hand (with contact detection)
 
     Args:
         scenario: what the station is made of.
@@ -170,10 +188,12 @@ def MakeTeleopStation(
         load_covariance: (16, 16) of the estimate, with which a load that is to be watched
             (`load_estimator.watch`) need not be learnt first. Of a method that allows for noise in
             the motion ("total"): that of plain least squares is too small.
+        noise_floor: of the wrench that is left in free motion, which detection of contact needs:
+            `LoadIdentification.noise_floor`, at the rate of the estimator.
 
     Raises:
-        DrakeTeleopError: for a value that cannot be right, a start out of reach, or scales that
-            mean something only if the load is known while it is not.
+        DrakeTeleopError: for a value that cannot be right, a start out of reach, scales that mean
+            something only if the load is known while it is not, or detection without its floor.
     """
     scenario.check()
     _check_load_is_known(scenario, load_estimate)
@@ -220,6 +240,21 @@ def MakeTeleopStation(
         builder.AddNamedSystem("channel", channel)
         _connect(builder, _CHANNEL_WIRES)
         signals |= _CHANNEL_SIGNALS
+    if scenario.contact_detection is not None:
+        if noise_floor is None:
+            raise DrakeTeleopError(
+                "nobody knows how large the contact wrench is in free motion",
+                where="contact_detection",
+                remedy="pass the noise_floor of identify_load, as load_estimate",
+            )
+        detection = ContactDetection(
+            scenario.contact_detection, noise_floor, slave.arm, 1 / scenario.rates.estimator_hz
+        )
+        builder.AddNamedSystem("contact_detection", detection)
+        builder.AddNamedSystem("contact_at_hand", PassThrough(1))
+        _connect(builder, _DETECTION_WIRES)
+        _connect(builder, _DIRECT_FLAG if _is_direct(scenario) else _CHANNEL_FLAG)
+        signals |= _DETECTION_SIGNALS
     builder.ExportInput(_input(builder, "kinematic_scaling.clutch"), "clutch")
     return _finish(builder, "teleop_station", signals, scenario)
 

@@ -35,7 +35,14 @@ from drake_teleop.passivity.memory import (
     STIFFNESS,
 )
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
-from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, difference_into, dot, finite
+from drake_teleop.passivity.packet import (
+    CONTACT,
+    HEALTHY,
+    PACKET_SIZE,
+    difference_into,
+    dot,
+    finite,
+)
 from drake_teleop.passivity.pspm import OFFSET
 from drake_teleop.passivity.safe_state import (
     MASTER_WATCH,
@@ -130,6 +137,7 @@ def channel_step(
     hand_B,
     slave_pose,
     saturated,
+    contact,
     T,
     timeout,
     frame,
@@ -152,6 +160,7 @@ def channel_step(
         hand_B: (6,) of the hand on the stylus, in B [N, N m].
         slave_pose: (7,) X_WS, actual.
         saturated: whether the wrench is not to be trusted: the last good one is kept.
+        contact: the flag of the slave's detector, 0 or 1; it travels with the slave's packets.
         T, timeout: [s].
         frame: (11,) R_WB by rows, scale of translation and of rotation.
         parameters: of the method.
@@ -161,7 +170,8 @@ def channel_step(
         pose_received: (7,) X_WS that the slave shall follow, written.
         ports: (6,) energy that hand and slave have put in, by group [J], updated; for how long
             master and slave have heard nothing [s], written.
-        wrench_received: (6,) F_E_B that the hand shall feel, written.
+        wrench_received: (7,) F_E_B that the hand shall feel, and the flag of the newest packet,
+            written.
     """
     k = int(ends[_STEP])
     ends[_STEP] += 1.0
@@ -202,6 +212,7 @@ def channel_step(
         packet[HEALTHY] = 0.0
     network.send(forward_parameters, forward, k, packet)
     _to_master(held_M, frame, wrench_received)
+    wrench_received[6] = received[CONTACT]
 
     # The slave's end.
     good = _moved(slave_pose, before_S, dx)
@@ -230,6 +241,7 @@ def channel_step(
     )  # fmt: skip
     if not good:
         packet[HEALTHY] = 0.0
+    packet[CONTACT] = contact
     network.send(backward_parameters, backward, k, packet)
     slave_command_into(
         alive, (fresh and not alive) or not good, T, timeout, command[:7], watch_S, pose_received
@@ -332,11 +344,13 @@ class TeleopChannel(LeafSystem):
         - wrench_B: (6,) F_E_B, what the hand should feel, from force scaling [N, N m]
         - hand_wrench_E: (6,) of the hand on the stylus at E, in B [N, N m]
         - sample: the wrist sensor's, see `drake_teleop.slave.wrist_sensor.sample_parts`
+        - contact: (1,) whether the slave's detector notices a contact; unconnected 0
         output_ports:
         - pose_received: (7,) X_WS that the slave shall follow
         - wrench_received: (6,) F_E_B that the hand shall feel [N, N m]
         - ports: (6,) energy that the hand has put in by translation and by rotation, and what the
           slave has [J]; for how long master and slave have heard nothing [s]
+        - contact_at_hand: (1,) the flag that the master's end has received last
 
     Args:
         channel: the network.
@@ -384,9 +398,11 @@ class TeleopChannel(LeafSystem):
         self._wrench = self.DeclareVectorInputPort("wrench_B", 6)
         self._hand = self.DeclareVectorInputPort("hand_wrench_E", 6)
         self._sample = self.DeclareVectorInputPort("sample", sum(parts.values()))
+        self._contact = self.DeclareVectorInputPort("contact", 1)
         ends = initial_ends(passivity.method, parameters, start)
         state = [*(network.initial_state(p, np.zeros(PACKET_SIZE)) for p in lines), ends]
         state += [np.array(start), np.zeros(6)]
+        received = np.zeros(7)
         self._groups = [self.DeclareDiscreteState(part) for part in state]
         self.DeclareStateOutputPort("pose_received", self._groups[3])
         self.DeclareStateOutputPort("ports", self._groups[4])
@@ -394,16 +410,18 @@ class TeleopChannel(LeafSystem):
         self._step = self.DeclareCacheEntry(
             "step",
             ValueProducer(
-                allocate=lambda: AbstractValue.Make([*map(np.array, state), np.zeros(6)]),
+                allocate=lambda: AbstractValue.Make([*map(np.array, state), received.copy()]),
                 calc=self._calc_step,
             ),
             {self.all_input_ports_ticket(), self.xd_ticket()},
         )
-        self.DeclareVectorOutputPort("wrench_received", 6, self._calc_wrench, {self._step.ticket()})
+        taken = {self._step.ticket()}
+        self.DeclareVectorOutputPort("wrench_received", 6, self._calc_wrench, taken)
+        self.DeclareVectorOutputPort("contact_at_hand", 1, self._calc_contact, taken)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _calc_step(self, context: Context, step: AbstractValue) -> None:
-        *state, wrench = step.get_mutable_value()
+        *state, received = step.get_mutable_value()
         for part, group in zip(state, self._groups, strict=True):
             part[:] = context.get_discrete_state(group).value()
         sample = self._sample.Eval(context)
@@ -415,13 +433,17 @@ class TeleopChannel(LeafSystem):
             self._hand.Eval(context),
             self._slave_pose,
             sample[self._saturated] > 0.5,
+            self._contact.Eval(context)[0] if self._contact.HasValue(context) else 0.0,
             *self._constants,
             *state,
-            wrench,
+            received,
         )
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step.Eval(context)[-1])
+        output.SetFromVector(self._step.Eval(context)[-1][:6])
+
+    def _calc_contact(self, context: Context, output: BasicVector) -> None:
+        output[0] = self._step.Eval(context)[-1][6]
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         for part, group in zip(self._step.Eval(context), self._groups, strict=False):

@@ -20,13 +20,15 @@ from drake_teleop.excitation.excite import criteria_of, excite
 from drake_teleop.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.experiments.progress import Progress, Stage, silent
 from drake_teleop.load.batch import identify_batch
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.detection import NoiseFloor, finite_covariance, fit_noise_floor
 from drake_teleop.load.excitation import FourierTrajectory
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.moments import Noise
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.simulation import simulate
-from drake_teleop.slave.arm import ArmModel
+from drake_teleop.slave.arm import ArmModel, accelerations
 from drake_teleop.slave.motion_estimation import estimated_motion_std
 from drake_teleop.slave.plant import AddSlavePlant
 from drake_teleop.station import MakeIdentificationStation
@@ -71,6 +73,20 @@ class LoadIdentification:
             self.batch, offsets=self.estimate[:6], phi=self.estimate[6:], method=self.method
         )
 
+    def noise_floor(self, arm: ArmModel) -> NoiseFloor:
+        """How large the wrench is that the estimate leaves in this free motion, for detection.
+
+        Args:
+            arm: the slave's, for its kinematics.
+        """
+        usable = self.result["saturated"][:, 0] == 0
+        wrench, s, omega, alpha = (x[usable] for x in sensor_samples(self.result))
+        offsets, phi = self.estimate[:6], self.estimate[6:]
+        contact = contact_wrench(wrench, offsets, s, omega, alpha, phi)
+        a = accelerations(arm, self.result["joint_position"][usable], s)
+        P = finite_covariance(phi, self.batch.covariance)
+        return fit_noise_floor(contact, s, omega, alpha, a, P)
+
     @property
     def recursive_against_batch(self) -> float:
         """Largest difference of the two estimates, in standard deviations."""
@@ -85,11 +101,18 @@ def slave_arm(scenario: Scenario) -> ArmModel:
 
 
 def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
-    """The shipped scenario "identification" with the slave and the sensor of another scenario."""
+    """The shipped scenario "identification" with the slave and the sensor of another scenario.
+
+    If contact is to be detected, it is logged at the rate at which that is done: the noise floor
+    tells how alike samples are that follow each other.
+    """
+    rates = scenario.rates
+    if scenario.contact_detection is not None:
+        rates = dataclasses.replace(rates, log_hz=rates.estimator_hz)
     return replace(
         LoadScenario("identification"),
         simulation__seed=seed,
-        rates=scenario.rates,
+        rates=rates,
         slave=scenario.slave,
         joint_control=scenario.joint_control,
         wrist_sensor=scenario.wrist_sensor,

@@ -292,7 +292,7 @@ def _simulate(
     frame = np.zeros(11)
     frame[0] = frame[4] = frame[8] = frame[9] = frame[10] = 1.0
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
-    wrench, hand, felt, ports = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
+    wrench, hand, felt, ports = np.zeros(6), np.zeros(6), np.zeros(7), np.zeros(6)
     rows = np.empty((intent.shape[0], 9))
     x = x_s = start[4]
     v = v_s = a_s = 0.0
@@ -304,8 +304,8 @@ def _simulate(
         pose_m[4], pose_s[4] = x, x_s
         before = received[4]
         channel_step(
-            method, pose_m, wrench, hand, pose_s, False, PERIOD, timeout, frame, p, forward_line,
-            backward_line, forward, backward, ends, received, ports, felt,
+            method, pose_m, wrench, hand, pose_s, False, 0.0, PERIOD, timeout, frame, p,
+            forward_line, backward_line, forward, backward, ends, received, ports, felt,
         )  # fmt: skip
         command = received[4]
         rows[k, :7] = np.array([x, x_s, command, felt[0], wall, ports[0], ports[2]])

@@ -17,6 +17,9 @@ peak_contact_force_N        largest calculated contact force; likewise peak_cont
 residual_force_max_N        largest contact force calculated while there was no contact; null if
                             there was contact throughout; likewise residual_torque_max_Nm
 true_contact_s              [start, end] of each contact
+contact_noticed_ms          with contact_detection: how long after the beginning of each contact the
+                            detector noticed it, null if it did not; likewise contact_at_hand_ms
+false_contacts              how often the detector began to notice a contact that there was not
 peak_force_to_master_N      largest force that the device displayed
 joint_speed_use             largest share of a joint's speed limit; likewise joint_torque_use
 mass_error_percent          of the estimate at the end; likewise com_error_mm
@@ -134,13 +137,15 @@ def run_scenario(scenario: Scenario, stage: Stage = silent, log: Path | None = N
     if learns and not scenario.operator.intent:
         found = identify_load(scenario, stage, log=log)
         return ScenarioRun(scenario, found.result, found.identification, found.real_time_factor)
-    identification, estimate = None, None
+    identification, estimate, floor = None, None, None
     if not learns:
         # Another seed: the noise of the run must not be the one that was learnt from.
         before = identification_scenario(scenario, scenario.simulation.seed + 1)
         found = identify_load(before, stage)
         identification, estimate = found.identification, found.estimate
-    station = MakeTeleopStation(scenario, load_estimate=estimate)
+        if scenario.contact_detection is not None:
+            floor = found.noise_floor(slave_arm(scenario))
+    station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
     result, factor = timed(station, scenario.simulation, stage("Run the scenario"), log)
     return ScenarioRun(scenario, result, identification, factor)
 
@@ -193,6 +198,8 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     }
     if "force_to_master" in result:
         summary |= _peaks("peak", "_to_master", result["force_to_master"])
+    if "contact" in result:
+        summary |= _detection_figures(result, contact_spans(result.t, contact))
     return summary | {"warnings": list(_warnings(run, summary))}
 
 
@@ -230,6 +237,27 @@ def _since(what: str, result: SimulationResult, happened: NDArray[Any]) -> Itera
     if np.any(happened):
         first = result.t[np.argmax(happened)]
         yield f"{what} from {first:.3f} s on, for {np.mean(happened != 0):.1%} of the time"
+
+
+def _detection_figures(
+    result: SimulationResult, spans: list[tuple[float, float]]
+) -> dict[str, Any]:
+    """When each contact was noticed, at the slave and by the hand, and what was none."""
+    t, summary = result.t, {}
+    for name, key in (("contact", "contact_noticed_ms"), ("contact_at_hand", "contact_at_hand_ms")):
+        flagged = t[result[name][:, 0] > 0]
+        ends = [start for start, _ in spans[1:]] + [np.inf]
+        found = [
+            flagged[(flagged >= start) & (flagged < end)]
+            for (start, _), end in zip(spans, ends, strict=True)
+        ]
+        summary[key] = [
+            1e3 * float(times[0] - start) if len(times) else None
+            for times, (start, _) in zip(found, spans, strict=True)
+        ]
+    onsets = t[1:][np.diff(result["contact"][:, 0]) > 0]
+    false = [x for x in onsets if not any(a <= x <= b + FILTER_TAIL for a, b in spans)]
+    return summary | {"false_contacts": len(false)}
 
 
 def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:

@@ -32,9 +32,14 @@ The w_n are 1 if e is white. What is left of the load's wrench changes as slowly
 slowly than rho tells, and adds up over long sums: w_n is by how much such sums exceeded those of
 white noise in free motion. Without it the errors of the load would set the threshold for all n.
 
-**Hysteresis.** Contact begins when the chosen statistic reaches the threshold. It ends when the
-level has stayed below a share of the level's own threshold for a while; then the sums start anew,
-because after a long contact they would take as long to come down.
+**Drift.** Long sums notice half a standard deviation, and in minutes a force sensor drifts as far.
+So r may be taken about a mean of its own past, which follows with a time constant of some seconds
+while the level is low: a push that is so weak and lasts so long cannot be told from drift.
+
+**Hysteresis.** Contact begins when the chosen statistic reaches the threshold. It ends when for a
+while the level has stayed below a share of the level's own threshold, and the sum over that while
+is as low; then the sums start anew, because after a long contact they would take as long to come
+down.
 """
 
 from __future__ import annotations
@@ -56,10 +61,13 @@ STATISTICS = ("level", "cusum", "glr")
 SLACK = 1.0
 """Of the cumulative sum [standard deviations]. Half of the shift to be noticed is best in white
 noise; this much lets lasting errors of the load pass (benchmarks/contact_detection.py)."""
+MARGIN = 1.25
+"""Of a threshold over the largest value of free motion, which is reached about once in as long a
+record of more of it. Normal noise reaches a quarter more hundreds of times less often."""
 WINDOW = 128
 """Longest sum of the likelihood ratio [samples], a power of two."""
-LEAVE = 0.7
-"""Share of the level's threshold under which contact may end."""
+LEAVE = 0.7 * 6.2
+"""Level below which contact may end; normal noise reaches 6.2 once in a million samples."""
 
 _LENGTHS = WINDOW.bit_length()  # 1, 2, 4 ... WINDOW
 # A noise floor below this counts as this [N, N m]: as in `logs.contact`.
@@ -67,11 +75,27 @@ _RESOLUTION = np.repeat([1e-3, 1e-4], 3)
 _FITS, _HIGHEST_RHO, _NARROWEST = 20, 0.999, 0.1
 
 # Memory: samples so far, held |a|^2 and |alpha|^2, flag, samples of quiet; statistics (3); z of the
-# sample before; S; sum of all e; what it was after each of the last WINDOW samples, in a ring.
+# sample before; mean of r; S; sum of all e; what it was after each of the last WINDOW samples, in a
+# ring.
 _COUNT, _HELD_A, _HELD_ALPHA, _FLAG, _QUIET_FOR, _STATISTICS = 0, 1, 2, 3, 4, 5
-_Z, _S, _TOTAL, _RING = 8, 14, 20, 26
+_Z, _MEAN, _S, _TOTAL, _RING = 8, 14, 20, 26, 32
 SIZE = _RING + 6 * WINDOW
 """Of the memory of `detection_update`."""
+
+
+def statistic_index(statistic: str) -> int:
+    """The column of a statistic in `statistics`.
+
+    Raises:
+        DrakeTeleopError: for a name that is not one of `STATISTICS`.
+    """
+    if statistic not in STATISTICS:
+        raise DrakeTeleopError(
+            f"{statistic!r} is not a statistic",
+            where="statistic",
+            remedy=f"give one of {', '.join(STATISTICS)}",
+        )
+    return STATISTICS.index(statistic)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +110,7 @@ class NoiseFloor:
         rho: (6,) lag-one correlation of the decorrelated components, of the log's rate.
         widths: (8,) w_n of sums of 1, 2, 4 ... `WINDOW` innovations; 1 for white ones.
         fade: factor by which held squares of the acceleration fade each sample, 0 for no hold.
+        reached: (3,) the largest of each of the `STATISTICS` in the motion that this was fitted to.
     """
 
     noise: Array
@@ -95,6 +120,7 @@ class NoiseFloor:
     rho: Array
     widths: Array = field(default_factory=lambda: np.ones(_LENGTHS))
     fade: float = 0.0
+    reached: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         positive("noise", self.noise, 6)
@@ -107,10 +133,21 @@ class NoiseFloor:
         if (np.abs(rho) >= 1.0).any():
             raise DrakeTeleopError("is not within -1 to 1", where="rho")
         positive("widths", self.widths, _LENGTHS)
+        checked("reached", self.reached, 3)
         if not 0.0 <= self.fade < 1.0:
             raise DrakeTeleopError(f"{self.fade} is not within [0, 1)", where="fade")
         if np.linalg.eigvalsh(correlation).min() <= 0.0:
             raise DrakeTeleopError("is not positive definite", where="correlation")
+
+    def threshold(self, statistic: str, margin: float = MARGIN) -> float:
+        """What the statistic reached in free motion, times a margin.
+
+        It is worth as much as that motion, which should be as fast as what is judged by it.
+
+        Raises:
+            DrakeTeleopError: for another statistic, or if this was not fitted to a motion.
+        """
+        return margin * float(positive("reached", self.reached, 3)[statistic_index(statistic)])
 
     @property
     def parameters(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
@@ -188,6 +225,8 @@ def detection_update(
     widths,
     fade,
     slack,
+    following,
+    quiet,
 ):
     """One sample, in place: memory[5:8] are then the three `STATISTICS`; compiled, checks nothing.
 
@@ -197,13 +236,17 @@ def detection_update(
         s, omega, alpha, acceleration: (3,) as for `NoiseFloor.sigma`.
         variances, P, growth, root, rho, widths, fade: `NoiseFloor.parameters`.
         slack: of the cumulative sum.
+        following: share by which the mean of F_c follows each sample while the level is below
+            `quiet`; 0 for no mean.
+        quiet: see there.
     """
     V, scaled = np.empty((6, 10)), np.empty(6)
     _hold(memory, acceleration, alpha, fade)
     _parameter_variance(s, omega, alpha, P, V, scaled)
     for c in range(6):
         moving = growth[c, 0] * memory[_HELD_A] + growth[c, 1] * memory[_HELD_ALPHA]
-        scaled[c] = contact[c] / math.sqrt(variances[c] + max(scaled[c], 0.0) + moving)
+        variance = variances[c] + max(scaled[c], 0.0) + moving
+        scaled[c] = (contact[c] - memory[_MEAN + c]) / math.sqrt(variance)
     count = int(memory[_COUNT])
     level, length = 0.0, 0.0
     for i in range(6):
@@ -217,7 +260,10 @@ def detection_update(
         memory[_S + i] += e
         length += memory[_S + i] * memory[_S + i]
         memory[_TOTAL + i] += e
-    length = math.sqrt(length)
+    level, length = math.sqrt(level), math.sqrt(length)
+    if level < quiet:
+        for c in range(6):
+            memory[_MEAN + c] += following * (contact[c] - memory[_MEAN + c])
     shrink = max(0.0, 1.0 - slack / length) if length > 0.0 else 0.0
     for i in range(6):
         memory[_S + i] *= shrink
@@ -237,28 +283,44 @@ def detection_update(
     for i in range(6):
         memory[here + i] = memory[_TOTAL + i]
     memory[_COUNT] += 1.0
-    memory[_STATISTICS] = math.sqrt(level)
+    memory[_STATISTICS] = level
     memory[_STATISTICS + 1] = length * shrink
     memory[_STATISTICS + 2] = math.sqrt(best)
 
 
 @njit(cache=True)
-def hysteresis_update(memory, statistic, enter, leave, hold):
+def _last_sum(memory, hold, widths):
+    """The likelihood ratio of the longest window within `hold` samples, without a maximum."""
+    m = 0
+    while 2 << m <= min(hold, WINDOW // 2):
+        m += 1
+    # The sample before that window; what no sample has filled is zero.
+    before = _RING + 6 * ((int(memory[_COUNT]) + WINDOW - 1 - (1 << m)) % WINDOW)
+    total = 0.0
+    for i in range(6):
+        difference = memory[_TOTAL + i] - memory[before + i]
+        total += difference * difference
+    return math.sqrt(total / (1 << m)) / widths[m]
+
+
+@njit(cache=True)
+def hysteresis_update(memory, statistic, enter, leave, hold, widths):
     """Whether there is contact, after `detection_update`; compiled, checks nothing.
 
     Args:
         memory: the same, updated.
         statistic: index into `STATISTICS`.
         enter: threshold of that statistic.
-        leave: level below which contact may end.
+        leave: level below which contact may end, and sum of the longest window within `hold`.
         hold: samples below it, after which it has ended.
+        widths: of the sums.
     """
     if memory[_FLAG] == 0.0:
         if memory[_STATISTICS + statistic] >= enter:
             memory[_FLAG], memory[_QUIET_FOR] = 1.0, 0.0
     else:
         memory[_QUIET_FOR] = memory[_QUIET_FOR] + 1.0 if memory[_STATISTICS] < leave else 0.0
-        if memory[_QUIET_FOR] > hold:
+        if memory[_QUIET_FOR] > hold and _last_sum(memory, hold, widths) < leave:
             # The sums start anew, the noise goes on.
             memory[_FLAG] = 0.0
             memory[_S:] = 0.0
@@ -267,24 +329,47 @@ def hysteresis_update(memory, statistic, enter, leave, hold):
 
 
 @njit(cache=True)
-def _statistics(rows, parameters, slack, out):
+def flag_update(
+    memory,
+    contact,
+    s,
+    omega,
+    alpha,
+    acceleration,
+    parameters,
+    slack,
+    following,
+    statistic,
+    enter,
+    leave,
+    hold,
+):
+    """One sample, in place; whether there is contact. `ContactDetector.settings` are the last."""
+    detection_update(
+        memory, contact, s, omega, alpha, acceleration, *parameters, slack, following, leave
+    )
+    return hysteresis_update(memory, statistic, enter, leave, hold, parameters[5])
+
+
+@njit(cache=True)
+def _statistics(rows, parameters, slack, following, quiet, out):
     contact, s, omega, alpha, acceleration = rows
     memory = np.zeros(SIZE)
     for k in range(contact.shape[0]):
         detection_update(
-            memory, contact[k], s[k], omega[k], alpha[k], acceleration[k], *parameters, slack
-        )
+            memory, contact[k], s[k], omega[k], alpha[k], acceleration[k], *parameters, slack,
+            following, quiet,
+        )  # fmt: skip
         out[k] = memory[_STATISTICS : _STATISTICS + 3]
 
 
 @njit(cache=True)
-def _flags(memory, rows, parameters, slack, statistic, enter, leave, hold, out):
+def _flags(memory, rows, settings, out):
     contact, s, omega, alpha, acceleration = rows
     for k in range(contact.shape[0]):
-        detection_update(
-            memory, contact[k], s[k], omega[k], alpha[k], acceleration[k], *parameters, slack
+        out[k] = flag_update(
+            memory, contact[k], s[k], omega[k], alpha[k], acceleration[k], *settings
         )
-        out[k] = hysteresis_update(memory, statistic, enter, leave, hold)
 
 
 def _rows(**arrays: ArrayLike) -> list[Array]:
@@ -384,7 +469,8 @@ def fit_noise_floor(
     lengths = [min(2**m, len(e)) for m in range(_LENGTHS)]
     power = np.array([np.mean((sums[n:] - sums[:-n]) ** 2) / n for n in lengths])
     widths = np.sqrt(np.maximum(power, _NARROWEST**2))
-    return replace(floor, correlation=correlation, rho=rho, widths=widths)
+    floor = replace(floor, correlation=correlation, rho=rho, widths=widths)
+    return replace(floor, reached=statistics(floor, *rows).max(axis=0))
 
 
 def statistics(
@@ -396,6 +482,7 @@ def statistics(
     acceleration: ArrayLike,
     *,
     slack: float = SLACK,
+    following: float = 0.0,
 ) -> Array:
     """The three `STATISTICS` of each sample of a log, without hysteresis.
 
@@ -404,6 +491,7 @@ def statistics(
         contact: (N, 6) F_c of Eq. (13) [N, N m].
         s, omega, alpha, acceleration: (N, 3) as for `NoiseFloor.sigma`.
         slack: of the cumulative sum [standard deviations].
+        following: share by which the mean of F_c follows each sample, see `ContactDetector`.
 
     Returns:
         (N, 3).
@@ -413,7 +501,8 @@ def statistics(
     """
     rows = _rows(contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration)
     out = np.empty((len(rows[0]), 3))
-    _statistics(tuple(rows), floor.parameters, float(positive("slack", slack)), out)
+    sums = float(positive("slack", slack)), float(following), LEAVE
+    _statistics(tuple(rows), floor.parameters, *sums, out)
     return out
 
 
@@ -421,16 +510,17 @@ class ContactDetector:
     """Says at each sample whether something is touched (module docstring).
 
     What it knows is a `memory` (an array), which can be kept outside, as in the state of a Drake
-    system: `initial_memory`, `update_into`.
+    system: `initial_memory`, `flag_update(memory, ..., *settings)`.
 
     Args:
         floor: of the free motion.
         threshold: of the chosen statistic; see `free_threshold`.
         statistic: one of `STATISTICS`.
-        leave: level below which contact may end. Default: `LEAVE` times the threshold of a level
-            that normal noise passes once in a million samples (6.2).
+        leave: level below which contact may end.
         hold: samples of quiet after which it has ended.
         slack: of the cumulative sum.
+        following: share by which the mean of F_c, which is taken away, follows each sample while
+            the level is below `leave`: period over time constant, or 0 for no mean.
 
     Raises:
         DrakeTeleopError: for another statistic or values that are not positive.
@@ -442,32 +532,25 @@ class ContactDetector:
         threshold: float,
         *,
         statistic: str = "cusum",
-        leave: float = LEAVE * 6.2,
+        leave: float = LEAVE,
         hold: int = 20,
         slack: float = SLACK,
+        following: float = 0.0,
     ) -> None:
-        if statistic not in STATISTICS:
-            raise DrakeTeleopError(
-                f"{statistic!r} is not a statistic",
-                where="statistic",
-                remedy=f"give one of {', '.join(STATISTICS)}",
-            )
+        column = statistic_index(statistic)
         enter, low = float(positive("threshold", threshold)), float(positive("leave", leave))
-        self._floor, self._slack = floor.parameters, float(positive("slack", slack))
-        self._decision = STATISTICS.index(statistic), enter, low, int(hold)
+        if not 0.0 <= following < 1.0:
+            raise DrakeTeleopError(f"{following} is not within [0, 1)", where="following")
+        sums = float(positive("slack", slack)), float(following)
+        decision = column, enter, low, int(hold)
+        #: The last arguments of `flag_update`, the kernel of this class.
+        self.settings = (floor.parameters, *sums, *decision)
         self._memory = self.initial_memory()
 
     @staticmethod
     def initial_memory() -> Array:
         """The memory before the first sample, (n,)."""
         return np.zeros(SIZE)
-
-    def update_into(
-        self, memory: Array, contact: Array, s: Array, omega: Array, alpha: Array, a: Array
-    ) -> bool:
-        """`update` of a memory that is kept elsewhere; compiled, checks nothing."""
-        detection_update(memory, contact, s, omega, alpha, a, *self._floor, self._slack)
-        return bool(hysteresis_update(memory, *self._decision))
 
     def update(
         self,
@@ -484,7 +567,8 @@ class ContactDetector:
         """
         parts = {"s": s, "omega": omega, "alpha": alpha, "acceleration": acceleration}
         motion = [checked(name, value, 3) for name, value in parts.items()]
-        return self.update_into(self._memory, checked("contact", contact, 6), *motion)
+        wrench = checked("contact", contact, 6)
+        return bool(flag_update(self._memory, wrench, *motion, *self.settings))
 
     def detect(
         self,
@@ -497,7 +581,7 @@ class ContactDetector:
         """`update` with each of N samples of a log, in a compiled loop; (N,) flags."""
         rows = _rows(contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration)
         out = np.empty(len(rows[0]), np.bool_)
-        _flags(self._memory, tuple(rows), self._floor, self._slack, *self._decision, out)
+        _flags(self._memory, tuple(rows), self.settings, out)
         return out
 
 

@@ -36,12 +36,13 @@ from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.detection import (
+    MARGIN,
     STATISTICS,
     ContactDetector,
     NoiseFloor,
     finite_covariance,
     fit_noise_floor,
-    free_threshold,
+    statistic_index,
     statistics,
     wrench_axis,
 )
@@ -51,9 +52,6 @@ from drake_teleop.logs.commands import common_figures, plain, print_results, wri
 from drake_teleop.logs.contact import contacts_of
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
 
-# The largest value of free motion is reached about once in as long a record of more of it. Normal
-# noise reaches a quarter more about a hundred times less often (and the same for both thresholds).
-_MARGIN = 1.25
 # Where the orientation is not known, gravity is what is slower than this in the specific force.
 _GRAVITY_HZ = 0.5
 
@@ -127,13 +125,7 @@ def detect_log(
     for log in (found.log, calm.log):
         if log.static:
             raise DrakeTeleopError("holds poses at rest, which have no contact", where=log.source)
-    if statistic not in STATISTICS:
-        raise DrakeTeleopError(
-            f"{statistic!r} is not a statistic",
-            where="statistic",
-            remedy=f"give one of {', '.join(STATISTICS)}",
-        )
-    column = STATISTICS.index(statistic)
+    statistic_index(statistic)  # refused here, if it is none
     inner = _judged(calm, cutoff_hz)
     quiet = ~calm.touched[inner] if free is None else slice(None)
     train = _Samples(*(x[inner][quiet] for x in _samples(calm, cutoff_hz)))
@@ -141,7 +133,7 @@ def detect_log(
     fade = math.exp(-calm.log.dt * cutoff_hz)
     covariance = finite_covariance(found.phi, load.covariance, tared=True)
     floor = fit_noise_floor(*train, covariance, fade=fade)
-    threshold = _MARGIN * free_threshold(statistics(floor, *train)[:, column])
+    threshold = floor.threshold(statistic)
 
     inner = _judged(found, cutoff_hz)
     rows = _Samples(*(x[inner] for x in _samples(found, cutoff_hz)))
@@ -157,7 +149,7 @@ def detect_log(
         statistics=values,
         touched=touched,
         free_s=len(train.contact) * calm.log.dt,
-        force_threshold=_MARGIN * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
+        force_threshold=MARGIN * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
     )
 
 

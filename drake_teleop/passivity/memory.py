@@ -13,9 +13,9 @@ SENT = 5  #: (2,) this end's counter of energy, as sent [J]
 LOST = 7  #: (2,) energy that the method took out of the loop here [J]
 HELD = 9  #: (6,) the wrench at this port since the last step
 COMMAND = 15  #: (13,) the slave's command [pose 7; twist 6] since the last step
-PACKET = 28  #: (31,) the last packet that was sent
-OWN = 59  #: here begins what one method alone remembers
-MEMORY = 91
+PACKET = 28  #: (32,) the last packet that was sent
+OWN = 60  #: here begins what one method alone remembers
+MEMORY = 92
 
 # Parameters (PARAMETERS,), packed by `methods.parameters`.
 LIMIT = 0  #: (2,) what the device can display [N, N m]

@@ -1,6 +1,6 @@
 """What a packet holds, and the small vector operations that the methods share.
 
-One layout serves every method and both directions: (31,) float64. Counters and integrals are
+One layout serves every method and both directions: (32,) float64. Counters and integrals are
 cumulative, so a receiver takes differences to the newest packet that it has, and lost, late or
 doubled packets do no harm.
 
@@ -24,7 +24,8 @@ WRENCH = 15  #: (6,) its wrench [f; tau], in W, in the master's power units
 INTEGRAL = 21  #: (6,) cumulative integral, of the method's choice
 ENERGY = 27  #: (2,) cumulative energy that the receiver may use, for each group [J]
 OTHER_ENERGY = 29  #: (2,) a second counter of energy, for each group [J]
-PACKET_SIZE = 31
+CONTACT = 31  #: 1 while the slave's detector says that something is touched
+PACKET_SIZE = 32
 
 
 @njit(cache=True)

@@ -292,6 +292,24 @@ def _advance(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) 
     x[8] += z2 * qdd + (w0 * z1 - w1 * z0) * qd
 
 
+def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
+    """(N, 3) a = s + g in S, of specific forces s (N, 3) at joint positions q (N, n)."""
+    out = np.empty_like(s)
+    for k in range(len(s)):
+        acceleration_into(arm.table, q[k], s[k], out[k])
+    return out
+
+
+@njit(cache=True)
+def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
+    """Writes a = s + g of So, in S, of the specific force s (3,) at q (n,) into out (3,)."""
+    R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+    forward_kinematics(table, q, R_WS, p_WS)
+    g = table[table.shape[0] - 1, _GRAVITY : _GRAVITY + 3]
+    for i in range(3):
+        out[i] = s[i] + R_WS[0, i] * g[0] + R_WS[1, i] * g[1] + R_WS[2, i] * g[2]
+
+
 @njit(cache=True, inline="always")
 def _start(table: Array, x: Array) -> None:
     """The state of the world's frame at rest: s = -g, identity pose."""

@@ -24,7 +24,10 @@ FAULTS = ("hand_pose", "hand_wrench", "slave_pose", "slave_wrench", "saturated")
 
 @dataclass
 class Run:
-    """Arrays over the steps; x along the axis of motion, wrenches (N, 6), ports (N, 6)."""
+    """Arrays over the steps; x along the axis of motion, ports (N, 6).
+
+    What is felt: the wrench (6) and the flag of contact.
+    """
 
     t: np.ndarray
     hand: np.ndarray
@@ -32,6 +35,7 @@ class Run:
     felt: np.ndarray
     ports: np.ndarray
     servo: np.ndarray  # what its servo pulls with, and what the method at its port believes
+    touched: np.ndarray  # by the wall, at the slave
 
 
 def hand_position() -> np.ndarray:
@@ -52,8 +56,10 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
     hand = hand_position()
     start = np.array([1.0, 0, 0, 0, hand[0], 0, 0])
     ends, received, slave = initial_ends(method, p, start), start.copy(), start.copy()
-    ports, felt, velocity = np.zeros(6), np.zeros(6), 0.0
-    found = Run(np.arange(STEPS) * T, hand, *(np.zeros((STEPS, n)) for n in (7, 6, 6, 2)))
+    ports, felt, velocity = np.zeros(6), np.zeros(7), 0.0
+    found = Run(
+        np.arange(STEPS) * T, hand, *(np.zeros((STEPS, n)) for n in (7, 7, 6, 2)), np.zeros(STEPS)
+    )
     for k, x in enumerate(hand):
         wall = -7000.0 * max(slave[4], 0.0)
         velocity += T * (117.0**2 * (received[4] - slave[4]) - 234.0 * velocity + wall / 15.13)
@@ -70,13 +76,23 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
         if now and fault == "saturated":
             inputs["slave_wrench"][:] = 1e3
         channel_step(
-            METHODS.index(method), *inputs.values(), now and fault == "saturated", T, TIMEOUT,
-            frame, p, *lines, *states, ends, received, ports, felt,
+            METHODS.index(method), *inputs.values(), now and fault == "saturated",
+            float(wall < 0.0), T, TIMEOUT, frame, p, *lines, *states, ends, received, ports, felt,
         )  # fmt: skip
+        found.touched[k] = wall < 0.0
         found.command[k], found.felt[k], found.ports[k] = received, felt, ports
         pull = p[STIFFNESS] * (received[4] - slave[4]) - p[DAMPING] * velocity
         found.servo[k] = pull, ends[_MEMORY_S + HELD]
     return found
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_flag_of_contact_travels_with_the_packets(method):
+    found = run(method, None)
+    touched, told = found.touched, found.felt[:, 6]
+    late = round(DELAY / T)
+    assert 0 < np.count_nonzero(touched) < STEPS
+    np.testing.assert_array_equal(told[late:], touched[: STEPS - late])
 
 
 @pytest.mark.parametrize("method", METHODS)

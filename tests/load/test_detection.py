@@ -17,6 +17,7 @@ from scipy.stats import chi2, norm
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.detection import (
+    LEAVE,
     SIZE,
     SLACK,
     STATISTICS,
@@ -254,6 +255,42 @@ def test_a_long_contact_is_over_at_once_and_the_next_is_noticed():
     np.testing.assert_array_equal(np.flatnonzero(np.diff(flags)), [99, 15_019, 15_099])
 
 
+@pytest.mark.parametrize("statistic", ["cusum", "glr"])
+def test_a_weak_contact_is_one_contact(statistic):
+    """Two standard deviations, which only sums notice: the flag must not go on and off."""
+    rng = np.random.default_rng(3)
+    noise = rng.normal(size=(6000, 6)) * NOISE
+    contact = noise.copy()
+    contact[3000:5000, 1] += 2.0 * NOISE[1]
+    rows = at_rest(6000)
+    threshold = 1.25 * statistics(white(), noise, *rows)[:, STATISTICS.index(statistic)].max()
+    flags = ContactDetector(white(), threshold, statistic=statistic).detect(contact, *rows)
+    first, last = np.flatnonzero(np.diff(flags))
+    assert 3000 <= first < 3050
+    assert 5000 <= last < 5080
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_drift_is_no_contact_and_a_push_on_top_of_it_is(seed):
+    """1.5 standard deviations within 100 s, twice what the sensor of the station does."""
+    rng, n = np.random.default_rng(seed), 100_000
+    wrench = rng.normal(size=(n, 6)) * NOISE
+    quiet = wrench[:20_000]
+    floor = fit_noise_floor(quiet, *at_rest(len(quiet)), np.zeros((16, 16)))
+    wrench[:, 2] += np.linspace(0.0, 1.5, n) * NOISE[2]
+    wrench[-1000:, 2] -= 3.0 * NOISE[2]
+    threshold = floor.threshold("glr")
+    follows, stays = (
+        ContactDetector(floor, threshold, statistic="glr", following=following).detect(
+            wrench, *at_rest(n)
+        )
+        for following in (1 / 5000, 0.0)
+    )
+    assert not follows[:-1000].any()
+    assert follows[-950:].all()
+    assert stays[:-1000].mean() > 0.2
+
+
 def test_fast_motion_is_no_contact_and_a_push_in_it_is():
     """A load that is 1 % too light in the estimate, late by 2 ms: eliminated, but not quite."""
     samples = 40_000
@@ -295,7 +332,7 @@ def test_a_sample_takes_less_than_5_us():
     start = time.thread_time()
     statistics(floor, rows[0], *motion)
     assert (time.thread_time() - start) / 20_000 < 5e-6
-    detection_update(memory, rows[0][0], *STILL, *floor.parameters, SLACK)
+    detection_update(memory, rows[0][0], *STILL, *floor.parameters, SLACK, 0.0, LEAVE)
     assert memory[0] == 1.0
 
 
