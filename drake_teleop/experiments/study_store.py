@@ -45,6 +45,24 @@ class Store:
         rows.write_parquet(unfinished)
         unfinished.replace(self.folder / _PART.format(rows["run"][0]))
 
+    def mark(self, run: int) -> None:
+        """Notes that the chunk with this first run is under way, once more."""
+        self._marks.mkdir(exist_ok=True)
+        with (self._marks / str(run)).open("ab") as mark:
+            mark.write(b".")
+
+    def unmark(self, run: int) -> None:
+        """Takes its marks away, if it has any."""
+        (self._marks / str(run)).unlink(missing_ok=True)
+
+    def marked(self, times: int) -> set[int]:
+        """The first runs of the chunks that were so often under way when their process ended."""
+        return {int(mark.name) for mark in self._marks.glob("*") if mark.stat().st_size >= times}
+
+    @property
+    def _marks(self) -> Path:
+        return self.folder.with_name("running")
+
     def read(self) -> pl.DataFrame:
         """All rows, sorted by run."""
         import polars as pl

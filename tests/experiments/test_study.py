@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +17,10 @@ import pytest
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.experiments import study as studies
-from drake_teleop.experiments.study import (
-    MEASURES,
-    Factor,
-    LoadStudy,
-    Study,
-    run_study,
-    study_command,
-)
+from drake_teleop.experiments.study import LoadStudy, study_command
+from drake_teleop.experiments.study_design import Factor, Study
+from drake_teleop.experiments.study_measures import MEASURES
+from drake_teleop.experiments.study_runs import run_study
 from drake_teleop.experiments.study_store import open_store
 from drake_teleop.result import SimulationResult
 from drake_teleop.signals import SIGNALS
@@ -50,7 +46,8 @@ FAKE = """
 import os, random, signal, sys, time
 from pathlib import Path
 import joblib, polars
-from drake_teleop.experiments.study import Factor, Study, run_study
+from drake_teleop.experiments.study_runs import run_study
+from drake_teleop.experiments.study_design import Factor, Study
 
 def work(values, seed):
     time.sleep(pause)
@@ -128,7 +125,6 @@ def test_processes_give_the_same_bytes(serial, files):
 
 
 def test_a_dask_cluster_gives_the_same_bytes(serial, files):
-    pytest.importorskip("distributed")
     out = files / "dask"
     summary = study_command(files / "study.yaml", out, jobs=2, cluster="local", quiet=True)
     assert summary == serial[0]
@@ -238,23 +234,167 @@ def test_an_interrupt_says_what_is_kept(tmp_path):
     assert len(calls) == 5  # the third one again
 
 
-@dataclass(frozen=True)
-class Dies:
-    """A run that ends its process, unless that is the study's own."""
+def dying(own: int, at: float):
+    """A run that ends its process at one value; a closure, so that nobody has to import this."""
 
-    own: int
-
-    def __call__(self, values, seed):
-        if os.getpid() != self.own:
+    def work(values, seed):
+        assert os.getpid() != own
+        if values["a.b"] == at:
             os._exit(1)
-        return {}
+        return {"hand_work_J": values["a.b"]}
+
+    return work
 
 
-def test_a_process_that_dies_costs_no_row_that_was_written(tmp_path):
-    study = Study(factors=[Factor("a.b", values=[1.0, 2.0, 3.0, 4.0])])
-    with pytest.raises(DrakeTeleopError, match="a process has died after 1 of 4 runs"):
-        run_study(study, tmp_path, Dies(os.getpid()), {}, jobs=2)
-    assert run_study(study, tmp_path, Dies(os.getpid()), {}, jobs=1).height == 4
+@pytest.mark.parametrize("cluster", [None, "local"])
+def test_a_run_that_ends_its_process_is_a_row(tmp_path, cluster):
+    factor = Factor("a.b", low=0.0, high=9.0, levels=10)
+    study = Study(factors=[factor], measures=["hand_work_J"])
+    rows = run_study(study, tmp_path, dying(os.getpid(), at=3.0), {}, jobs=2, cluster=cluster)
+    assert rows["run"].to_list() == list(range(10))
+    failed = rows.filter(pl.col("error").is_not_null())
+    assert failed["a.b"].to_list() == [3.0]
+    assert failed["error"].to_list() == ["the run has ended its process"]
+    assert rows["hand_work_J"].drop_nulls().to_list() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+    assert not list(tmp_path.glob("running/*"))
+
+
+def test_processes_that_never_begin_are_an_error(tmp_path):
+    study = Study(factors=[Factor("a.b", values=[1.0, 2.0, 3.0])])
+    with pytest.raises(DrakeTeleopError, match="processes end before they begin"):
+        run_study(study, tmp_path, Unreadable(), {}, jobs=2)
+
+
+class Unreadable:
+    """A work that ends each process that receives it."""
+
+    def __reduce__(self):
+        return os._exit, (1,)
+
+
+ORPHANS = """
+import os, sys, time
+from pathlib import Path
+from drake_teleop.experiments.study_runs import run_study
+from drake_teleop.experiments.study_design import Factor, Study
+
+out = Path(sys.argv[1])
+
+def work(values, seed):
+    (out / str(os.getpid())).touch()
+    time.sleep(600)
+
+run_study(Study(factors=[Factor("a.b", values=[1.0, 2.0])]), out / "out", work, {}, jobs=2)
+"""
+
+
+def test_processes_end_with_a_study_that_is_killed(tmp_path):
+    script = tmp_path / "orphans.py"
+    script.write_text(ORPHANS)
+    process = subprocess.Popen([sys.executable, str(script), str(tmp_path)])
+    wait_for(lambda: sum(path.name.isdigit() for path in tmp_path.iterdir()) == 2)
+    process.kill()
+    process.wait()
+    children = [int(path.name) for path in tmp_path.iterdir() if path.name.isdigit()]
+    wait_for(lambda: not any(alive(pid) for pid in children))
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # One that has ended and that nobody has buried yet.
+    return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
+
+
+def wait_for(condition, seconds=60.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_factors_over_flags_and_vectors(files, tmp_path):
+    """They reach the scenario, and the table has a column of their kind."""
+    path = files / "kinds.yaml"
+    path.write_text("""
+scenario: tiny.yaml
+factors:
+  - {field: wrist_sensor.ideal, flags: [true, false]}
+  - {field: slave.position, vectors: [[0.55, 0, 0.45], [0.5, 0.1, 0.45]]}
+  - {field: slave.payload.mass, values: [0, 2]}
+""")
+    out = tmp_path / "out"
+    assert study_command(path, out, jobs=1, quiet=True)["failed"] == 0
+    rows = pl.read_parquet(out / "runs.parquet").sort("run")
+    assert rows["wrist_sensor.ideal"].to_list() == [True] * 4 + [False] * 4
+    assert rows["slave.position"].to_list() == [[0.55, 0, 0.45]] * 2 + [[0.5, 0.1, 0.45]] * 2 + (
+        [[0.55, 0, 0.45]] * 2 + [[0.5, 0.1, 0.45]] * 2
+    )
+    assert rows["rms_force_to_master_N"].n_unique() == 8
+    heavy = rows.filter(pl.col("wrist_sensor.ideal"))["rms_force_to_master_N"].to_list()
+    # All that is felt of a load that is being learnt is in proportion to it, offsets apart.
+    assert heavy[1] / heavy[0] == pytest.approx((3.13 + 2) / 3.13, rel=0.1)
+
+
+def bowl(values, seed):
+    """Smallest at (0.3, "b"), with noise that is the same at all points."""
+    away = (values["a.x"] - 0.3) ** 2 + (values["a.w"] != "b")
+    if values["a.w"] == "c" and values["a.x"] > 0.9:
+        raise ValueError("out of reach")
+    return {"hand_work_J": away + 0.01 * seed}
+
+
+BOWL = Study(
+    factors=[Factor("a.x", low=-1.0, high=1.0), Factor("a.w", words=["a", "b", "c"])],
+    design="adaptive",
+    samples=40,
+    batch=4,
+    repeats=2,
+    measures=["hand_work_J"],
+    objective="hand_work_J",
+)
+
+
+def test_an_adaptive_design_finds_the_best_point(tmp_path):
+    rows = run_study(BOWL, tmp_path, bowl, {}, jobs=1)
+    assert rows["point"].max() == 39 and rows.height == 80
+    best = (
+        rows.filter(pl.col("repeat") == 0).sort("hand_work_J", nulls_last=True).row(0, named=True)
+    )
+    assert best["a.w"] == "b"
+    assert best["a.x"] == pytest.approx(0.3, abs=0.01)
+    # It looks where it is good: chance would have a third of the points there.
+    late = rows.filter(pl.col("point") >= 20)
+    assert (late["a.w"] == "b").mean() > 0.5
+    assert len(rows.select("a.x", "a.w").unique()) == 40
+
+
+def test_an_adaptive_design_goes_on_after_any_stop(tmp_path):
+    run_study(BOWL, tmp_path / "whole", bowl, {}, jobs=1)
+    calls = []
+
+    def stopping(values, seed):
+        calls.append(values)
+        if len(calls) % 7 == 0:
+            raise KeyboardInterrupt
+        return bowl(values, seed)
+
+    while True:
+        try:
+            run_study(BOWL, tmp_path / "stopped", stopping, {}, jobs=1)
+            break
+        except KeyboardInterrupt:
+            pass
+    assert len(calls) > 85
+    assert parts(tmp_path / "stopped") == parts(tmp_path / "whole")
+
+
+def test_an_adaptive_design_ends_when_it_has_every_combination(tmp_path):
+    factors = [Factor("a.x", values=[0.0, 1.0]), Factor("a.w", words=["a", "b", "c"])]
+    rows = run_study(dataclasses.replace(BOWL, factors=factors), tmp_path, bowl, {}, jobs=1)
+    assert len(rows.select("a.x", "a.w").unique()) == 6
 
 
 def test_sobol_points_are_balanced():
@@ -307,7 +447,7 @@ def test_measures_of_a_known_motion():
 
 def test_a_preset_brings_its_values(files):
     """A factor acts as if it stood in the file: a preset is more than its name."""
-    work = studies.StationWork({}, "x", (), 1.0)
+    work = studies.StationWork({}, "x", (), 1.0, files / "loads")
     ideal = work.scenario({"wrist_sensor.preset": "ideal"}, 3)
     assert ideal.simulation.seed == 3
     assert ideal.wrist_sensor != work.scenario({}, 3).wrist_sensor
@@ -337,6 +477,8 @@ def test_a_preset_brings_its_values(files):
         (("repeats: 2", "{design: sobol, samples: 48}"), "is not YAML"),
         (("repeats: 2", "design: sobol\nsamples: 48"), "samples: 48 Sobol points"),
         (("repeats: 2", "measures: [joy]"), "there is no measure 'joy'"),
+        (("repeats: 2", "design: adaptive"), "objective: '' is no objective"),
+        (("repeats: 2", "objective: hand_work_J"), "no objective for a design that is factorial"),
         ((STUDY, "scenario: tiny.yaml"), "factors: nothing is varied"),
         ((STUDY, "- 1"), "expected a mapping"),
     ],
