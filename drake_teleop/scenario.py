@@ -19,6 +19,7 @@ from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.master.device import JointFriction
 from drake_teleop.master.operator import OperatorConfig
+from drake_teleop.master.task import check_task
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.quantities import check_ranges, check_structure, choice, quantity
 from drake_teleop.resources import scenarios_dir
@@ -127,6 +128,7 @@ class Scenario:
                 where=f"{where}:slot",
                 remedy="leave one of them out",
             )
+        _check_task(self, where)
         _check_steps(self, where)
         _check_channel(self, where)
 
@@ -193,6 +195,18 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
             value = dataclasses.replace(getattr(scenario, block), **{inner: value})
         scenario = dataclasses.replace(scenario, **{block: value})  # type: ignore[arg-type]
     return scenario
+
+
+def _check_task(scenario: Scenario, where: str) -> None:
+    if scenario.operator.task is None:
+        return
+    check_task(scenario.operator.task, f"{where}:operator.task")
+    if scenario.kinematic_scaling.translation_scale == 0.0:
+        raise DrakeTeleopError(
+            "a hand that does not move the tool cannot do a task",
+            where=f"{where}:kinematic_scaling.translation_scale",
+            remedy="set it above 0, or operator.task: null",
+        )
 
 
 def _check_steps(scenario: Scenario, where: str) -> None:

@@ -46,6 +46,13 @@ SIGNALS = {
         _signal("true_contact_wrench_W", *_WRENCH, "environment on the tool, about the origin"),
         _signal("sheet_state", "z v_z", "m,m/s", "deflection of the sheet spring's end, upwards"),
         _signal("intent", *_POSE, "where the operator wants the stylus, X_BE"),
+        _signal(
+            "task_state",
+            "phase outcome noticed threshold trust",
+            "1,1,1,N,1",
+            "of the operator's task: phase, 1 done or -1 given up, 1 while contact is noticed, from"
+            " which felt force on it is, and trust: master/task.py",
+        ),
         _signal("pose_master", *_POSE, "of the stylus, X_BE"),
         _signal("twist_master", *_TWIST, "of the stylus in the device's base"),
         _signal("master_state", _STATE, _STATE_UNITS, "joint angles and velocities of the device"),

@@ -14,7 +14,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, Output
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer, PassThrough
 
 from drake_teleop.channel.channel import TeleopChannel
-from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.channel.network import NetworkConfig, mean_delay
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.detection import NoiseFloor
 from drake_teleop.load.excitation import FourierTrajectory
@@ -23,6 +23,7 @@ from drake_teleop.master.device import MasterDevice
 from drake_teleop.master.force_display import ForceDisplay
 from drake_teleop.master.operator import Operator
 from drake_teleop.scaling.contact_detection import ContactDetection
+from drake_teleop.master.task import Training
 from drake_teleop.scaling.force_scaling import ForceScaling
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.scenario import Scenario
@@ -120,6 +121,8 @@ _DETECTION_SIGNALS = {
     "contact": "contact_detection.contact",
     "contact_at_hand": "contact_at_hand.y",
 }
+_TASK_WIRES = (("slave_plant.rx90_state", "operator.slave_state"),)
+_TASK_SIGNALS = {"task_state": "operator.task_state"}
 _CHANNEL_SIGNALS = {"pose_received": "channel.pose_received", "ports": "channel.ports"}
 
 
@@ -165,6 +168,7 @@ def MakeTeleopStation(
         - true_contact_wrench_W (with something to touch)
         - sheet_state (with a sheet spring)
         - intent
+        - task_state (with a task)
         - hand_wrench_E
         - master_state
         - pose_master
@@ -206,7 +210,7 @@ def MakeTeleopStation(
     builder = DiagramBuilder()
     slave, slave_signals = AddSlave(builder, scenario, load_estimate, load_covariance)
     blocks = {
-        "operator": Operator(scenario.operator, start_B),
+        "operator": _operator(scenario, start_B, slave, R_WB.matrix()),
         "master_device": MasterDevice(
             period,
             hand_mass=hand.mass,
@@ -223,6 +227,9 @@ def MakeTeleopStation(
         builder.AddNamedSystem(name, block)
     _connect(builder, _TELEOP_WIRES)
     signals = slave_signals | _TELEOP_SIGNALS
+    if scenario.operator.task is not None:
+        _connect(builder, _TASK_WIRES)
+        signals |= _TASK_SIGNALS
     if _is_direct(scenario):
         _connect(builder, _DIRECT_WIRES)
     else:
@@ -257,6 +264,26 @@ def MakeTeleopStation(
         signals |= _DETECTION_SIGNALS
     builder.ExportInput(_input(builder, "kinematic_scaling.clutch"), "clutch")
     return _finish(builder, "teleop_station", signals, scenario)
+
+
+def _operator(
+    scenario: Scenario, start_B: NDArray[np.float64], slave: SlavePlant, R_WB: NDArray[np.float64]
+) -> Operator:
+    """The operator; for a task it sees the tool, and has been trained on this station."""
+    if scenario.operator.task is None:
+        return Operator(scenario.operator, start_B)
+    forward, backward = (mean_delay(line) for line in scenario.channel.lines())
+    training = Training(
+        R_WB,
+        scenario.kinematic_scaling.translation_scale,
+        scenario.force_scaling.scales()[2] * scenario.force_scaling.force_scale,
+        forward,
+        backward,
+        scenario.simulation.seed,
+    )
+    tip = slave.plant.GetFrameByName("tip").GetFixedPoseInBodyFrame().translation()
+    tip_W = np.array(scenario.slave.position) + R_WS_HOME.matrix() @ tip
+    return Operator(scenario.operator, start_B, training, slave.arm, np.concatenate([tip, tip_W]))
 
 
 def _is_direct(scenario: Scenario) -> bool:

@@ -37,6 +37,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.noise import random_bits
 from drake_teleop.passivity.packet import POSE, VELOCITY, WRENCH, arrived, moved_into
 from drake_teleop.quantities import check_ranges, choice, quantity
 
@@ -50,6 +51,7 @@ LONGEST_EXTRAPOLATION = 0.1  # [s]; what is not known after that stands still
 _TAILS = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
 _SILENCE = ("hold", "zero", "extrapolate")
 _ZERO, _EXTRAPOLATE = 1, 2
+_TRACE_STEP = 1e-3  # [s], as fine as a mean needs
 
 
 @dataclass
@@ -145,7 +147,7 @@ def parameters(
     sojourn = config.burst * (1 - bad)  # time constant of the chain
     p = np.empty(_TRACE + trace.size)
     # 53 bits of a key are exact in a float.
-    p[_KEY] = _bits(np.uint64(_bits(np.uint64(seed % 2**64), 0)), direction)
+    p[_KEY] = random_bits(np.uint64(random_bits(np.uint64(seed % 2**64), 0)), direction)
     p[_PERIOD], p[_DELAY], p[_JITTER], p[_LONGEST] = period, mean, config.jitter, longest
     p[_DISTRIBUTION] = list(_TAILS).index(config.distribution)
     p[_BAD_SHARE], p[_BAD_MEMORY] = bad, math.exp(-period / sojourn) if sojourn > 0 else 0.0
@@ -155,6 +157,15 @@ def parameters(
     p[_POLICY], p[_LEAST] = _SILENCE.index(config.silence), least
     p[_TRACE:] = trace
     return p
+
+
+def mean_delay(config: NetworkConfig) -> float:
+    """How long a packet that is used has been on its way, on average [s]; lost ones left out."""
+    if config.trace is None:
+        return max(config.delay, config.playout)
+    delays = _read_trace(Path(config.trace), _TRACE_STEP) * _TRACE_STEP
+    used = np.maximum(delays[delays >= 0], config.playout)
+    return float(used.mean()) if used.size else config.playout
 
 
 def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
@@ -183,18 +194,9 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _bits(key, counter):
-    """53 random bits, as a whole number: splitmix64 (Steele, Lea, Flood 2014) at any place."""
-    z = key + np.uint64(counter + 1) * np.uint64(0x9E3779B97F4A7C15)
-    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return (z ^ (z >> np.uint64(31))) >> np.uint64(11)
-
-
-@njit(cache=True)
 def _uniform(p, k, draw):
     """The random number of the packet k, uniform in (0, 1]; `draw` tells its 16 numbers apart."""
-    return (float(_bits(np.uint64(p[_KEY]), 16 * k + draw)) + 1.0) * 2.0**-53
+    return (float(random_bits(np.uint64(p[_KEY]), 16 * k + draw)) + 1.0) * 2.0**-53
 
 
 @njit(cache=True)

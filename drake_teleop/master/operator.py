@@ -2,6 +2,9 @@
 
 The hand is a two-port: it pulls the stylus towards where the operator wants it, and gives way to
 the force that it feels. Its passive mass moves with the stylus and is part of the device.
+
+With a task the operator is closed-loop: it sees the tool and feels the stylus, both late, and plans
+its movements from them (`task.py`, `perception.py`); the intent's segments are added to these.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -12,10 +15,21 @@ from dataclasses import dataclass, field
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DependencyTicket,
+    DiscreteValues,
+    LeafSystem,
+)
 
+from drake_teleop.master import perception as feeling
+from drake_teleop.master import task as tasks
+from drake_teleop.master.perception import Perception, perceive_into
+from drake_teleop.master.task import Movement, Press, Reach, Touch, Training
 from drake_teleop.quantities import choice, quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, rotate
+from drake_teleop.slave.arm import ArmModel, forward_kinematics
 
 _FORCE_LIMIT = 60.0  # N, what a hand can exert on a stylus and still control, E
 _TORQUE_LIMIT = 2.0  # N m, E
@@ -82,6 +96,10 @@ class OperatorConfig:
     grip: str = choice("medium", tuple(GRIPS), "stiffness, damping and mass of the hand")
     intent: list[MinimumJerk | Sine] = field(default_factory=list)
     """Moves and oscillations relative to the start pose; they may overlap, and add up."""
+    task: Reach | Touch | Press | None = None
+    """What the operator does by eye and by feel, on top of the intent; null: nothing."""
+    perception: Perception = field(default_factory=Perception)
+    movement: Movement = field(default_factory=Movement)
 
     @property
     def hand(self) -> HandImpedance:
@@ -207,10 +225,62 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
 
 
 @njit(cache=True)
-def _wrench_now(packed, start, time, impedance, wanted, wanted_twist, pose, twist, wrench):
-    """`intent_into` and `hand_wrench_into` in one call of compiled code."""
-    intent_into(packed, start, time, wanted, wanted_twist)
+def _wanted_into(packed, start, memory, time, pose, twist):
+    """The intent's segments, and on top of them what the task asks for; no memory: no task."""
+    intent_into(packed, start, time, pose, twist)
+    if memory.shape[0] > 0:
+        tasks.add_plan_into(memory, time, pose, twist)
+
+
+@njit(cache=True)
+def _wrench_now(packed, start, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench):
+    """`_wanted_into` and `hand_wrench_into` in one call of compiled code."""
+    _wanted_into(packed, start, memory, time, wanted, wanted_twist)
     hand_wrench_into(impedance, wanted, wanted_twist, pose, twist, wrench)
+
+
+@njit(cache=True)
+def _look_feel_decide(
+    task, person, senses, hand_mass, arm, tip, time, hand_wrench, twist, slave_q, task_state,
+    memory, feelings, sights, touches,
+):  # fmt: skip
+    """One step of the operator's head, see `Operator`; compiled, checks nothing.
+
+    Args:
+        task, person: of `pack_task`, `pack_person`.
+        senses: (4,) of `Perception.parameters`.
+        hand_mass: [kg].
+        arm: the slave's table.
+        tip: (6,) the tool's tip in S, and where it starts in W [m].
+        time: now [s].
+        hand_wrench, twist: (6,) of the hand on the stylus and of the stylus, in B.
+        slave_q: (n,) [rad].
+        task_state, memory, feelings: states of `decide` and `perceive_into`, updated.
+        sights: (m, 3) what is seen and has not reached the mind yet, a ring; updated.
+        touches: (n, 5) likewise what is felt.
+    """
+    step = int(memory[0])
+    R_WS, p_WS, displacement = np.empty((3, 3)), np.empty(3), np.empty(3)
+    forward_kinematics(arm, slave_q, R_WS, p_WS)
+    for i in range(3):
+        displacement[i] = p_WS[i] - tip[3 + i]
+        for k in range(3):
+            displacement[i] += R_WS[i, k] * tip[k]
+    tasks.look_into(person, step, displacement, sights[step % sights.shape[0]])
+    # Until contact is expected the operator learns what moving alone feels like.
+    attentive = task_state[tasks.PHASE] > tasks.MOVING
+    felt = touches[step % touches.shape[0]]
+    perceive_into(
+        feelings, senses, tasks.PERIOD, hand_mass, hand_wrench[:3], twist[:3], attentive, felt
+    )
+    # The next to be written over is the oldest.
+    seen, felt = sights[(step + 1) % sights.shape[0]], touches[(step + 1) % touches.shape[0]]
+    tasks.decide(task, person, time, seen, felt, task_state, memory)
+
+
+def _ring(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, k) what is on its way for `delay` [s]."""
+    return np.tile(start, (round(delay / tasks.PERIOD) + 1, 1))
 
 
 class Operator(LeafSystem):
@@ -222,16 +292,29 @@ class Operator(LeafSystem):
         input_ports:
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B
+        - slave_state: [q; v] of the slave, for what is seen of the tool (with a task)
         output_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
         - intent: (7,) the intended X_BE
+        - task_state: (5,) phase, 1 done or -1 given up, 1 while contact is noticed, threshold of
+          the felt force [N], trust (with a task)
 
     Args:
-        config: grip and intent.
+        config: grip, intent and task.
         start: (7,) X_BE to which the intent is relative.
+        training: what a task needs to be known of the station.
+        arm: the slave's, likewise.
+        tip: (6,) the tool's tip in S and where it starts in W [m], likewise.
     """
 
-    def __init__(self, config: OperatorConfig, start: NDArray[np.float64]) -> None:
+    def __init__(
+        self,
+        config: OperatorConfig,
+        start: NDArray[np.float64],
+        training: Training | None = None,
+        arm: ArmModel | None = None,
+        tip: NDArray[np.float64] | None = None,
+    ) -> None:
         super().__init__()
         hand = config.hand
         self._impedance = np.array(
@@ -240,15 +323,78 @@ class Operator(LeafSystem):
         self._intent = pack_intent(config.intent)
         self._start = np.array(start, dtype=float)
         self._wanted, self._wanted_twist = np.empty(7), np.empty(6)
+        self._no_memory = np.empty(0)
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        self.DeclareVectorOutputPort("hand_wrench_E", 6, self._calc_wrench)
-        self.DeclareVectorOutputPort("intent", 7, self._calc_intent, {self.time_ticket()})
+        self._has_task = config.task is not None
+        held, moving = {self._pose.ticket(), self._twist.ticket()}, {self.time_ticket()}
+        if config.task is not None:
+            if training is None or arm is None or tip is None:
+                raise ValueError("a task needs training, arm and tip")
+            moving.add(self._declare_task(config, config.task, training, arm, tip))
+        self._wrench = self.DeclareVectorOutputPort(
+            "hand_wrench_E", 6, self._calc_wrench, held | moving
+        )
+        self.DeclareVectorOutputPort("intent", 7, self._calc_intent, moving)
+
+    def _declare_task(
+        self,
+        config: OperatorConfig,
+        task: tasks.Task,
+        training: Training,
+        arm: ArmModel,
+        tip: NDArray[np.float64],
+    ) -> DependencyTicket:
+        """Ports, states and event of the head; what the plan depends on."""
+        senses = config.perception
+        nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
+        self._sights = _ring(senses.vision_delay + training.backward, np.zeros(3))
+        self._touches = _ring(senses.reaction_time, nothing_felt)
+        self._head = (
+            tasks.pack_task(task),
+            tasks.pack_person(training, senses, config.movement),
+            senses.parameters(tasks.PERIOD),
+            config.hand.mass,
+            arm.table,
+            np.array(tip, dtype=float),
+        )
+        self._joints = arm.num_joints
+        self._slave = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
+        state = (
+            np.zeros(tasks.STATE),
+            tasks.initial_memory(),
+            feeling.initial_memory(),
+            self._sights.ravel(),
+            self._touches.ravel(),
+        )
+        self._groups = [self.DeclareDiscreteState(part) for part in state]
+        self.DeclareStateOutputPort("task_state", self._groups[0])
+        self.DeclarePeriodicDiscreteUpdateEvent(tasks.PERIOD, 0.0, self._decide)
+        return self.discrete_state_ticket(self._groups[1])
+
+    def _decide(self, context: Context, discrete_state: DiscreteValues) -> None:
+        state = [discrete_state.get_mutable_value(group) for group in self._groups]
+        state[3] = state[3].reshape(self._sights.shape)
+        state[4] = state[4].reshape(self._touches.shape)
+        _look_feel_decide(
+            *self._head,
+            context.get_time(),
+            self._wrench.Eval(context),
+            self._twist.Eval(context),
+            self._slave.Eval(context)[: self._joints],
+            *state,
+        )
+
+    def _memory(self, context: Context) -> NDArray[np.float64]:
+        if not self._has_task:
+            return self._no_memory
+        return context.get_discrete_state(self._groups[1]).value()
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         _wrench_now(
             self._intent,
             self._start,
+            self._memory(context),
             context.get_time(),
             self._impedance,
             self._wanted,
@@ -259,5 +405,5 @@ class Operator(LeafSystem):
         )
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
-        time, pose = context.get_time(), output.get_mutable_value()
-        intent_into(self._intent, self._start, time, pose, self._wanted_twist)
+        time, pose, memory = context.get_time(), output.get_mutable_value(), self._memory(context)
+        _wanted_into(self._intent, self._start, memory, time, pose, self._wanted_twist)
