@@ -281,9 +281,9 @@ def _operator(
         backward,
         scenario.simulation.seed,
     )
-    tip = slave.plant.GetFrameByName("tip").GetFixedPoseInBodyFrame().translation()
-    tip_W = np.array(scenario.slave.position) + R_WS_HOME.matrix() @ tip
-    return Operator(scenario.operator, start_B, training, slave.arm, np.concatenate([tip, tip_W]))
+    tip_W = np.array(scenario.slave.position) + R_WS_HOME.matrix() @ slave.tip
+    tip = np.concatenate([slave.tip, tip_W])
+    return Operator(scenario.operator, start_B, training, slave.arm, tip)
 
 
 def _is_direct(scenario: Scenario) -> bool:

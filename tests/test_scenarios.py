@@ -12,6 +12,7 @@ from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
 
 MOVEMENTS = ("free_motion_force", "free_motion_torque", "contact_transition", "peg_in_slot")
+TASKS = ("press", "reach", "touch")
 
 
 def run(name: str, **changes):
@@ -27,7 +28,7 @@ def margin(values, lower, upper):
 
 
 def test_these_are_shipped_and_say_what_they_are():
-    assert ScenarioNames() == sorted([*MOVEMENTS, "ideal_sensor", "identification"])
+    assert ScenarioNames() == sorted([*MOVEMENTS, *TASKS, "ideal_sensor", "identification"])
     for name in ScenarioNames():
         scenario = LoadScenario(name)
         scenario.check()
@@ -39,7 +40,7 @@ def test_the_ideal_sensor_sees_the_vertical_movement():
     assert ideal == replace(realistic, description=ideal.description, wrist_sensor__ideal=True)
 
 
-@pytest.fixture(scope="module", params=MOVEMENTS)
+@pytest.fixture(scope="module", params=(*MOVEMENTS, *TASKS))
 def movement(request):
     return run(request.param)
 

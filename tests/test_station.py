@@ -16,6 +16,7 @@ from drake_teleop.load.excitation import FourierTrajectory
 from drake_teleop.master import device
 from drake_teleop.master.device import JointFriction
 from drake_teleop.master.operator import OperatorConfig, Sine
+from drake_teleop.master.task import Touch
 from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.signals import SIGNALS
 from drake_teleop.simulation import MakeSimulator, advance, simulate
@@ -333,6 +334,7 @@ def test_scales_change_while_running_without_a_step_of_the_force(slave):
 def test_every_output_port_is_a_documented_signal():
     scenario = replace(LoadScenario("contact_transition"), simulation=Simulation(duration=0.01))
     scenario = replace(scenario, channel__network="lan", load_estimator__watch=True)
+    scenario = replace(scenario, operator__task=Touch())
     station = MakeTeleopStation(
         scenario, load_estimate=np.ones(16), load_covariance=np.identity(16)
     )

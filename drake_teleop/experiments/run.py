@@ -134,7 +134,7 @@ def run_scenario(scenario: Scenario, stage: Stage = silent, log: Path | None = N
         log: as `simulate` has it.
     """
     learns = scenario.load_estimator.enabled
-    if learns and not scenario.operator.intent:
+    if learns and not scenario.operator.intent and scenario.operator.task is None:
         found = identify_load(scenario, stage, log=log)
         return ScenarioRun(scenario, found.result, found.identification, found.real_time_factor)
     identification, estimate, floor = None, None, None

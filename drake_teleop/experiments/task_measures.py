@@ -21,14 +21,14 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.experiments.identification import slave_arm
 from drake_teleop.master.task import DONE, FELT, PHASE, WAITING, Press, Reach, Task
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario
 from drake_teleop.slave.arm import forward_kinematics
-from drake_teleop.slave.plant import R_WS_HOME, TIP_IN_S
+from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant
 
 Array = NDArray[np.float64]
 
@@ -74,10 +74,11 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     hand, twist = result["hand_wrench_E"][span], result["twist_master"][span]
     power = np.abs(np.sum(hand * twist, axis=1))
     noticed, touching = state[span, FELT] > 0.0, force[span] > 0.0
+    # The log may begin later than the task.
+    taken = float(t[ended]) + scenario.simulation.settle - task.t_start
     return {
         "success": float(done and _truly(result, scenario, task, ended, force, held)),
-        # The log may begin later than the task.
-        "task_time_s": t[ended] + scenario.simulation.settle - task.t_start if done else math.nan,
+        "task_time_s": taken if done else math.nan,
         "contact_force_overshoot_N": max(float(force[span].max()) - wanted, 0.0),
         "effort_Ns": float(np.trapezoid(np.linalg.norm(hand[:, :3], axis=1), t[span])),
         "task_work_J": float(np.trapezoid(power, t[span])),
@@ -120,8 +121,9 @@ def _truly(
         return bool(abs(held.mean() - task.force) <= task.tolerance)
     if not isinstance(task, Reach):
         return bool(force[ended] > 0.0)
-    R_WS, p_WS, arm = np.empty((3, 3)), np.empty(3), slave_arm(scenario)
-    forward_kinematics(arm.table, result["slave_state"][ended, : arm.num_joints], R_WS, p_WS)
-    start = np.array(scenario.slave.position) + R_WS_HOME.matrix() @ TIP_IN_S
-    off = p_WS + R_WS @ TIP_IN_S - start - np.array(task.translation)
+    slave = AddSlavePlant(DiagramBuilder(), scenario.slave.position, None)
+    R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+    forward_kinematics(slave.arm.table, result["slave_state"][ended, :6], R_WS, p_WS)
+    start = np.array(scenario.slave.position) + R_WS_HOME.matrix() @ slave.tip
+    off = p_WS + R_WS @ slave.tip - start - np.array(task.translation)
     return bool(np.linalg.norm(off) <= task.width / 2)

@@ -57,7 +57,7 @@ class Reach(_Task):
 class Touch(_Task):
     """Approaches a surface at the target, notices contact, and stops."""
 
-    standoff: float = quantity(0.02, "m", 0.0, 0.5, "from where on the approach is careful")
+    standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest after the stop")
 
 
@@ -65,9 +65,9 @@ class Touch(_Task):
 class Press(_Task):
     """Approaches a surface at the target and presses on it with a set force for a while."""
 
-    standoff: float = quantity(0.02, "m", 0.0, 0.5, "from where on the approach is careful")
+    standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
     force: float = quantity(8.0, "N", 0.1, 500.0, "to press with, tool on surface")
-    tolerance: float = quantity(1.5, "N", 0.05, 100.0, "of that force")
+    tolerance: float = quantity(2.0, "N", 0.05, 100.0, "of that force")
     hold: float = quantity(1.0, "s", 0.0, 60.0, "how long")
 
 
@@ -83,7 +83,7 @@ class Movement:
     acceleration: float = quantity(1.5, "m/s^2", 0.01, 50.0, "peak, of the hand in a submovement")
     shortest: float = quantity(0.2, "s", 0.05, 2.0, "least duration of a submovement")
     noise: float = quantity(0.05, "1", 0.0, 0.5, "standard deviation of its end over its length")
-    approach_speed: float = quantity(0.05, "m/s", 1e-3, 1.0, "careful, of the tool, at full trust")
+    approach_speed: float = quantity(0.03, "m/s", 1e-3, 1.0, "careful, of the tool, at full trust")
     gentle_force: float = quantity(
         2.0, "N", 0.01, 100.0, "a contact that does no harm, at the tool"
     )
@@ -179,6 +179,7 @@ _STEP, _READY, _SINCE, _STIFFNESS, _LAST_FORCE, _LAST_MOVE, _PLAN = range(7)
 _PLAN_SIZE = 20
 MEMORY = _PLAN + _PLAN_SIZE
 
+_FIXATION = 50  # steps for which the eye rests, 0.25 s
 _SETTLE = 0.05  # s, after a submovement until its effect is there, E
 _RENEW = 0.3  # s, after which a careful approach is set anew to what is trusted, E
 _STOP = 0.15  # s, in which the hand stops, E
@@ -262,9 +263,10 @@ def _random(person, step, draw):
 
 @njit(cache=True)
 def look_into(person, step, displacement_W, seen_W):
-    """Writes where the tool is seen (3,), from where it is; step counts the looks."""
+    """Writes where the tool is seen (3,), from where it is; the error is that of a fixation."""
     for i in range(3):
-        seen_W[i] = displacement_W[i] + person[_SEEN_NOISE] * _random(person, step, 4 + i)
+        noise = person[_SEEN_NOISE] * _random(person, step // _FIXATION, 4 + i)
+        seen_W[i] = displacement_W[i] + noise
 
 
 @njit(cache=True)

@@ -56,6 +56,11 @@ class SlavePlant:
         """Whether there is something to touch."""
         return len(self.contact_pairs) > 0
 
+    @property
+    def tip(self) -> NDArray[np.float64]:
+        """(3,) p_STip, where the tool makes contact [m]."""
+        return self.plant.GetFrameByName("tip").GetFixedPoseInBodyFrame().translation()
+
 
 def AddSlavePlant(
     builder: DiagramBuilder,
