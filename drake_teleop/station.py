@@ -22,8 +22,8 @@ from drake_teleop.master import device
 from drake_teleop.master.device import MasterDevice
 from drake_teleop.master.force_display import ForceDisplay
 from drake_teleop.master.operator import Operator
-from drake_teleop.scaling.contact_detection import ContactDetection
 from drake_teleop.master.task import Training
+from drake_teleop.scaling.contact_detection import ContactDetection
 from drake_teleop.scaling.force_scaling import ForceScaling
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.scenario import Scenario
