@@ -24,6 +24,10 @@ runs.parquet a folder of parts, one table: run (the key, its place in the design
              seed, a column for each factor and each measure, and error: why a run failed; its
              measures are then null
 summary.json runs, failed, and of each measure mean, least and largest
+effects.csv  of each level of each factor: mean of each measure, effect (its difference from the
+             mean of all levels), and half the widths of their 95 % intervals over the seeds
+*.png        main_effects, interactions of two factors, and the front of effort against task time
+             and overshoot of the contact force, as far as the study has what they show
 ============ =====================================================================================
 
 A study that was stopped or killed goes on where it was when the same command is given again. The
@@ -37,6 +41,7 @@ import copy
 import hashlib
 import json
 import os
+import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,11 +53,18 @@ from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.experiments.identification import identification_scenario, identify_load
+from drake_teleop.experiments.identification import (
+    identification_scenario,
+    identify_load,
+    slave_arm,
+)
 from drake_teleop.experiments.run import run_scenario
 from drake_teleop.experiments.study_design import Factor, Study, Values
+from drake_teleop.experiments.study_effects import effects
 from drake_teleop.experiments.study_measures import measured
+from drake_teleop.experiments.study_pictures import write_pictures
 from drake_teleop.experiments.study_runs import run_study
+from drake_teleop.load.detection import NoiseFloor
 from drake_teleop.quantities import check_ranges, check_structure
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import ReadScenario, Scenario, ScenarioFromData, ScenarioNames
@@ -97,31 +109,35 @@ class StationWork:
         """`run_scenario`, which identifies a load only once in a study."""
         if scenario.load_estimator.enabled:
             return run_scenario(scenario).result
-        before = identification_scenario(scenario, scenario.simulation.seed + 1)
-        station = MakeTeleopStation(scenario, load_estimate=self._estimate(before))
+        estimate, floor = self._identified(scenario)
+        station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
         return simulate(station, scenario.simulation)
 
-    def _estimate(self, before: Scenario) -> Array:
-        path = self.loads / f"{hashlib.sha256(repr(before).encode()).hexdigest()}.npy"
-        if path.exists():
-            kept: Array = np.load(path)
-            return kept
-        if path not in _estimates:
-            _estimates[path] = identify_load(before).estimate
+    def _identified(self, scenario: Scenario) -> tuple[Array, NoiseFloor | None]:
+        """The load's estimate, and the noise floor if the station detects contact."""
+        before = identification_scenario(scenario, scenario.simulation.seed + 1)
+        detects = scenario.contact_detection is not None
+        key = hashlib.sha256(repr((before, detects)).encode()).hexdigest()
+        path = self.loads / f"{key}.pickle"
+        if path not in _identified and path.exists():
+            _identified[path] = pickle.loads(path.read_bytes())
+        if path not in _identified:
+            found = identify_load(before)
+            floor = found.noise_floor(slave_arm(before)) if detects else None
+            _identified[path] = found.estimate, floor
             if self.loads.parent.is_dir():  # not so on another machine of a cluster
-                _keep_array(path, _estimates[path])
-        return _estimates[path]
+                _keep(path, pickle.dumps(_identified[path]))
+        return _identified[path]
 
 
-_estimates: dict[Path, Array] = {}
+_identified: dict[Path, tuple[Array, NoiseFloor | None]] = {}
 
 
-def _keep_array(path: Path, array: Array) -> None:
+def _keep(path: Path, content: bytes) -> None:
     """Writes it, complete or not at all, whoever else does the same now."""
     path.parent.mkdir(exist_ok=True)
     unfinished = path.with_suffix(f".{os.getpid()}.unfinished")
-    with unfinished.open("wb") as file:
-        np.save(file, array)
+    unfinished.write_bytes(content)
     unfinished.replace(path)
 
 
@@ -160,6 +176,8 @@ def study_command(
     summary = _summary(study, rows)
     text = json.dumps(summary, indent=2, allow_nan=False)
     (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    effects(study, rows).write_csv(out / "effects.csv")
+    write_pictures(study, rows, out)
     if not quiet:
         _print(study, summary, out)
     return summary
