@@ -21,11 +21,10 @@ from drake_teleop.errors import DrakeTeleopError
 
 Array = NDArray[np.float64]
 
-#: Slip at which friction is complete [m/s], to be set in the plant too.
-STICTION = 1e-4
 #: Columns of the table of pairs: static and dynamic friction.
 FRICTION = slice(24, 26)
-_WIDTH = 26
+#: Their number.
+WIDTH = 27
 _STIFFNESS, _DISSIPATION = "point_contact_stiffness", "hunt_crossley_dissipation"
 _NO_SLIP = 1e-14  # m/s, as in Drake: a point at rest has a direction
 
@@ -35,6 +34,7 @@ def ContactPairs(
     inspector: SceneGraphInspector,
     tool: BodyIndex,
     environment: ModelInstanceIndex,
+    slip: float,
 ) -> Array:
     """The pairs of a sphere of the tool and a box of the environment, as a table for the kernel.
 
@@ -44,12 +44,13 @@ def ContactPairs(
         inspector: of the scene graph, with the shapes and their compliance.
         tool: its body.
         environment: what it may touch.
+        slip: at which friction is complete [m/s]; the plant's stiction tolerance.
 
     Returns:
-        (pairs, 26): 0-2 centre of the sphere in the tool's frame [m], 3 its radius, 4-12 R_WBox by
+        (pairs, 27): 0-2 centre of the sphere in the tool's frame [m], 3 its radius, 4-12 R_WBox by
         rows and 13-15 p_WBox at rest, 16-18 half the box's edges, 19-21 direction in W in which it
         moves (zero if it does not), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25 static
-        and dynamic friction.
+        and dynamic friction, 26 slip at which it is complete [m/s].
 
     Raises:
         DrakeTeleopError: for other shapes.
@@ -70,9 +71,10 @@ def ContactPairs(
                     np.array(edges.size()) / 2,
                     _direction(plant, context, body),
                     _law(*map(inspector.GetProximityProperties, (ball, box))),
+                    [slip],
                 ]
                 rows.append(np.concatenate(row))
-    return np.array(rows).reshape(len(rows), _WIDTH)
+    return np.array(rows).reshape(len(rows), WIDTH)
 
 
 def _sphere_and_box(
@@ -122,7 +124,7 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
     """How deep a sphere is in its box [m], below 0 if it is not.
 
     Args:
-        pair: (26,) row of `ContactPairs`.
+        pair: (27,) row of `ContactPairs`.
         p_WS: (3,) origin of the tool's frame in W [m].
         R_WS: (3, 3) its rotation.
         deflection: of the environment [m].
@@ -187,7 +189,7 @@ def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: 
     """The force on the sphere that is `x` [m] deep in its box.
 
     Args:
-        pair: (26,) row of `ContactPairs`.
+        pair: (27,) row of `ContactPairs`.
         x: its indentation [m].
         normal: (3,) out of the box.
         velocity: (3,) of the sphere at the point of contact, relative to the box [m/s].
@@ -200,6 +202,6 @@ def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: 
         force[i] = velocity[i] - out * normal[i]
         speed += force[i] * force[i]
     speed = np.sqrt(speed + _NO_SLIP * _NO_SLIP)
-    mu = _friction(pair[24], pair[25], speed / STICTION)
+    mu = _friction(pair[24], pair[25], speed / pair[26])
     for i in range(3):
         force[i] = f_n * (normal[i] - mu * force[i] / speed)

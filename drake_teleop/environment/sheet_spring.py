@@ -49,6 +49,11 @@ class SheetSpring:
         return 2 * self.damping_ratio * np.sqrt(self.stiffness * self.effective_mass)
 
     @property
+    def slip(self) -> float:
+        """At which friction between ball and leaf is complete [m/s] (E)."""
+        return 1e-4
+
+    @property
     def largest_small_deflection(self) -> float:
         """10 % of the length [m]: beyond it the linear leaf is no longer a good model."""
         return 0.1 * self.length

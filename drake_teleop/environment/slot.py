@@ -69,6 +69,15 @@ class Slot:
         return 2 * PEG_RADIUS + self.clearance
 
     @property
+    def slip(self) -> float:
+        """At which friction is complete [m/s] (E).
+
+        A peg that stands on the floor or sticks creeps, more slowly than this. A tenth of it, as
+        on the leaf, would make every second of that three times as long to simulate.
+        """
+        return 1e-3
+
+    @property
     def foot(self) -> float:
         """z_W of the floor's lower face [m], on which the slot stands."""
         return self.position[2] - self.depth - _FLOOR

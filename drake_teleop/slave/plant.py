@@ -13,7 +13,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, M
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, WeldJoint
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.environment.point_contact import STICTION, ContactPairs
+from drake_teleop.environment.point_contact import WIDTH, ContactPairs
 from drake_teleop.environment.sheet_spring import AddSheetSpring, SheetSpring
 from drake_teleop.environment.slot import AddSlot, Slot, TouchAsSlot
 from drake_teleop.errors import DrakeTeleopError
@@ -38,7 +38,7 @@ class SlavePlant:
         tool: the tool's body.
         arm: kinematics and dynamics up to S, with the tool as its load.
         sheet: the leaf's model instance, if there is one: what moves when it is touched.
-        contact_pairs: (k, 26) what may touch, see `ContactPairs`; none without an environment.
+        contact_pairs: (k, 27) what may touch, see `ContactPairs`; none without an environment.
         leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] of the leaf, and its acceleration by
             gravity [m/s^2]; without one, a mass that nothing moves.
     """
@@ -89,18 +89,19 @@ def AddSlavePlant(
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
         plant.set_name("slave_plant")
         plant.set_contact_model(ContactModel.kPoint)
-        plant.set_stiction_tolerance(STICTION)
+        plant.set_stiction_tolerance(environment.slip)
     instance, tool = ParseSlave(plant)
     if payload is not None:
         AddPayload(plant, tool, payload)
     touched = None if environment is None else AddEnvironment(plant, environment)
     finalize(plant)
-    pairs, leaf = np.zeros((0, 26)), np.array([1.0, 0.0, 0.0, 0.0])
-    if touched is not None:
+    pairs, leaf = np.zeros((0, WIDTH)), np.array([1.0, 0.0, 0.0, 0.0])
+    if environment is not None and touched is not None:
         _remove_visuals(plant, scene_graph)
         if isinstance(environment, Slot):
             TouchAsSlot(plant, scene_graph, environment)
-        pairs = ContactPairs(plant, scene_graph.model_inspector(), tool, touched)
+        inspector = scene_graph.model_inspector()
+        pairs = ContactPairs(plant, inspector, tool, touched, environment.slip)
     sheet = None
     if isinstance(environment, SheetSpring):
         sheet = touched

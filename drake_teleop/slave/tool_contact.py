@@ -17,7 +17,7 @@ def environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W):
 
     Args:
         arm: `ArmModel.table`.
-        pairs: (k, 26) of `ContactPairs`.
+        pairs: (k, 27) of `ContactPairs`.
         applied_W: (6,) [f; tau] about So, in W, on top of the contacts [N, N m].
         q, v: (n,) of the arm.
         sheet: (2,) deflection and its rate [m, m/s], of what moves.
@@ -76,7 +76,7 @@ class ToolContact(LeafSystem):
 
     Args:
         arm: kinematics up to the tool.
-        pairs: (k, 26) what may touch, see `ContactPairs`.
+        pairs: (k, 27) what may touch, see `ContactPairs`.
         moves: whether that is a sheet spring.
     """
 

@@ -343,7 +343,7 @@ class WristSensor(LeafSystem):
 
     @property
     def contact_pairs(self) -> Array:
-        """(k, 26) what may touch, see `ContactPairs`, a view."""
+        """(k, 27) what may touch, see `ContactPairs`, a view."""
         return self._physics[2]
 
     @property

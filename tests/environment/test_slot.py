@@ -38,7 +38,7 @@ def pairs_of_a_ball(slot: Slot) -> np.ndarray:
     environment = AddEnvironment(plant, slot)
     plant.Finalize()
     TouchAsSlot(plant, scene_graph, slot)
-    pairs = ContactPairs(plant, scene_graph.model_inspector(), tool.index(), environment)
+    pairs = ContactPairs(plant, scene_graph.model_inspector(), tool.index(), environment, slot.slip)
     return pairs[np.all(pairs[:, :3] == 0.0, axis=1)]
 
 
@@ -62,7 +62,9 @@ def test_both_sides_of_a_contact_together_are_what_the_slot_says():
     slot = Slot(stiffness=3e3, dissipation=0.7, friction=0.45)
     pairs = slave_at(slot).contact_pairs
     assert len(pairs) == 2 * 7
-    np.testing.assert_allclose(pairs[:, 22:], np.tile([3e3, 0.7, 0.45, 0.45], (14, 1)), rtol=1e-12)
+    np.testing.assert_allclose(
+        pairs[:, 22:26], np.tile([3e3, 0.7, 0.45, 0.45], (14, 1)), rtol=1e-12
+    )
 
 
 def profile(slot: Slot) -> np.ndarray:
