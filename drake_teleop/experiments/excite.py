@@ -253,7 +253,7 @@ def _print(summary: dict[str, Any], out: Path) -> None:
     for name, meaning in summary["meaning"].items():
         marked = f"[bold]{name}[/]" if name == summary["criterion"] else name
         values.add_row(marked, f"{summary[name]:.4g}", meaning)
-    uses = Table("limit, checked at 1 kHz", "use", "where", "t [s]")
+    uses = Table("limit, checked at 1 kHz", "use", "where", r"t \[s]")
     for name, use in summary["limit_use"].items():
         uses.add_row(name, f"{use['share']:.1%}", use["where"], f"{use['t']:.3f}")
     deviations = Table("parameter", "predicted standard deviation")

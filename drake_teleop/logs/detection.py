@@ -301,19 +301,22 @@ def draw_detection(found: DetectedLog) -> Any:
 
 
 def _print_detection(summary: dict[str, Any], out: Path) -> None:
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title=f"Contact in {Path(summary['log']).name}", title_justify="left")
     for heading in ("from [s]", "to [s]", "|F| [N]", "|tau| [N m]", "pushed along"):
-        table.add_column(heading, justify="right")
+        table.add_column(escape(heading), justify="right")
     for c in summary["contacts"]:
         push = "" if c["push"] is None else " ".join(f"{x:+.2f}" for x in c["push"])
         table.add_row(
             f"{c['start_s']:.3f}", f"{c['stop_s']:.3f}", f"{c['peak_N']:.3g}",
             f"{c['peak_Nm']:.3g}", push,
         )  # fmt: skip
+    if not summary["contacts"]:
+        table.add_row("none", *[""] * 4)
     shares = ", ".join(
-        f"{name.replace('_', ' ')} {100 * share:.2g} %"
+        f"{name.replace('_', ' ')} {100 * share:.3g}%"
         for name, share in summary["above_force_threshold"].items()
         if share is not None
     )

@@ -440,7 +440,9 @@ def _print(summary: dict[str, Any]) -> None:
     from rich.table import Table as Grid
 
     console = Console()
-    grid = Grid("stream", "rows", "rate [Hz]", "span [s]", "longest step [s]", "NaN", "repeated")
+    grid = Grid(
+        "stream", "rows", "rate [Hz]", r"span \[s]", r"longest step \[s]", "NaN", "repeated"
+    )
     for name, figures in summary["streams"].items():
         shown = (figures.get(key) for key in ("rate_hz", "duration_s", "longest_gap_s"))
         grid.add_row(
