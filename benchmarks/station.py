@@ -3,7 +3,8 @@
 Bare plant: arm and tool under a constant torque, nothing around them, in steps of 125 us by the
 second-order Runge-Kutta method. All run interleaved in this process; times are thread CPU time, so
 a busy machine matters little. "contact" is the mean over the whole of the shipped scenario, in
-which the tool bounces on the leaf; "pressed" never leaves it.
+which the tool bounces on the leaf; "pressed" never leaves it. "in_slot" is the tool as a peg that
+slides down into the slot and stands there, with up to four contacts at once.
 
     python benchmarks/station.py [--json FILE]
 """
@@ -36,8 +37,11 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
     free, contact = LoadScenario("free_motion_force"), LoadScenario("contact_transition")
-    figures = costs(free, contact) | rates(free) | {"two_processes_throughput": two_processes()}
-    for name, scenario in (("free_motion", free), ("contact", contact)):
+    slot = replace(LoadScenario("peg_in_slot"), simulation__settle=1.1, simulation__duration=0.8)
+    figures = (
+        costs(free, contact, slot) | rates(free) | {"two_processes_throughput": two_processes()}
+    )
+    for name, scenario in (("free_motion", free), ("contact", contact), ("in_slot", slot)):
         figures[f"{name}_wrench_against_reaction_port_n"] = against_the_port(scenario)
         figures[f"{name}_wrench_against_tight_run_n"] = against_a_tight_run(scenario)
     old = {"simulation__integrator": "runge_kutta2", "simulation__max_step": 1.25e-4}
@@ -57,12 +61,13 @@ def pressed(contact: Scenario) -> Scenario:
     )
 
 
-def costs(free: Scenario, contact: Scenario) -> dict[str, float]:
+def costs(free: Scenario, contact: Scenario, slot: Scenario) -> dict[str, float]:
     """CPU time over that of the bare plant; each piece of a motion at its fastest repeat."""
     scenarios = {
         "free_motion": free,
         "contact": contact,
         "pressed": pressed(contact),
+        "in_slot": slot,
         "free_motion_joint_control_10_khz": replace(free, rates__joint_control_hz=10000.0),
     }
     best = {name: np.full(_PIECES, np.inf) for name in (*scenarios, "bare")}

@@ -12,11 +12,13 @@ from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.compensation import scaled_wrench
+from drake_teleop.load.detection import NoiseFloor
 from drake_teleop.load.excitation import FourierTrajectory
 from drake_teleop.master import device
 from drake_teleop.master.device import JointFriction
 from drake_teleop.master.operator import OperatorConfig, Sine
 from drake_teleop.master.task import Touch
+from drake_teleop.scaling.contact_detection import ContactDetectionConfig
 from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.signals import SIGNALS
 from drake_teleop.simulation import MakeSimulator, advance, simulate
@@ -335,8 +337,16 @@ def test_every_output_port_is_a_documented_signal():
     scenario = replace(LoadScenario("contact_transition"), simulation=Simulation(duration=0.01))
     scenario = replace(scenario, channel__network="lan", load_estimator__watch=True)
     scenario = replace(scenario, operator__task=Touch())
+    scenario = replace(scenario, contact_detection=ContactDetectionConfig())
+    rising, still = np.zeros((6, 2)), np.zeros(6)
+    floor = NoiseFloor(
+        np.ones(6), np.identity(16), rising, np.identity(6), still, reached=np.ones(3)
+    )
     station = MakeTeleopStation(
-        scenario, load_estimate=np.ones(16), load_covariance=np.identity(16)
+        scenario,
+        load_estimate=np.ones(16),
+        load_covariance=np.identity(16),
+        noise_floor=floor,
     )
     names = {station.get_output_port(i).get_name() for i in range(station.num_output_ports())}
     assert names == set(SIGNALS)
