@@ -20,6 +20,8 @@ true_contact_s              [start, end] of each contact
 contact_noticed_ms          with contact_detection: how long after the beginning of each contact the
                             detector noticed it, null if it did not; likewise contact_at_hand_ms
 false_contacts              how often the detector began to notice a contact that there was not
+success, task_time_s, ...   with a task, see `drake_teleop.experiments.task_measures`; null for
+                            what did not happen
 peak_force_to_master_N      largest force that the device displayed
 joint_speed_use             largest share of a joint's speed limit; likewise joint_torque_use
 mass_error_percent          of the estimate at the end; likewise com_error_mm
@@ -48,6 +50,7 @@ from drake_teleop.experiments.identification import (
     timed,
 )
 from drake_teleop.experiments.progress import Stage, progress_bars, silent
+from drake_teleop.experiments.task_measures import task_measures
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.result import SimulationResult, remove_log
@@ -200,6 +203,9 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         summary |= _peaks("peak", "_to_master", result["force_to_master"])
     if "contact" in result:
         summary |= _detection_figures(result, contact_spans(result.t, contact))
+    if run.scenario.operator.task is not None:
+        figures = task_measures(result, run.scenario)
+        summary |= {name: None if np.isnan(x) else x for name, x in figures.items()}
     return summary | {"warnings": list(_warnings(run, summary))}
 
 
@@ -306,8 +312,16 @@ def _print(summary: dict[str, Any], out: Path) -> None:
     console = Console()
     console.print(summary["description"] or summary["scenario"], style="bold", markup=False)
     console.print(table)
-    for start, stop in summary["true_contact_s"]:
-        console.print(f"contact from {start:.4f} to {stop:.4f} s", highlight=False)
+    for k, (start, stop) in enumerate(summary["true_contact_s"]):
+        noticed = ""
+        if "contact_noticed_ms" in summary:
+            slave, hand = (summary[f"contact_{at}_ms"][k] for at in ("noticed", "at_hand"))
+            noticed = f", noticed after {_ms(slave)}, at the hand after {_ms(hand)}"
+        console.print(f"contact from {start:.4f} to {stop:.4f} s{noticed}", highlight=False)
     for warning in summary["warnings"]:
         console.print(f"[bold yellow]warning:[/] {warning}", highlight=False)
     console.print(f"written to {out}", highlight=False, markup=False)
+
+
+def _ms(delay: float | None) -> str:
+    return "never" if delay is None else f"{delay:.1f} ms"

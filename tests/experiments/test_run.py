@@ -15,6 +15,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.load.uncertainty import intervals
 from drake_teleop.logs.processing import identify_log
+from drake_teleop.resources import scenarios_dir
 from drake_teleop.result import Signal, SimulationResult
 from drake_teleop.scenario import LoadScenario
 
@@ -169,3 +170,20 @@ def test_bounces_belong_to_one_contact():
     spec = Signal("true_contact_wrench_W", tuple("abcdef"), "N")
     contact = in_contact(SimulationResult(t, {spec.name: force}, [spec]))
     np.testing.assert_array_equal(np.flatnonzero(contact), [*range(10, 22), 60])
+
+
+def test_a_touch_is_noticed_by_the_detector_and_then_by_the_operator(tmp_path, capsys):
+    text = (scenarios_dir() / "touch.yaml").read_text()
+    path = tmp_path / "touch.yaml"
+    path.write_text(text.replace("duration: 5.0", "duration: 3.0") + "contact_detection: {}\n")
+    summary = run_command(path, tmp_path / "out")
+    assert summary["success"] == 1
+    noticed, at_hand = summary["contact_noticed_ms"], summary["contact_at_hand_ms"]
+    assert len(noticed) == len(summary["true_contact_s"])
+    assert 0 < noticed[0] <= at_hand[0] < 10
+    assert at_hand[0] < 1e3 * summary["detection_time_s"]
+    assert summary["false_contacts"] == summary["false_notices"] == 0
+    assert summary["press_error_N"] is None
+    printed = " ".join(capsys.readouterr().out.split())
+    assert f"noticed after {noticed[0]:.1f} ms, at the hand after {at_hand[0]:.1f} ms" in printed
+    assert "task_time_s" in printed
