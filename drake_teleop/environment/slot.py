@@ -89,14 +89,16 @@ class Slot:
 
 
 def AddSlot(plant: MultibodyPlant, slot: Slot) -> ModelInstanceIndex:
-    """Adds the slot and the tool's second ball to a plant that has the tool and a scene graph.
+    """Adds the slot and the tool's second ball to a plant that has the tool, and is not finalized.
 
     The body "slot" is welded to the world. The second ball has shape only: the mass of the tool is
-    what it was.
+    what it was. Without a scene graph there are no shapes, as when a model is parsed.
     """
     instance = plant.AddModelInstance("slot")
     body = plant.AddRigidBody("slot", instance, SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), slot.X_WM)
+    if not plant.geometry_source_is_registered():
+        return instance
     tool, above = plant.GetBodyByName("tool"), RigidTransform([0.0, 0.0, UPPER_BALL])
     ball, properties = Sphere(PEG_RADIUS), _material(slot)
     plant.RegisterCollisionGeometry(tool, above, ball, "upper_ball", properties)

@@ -199,9 +199,10 @@ def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
         assert bodies & set(clearance.what.split(" and "))
 
 
-def test_what_a_scenario_has_to_touch_is_not_touched():
-    """The sheet spring stands in the room in which the tool moves."""
-    robot = RobotFromScenario(LoadScenario("contact_transition"))
+@pytest.mark.parametrize("name", ["contact_transition", "peg_in_slot"])
+def test_what_a_scenario_has_to_touch_is_not_touched(name):
+    """The sheet spring, or the slot, stands in the room in which the tool moves."""
+    robot = RobotFromScenario(LoadScenario(name))
     found = excite(robot, starts=2, period=2.4, harmonics=2)
     assert all(use.share <= 1 for use in found.uses)
     context = robot.diagram.CreateDefaultContext()
