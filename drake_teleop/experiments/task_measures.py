@@ -2,7 +2,8 @@
 
 ============================ ====================================================================
 success                      1 if the operator ended its task, and the truth agrees: the tip is in
-                             the target; the tool touches; the force was held within its tolerance
+                             the target; the tool touches; the force was held within its tolerance;
+                             the tip is within 2 mm of the slot's floor
 task_time_s                  from the task's start until the operator has done it; nan if not
 contact_force_overshoot_N    largest contact force at the tool, less the force that was wanted
 effort_Ns                    integral of |force of the hand|: what tires an arm that pushes or holds
@@ -24,13 +25,15 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master.task import DONE, FELT, PHASE, WAITING, Press, Reach, Task
+from drake_teleop.master.task import DONE, FELT, PHASE, WAITING, Insert, Press, Task, Touch
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario
 from drake_teleop.slave.arm import forward_kinematics
 from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant
 
 Array = NDArray[np.float64]
+
+_ON_THE_FLOOR = 2e-3  # m
 
 TASK_MEASURES = (
     "success",
@@ -60,7 +63,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
         raise DrakeTeleopError(
             "there is no task to measure",
             where="operator.task",
-            remedy="give the operator a task: !Reach, !Touch or !Press",
+            remedy="give the operator a task: !Reach, !Touch, !Press or !Insert",
         )
     state = result["task_state"]
     t, outcome = result.t, state[:, DONE]
@@ -70,7 +73,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     done = outcome[ended] > 0.0
     force = contact_force(result)
     held = _held(t, force, task, ended) if done and isinstance(task, Press) else np.empty(0)
-    wanted = task.force if isinstance(task, Press) else 0.0
+    wanted = _wanted_force(task)
     hand, twist = result["hand_wrench_E"][span], result["twist_master"][span]
     power = np.abs(np.sum(hand * twist, axis=1))
     noticed, touching = state[span, FELT] > 0.0, force[span] > 0.0
@@ -86,6 +89,12 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
         "false_notices": float(_false_notices(touching, noticed)),
         "press_error_N": float(np.sqrt(np.mean((held - wanted) ** 2))) if held.size else math.nan,
     }
+
+
+def _wanted_force(task: Task) -> float:
+    if isinstance(task, Press):
+        return task.force
+    return task.push if isinstance(task, Insert) else 0.0
 
 
 def contact_force(result: SimulationResult) -> Array:
@@ -119,11 +128,13 @@ def _truly(
 ) -> bool:
     if isinstance(task, Press):
         return bool(abs(held.mean() - task.force) <= task.tolerance)
-    if not isinstance(task, Reach):
+    if isinstance(task, Touch):
         return bool(force[ended] > 0.0)
     slave = AddSlavePlant(DiagramBuilder(), scenario.slave.position, None)
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(slave.arm.table, result["slave_state"][ended, :6], R_WS, p_WS)
     start = np.array(scenario.slave.position) + R_WS_HOME.matrix() @ slave.tip
     off = p_WS + R_WS @ slave.tip - start - np.array(task.translation)
+    if isinstance(task, Insert):
+        return bool(off[2] <= _ON_THE_FLOOR - task.depth)
     return bool(np.linalg.norm(off) <= task.width / 2)

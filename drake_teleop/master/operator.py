@@ -26,7 +26,7 @@ from pydrake.systems.framework import (
 from drake_teleop.master import perception as feeling
 from drake_teleop.master import task as tasks
 from drake_teleop.master.perception import Perception, perceive_into
-from drake_teleop.master.task import Movement, Press, Reach, Touch, Training
+from drake_teleop.master.task import Insert, Movement, Press, Reach, Touch, Training
 from drake_teleop.quantities import choice, quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, rotate
 from drake_teleop.slave.arm import ArmModel, forward_kinematics
@@ -96,7 +96,7 @@ class OperatorConfig:
     grip: str = choice("medium", tuple(GRIPS), "stiffness, damping and mass of the hand")
     intent: list[MinimumJerk | Sine] = field(default_factory=list)
     """Moves and oscillations relative to the start pose; they may overlap, and add up."""
-    task: Reach | Touch | Press | None = None
+    task: Reach | Touch | Press | Insert | None = None
     """What the operator does by eye and by feel, on top of the intent; null: nothing."""
     perception: Perception = field(default_factory=Perception)
     movement: Movement = field(default_factory=Movement)

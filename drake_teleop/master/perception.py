@@ -65,7 +65,8 @@ class Perception:
     reaction_time: float = quantity(0.16, "s", 0.0, 1.0, "from a felt force to the hand's answer")
     vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "from a picture to the hand's answer")
     vision_noise: float = quantity(0.5e-3, "m", 0.0, 0.1, "of a seen position, at the tool")
-    depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "of where a surface or a slot is seen")
+    depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "of how far away a surface is seen")
+    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "of where a slot is seen, sideways")
 
     def parameters(self, dt: float) -> Array:
         """(4,) for `perceive_into`: Weber fraction, threshold [N], fade and smoothing per step."""

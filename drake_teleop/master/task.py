@@ -71,9 +71,20 @@ class Press(_Task):
     hold: float = quantity(1.0, "s", 0.0, 60.0, "how long")
 
 
-Task: TypeAlias = Reach | Touch | Press
-REACH, TOUCH, PRESS = range(3)
-_KINDS = (Reach, Touch, Press)
+@dataclass
+class Insert(_Task):
+    """Puts the tool down into a slot whose mouth is the target, and pushes it to the floor."""
+
+    timeout: float = quantity(20.0, "s", 0.1, 3600.0, "after which the operator gives up")
+    standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
+    depth: float = quantity(0.04, "m", 1e-3, 0.5, "of the slot")
+    push: float = quantity(10.0, "N", 0.1, 500.0, "force down, tool in slot")
+    dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest on the floor")
+
+
+Task: TypeAlias = Reach | Touch | Press | Insert
+REACH, TOUCH, PRESS, INSERT = range(4)
+_KINDS = (Reach, Touch, Press, Insert)
 
 
 @dataclass
@@ -106,12 +117,12 @@ def check_task(task: Task, where: str) -> None:
 
 # Of a packed task.
 _KIND, _T_START, _TIMEOUT, _GOAL, _AXIS, _WITHIN, _DWELL = 0, 1, 2, 3, 6, 9, 10
-_STANDOFF, _FORCE, _TOLERANCE = 11, 12, 13
+_STANDOFF, _FORCE, _TOLERANCE, _DEPTH, _TASK = 11, 12, 13, 14, 15
 _STREAM = 2  # of the seed; the network's lines have others
 # Of a packed person: what it knows of the station, and how it moves, sees and feels.
 _SCALE, _GAIN, _WAIT_SEEN, _WAIT_FELT, _KEY = 0, 1, 2, 3, 4
 _ACCELERATION, _SHORTEST, _NOISE, _SPEED, _GENTLE, _SEEN_NOISE, _DEPTH_ERROR = range(5, 12)
-_WEBER, _R_WB = 12, 13
+_AIM_ERROR, _WEBER, _R_WB = 12, 13, 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +146,7 @@ class Training:
 
 
 def pack_person(training: Training, perception: Perception, movement: Movement) -> Array:
-    """(22,) for `decide`."""
+    """(23,) for `decide`."""
     there_and_back = training.forward + training.backward + _SETTLE
     # 53 bits of a key are exact in a float.
     key = float(random_bits(np.uint64(training.seed % 2**64), _STREAM))
@@ -145,15 +156,16 @@ def pack_person(training: Training, perception: Perception, movement: Movement) 
             *(perception.vision_delay + there_and_back, perception.reaction_time + there_and_back),
             *(key, movement.acceleration, movement.shortest, movement.noise),
             *(movement.approach_speed, movement.gentle_force),
-            *(perception.vision_noise, perception.depth_error, perception.weber_fraction),
+            *(perception.vision_noise, perception.depth_error, perception.aim_error),
+            perception.weber_fraction,
             *training.R_WB.ravel(),
         ]
     )
 
 
 def pack_task(task: Task) -> Array:
-    """(14,) for `decide`."""
-    packed = np.zeros(14)
+    """(15,) for `decide`."""
+    packed = np.zeros(_TASK)
     packed[[_KIND, _T_START, _TIMEOUT]] = _KINDS.index(type(task)), task.t_start, task.timeout
     packed[_GOAL : _GOAL + 3] = task.translation
     packed[_AXIS : _AXIS + 3] = np.array(task.translation) / task.distance
@@ -161,20 +173,24 @@ def pack_task(task: Task) -> Array:
         packed[[_WITHIN, _DWELL]] = task.width / 2, task.dwell
         return packed
     packed[[_WITHIN, _STANDOFF]] = max(0.25 * task.standoff, 1e-3), task.standoff
-    packed[_DWELL] = task.dwell if isinstance(task, Touch) else task.hold
+    packed[_DWELL] = task.hold if isinstance(task, Press) else task.dwell
     if isinstance(task, Press):
         packed[[_FORCE, _TOLERANCE]] = task.force, task.tolerance
+    if isinstance(task, Insert):
+        packed[_AXIS : _AXIS + 3] = 0.0, 0.0, -1.0
+        packed[[_FORCE, _DEPTH]] = task.push, task.depth
     return packed
 
 
 # What has happened so far: `state` of `decide`.
 PHASE, DONE, FELT, LIMIT, TRUST, STATE = 0, 1, 2, 3, 4, 5
 """Places in the signal task_state, and its size."""
-WAITING, MOVING, FEELING, STOPPING, PRESSING, OVER = range(6)
-"""Phases: not begun; by eye; careful, until contact is felt; stopping; by force; done or not."""
+WAITING, MOVING, FEELING, STOPPING, PRESSING, SEEKING, OVER = range(7)
+"""Phases: not begun; by eye; careful, until contact is felt; stopping; by force; seeking the way
+into the slot; done or not."""
 # Memory: steps; when the next submovement may be planned; since when the aim is met, -1 if not;
-# learnt stiffness of what is pressed; force and place of the press before; plan.
-_STEP, _READY, _SINCE, _STIFFNESS, _LAST_FORCE, _LAST_MOVE, _PLAN = range(7)
+# learnt stiffness of what is pressed; force and move of the press before; searches so far; plan.
+_STEP, _READY, _SINCE, _STIFFNESS, _LAST_FORCE, _LAST_MOVE, _SEARCHES, _PLAN = range(8)
 # Plan: start [s], length [s], and coefficients of a quintic in time over length, for each axis.
 _PLAN_SIZE = 20
 MEMORY = _PLAN + _PLAN_SIZE
@@ -187,6 +203,10 @@ _DISBELIEF = 0.03  # m, seen beyond the surface without feeling it: given up, E
 _LEAST_TRUST = 0.1  # by eye alone, E
 _FIRST_STIFFNESS, _SOFTEST, _STIFFEST = 2000.0, 200.0, 50000.0  # N/m, of what is pressed, E
 _LONGEST_PRESS = 0.003  # m, of one correction by force, at the tool, E
+_STUCK = 0.5  # of the push, from which on the peg does not just slide, E
+_GIVING, _LONGEST_GIVING = 5000.0, 0.0015  # N/m and m: how one gives way to a push sideways, E
+_SPIRAL, _GOLDEN_ANGLE = 0.5e-3, 2.399963  # m times the root of the searches, E; rad
+_DEEP = 0.8  # of the depth, from which on what is felt is taken for the floor, E
 
 
 def initial_memory() -> Array:
@@ -348,7 +368,7 @@ def decide(task, person, time, seen_W, felt, state, memory):
     elif state[PHASE] == MOVING:
         _move(task, person, step, time, seen_W, state, memory)
     elif state[PHASE] == FEELING:
-        _feel(task, person, time, seen_W, state, memory)
+        _feel(task, person, time, seen_W, felt, state, memory)
     elif state[PHASE] == STOPPING and time >= memory[_READY]:
         if task[_KIND] == PRESS:
             _enter(state, memory, PRESSING, time)
@@ -356,6 +376,8 @@ def decide(task, person, time, seen_W, felt, state, memory):
             _finish(state, memory, time, 1.0)
     elif state[PHASE] == PRESSING:
         _press(task, person, step, time, felt, state, memory)
+    elif state[PHASE] == SEEKING and time >= memory[_READY]:
+        _seek(task, person, step, time, seen_W, felt, state, memory)
 
 
 @njit(cache=True)
@@ -364,6 +386,18 @@ def _seen_target(task, person, out):
     depth = 0.0 if task[_KIND] == REACH else person[_DEPTH_ERROR] * _random(person, 0, 15)
     for i in range(3):
         out[i] = task[_GOAL + i] + (depth - task[_STANDOFF]) * task[_AXIS + i]
+        if task[_KIND] == INSERT and i < 2:
+            out[i] += person[_AIM_ERROR] * _random(person, 0, 13 + i)
+
+
+@njit(cache=True)
+def _seen_depth(task, person, seen_W):
+    """How far the tool is seen beyond the surface or the mouth, along the axis [m]."""
+    target, beyond = np.empty(3), -task[_STANDOFF]
+    _seen_target(task, person, target)
+    for i in range(3):
+        beyond += (seen_W[i] - target[i]) * task[_AXIS + i]
+    return beyond
 
 
 @njit(cache=True)
@@ -390,17 +424,18 @@ def _move(task, person, step, time, seen_W, state, memory):
 
 
 @njit(cache=True)
-def _feel(task, person, time, seen_W, state, memory):
+def _feel(task, person, time, seen_W, felt, state, memory):
     """On along the axis, as fast as one trusts to notice contact, until it is noticed."""
-    if state[FELT] > 0.0:
+    if task[_KIND] == INSERT:
+        if state[FELT] > 0.0 and _is_stuck(task, person, felt):
+            _plan_stop(memory, time)
+            _enter(state, memory, SEEKING, time + _STOP + person[_WAIT_FELT])
+            return
+    elif state[FELT] > 0.0:
         _plan_stop(memory, time)
         _enter(state, memory, STOPPING, time + _STOP + person[_WAIT_FELT])
         return
-    target, beyond = np.empty(3), 0.0
-    _seen_target(task, person, target)
-    for i in range(3):
-        beyond += (seen_W[i] - target[i]) * task[_AXIS + i]
-    if beyond - task[_STANDOFF] > _DISBELIEF:
+    if _seen_depth(task, person, seen_W) > task[_DEPTH] + _DISBELIEF:
         _finish(state, memory, time, -1.0)
     elif time >= memory[_READY]:
         velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
@@ -415,23 +450,86 @@ def _feel(task, person, time, seen_W, state, memory):
 
 
 @njit(cache=True)
-def _press(task, person, step, time, felt, state, memory):
-    """Corrects the force by small submovements; how stiff the surface is shows in their effect."""
-    force = _pressed_force(task, person, felt)
-    # How it is judged stays the same until it is judged anew.
-    force *= 1.0 + person[_WEBER] * _random(person, int(memory[_READY] / PERIOD), 3)
-    error = task[_FORCE] - force
-    met = _met(memory, time, abs(error) <= 0.5 * task[_TOLERANCE], abs(error) <= task[_TOLERANCE])
-    if met and time - memory[_SINCE] >= task[_DWELL]:
-        _finish(state, memory, time, 1.0)
-    if met or time < memory[_READY]:
-        return
+def _judged_force(task, person, felt, memory):
+    """The contact's force against the axis; its error stays the same until it is judged anew."""
+    error = person[_WEBER] * _random(person, int(memory[_READY] / PERIOD), 3)
+    return (1.0 + error) * _pressed_force(task, person, felt)
+
+
+@njit(cache=True)
+def _correction(task, memory, force):
+    """How far to move for the set force; how stiff what is pressed is shows in the effect."""
     effect = force - memory[_LAST_FORCE]
     if effect * memory[_LAST_MOVE] > 0.0:
         stiffness = 0.5 * (memory[_STIFFNESS] + effect / memory[_LAST_MOVE])
         memory[_STIFFNESS] = min(max(stiffness, _SOFTEST), _STIFFEST)
-    move = error / memory[_STIFFNESS]
+    move = (task[_FORCE] - force) / memory[_STIFFNESS]
     move = min(max(move, -_LONGEST_PRESS), _LONGEST_PRESS)
     memory[_LAST_FORCE], memory[_LAST_MOVE] = force, move
-    duration = _submovement(person, memory, step, time, move * task[_AXIS : _AXIS + 3])
+    return move
+
+
+@njit(cache=True)
+def _press(task, person, step, time, felt, state, memory):
+    """Corrects the force by small submovements."""
+    force = _judged_force(task, person, felt, memory)
+    error = abs(task[_FORCE] - force)
+    met = _met(memory, time, error <= 0.5 * task[_TOLERANCE], error <= task[_TOLERANCE])
+    if met and time - memory[_SINCE] >= task[_DWELL]:
+        _finish(state, memory, time, 1.0)
+    elif not met and time >= memory[_READY]:
+        move = _correction(task, memory, force)
+        duration = _submovement(person, memory, step, time, move * task[_AXIS : _AXIS + 3])
+        memory[_READY] = time + duration + person[_WAIT_FELT]
+
+
+@njit(cache=True)
+def _sideways_into(task, person, felt, out):
+    """Writes the contact's force across the axis (3,), in W, and returns its size [N]."""
+    along, size = _pressed_force(task, person, felt), 0.0
+    for i in range(3):
+        out[i] = along * task[_AXIS + i]
+        for k in range(3):
+            if person[_GAIN] > 0.0:
+                out[i] += person[_R_WB + 3 * i + k] * felt[k] / person[_GAIN]
+        size += out[i] * out[i]
+    return math.sqrt(size)
+
+
+@njit(cache=True)
+def _is_stuck(task, person, felt):
+    """Whether the slot holds against more than sliding does."""
+    limit = _STUCK * task[_FORCE]
+    sideways = _sideways_into(task, person, felt, np.empty(3))
+    return _pressed_force(task, person, felt) >= limit or sideways >= limit
+
+
+@njit(cache=True)
+def _seek(task, person, step, time, seen_W, felt, state, memory):
+    """Pushes with the set force, gives way sideways, and looks around where nothing says where."""
+    force = _judged_force(task, person, felt, memory)
+    if not (state[FELT] > 0.0 and _is_stuck(task, person, felt)):
+        _enter(state, memory, FEELING, time)
+        return
+    deep = _seen_depth(task, person, seen_W) >= _DEEP * task[_DEPTH]
+    if deep and abs(force - task[_FORCE]) <= _STUCK * task[_FORCE]:
+        _enter(state, memory, STOPPING, time)
+        return
+    move, push = np.empty(3), _correction(task, memory, force)
+    sideways = _sideways_into(task, person, felt, move)
+    if sideways >= state[LIMIT] / person[_GAIN]:
+        share = min(1.0 / _GIVING, _LONGEST_GIVING / sideways)
+        for i in range(3):
+            move[i] *= share
+    else:
+        n = memory[_SEARCHES]
+        memory[_SEARCHES] += 1.0
+        for k in range(2):
+            before = _SPIRAL * math.sqrt(n) * math.cos(_GOLDEN_ANGLE * n - 0.5 * math.pi * k)
+            now = _SPIRAL * math.sqrt(n + 1) * math.cos(_GOLDEN_ANGLE * (n + 1) - 0.5 * math.pi * k)
+            move[k] = now - before
+        move[2] = 0.0
+    for i in range(3):
+        move[i] += push * task[_AXIS + i]
+    duration = _submovement(person, memory, step, time, move)
     memory[_READY] = time + duration + person[_WAIT_FELT]
