@@ -65,6 +65,8 @@ class Simulation:
     max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
     accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "of error-controlled integrators")
     seed: int = 0
+    end_with_task: bool = False
+    """Whether the run ends, within 20 ms, when the operator has done its task or given up."""
 
 
 @dataclass

@@ -11,6 +11,7 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Diagram
 
+from drake_teleop.master.task import DONE
 from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.scenario import Simulation
 from drake_teleop.signals import LOG, SIGNALS
@@ -60,12 +61,21 @@ def simulate(
                 on_disk.take()
             if progress is not None:
                 progress(time / end)
+            if simulation.end_with_task and _task_is_over(simulator):
+                break
     finally:
         if on_disk is not None:
             on_disk.take()
     if log is not None:
         return SimulationResult.scan_parquet(log)
     return read_log(simulator, simulation.settle)
+
+
+def _task_is_over(simulator: Simulator) -> bool:
+    station = simulator.get_system()
+    if not station.HasOutputPort("task_state"):
+        return False
+    return bool(station.GetOutputPort("task_state").Eval(simulator.get_context())[DONE] != 0.0)
 
 
 class _LogOnDisk:

@@ -12,7 +12,7 @@ from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
 
 MOVEMENTS = ("free_motion_force", "free_motion_torque", "contact_transition", "peg_in_slot")
-TASKS = ("press", "reach", "touch")
+TASKS = ("insert", "press", "reach", "touch")
 
 
 def run(name: str, **changes):

@@ -10,7 +10,7 @@ from drake_teleop.experiments.identification import slave_arm
 from drake_teleop.experiments.task_measures import contact_force, task_measures
 from drake_teleop.master import task as tasks
 from drake_teleop.master.device import JointFriction
-from drake_teleop.master.task import DONE, OVER, PHASE, Press, Reach, Touch
+from drake_teleop.master.task import DONE, OVER, PHASE, SEEKING, Insert, Press, Reach, Touch
 from drake_teleop.noise import random_normal
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
@@ -107,6 +107,8 @@ def test_contact_is_noticed_and_the_hand_stops(touch):
         # It has stopped: what the tool does to the leaf no longer changes.
         force = contact_force(result)
         assert force[-1] > 0.5 and np.ptp(force[-200:]) < 2.0
+        # And the run ends with the task.
+        assert 0.0 <= result.t[-1] - measures["task_time_s"] < 0.03
 
 
 def test_weight_that_is_felt_makes_one_slow_and_blunt(touch):
@@ -117,6 +119,22 @@ def test_weight_that_is_felt_makes_one_slow_and_blunt(touch):
     limit = [result["task_state"][-1, tasks.LIMIT] for result, _ in touch.values()]
     assert limit[0] == pytest.approx(0.06, abs=0.005)
     assert limit[1] == pytest.approx(0.1 * 3.13 * 9.81 / 17.5, rel=0.1)
+
+
+def test_the_peg_is_felt_into_the_slot():
+    _, measures = run("insert")
+    assert measures["success"] == 1.0
+    assert measures["false_notices"] == 0
+
+
+def test_who_misses_the_mouth_looks_around():
+    """The chamfers reach 4 mm to each side; who sees the mouth farther off lands beside them."""
+    task = Insert(translation=[0.0, 0.0085, -0.02], depth=0.04)
+    result, measures = run("insert", **with_task(task))
+    assert measures["success"] == 1.0
+    assert (result["task_state"][:, PHASE] == SEEKING).any()
+    # It stood on the top first: at the force of a push, above the mouth.
+    assert measures["detection_time_s"] < 0.5
 
 
 def test_who_feels_nothing_gives_up():
@@ -185,6 +203,7 @@ def test_the_operators_noise_is_normal():
     ("changes", "message"),
     [
         (with_task(Reach(width=0.4)), r"operator\.task\.translation: the target is 0\.1 m away"),
+        (with_task(Insert(translation=[0.0, 0.0, -0.01])), r"operator\.task\.translation"),
         (with_task(Touch(standoff=0.3)), r"operator\.task\.translation"),
         (with_task(Press(force=-1.0)), r"operator\.task\.force"),
         (with_task(Reach(), kinematic_scaling__translation_scale=0.0), "translation_scale"),
