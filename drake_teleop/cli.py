@@ -389,6 +389,31 @@ def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: 
     study_command(study, out, jobs=jobs or -1, cluster=cluster, quiet=quiet)
 
 
+@cli.command("scaling-study")
+@click.option(
+    "--jobs", type=click.IntRange(min=1), help="Processes at once.  [default: one for each core]"
+)
+@click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    help="Of a Dask scheduler, which has the processes; or local, for one on this machine.",
+)
+@click.option("--repeats", type=click.IntRange(min=1), help="Seeds of each point.  [default: 34]")
+@_out("scaling-study")
+@_quiet
+def scaling_study(
+    jobs: int | None, cluster: str | None, repeats: int | None, out: Path, quiet: bool
+) -> None:
+    """Answer how to scale forces, for a simulated operator.
+
+    Studies its tasks over sigma, gamma and eta, in more than 2000 runs. If it was stopped or
+    killed, the same command goes on where it was.
+    """
+    from drake_teleop.experiments.scaling_study import scaling_study_command
+
+    scaling_study_command(out, jobs=jobs or -1, cluster=cluster, repeats=repeats, quiet=quiet)
+
+
 class _Positive(click.ParamType):
     """Positive numbers with commas between them."""
 

@@ -19,3 +19,8 @@ def models_dir() -> Path:
 def scenarios_dir() -> Path:
     """The folder of the scenarios that are shipped by name."""
     return _PACKAGE / "scenarios"
+
+
+def studies_dir() -> Path:
+    """The folder of the studies that are shipped by name."""
+    return _PACKAGE / "studies"

@@ -66,6 +66,7 @@ from drake_teleop.experiments.study_pictures import write_pictures
 from drake_teleop.experiments.study_runs import run_study
 from drake_teleop.load.detection import NoiseFloor
 from drake_teleop.quantities import check_ranges, check_structure
+from drake_teleop.resources import studies_dir
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import ReadScenario, Scenario, ScenarioFromData, ScenarioNames
 from drake_teleop.simulation import simulate
@@ -102,8 +103,8 @@ class StationWork:
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
         """The measures of one run."""
-        result = self._simulated(self.scenario(values, seed))
-        return measured(result, self.measures, self.threshold)
+        scenario = self.scenario(values, seed)
+        return measured(self._simulated(scenario), scenario, self.measures, self.threshold)
 
     def _simulated(self, scenario: Scenario) -> SimulationResult:
         """`run_scenario`, which identifies a load only once in a study."""
@@ -142,21 +143,25 @@ def _keep(path: Path, content: bytes) -> None:
 
 
 def study_command(
-    path: Path,
+    path: str | Path,
     out: Path,
     *,
     jobs: int = -1,
     cluster: str | None = None,
     quiet: bool = False,
+    repeats: int | None = None,
+    loads: Path | None = None,
 ) -> dict[str, Any]:
     """Runs a study, or what is left of it.
 
     Args:
-        path: the study's file.
+        path: the study's file, or the name of one that is shipped.
         out: the folder.
         jobs: processes at once on this machine; -1: one for each core.
         cluster: address of a Dask scheduler instead, or "local" for one of this machine's own.
         quiet: no progress bar and no table.
+        repeats: instead of the file's.
+        loads: folder of the loads that were identified, if studies share them.
 
     Returns:
         The summary, see the top of this module.
@@ -165,12 +170,13 @@ def study_command(
         DrakeTeleopError: for a bad file, a folder of another study, or Dask that is not installed.
         KeyboardInterrupt: saying what is kept.
     """
-    study = LoadStudy(path)
+    study, path = LoadStudy(path), study_file(path)
     data, where = ReadScenario(_scenario_of(study, path))
     ScenarioFromData(data, where)
     for index, factor in enumerate(study.factors):
         _check_values(factor, f"{path}:factors[{index}]")
-    loads = out / "loads"
+    study.repeats = repeats or study.repeats
+    loads = loads or out / "loads"
     work = StationWork(data, where, tuple(study.measures), study.force_threshold, loads)
     rows = run_study(study, out, work, {"data": data}, jobs=jobs, cluster=cluster, quiet=quiet)
     summary = _summary(study, rows)
@@ -183,12 +189,22 @@ def study_command(
     return summary
 
 
+def study_file(name_or_path: str | Path) -> Path:
+    """The file of a study that is shipped, by its name, or the path as it is."""
+    shipped = studies_dir() / f"{name_or_path}.yaml"
+    return shipped if shipped.is_file() else Path(name_or_path)
+
+
 def LoadStudy(path: str | Path) -> Study:
     """Loads and checks a study's file; its factors are checked when the scenario is known.
+
+    Args:
+        path: or the name of one that is shipped.
 
     Raises:
         DrakeTeleopError: naming file and field of what is wrong.
     """
+    path = study_file(path)
     try:
         text = Path(path).read_text()
         data = yaml_load(data=text)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.experiments.study_measures import MEASURES
+from drake_teleop.experiments.study_measures import MEASURES, default_measures
 from drake_teleop.quantities import check_ranges, choice, quantity
 
 Array = NDArray[np.float64]
@@ -107,7 +107,7 @@ class Study:
     batch: int = quantity(8, "1", 1, 2**10, "points that an adaptive design chooses at once")
     repeats: int = quantity(1, "1", 1, 1e6, "runs of each point, each with a seed of its own")
     seed: int = quantity(0, "1", 0, 1e9, "of the Sobol points, and of the first repeat")
-    measures: list[str] = dataclasses.field(default_factory=lambda: list(MEASURES))
+    measures: list[str] = dataclasses.field(default_factory=default_measures)
     force_threshold: float = quantity(1.0, "N", 0.0, 1e3, "of time_above_force_s")
 
     def check(self, where: str) -> None:

@@ -7,7 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.experiments.task_measures import TASK_MEASURES, task_measures
 from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import Scenario
 
 Array = NDArray[np.float64]
 
@@ -36,8 +38,8 @@ def _time_above(result: SimulationResult, threshold: float) -> float:
     return float(np.trapezoid(above.astype(float), result.t))
 
 
-#: Measures of a run by name: of its signals and the study's `force_threshold` [N].
-MEASURES: dict[str, Callable[[SimulationResult, float], float]] = {
+#: Those of every run by name: of its signals and the study's `force_threshold` [N].
+_OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = {
     # Largest force that the device displays.
     "peak_force_to_master_N": lambda result, _: _peak(_force_to_master(result)),
     # Root of the mean of its square.
@@ -53,8 +55,25 @@ MEASURES: dict[str, Callable[[SimulationResult, float], float]] = {
 }
 
 
+#: All names; those of tasks are explained in `experiments/task_measures.py`.
+MEASURES = (*_OF_EVERY_RUN, *TASK_MEASURES)
+
+
+def default_measures() -> list[str]:
+    """What a study measures that does not say: what every run has."""
+    return list(_OF_EVERY_RUN)
+
+
 def measured(
-    result: SimulationResult, names: Sequence[str], force_threshold: float
+    result: SimulationResult, scenario: Scenario, names: Sequence[str], force_threshold: float
 ) -> dict[str, float]:
-    """The measures of one run, by name."""
-    return {name: MEASURES[name](result, force_threshold) for name in names}
+    """The measures of one run, by name.
+
+    Raises:
+        DrakeTeleopError: if they are those of a task and there is none.
+    """
+    own = [name for name in names if name in _OF_EVERY_RUN]
+    found = {name: _OF_EVERY_RUN[name](result, force_threshold) for name in own}
+    if len(own) < len(names):
+        found |= task_measures(result, scenario)
+    return {name: found[name] for name in names}

@@ -19,10 +19,11 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.experiments import study as studies
 from drake_teleop.experiments.study import LoadStudy, study_command
 from drake_teleop.experiments.study_design import Factor, Study
-from drake_teleop.experiments.study_measures import MEASURES
+from drake_teleop.experiments.study_measures import default_measures, measured
 from drake_teleop.experiments.study_runs import run_study
 from drake_teleop.experiments.study_store import open_store
 from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import Scenario
 from drake_teleop.signals import SIGNALS
 
 # Learns while it moves, so that no identification comes first.
@@ -103,7 +104,7 @@ def test_a_row_for_each_run(serial):
     assert rows.columns == [
         *("run", "point", "repeat", "seed"),
         *("force_scaling.sigma", "operator.grip", "simulation.max_step"),
-        *MEASURES,
+        *default_measures(),
         "error",
     ]
     assert summary["runs"] == 12
@@ -432,7 +433,7 @@ def test_measures_of_a_known_motion():
     signals["force_to_master"][:, 3] = 9.0  # torques do not count
     signals["true_contact_wrench_W"][100, :3] = 2.0, -3.0, 6.0
     result = SimulationResult(t, signals, [SIGNALS[name] for name in signals])
-    found = {name: measure(result, 1.0) for name, measure in MEASURES.items()}
+    found = measured(result, Scenario(), default_measures(), 1.0)
     assert found == pytest.approx(
         {
             "peak_force_to_master_N": 2.0,

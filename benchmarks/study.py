@@ -1,0 +1,127 @@
+"""How well does a study use two cores, is it the same everywhere, and what does a kill cost?
+
+`python benchmarks/study.py [--runs 2000] [--kills 20] [--json FILE]` runs one study of the station
+(a contact transition over sigma, gamma and seeds: 1 s simulated, the loads identified before) by
+one process, by two, and on a local Dask cluster, each from an empty folder, and once more by two
+processes with SIGKILL at random moments. Baseline of the efficiency is the one process, by the
+clock: it wants an idle machine. Parts are compared byte by byte.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import polars as pl
+
+_STUDY = """
+scenario: contact_transition
+factors:
+  - {{field: force_scaling.sigma, values: [0, 0.25, 0.5, 0.75, 1]}}
+  - {{field: force_scaling.gamma, values: [0.5, 1, 1.5, 2, 3]}}
+  - {{field: rates.sensor_hz, values: [2000]}}
+  - {{field: rates.hand_hz, values: [1000]}}
+  - {{field: rates.joint_control_hz, values: [1000]}}
+  - {{field: simulation.settle, values: [0.4]}}
+  - {{field: simulation.duration, values: [0.6]}}
+repeats: {repeats}
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=2000, help="a multiple of 25")
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--no-cluster", action="store_true", help="without Dask")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        figures = measured(Path(folder), arguments)
+    for name, figure in figures.items():
+        print(f"{name:30s} {figure:10.4g}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def measured(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
+    """All figures; the studies lie in `folder`."""
+    study = folder / "study.yaml"
+    study.write_text(_STUDY.format(repeats=max(arguments.runs // 25, 1)))
+    warm = folder / "warm.yaml"  # compiles what is not compiled yet
+    warm.write_text(_STUDY.format(repeats=1))
+    run(warm, folder / "warm", "--jobs", "1")
+    serial = run(study, folder / "serial", "--jobs", "1")
+    joblib = run(study, folder / "joblib", "--jobs", "2")
+    same = parts(folder / "serial") == parts(folder / "joblib")
+    rows = pl.read_parquet(folder / "serial" / "runs.parquet")
+    figures = {
+        "runs": float(rows.height),
+        "failed": float(rows["error"].count()),
+        "one_process_s": serial,
+        "two_processes_s": joblib,
+        "efficiency": serial / (2 * joblib),
+        "two_processes_the_same": float(same),
+    }
+    if not arguments.no_cluster:
+        figures["dask_s"] = run(study, folder / "dask", "--jobs", "2", "--cluster", "local")
+        figures["dask_the_same"] = float(parts(folder / "serial") == parts(folder / "dask"))
+    kills = killed(study, folder / "killed", arguments.kills, joblib)
+    run(study, folder / "killed", "--jobs", "2")
+    rows = pl.read_parquet(folder / "killed" / "runs.parquet")
+    return figures | {
+        "kills": float(kills),
+        "rows_doubled": float(rows.height - rows["run"].n_unique()),
+        "rows_lost": figures["runs"] - rows["run"].n_unique(),
+        "killed_the_same": float(parts(folder / "serial") == parts(folder / "killed")),
+    }
+
+
+def command(study: Path, out: Path, *options: str) -> list[str]:
+    start = "from drake_teleop.cli import main; main()"
+    return [
+        sys.executable,
+        "-c",
+        start,
+        "study",
+        str(study),
+        "--quiet",
+        "--out",
+        str(out),
+        *options,
+    ]
+
+
+def run(study: Path, out: Path, *options: str) -> float:
+    """Seconds by the clock, imports and pictures included."""
+    start = time.perf_counter()
+    subprocess.run(command(study, out, *options), check=True)
+    return time.perf_counter() - start
+
+
+def killed(study: Path, out: Path, times: int, whole: float) -> int:
+    """Kills the study at random moments; returns how often it was not over before."""
+    pauses, kills = random.Random(0), 0
+    for _ in range(times):
+        process = subprocess.Popen(command(study, out, "--jobs", "2"))
+        try:
+            # Imports take seconds, so that some kills come before the first row.
+            process.wait(timeout=pauses.uniform(0.0, 5.0 + whole / times))
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            kills += process.wait() == -signal.SIGKILL
+    return kills
+
+
+def parts(out: Path) -> dict[str, bytes]:
+    return {part.name: part.read_bytes() for part in (out / "runs.parquet").iterdir()}
+
+
+if __name__ == "__main__":
+    main()
