@@ -37,9 +37,9 @@ from drake_teleop.quantities import quantity
 Array = NDArray[np.float64]
 
 # Random walks of [m, b, c, u_0 (3)] in a second, and where they start; all E.
-_WALK = np.array([0.02, 0.1, 0.01, 0.015, 0.015, 0.015])
+_WALK = np.array([0.001, 0.01, 0.002, 0.015, 0.015, 0.015])
 _FIRST_DOUBT = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
-_RESIDUAL = 0.1  # N, of the expectation while it is learnt, E
+_RESIDUAL = 0.007  # N / sqrt(Hz), of the expectation while it is learnt: 0.1 N at 200 Hz, E
 _SLOW = 0.01  # m/s, v_0, as of the device's friction
 _PARAMETERS = 6
 
@@ -140,7 +140,7 @@ def _learn(theta, P, rows, excess, dt):
         P[j, j] += _WALK[j] * _WALK[j] * dt
     before = theta.copy()
     for i in range(3):
-        residual, variance = excess[i], _RESIDUAL * _RESIDUAL
+        residual, variance = excess[i], _RESIDUAL * _RESIDUAL / dt
         for j in range(_PARAMETERS):
             residual -= rows[i, j] * (theta[j] - before[j])
             gain[j] = 0.0

@@ -7,9 +7,10 @@ import pytest
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.experiments.identification import slave_arm
-from drake_teleop.experiments.task_measures import contact_force, task_measures
+from drake_teleop.experiments.task_measures import contact_force, detection_time, task_measures
 from drake_teleop.master import task as tasks
 from drake_teleop.master.device import JointFriction
+from drake_teleop.master.perception import NOTICED, Perception, perceive
 from drake_teleop.master.task import DONE, OVER, PHASE, SEEKING, Insert, Press, Reach, Touch
 from drake_teleop.noise import random_normal
 from drake_teleop.scenario import LoadScenario, Scenario, replace
@@ -160,6 +161,21 @@ def test_a_press_that_takes_too_long_is_given_up():
     result, measures = run("press", **with_task(task, simulation__duration=1.5))
     assert measures["success"] == 0.0
     assert result["task_state"][-1, DONE] == -1.0
+
+
+def test_a_human_notices_the_papers_contact_and_nothing_before():
+    """Fig. 8 without inertia: the fast motion before is expected, the touch of 50 ms is not."""
+    scenario = LoadScenario("contact_transition")
+    changes = FAST | {"simulation__settle": 0.0, "simulation__duration": 1.7}
+    scenario = replace(scenario, **changes)
+    estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+    result = simulate(MakeTeleopStation(scenario, load_estimate=estimate), scenario.simulation)
+    hand, velocity = result["hand_wrench_E"][:, :3], result["twist_master"][:, :3]
+    mass = scenario.operator.hand.mass
+    noticed = perceive(result.t, hand, velocity, Perception(), mass, 1.0)[:, NOTICED] > 0.0
+    touching = contact_force(result) > 0.0
+    assert not noticed[: np.argmax(touching)].any()
+    assert detection_time(result.t, touching, noticed) < 0.03
 
 
 def test_every_movement_goes_on_from_the_one_before():
