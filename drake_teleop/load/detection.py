@@ -30,10 +30,10 @@ of each component. For a sensor with white noise rho = 0 and e = z.
 
 The w_n are 1 if e is white. What is left of the load's wrench changes as slowly as the motion, more
 slowly than rho tells, and adds up over long sums: w_n is by how much such sums exceeded those of
-white noise in free motion, or rare ones a rare e, whichever is more. Without it the
-errors of the load would set the threshold for all n; with it all n reach about the same in free
-motion, n = 1 is the plain threshold, and the others notice weaker contacts at the same rate of false
-alarms (benchmarks/contact_detection.py).
+white noise in free motion, or rare ones a rare e, whichever is more. Without it the errors of the
+load would set the threshold for all n; with it all n reach about the same in free motion, n = 1 is
+the plain threshold, and the others notice weaker contacts at the same rate of false alarms
+(benchmarks/contact_detection.py).
 
 **Drift.** Long sums notice half a standard deviation, and in minutes a force sensor drifts as far.
 So r may be taken about a mean of its own past, which follows with a time constant of some seconds

@@ -1,0 +1,14 @@
+"""What docs/detection.md tells a user to type works."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+DOC = Path(__file__).parents[1] / "docs" / "detection.md"
+
+
+def test_the_code_notices_the_contact(capsys) -> None:
+    (code,) = re.findall(r"^```python\n(.+?)^```", DOC.read_text(encoding="utf-8"), re.M | re.S)
+    exec(code, {})
+    assert 0.21 < float(capsys.readouterr().out.strip(" []\n")) < 0.23
