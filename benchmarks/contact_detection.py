@@ -2,11 +2,11 @@
 
 `python benchmarks/contact_detection.py [--json] [--hours 1]` moves a load of 3.1 kg fast and
 touches it 500 times with 0.05 to 5 N in any direction, 0.3 s each. The wrench has white noise
-(0.08 N, 3 mN m) and gains that are off by 0.3 %; the motion has noise of its own and comes 1 ms late, uncorrected. Load
-and offsets are identified from another such motion by the same sensors, and the noise floors are
-fitted to a third. The thresholds are those at which 1 % of the windows of 0.3 s have a false alarm
-in the same motion without contacts, so that all are compared at one rate; how many have one in a
-fourth motion says whether a threshold can be carried over.
+(0.08 N, 3 mN m) and gains that are off by 0.3 %; the motion has noise of its own and comes 1 ms
+late, uncorrected. Load and offsets are identified from another such motion by the same sensors, and
+the noise floors are fitted to a third. The thresholds are those at which 1 % of the windows of 0.3
+s have a false alarm in the same motion without contacts, so that all are compared at one rate; how
+many have one in a fourth motion says whether a threshold can be carried over.
 
 The table has, for the measured wrench (tared), for that without the static weight (of the same
 identification) and for the eliminated one: the AUC of a window's largest statistic, the share of
