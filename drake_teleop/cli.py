@@ -398,7 +398,7 @@ def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: 
     metavar="ADDRESS",
     help="Of a Dask scheduler, which has the processes; or local, for one on this machine.",
 )
-@click.option("--repeats", type=click.IntRange(min=1), help="Seeds of each point.  [default: 34]")
+@click.option("--repeats", type=click.IntRange(min=1), help="Seeds of each point.  [default: 24]")
 @_out("scaling-study")
 @_quiet
 def scaling_study(

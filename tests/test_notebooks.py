@@ -68,6 +68,19 @@ assert 0.7 * bound < most < bound
 assert abs(closed.multipliers[0]) < 1
 assert np.abs(ratio - 1).max() < 0.02 and coherence.min() > 0.95
 """,
+    "04_scaling_study": """
+assert all(measures["success"] == 1 for _, measures in runs.values())
+assert runs[1.0][1]["detection_time_s"] > runs[0.0][1]["detection_time_s"] + 0.03
+assert runs[1.0][1]["effort_Ns"] > 3 * runs[0.0][1]["effort_Ns"]
+assert summary["runs"] == 18 and summary["failed"] == 0
+effort = found.filter(measure="effort_Ns", factor="force_scaling.sigma")["mean"]
+assert (np.diff(effort) > 0).all()
+scales = ["force_scaling.sigma", "force_scaling.gamma"]
+late = rows.group_by(scales).agg(pl.col("detection_time_s").mean()).sort(scales)
+late = late["detection_time_s"].to_numpy().reshape(3, 3)
+assert (late[2] > late[0]).all() and (np.diff(late[2]) < 0).all()
+assert 0 < points["front"].sum() < 9
+""",
 }
 
 

@@ -1,8 +1,8 @@
 """`drake-teleop scaling-study`: how to scale forces, for the simulated operator.
 
-The paper ends with that question. Three tasks are studied over sigma and gamma (free reaching, to
-which gamma does nothing; a contact transition; pressing with a set force), and eta for a contact
-transition with an object in the gripper: `drake_teleop/studies/scaling_*.yaml`.
+The paper ends with that question. Four tasks are studied over sigma and gamma (free reaching, to
+which gamma does nothing; a contact transition; pressing with a set force; a peg into a slot), and
+eta for a contact transition with an object in the gripper: `drake_teleop/studies/scaling_*.yaml`.
 
 What is best depends on what counts. Each criterion is the mean over the runs of a point, as a part
 of its value at the reference sigma = gamma = 1, where the hand feels everything as it is. The merit
@@ -50,7 +50,7 @@ CRITERIA = {
 }
 #: Ways of counting: the criteria that count, each as much as the others.
 WAYS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
-TASKS = {"reach": ("effort", "time"), "touch": tuple(CRITERIA), "press": tuple(CRITERIA)}
+TASKS = {"reach": ("effort", "time")} | dict.fromkeys(("touch", "press", "insert"), tuple(CRITERIA))
 """The criteria of each task: nothing is touched in free reaching."""
 _OBJECT = "scaling_object"
 _SIGMA, _GAMMA, _ETA = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
@@ -242,9 +242,9 @@ def criteria_picture(
     rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
 ) -> Figure:
     """Each criterion over sigma, a line for each gamma; bars: intervals against the mean of all."""
-    tasks = ("touch", "press")
+    tasks = [task for task in TASKS if "force" in TASKS[task]]
     with house_style():
-        figure = Picture(figsize=(10.0, 5.2))
+        figure = Picture(figsize=(10.0, 7.6))
         grid = figure.subplots(len(tasks), 3, sharex=True)
         for line, task in zip(grid, tasks, strict=True):
             table = rows[f"scaling_{task}"]

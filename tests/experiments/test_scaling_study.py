@@ -78,10 +78,10 @@ def test_they_are_two_thousand_runs_over_the_same_scales():
     assert sum(study.size() * study.repeats for study in studies.values()) >= 2000
     scales = [
         [f for f in studies[f"scaling_{task}"].factors if f.field.startswith("force_scaling.")]
-        for task in ("touch", "press", "reach")
+        for task in ("touch", "press", "insert", "reach")
     ]
-    assert scales[0] == scales[1]
-    assert scales[2] == scales[0][:1]
+    assert scales[0] == scales[1] == scales[2]
+    assert scales[3] == scales[0][:1]
 
 
 def test_the_answer_of_a_folder(tmp_path, monkeypatch):
@@ -100,7 +100,7 @@ def test_the_answer_of_a_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(scaling_study, "study_command", made_up)
     summary = scaling_study_command(tmp_path, repeats=3)
     assert summary == json.loads((tmp_path / "answer.json").read_text())
-    assert summary["runs"] == 3 * (5 + 25 + 25 + 5)
+    assert summary["runs"] == 3 * (5 + 3 * 25 + 5)
     assert summary["choice"]["effort"]["sigma"] == 0
     assert summary["choice"]["effort"]["merit"] == pytest.approx(0.5)
     assert [row["eta"] for row in summary["eta"]] == [0, 0.25, 0.5, 0.75, 1]
