@@ -37,7 +37,7 @@ from drake_teleop.quantities import quantity
 Array = NDArray[np.float64]
 
 # Random walks of [m, b, c, u_0 (3)] in a second, and where they start; all E.
-_WALK = np.array([0.001, 0.01, 0.002, 0.015, 0.015, 0.015])
+_WALK = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
 _FIRST_DOUBT = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
 _RESIDUAL = 0.007  # N / sqrt(Hz), of the expectation while it is learnt: 0.1 N at 200 Hz, E
 _SLOW = 0.01  # m/s, v_0, as of the device's friction
