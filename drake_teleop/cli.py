@@ -381,8 +381,9 @@ def compare_passivity(
 def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: bool) -> None:
     """Run a scenario over a design of its fields.
 
-    STUDY is a YAML file: factors, design, repeats, measures. Writes one table with a row for each
-    run. If it was stopped or killed, the same command goes on where it was.
+    STUDY is a YAML file: factors, design, repeats, measures; or the name of one that is shipped.
+    Writes one table with a row for each run, and pictures. If it was stopped or killed, the same
+    command goes on where it was.
     """
     from drake_teleop.experiments.study import study_command
 
