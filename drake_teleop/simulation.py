@@ -59,9 +59,10 @@ def simulate(
             advance(simulator, time)
             if on_disk is not None and on_disk.waiting() >= _PART_ROWS:
                 on_disk.take()
+            over = simulation.end_with_task and _task_is_over(simulator)
             if progress is not None:
-                progress(time / end)
-            if simulation.end_with_task and _task_is_over(simulator):
+                progress(1.0 if over else time / end)
+            if over:
                 break
     finally:
         if on_disk is not None:
