@@ -187,7 +187,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     summary = {
         "description": run.scenario.description,
         "seed": run.scenario.simulation.seed,
-        "duration_s": run.scenario.simulation.duration,
+        "duration_s": round(float(result.t[-1]), 6),
         "samples": len(result.t),
         **_peaks("peak_measured", "", measured),
         **_peaks("peak_contact", "", calculated),
