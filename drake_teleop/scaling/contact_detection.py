@@ -37,6 +37,9 @@ class ContactDetectionConfig:
     drift_time: float = quantity(
         5.0, "s", 0.5, 1e4, "within which the detector follows the offsets while nothing stands out"
     )
+    recovery: float = quantity(
+        5e-3, "s", 0.0, 1.0, "for which a saturation still shows in the sensor's low-pass"
+    )
 
 
 @njit(cache=True)
@@ -54,7 +57,8 @@ def _detected(memory, sample, estimate, arm, settings):
 class ContactDetection(LeafSystem):
     """Says whether the slave touches something.
 
-    While the wrist sensor is saturated nothing is known, and the flag stays as it is.
+    While the wrist sensor is saturated, and while that shows in its low-pass, nothing is known, and
+    the flag stays as it is.
 
     .. pydrake_system::
 
@@ -93,12 +97,19 @@ class ContactDetection(LeafSystem):
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         self._flag = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(ContactDetector.initial_memory())
+        self._recovery = round(config.recovery / period)
+        self._blind = self.DeclareDiscreteState(1)  # samples for which nothing will be known
         self.DeclareStateOutputPort("contact", self._flag)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
+        blind = discrete_state.get_mutable_value(self._blind)
         if sample[self._saturated] > 0.5:
+            blind[0] = self._recovery
+            return
+        if blind[0] > 0.0:
+            blind[0] -= 1.0
             return
         memory = discrete_state.get_mutable_value(self._memory)
         estimate = self._estimate.Eval(context)
