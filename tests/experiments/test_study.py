@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.experiments import study as studies
@@ -497,3 +498,15 @@ def test_a_bad_file_is_one_line_with_its_field(files, tmp_path, change, message)
 def test_no_file(tmp_path):
     with pytest.raises(OSError, match=r"none\.yaml"):
         LoadStudy(tmp_path / "none.yaml")
+
+
+def threads(values, seed):
+    return {"hand_work_J": float(max(library["num_threads"] for library in threadpool_info()))}
+
+
+def test_a_run_has_one_thread_of_blas_so_that_its_bytes_are_the_same_in_any_process(tmp_path):
+    study = Study(factors=[Factor("a.b", values=[0.0, 1.0])], measures=["hand_work_J"])
+    with threadpool_limits(2):
+        rows = run_study(study, tmp_path, threads, {}, jobs=1)
+        assert threads({}, 0) == {"hand_work_J": 2.0}
+    assert rows["hand_work_J"].to_list() == [1.0, 1.0]
