@@ -4,7 +4,7 @@
 success                      1 if the operator ended its task, and the truth agrees: the tip is in
                              the target; the tool touches; the force was held within its tolerance;
                              the tip is within 2 mm of the slot's floor
-task_time_s                  from the task's start until the operator has done it; nan if not
+task_time_s                  from the task's start until the operator has done it
 contact_force_overshoot_N    largest contact force at the tool, less the force that was wanted
 effort_Ns                    integral of |force of the hand|: what tires an arm that pushes or holds
 task_work_J                  integral of |power of the hand|: pushing and braking both count
@@ -14,6 +14,8 @@ press_error_N                root mean square error of the force while it was he
 ============================ ====================================================================
 
 All of them are of the time from the task's start until it was done or given up, or the log's end.
+Of a task that failed, also where the operator believes that it is done, there are only the success
+and what was noticed; the others are nan, for little effort in vain is no merit.
 """
 
 from __future__ import annotations
@@ -79,16 +81,22 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     noticed, touching = state[span, FELT] > 0.0, force[span] > 0.0
     # The log may begin later than the task.
     taken = float(t[ended]) + scenario.simulation.settle - task.t_start
-    return {
-        "success": float(done and _truly(result, scenario, task, ended, force, held)),
-        "task_time_s": taken if done else math.nan,
+    success = done and _truly(result, scenario, task, ended, force, held)
+    done_well = {
+        "task_time_s": taken,
         "contact_force_overshoot_N": max(float(force[span].max()) - wanted, 0.0),
         "effort_Ns": float(np.trapezoid(np.linalg.norm(hand[:, :3], axis=1), t[span])),
         "task_work_J": float(np.trapezoid(power, t[span])),
-        "detection_time_s": detection_time(t[span], touching, noticed),
-        "false_notices": float(_false_notices(touching, noticed)),
         "press_error_N": float(np.sqrt(np.mean((held - wanted) ** 2))) if held.size else math.nan,
     }
+    if not success:
+        done_well = dict.fromkeys(done_well, math.nan)
+    figures = done_well | {
+        "success": float(success),
+        "detection_time_s": detection_time(t[span], touching, noticed),
+        "false_notices": float(_false_notices(touching, noticed)),
+    }
+    return {name: figures[name] for name in TASK_MEASURES}
 
 
 def _wanted_force(task: Task) -> float:

@@ -73,9 +73,9 @@ def test_the_shipped_studies_load(name):
     assert study.scenario in ScenarioNames()
 
 
-def test_they_are_two_thousand_runs_over_the_same_scales():
+def test_they_are_a_thousand_runs_over_the_same_scales():
     studies = {name: LoadStudy(name) for name in STUDIES}
-    assert sum(study.size() * study.repeats for study in studies.values()) >= 2000
+    assert sum(study.size() * study.repeats for study in studies.values()) >= 1000
     scales = [
         [f for f in studies[f"scaling_{task}"].factors if f.field.startswith("force_scaling.")]
         for task in ("touch", "press", "insert", "reach")

@@ -62,12 +62,20 @@ def test_of_a_press():
     assert found["success"] == 1.0
     assert found["contact_force_overshoot_N"] == pytest.approx(1.0)
     assert found["press_error_N"] == pytest.approx(1.0)
-    # The operator believes to be done; the truth does not agree.
-    assert measures(Press(force=5.0, tolerance=0.5))["success"] == 0.0
+
+
+def test_a_task_that_failed_has_no_merits():
+    """Neither one that is given up, nor one that only the operator believes to be done."""
+    for found in (
+        measures(Press(force=5.0, tolerance=0.5)),
+        measures(Press(force=5.0, tolerance=2.0), done=-1.0),
+    ):
+        assert found["success"] == 0.0
+        missing = {name for name, value in found.items() if math.isnan(value)}
+        assert missing == set(TASK_MEASURES) - {"success", "detection_time_s", "false_notices"}
 
 
 def test_of_a_task_that_was_given_up():
     found = measures(Touch(), done=-1.0, force=0.0)
     assert found["success"] == 0.0
     assert math.isnan(found["task_time_s"]) and math.isnan(found["detection_time_s"])
-    assert found["effort_Ns"] == pytest.approx(2.0 * (END - START))
