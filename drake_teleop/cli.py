@@ -399,7 +399,7 @@ def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: 
     metavar="ADDRESS",
     help="Of a Dask scheduler, which has the processes; or local, for one on this machine.",
 )
-@click.option("--repeats", type=click.IntRange(min=1), help="Seeds of each point.  [default: 24]")
+@click.option("--repeats", type=click.IntRange(min=1), help="Seeds of each point.  [default: 12]")
 @_out("scaling-study")
 @_quiet
 def scaling_study(
@@ -407,7 +407,7 @@ def scaling_study(
 ) -> None:
     """Answer how to scale forces, for a simulated operator.
 
-    Studies its tasks over sigma, gamma and eta, in more than 2000 runs. If it was stopped or
+    Studies its tasks over sigma, gamma and eta, in about 1000 runs. If it was stopped or
     killed, the same command goes on where it was.
     """
     from drake_teleop.experiments.scaling_study import scaling_study_command

@@ -190,9 +190,20 @@ def study_command(
 
 
 def study_file(name_or_path: str | Path) -> Path:
-    """The file of a study that is shipped, by its name, or the path as it is."""
+    """The file of a study that is shipped, by its name, or the path as it is.
+
+    Raises:
+        DrakeTeleopError: if there is neither.
+    """
     shipped = studies_dir() / f"{name_or_path}.yaml"
-    return shipped if shipped.is_file() else Path(name_or_path)
+    path = shipped if shipped.is_file() else Path(name_or_path)
+    if not path.is_file():
+        names = sorted(file.stem for file in studies_dir().glob("*.yaml"))
+        raise DrakeTeleopError(
+            f"there is no study '{name_or_path}'",
+            remedy=f"give a YAML file or one of {', '.join(names)}",
+        )
+    return path
 
 
 def LoadStudy(path: str | Path) -> Study:
