@@ -1,7 +1,7 @@
 """How well does a study use two cores, is it the same everywhere, and what does a kill cost?
 
 `python benchmarks/study.py [--runs 2000] [--kills 20] [--json FILE]` runs one study of the station
-(a contact transition over sigma, gamma and seeds: 1 s simulated, the loads identified before) by
+(a contact transition over sigma, gamma and seeds: 1 s simulated, the loads identified first) by
 one process, by two, and on a local Dask cluster, each from an empty folder, and once more by two
 processes with SIGKILL at random moments. Baseline of the efficiency is the one process, by the
 clock: it wants an idle machine. Parts are compared byte by byte.
@@ -24,8 +24,8 @@ import polars as pl
 _STUDY = """
 scenario: contact_transition
 factors:
-  - {{field: force_scaling.sigma, values: [0, 0.25, 0.5, 0.75, 1]}}
-  - {{field: force_scaling.gamma, values: [0.5, 1, 1.5, 2, 3]}}
+  - {{field: force_scaling.sigma, low: 0, high: 1, levels: {levels}}}
+  - {{field: force_scaling.gamma, low: 0.5, high: 3, levels: {levels}}}
   - {{field: rates.sensor_hz, values: [2000]}}
   - {{field: rates.hand_hz, values: [1000]}}
   - {{field: rates.joint_control_hz, values: [1000]}}
@@ -37,7 +37,7 @@ repeats: {repeats}
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=2000, help="a multiple of 25")
+    parser.add_argument("--runs", type=int, default=2000, help="a multiple of 400")
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--no-cluster", action="store_true", help="without Dask")
     parser.add_argument("--json", type=Path, help="write the figures here")
@@ -53,9 +53,9 @@ def main() -> None:
 def measured(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
     """All figures; the studies lie in `folder`."""
     study = folder / "study.yaml"
-    study.write_text(_STUDY.format(repeats=max(arguments.runs // 25, 1)))
+    study.write_text(_STUDY.format(levels=20, repeats=max(arguments.runs // 400, 1)))
     warm = folder / "warm.yaml"  # compiles what is not compiled yet
-    warm.write_text(_STUDY.format(repeats=1))
+    warm.write_text(_STUDY.format(levels=2, repeats=1))
     run(warm, folder / "warm", "--jobs", "1")
     serial = run(study, folder / "serial", "--jobs", "1")
     joblib = run(study, folder / "joblib", "--jobs", "2")
