@@ -496,7 +496,7 @@ def test_a_bad_file_is_one_line_with_its_field(files, tmp_path, change, message)
 
 
 def test_no_file(tmp_path):
-    with pytest.raises(OSError, match=r"none\.yaml"):
+    with pytest.raises(DrakeTeleopError, match=r"none\.yaml'; give a YAML file or one of scaling_"):
         LoadStudy(tmp_path / "none.yaml")
 
 
