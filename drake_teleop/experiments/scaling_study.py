@@ -278,7 +278,10 @@ def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list
             axes.set_ylabel("$\\sigma$")
             axes.set_title(f"counts: {way}")
             for i, j in np.argwhere(found.best >= 0.005):
-                axes.text(j, i, f"{found.best[i, j]:.0%}", ha="center", va="center", color="white")
+                box = {"facecolor": "white", "alpha": 0.75, "lw": 0, "pad": 1}
+                axes.text(
+                    j, i, f"{found.best[i, j]:.0%}", ha="center", va="center", fontsize=7, bbox=box
+                )
             figure.colorbar(drawn, ax=axes)
         figure.suptitle(
             "Merit (below 1: better than feeling all); how often the best", x=0.01, ha="left"
