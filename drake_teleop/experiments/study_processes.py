@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
@@ -73,6 +74,8 @@ def _on_this_machine(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int)
 def _parallel(jobs: int) -> Any:
     from joblib import Parallel
 
+    # joblib replaces processes that have grown; a crash is an error, not this warning.
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
     return Parallel(
         n_jobs=jobs,
         backend="loky",
