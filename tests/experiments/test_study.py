@@ -73,7 +73,7 @@ for _ in range(20):
     time.sleep(pauses.uniform(0.0, 0.2))
     os.kill(child, signal.SIGKILL)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL, "it has ended by itself"
-    print(len(list((killed / "runs.parquet").glob("*"))))
+    print(len(list((killed / "runs.parquet").glob("*"))), flush=True)
 pause = 0.0
 run(killed)
 run(whole)
