@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
-from pydrake.systems.framework import BasicVector, DiagramBuilder
+from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder
 
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
@@ -333,7 +336,7 @@ def test_scales_change_while_running_without_a_step_of_the_force(slave):
     assert largest_step(at_once) > 10 * largest_step(changed)
 
 
-def test_every_output_port_is_a_documented_signal():
+def station_of_all_blocks() -> Diagram:
     scenario = replace(LoadScenario("contact_transition"), simulation=Simulation(duration=0.01))
     scenario = replace(scenario, channel__network="lan", load_estimator__watch=True)
     scenario = replace(scenario, operator__task=Touch())
@@ -342,12 +345,16 @@ def test_every_output_port_is_a_documented_signal():
     floor = NoiseFloor(
         np.ones(6), np.identity(16), rising, np.identity(6), still, reached=np.ones(3)
     )
-    station = MakeTeleopStation(
+    return MakeTeleopStation(
         scenario,
         load_estimate=np.ones(16),
         load_covariance=np.identity(16),
         noise_floor=floor,
     )
+
+
+def test_every_output_port_is_a_documented_signal():
+    station = station_of_all_blocks()
     names = {station.get_output_port(i).get_name() for i in range(station.num_output_ports())}
     assert names == set(SIGNALS)
     for name in names:
@@ -404,3 +411,27 @@ def test_identification_leaves_the_teleoperation_station_alone(slave):
     station = MakeIdentificationStation(scenario, trajectory_of_joint_5(slave, 0.1))
     assert "joint_command" in simulate(station, short)
     assert "pose_master" in simulate(MakeTeleopStation(Scenario()), short)
+
+
+def test_a_station_that_nobody_holds_is_no_more(slave):
+    """Thousands of stations in one process, one after the other, need the memory of one."""
+    short = Simulation(duration=0.02)
+    identification = replace(LoadScenario("identification"), simulation=short)
+    trajectory = trajectory_of_joint_5(slave, 0.1)
+    stations = [
+        station_of_all_blocks(),
+        MakeTeleopStation(Scenario()),
+        MakeIdentificationStation(identification, trajectory),
+    ]
+    for station in stations[1:]:
+        simulate(station, short)
+    # Python's handles of blocks that C++ has made come and go.
+    blocks = [system for station in stations for system in station.GetSystems()]
+    ours = [system for system in blocks if type(system).__module__.startswith("drake_teleop")]
+    alive = [weakref.ref(system) for system in [*stations, *ours]]
+    del blocks, ours, station
+    gc.collect()
+    assert len(alive) > 20 and all(system() is not None for system in alive)
+    stations.clear()
+    gc.collect()
+    assert [type(left).__name__ for left in (system() for system in alive) if left] == []

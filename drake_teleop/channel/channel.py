@@ -24,6 +24,7 @@ from pydrake.systems.framework import (
 from drake_teleop.channel import network
 from drake_teleop.channel.network import PRESETS, NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.passivity import methods
 from drake_teleop.passivity.memory import (
     COMMAND,
@@ -364,6 +365,8 @@ class TeleopChannel(LeafSystem):
         seed: of the network.
     """
 
+    __slots__ = ONE_DICT
+
     def __init__(
         self,
         channel: Channel,
@@ -407,17 +410,18 @@ class TeleopChannel(LeafSystem):
         self.DeclareStateOutputPort("pose_received", self._groups[3])
         self.DeclareStateOutputPort("ports", self._groups[4])
         # The step is taken once, for the wrench that acts now and for the state after it.
-        self._step = self.DeclareCacheEntry(
+        step = self.DeclareCacheEntry(
             "step",
             ValueProducer(
                 allocate=lambda: AbstractValue.Make([*map(np.array, state), received.copy()]),
-                calc=self._calc_step,
+                calc=weak_callback(self._calc_step),
             ),
             {self.all_input_ports_ticket(), self.xd_ticket()},
         )
-        taken = {self._step.ticket()}
-        self.DeclareVectorOutputPort("wrench_received", 6, self._calc_wrench, taken)
-        self.DeclareVectorOutputPort("contact_at_hand", 1, self._calc_contact, taken)
+        self._step = step.cache_index()  # the entry itself would keep the block alive
+        taken = {step.ticket()}
+        self.DeclareVectorOutputPort("wrench_received", 6, weak_callback(self._calc_wrench), taken)
+        self.DeclareVectorOutputPort("contact_at_hand", 1, weak_callback(self._calc_contact), taken)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _calc_step(self, context: Context, step: AbstractValue) -> None:
@@ -439,12 +443,16 @@ class TeleopChannel(LeafSystem):
             received,
         )
 
+    def _taken(self, context: Context) -> list[NDArray[np.float64]]:
+        """The state after the step, and what the hand's end received."""
+        return self.get_cache_entry(self._step).Eval(context)
+
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step.Eval(context)[-1][:6])
+        output.SetFromVector(self._taken(context)[-1][:6])
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._step.Eval(context)[-1][6]
+        output[0] = self._taken(context)[-1][6]
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for part, group in zip(self._step.Eval(context), self._groups, strict=False):
+        for part, group in zip(self._taken(context), self._groups, strict=False):
             discrete_state.set_value(group, part)

@@ -31,6 +31,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.quantities import quantity
 
 GRAVITY = 9.81  # m/s^2, along -z_B
@@ -507,6 +508,8 @@ class MasterDevice(LeafSystem):
         DrakeTeleopError: if the period is too long, for the device or for its friction, or the
             start is beyond a joint's limit.
     """
+
+    __slots__ = ONE_DICT
 
     def __init__(
         self,

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.master.device import (
     FORCE_LIMIT,
     WRIST_TORQUE_LIMIT,
@@ -77,6 +78,8 @@ class ForceDisplay(LeafSystem):
         - force_to_master: (6,) F, what is displayed within the device's limits [N, N m]
     """
 
+    __slots__ = ONE_DICT
+
     def __init__(self) -> None:
         super().__init__()
         self._jacobian = np.zeros((6, 6))
@@ -84,8 +87,8 @@ class ForceDisplay(LeafSystem):
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._state = self.DeclareVectorInputPort("master_state", 12)
         inputs = {self.all_input_ports_ticket()}
-        self.DeclareVectorOutputPort("motor_torque", 6, self._calc_torque, inputs)
-        self.DeclareVectorOutputPort("force_to_master", 6, self._calc_force, inputs)
+        self.DeclareVectorOutputPort("motor_torque", 6, weak_callback(self._calc_torque), inputs)
+        self.DeclareVectorOutputPort("force_to_master", 6, weak_callback(self._calc_force), inputs)
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
         self._calc(context, self._unused, output.get_mutable_value())

@@ -23,6 +23,7 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
+from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.master import perception as feeling
 from drake_teleop.master import task as tasks
 from drake_teleop.master.perception import Perception, perceive_into
@@ -307,6 +308,8 @@ class Operator(LeafSystem):
         tip: (6,) the tool's tip in S and where it starts in W [m], likewise.
     """
 
+    __slots__ = ONE_DICT
+
     def __init__(
         self,
         config: OperatorConfig,
@@ -333,9 +336,9 @@ class Operator(LeafSystem):
                 raise ValueError("a task needs training, arm and tip")
             moving.add(self._declare_task(config, config.task, training, arm, tip))
         self._wrench = self.DeclareVectorOutputPort(
-            "hand_wrench_E", 6, self._calc_wrench, held | moving
+            "hand_wrench_E", 6, weak_callback(self._calc_wrench), held | moving
         )
-        self.DeclareVectorOutputPort("intent", 7, self._calc_intent, moving)
+        self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
 
     def _declare_task(
         self,

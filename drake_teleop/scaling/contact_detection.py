@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.load.compensation import scaled_wrench_into
 from drake_teleop.load.detection import (
     MARGIN,
@@ -78,6 +79,8 @@ class ContactDetection(LeafSystem):
     Raises:
         DrakeTeleopError: if the floor was not fitted to a motion.
     """
+
+    __slots__ = ONE_DICT
 
     def __init__(
         self, config: ContactDetectionConfig, floor: NoiseFloor, arm: ArmModel, period: float

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.compensation import scaled_wrench_into, scales_from_eta
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.quantities import quantity
@@ -132,6 +133,8 @@ class ForceScaling(LeafSystem):
         R_WB: (3, 3) alignment of the master's base with the world.
     """
 
+    __slots__ = ONE_DICT
+
     def __init__(
         self, config: ForceScalingConfig, arm: ArmModel, R_WB: NDArray[np.float64]
     ) -> None:
@@ -152,8 +155,10 @@ class ForceScaling(LeafSystem):
             ("non_contact_wrench_S", self._calc_non_contact),
             ("wrench_B", self._calc_wrench_B),
         ):
-            self.DeclareVectorOutputPort(name, 6, calc, inputs)
-        self.DeclareVectorOutputPort("scaled_and_contact_S", 12, self._calc_both, inputs)
+            self.DeclareVectorOutputPort(name, 6, weak_callback(calc), inputs)
+        self.DeclareVectorOutputPort(
+            "scaled_and_contact_S", 12, weak_callback(self._calc_both), inputs
+        )
 
     def SetScales(
         self,

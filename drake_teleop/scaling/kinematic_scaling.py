@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.quantities import quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, normalized, rotate
 
@@ -87,6 +88,8 @@ class KinematicScaling(LeafSystem):
         start: (7,) X_WS commanded at the start.
     """
 
+    __slots__ = ONE_DICT
+
     def __init__(
         self, config: KinematicScalingConfig, period: float, start: NDArray[np.float64]
     ) -> None:
@@ -99,7 +102,7 @@ class KinematicScaling(LeafSystem):
         identity = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
         self.DeclareDiscreteState(np.concatenate([start, identity, [0.0]]))
         sources = {self._pose.ticket(), self.xd_ticket()}
-        self.DeclareVectorOutputPort("pose_command", 7, self._calc_command, sources)
+        self.DeclareVectorOutputPort("pose_command", 7, weak_callback(self._calc_command), sources)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         # The command follows from the first instant on.
         self.DeclareInitializationDiscreteUpdateEvent(self._update)

@@ -19,6 +19,8 @@ from numba import njit
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop.lifetime import ONE_DICT, weak_callback
+
 Array = NDArray[np.float64]
 
 SHOULDER_HEIGHT = 0.420
@@ -270,6 +272,8 @@ class InverseKinematics(LeafSystem):
         upper: (6,) joint limits [rad].
     """
 
+    __slots__ = ONE_DICT
+
     MAX_STEP = 2.0
     """[rad]. More than the quarter turn by which joints 4 and 6 may have to move past q5 = 0."""
 
@@ -280,8 +284,8 @@ class InverseKinematics(LeafSystem):
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._position = self.DeclareVectorInputPort("joint_position", 6)
         inputs = {self.all_input_ports_ticket()}
-        self.DeclareVectorOutputPort("joint_command", 6, self._calc_command, inputs)
-        self.DeclareVectorOutputPort("ik_status", 1, self._calc_status, inputs)
+        self.DeclareVectorOutputPort("joint_command", 6, weak_callback(self._calc_command), inputs)
+        self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status), inputs)
 
     def _solve(self, context: Context, q: np.ndarray) -> int:
         return solve_pose_command(

@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.quantities import quantity
 from drake_teleop.slave.arm import ArmModel, inverse_dynamics
 
@@ -59,6 +60,8 @@ class JointControl(LeafSystem):
         period: sampling period [s].
         q_start: (n,) where it holds the arm before the first sample [rad].
     """
+
+    __slots__ = ONE_DICT
 
     def __init__(
         self,

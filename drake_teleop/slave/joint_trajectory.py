@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.excitation import FourierTrajectory
 
 
@@ -22,10 +23,12 @@ class JointTrajectory(LeafSystem):
         start: when it begins [s].
     """
 
+    __slots__ = ONE_DICT
+
     def __init__(self, trajectory: FourierTrajectory, start: float) -> None:
         super().__init__()
         self._trajectory, self._start = trajectory, start
-        self.DeclareVectorOutputPort("joint_command", len(trajectory.q0), self._calc)
+        self.DeclareVectorOutputPort("joint_command", len(trajectory.q0), weak_callback(self._calc))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         time = np.clip(context.get_time() - self._start, 0.0, self._trajectory.period)

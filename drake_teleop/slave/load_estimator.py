@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.change import change_parameters
 from drake_teleop.load.recursive import RecursiveEstimator, RecursiveLeastSquares
 from drake_teleop.load.recursive_tls import RecursiveTotalLeastSquares
@@ -94,6 +95,8 @@ class LoadEstimator(LeafSystem):
         DrakeTeleopError: if it shall watch, and neither learns nor is given a covariance.
     """
 
+    __slots__ = ONE_DICT
+
     def __init__(
         self,
         config: LoadEstimatorConfig,
@@ -120,7 +123,9 @@ class LoadEstimator(LeafSystem):
         estimate = self.DeclareDiscreteState(start)
         self.DeclareDiscreteState(memory.ravel())
         self.DeclareStateOutputPort("load_estimate", estimate)
-        self.DeclareVectorOutputPort("load_state", 1, self._calc_state, {self.xd_ticket()})
+        self.DeclareVectorOutputPort(
+            "load_state", 1, weak_callback(self._calc_state), {self.xd_ticket()}
+        )
         if config.watch:
             unknown = np.zeros(SIZE)
             self.DeclareDiscreteState(

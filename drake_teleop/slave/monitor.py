@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.slave.arm import ArmModel
 
 
@@ -27,6 +28,8 @@ class SlaveMonitor(LeafSystem):
     Raises:
         DrakeTeleopError: from the simulation, when a joint is outside or not finite.
     """
+
+    __slots__ = ONE_DICT
 
     def __init__(self, arm: ArmModel, period: float) -> None:
         super().__init__()

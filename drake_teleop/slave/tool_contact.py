@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.environment.point_contact import contact_force, indentation
+from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.slave.arm import ArmModel, forward_kinematics, jacobian
 
 
@@ -80,13 +81,15 @@ class ToolContact(LeafSystem):
         moves: whether that is a sheet spring.
     """
 
+    __slots__ = ONE_DICT
+
     def __init__(self, arm: ArmModel, pairs: NDArray[np.float64], *, moves: bool) -> None:
         super().__init__()
         self._n = arm.num_joints
         self._contact, self._at_rest = (arm.table, pairs, np.zeros(6)), np.zeros(2)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._sheet = self.DeclareVectorInputPort("sheet_state", 2) if moves else None
-        self.DeclareVectorOutputPort("true_contact_wrench_W", 6, self._calc)
+        self.DeclareVectorOutputPort("true_contact_wrench_W", 6, weak_callback(self._calc))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         state = self._state.Eval(context)

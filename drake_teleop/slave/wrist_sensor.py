@@ -30,6 +30,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import Demultiplexer, RandomSource
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.slave.arm import (
     MOTION_SIZE,
@@ -281,6 +282,8 @@ class WristSensor(LeafSystem):
             told of: its samples would be wrong.
     """
 
+    __slots__ = ONE_DICT
+
     def __init__(
         self,
         slave: SlavePlant,
@@ -327,7 +330,9 @@ class WristSensor(LeafSystem):
             self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
         self.DeclareDiscreteState(memory)
         self._result = np.zeros(len(first) + len(memory))
-        self._step = self.DeclareVectorOutputPort("step", len(self._result), self._calc_step)
+        self._step = self.DeclareVectorOutputPort(
+            "step", len(self._result), weak_callback(self._calc_step)
+        )
         self.DeclarePerStepDiscreteUpdateEvent(self._update)
         self.DeclarePeriodicPublishEvent(_CHECK_PERIOD, 0.0, self._check)
 
