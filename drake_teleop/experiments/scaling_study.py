@@ -110,7 +110,7 @@ def scaling_study_command(
         "choice": {way: _chosen(found, sigmas, gammas) for way, found in answers.items()},
         "eta": _eta(rows[_OBJECT]),
     }
-    text = json.dumps(summary, indent=2)
+    text = json.dumps(summary, indent=2, allow_nan=False)
     (out / "answer.json").write_text(text + "\n", encoding="utf-8")
     _merits(answers, sigmas, gammas).write_csv(out / "answer.csv")
     criteria_picture(rows, sigmas, gammas).savefig(out / "answer.png")
@@ -140,12 +140,16 @@ def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> An
     ]
     merits = np.mean(parts, axis=0)
     usable = np.all([t["success"].mean(axis=-1) >= 1 - _FAILURES for t in tables.values()], axis=0)
+    # Seeds at which the reference failed say nothing alone.
+    known = np.isfinite(merits[:, usable]).all(axis=1)
     merits[:, ~usable] = np.nan
-    best = np.zeros(usable.shape)
-    if usable.any():
-        flat = np.where(usable, merits[1:], np.inf).reshape(_DRAWS, -1)
-        best = np.bincount(flat.argmin(axis=1), minlength=usable.size) / _DRAWS
-    low, high = np.quantile(merits[1:], [0.025, 0.975], axis=0)
+    drawn, best = merits[1:][known[1:]], np.zeros(usable.size)
+    if not (usable.any() and known[0] and len(drawn)):
+        nothing = np.full(usable.shape, np.nan)
+        return Answer(nothing, nothing, nothing, best.reshape(usable.shape))
+    flat = np.where(usable, drawn, np.inf).reshape(len(drawn), -1)
+    best = np.bincount(flat.argmin(axis=1), minlength=usable.size) / len(drawn)
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
     return Answer(merits[0], low, high, best.reshape(usable.shape))
 
 

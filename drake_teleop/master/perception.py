@@ -31,6 +31,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import checked, checked_rows
 from drake_teleop.quantities import quantity
 
@@ -182,12 +183,18 @@ def perceive(
         (N, 5) excess of the force on the hand (3) [N], threshold [N], 1 while it is noticed.
 
     Raises:
-        DrakeTeleopError: for arrays of the wrong shape or values that are not finite.
+        DrakeTeleopError: for arrays of the wrong shape, values that are not finite, or times that
+            do not rise.
     """
     rows = {"hand_force": (hand_force, 3), "velocity": (velocity, 3)}
     _, (force, speed) = checked_rows(**rows)
     times = checked("t", t, len(force))
-    dt, out = float(np.median(np.diff(times))), np.empty((len(times), PERCEIVED))
+    steps = np.diff(times)
+    if not len(steps) or steps.min() <= 0.0:
+        raise DrakeTeleopError(
+            "does not rise", where="t", remedy="give two samples or more, in order of their time"
+        )
+    dt, out = float(np.median(steps)), np.empty((len(times), PERCEIVED))
     parameters = perception.parameters(dt)
     _perceive_all(times, force, speed, parameters, dt, hand_mass, attentive, initial_memory(), out)
     return out

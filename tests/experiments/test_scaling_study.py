@@ -59,6 +59,16 @@ def test_points_that_fail_too_often_are_no_choice():
     assert found.best[0, 0] == 0.0
 
 
+@pytest.mark.parametrize(("failing", "best"), [(2, 1.0), (3, 0.0)])
+def test_a_reference_that_fails_leaves_the_seeds_at_which_it_does_not(failing, best):
+    rows = tables(seeds=3)
+    rows["press"]["success"][4, 1, :failing] = 0.0
+    rows["press"]["effort"][4, 1, :failing] = np.nan
+    found = answer(rows, ("effort",))
+    assert np.isfinite(found.low).sum() == np.isfinite(found.merit).sum() == 24 * best
+    assert found.best.sum() == pytest.approx(best)
+
+
 def test_more_seeds_make_surer():
     widths = [np.mean(found.high - found.low) for found in (
         answer(tables(seeds, 0.3), ("effort", "time", "force")) for seeds in (10, 160)

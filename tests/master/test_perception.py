@@ -78,3 +78,6 @@ def test_masking_fades_with_its_time_constant():
 def test_a_record_of_the_wrong_shape_is_refused():
     with pytest.raises(DrakeTeleopError, match="velocity"):
         perceive(T, np.zeros((len(T), 3)), np.zeros((len(T), 2)), HUMAN, 0.0)
+    for times in (T[:1], T[::-1]):
+        with pytest.raises(DrakeTeleopError, match="t: does not rise"):
+            perceive(times, np.zeros((len(times), 3)), np.zeros((len(times), 3)), HUMAN, 0.0)
