@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import random
+import shlex
 import signal
 import subprocess
 import sys
@@ -24,8 +26,8 @@ import polars as pl
 _STUDY = """
 scenario: contact_transition
 factors:
-  - {{field: force_scaling.sigma, low: 0, high: 1, levels: {levels}}}
-  - {{field: force_scaling.gamma, low: 0.5, high: 3, levels: {levels}}}
+  - {{field: force_scaling.sigma, low: 0, high: 1, levels: {sigmas}}}
+  - {{field: force_scaling.gamma, low: 0.5, high: 3, levels: {gammas}}}
   - {{field: rates.sensor_hz, values: [2000]}}
   - {{field: rates.hand_hz, values: [1000]}}
   - {{field: rates.joint_control_hz, values: [1000]}}
@@ -53,12 +55,19 @@ def main() -> None:
 def measured(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
     """All figures; the studies lie in `folder`."""
     study = folder / "study.yaml"
-    study.write_text(_STUDY.format(levels=20, repeats=max(arguments.runs // 400, 1)))
+    half = folder / "half.yaml"
     warm = folder / "warm.yaml"  # compiles what is not compiled yet
-    warm.write_text(_STUDY.format(levels=2, repeats=1))
+    repeats = max(arguments.runs // 400, 1)
+    study.write_text(_STUDY.format(sigmas=20, gammas=20, repeats=repeats))
+    half.write_text(_STUDY.format(sigmas=10, gammas=20, repeats=repeats))
+    warm.write_text(_STUDY.format(sigmas=2, gammas=2, repeats=1))
     run(warm, folder / "warm", "--jobs", "1")
-    serial = run(study, folder / "serial", "--jobs", "1")
-    joblib = run(study, folder / "joblib", "--jobs", "2")
+    halves = [command(half, folder / name, "--jobs", "1") for name in ("left", "right")]
+    serial, joblib, apart = by_turns(
+        (command(study, folder / "serial", "--jobs", "1"), 10.0),
+        (command(study, folder / "joblib", "--jobs", "2"), 5.0),
+        (["sh", "-c", " & ".join(map(shlex.join, halves)) + " & wait"], 5.0),
+    )
     same = parts(folder / "serial") == parts(folder / "joblib")
     rows = pl.read_parquet(folder / "serial" / "runs.parquet")
     figures = {
@@ -66,7 +75,9 @@ def measured(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
         "failed": float(rows["error"].count()),
         "one_process_s": serial,
         "two_processes_s": joblib,
+        "two_studies_of_half_s": apart,
         "efficiency": serial / (2 * joblib),
+        "efficiency_of_two_studies": serial / (2 * apart),
         "two_processes_the_same": float(same),
     }
     if not arguments.no_cluster:
@@ -103,6 +114,28 @@ def run(study: Path, out: Path, *options: str) -> float:
     start = time.perf_counter()
     subprocess.run(command(study, out, *options), check=True)
     return time.perf_counter() - start
+
+
+def by_turns(*studies: tuple[list[str], float]) -> list[float]:
+    """Seconds by the clock that each command has run for, a turn of so many seconds each time."""
+    started = [subprocess.Popen(words, start_new_session=True) for words, _ in studies]
+    for process in started:
+        os.killpg(process.pid, signal.SIGSTOP)
+    spent = [0.0] * len(studies)
+    while any(process.returncode is None for process in started):
+        for index, (process, (_, turn)) in enumerate(zip(started, studies, strict=True)):
+            if process.returncode is not None:
+                continue
+            start = time.perf_counter()
+            os.killpg(process.pid, signal.SIGCONT)
+            try:
+                process.wait(turn)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGSTOP)
+            spent[index] += time.perf_counter() - start
+    if any(process.returncode for process in started):
+        raise SystemExit("a study has failed")
+    return spent
 
 
 def killed(study: Path, out: Path, times: int, whole: float) -> int:
