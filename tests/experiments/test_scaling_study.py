@@ -20,7 +20,7 @@ STUDIES = sorted(path.stem for path in studies_dir().glob("*.yaml"))
 def tables(seeds: int = 20, spread: float = 0.05) -> dict[str, dict[str, np.ndarray]]:
     """Effort rises with both, force falls with gamma, time has its least in the middle."""
     noise = np.random.default_rng(0)
-    sigma, gamma = np.meshgrid([0, 0.1, 0.25, 0.5, 1], [0.5, 1, 2, 4, 8], indexing="ij")
+    sigma, gamma = np.meshgrid([0, 0.1, 0.25, 0.5, 1], [0.25, 0.5, 1, 2, 4, 8], indexing="ij")
     means = {
         "effort": 1 + 4 * sigma + 0.2 * gamma,
         "time": 3 + (np.log2(gamma) - 1) ** 2 + sigma,
@@ -28,22 +28,22 @@ def tables(seeds: int = 20, spread: float = 0.05) -> dict[str, dict[str, np.ndar
     }
     return {
         task: {
-            name: means[name][..., None] * (1 + spread * noise.normal(size=(5, 5, seeds)))
+            name: means[name][..., None] * (1 + spread * noise.normal(size=(5, 6, seeds)))
             for name in criteria
         }
-        | {"success": np.ones((5, 5, seeds))}
+        | {"success": np.ones((5, 6, seeds))}
         for task, criteria in TASKS.items()
     }
 
 
 def test_the_best_point_of_each_way_of_counting():
     # (sigma, gamma) as indices: no inertia always; little, medium and much contact.
-    for criteria, best in ((("effort",), (0, 0)), (("time",), (0, 2)), (("force",), None)):
+    for criteria, best in ((("effort",), (0, 0)), (("time",), (0, 3)), (("force",), None)):
         found = answer(tables(), criteria)
         place = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
-        assert place[1] == 4 if best is None else place == best
+        assert place[1] == 5 if best is None else place == best
         assert np.all((found.low <= found.merit) & (found.merit <= found.high))
-        assert found.merit[4, 1] == pytest.approx(1.0)  # the reference against itself
+        assert found.merit[4, 2] == pytest.approx(1.0)  # the reference against itself
         assert found.best.sum() == pytest.approx(1.0)
     assert answer(tables(), ("effort",)).best[0, 0] > 0.95
     # Nothing there depends on sigma, and it does not pretend to know.
@@ -62,10 +62,10 @@ def test_points_that_fail_too_often_are_no_choice():
 @pytest.mark.parametrize(("failing", "best"), [(2, 1.0), (3, 0.0)])
 def test_a_reference_that_fails_leaves_the_seeds_at_which_it_does_not(failing, best):
     rows = tables(seeds=3)
-    rows["press"]["success"][4, 1, :failing] = 0.0
-    rows["press"]["effort"][4, 1, :failing] = np.nan
+    rows["press"]["success"][4, 2, :failing] = 0.0
+    rows["press"]["effort"][4, 2, :failing] = np.nan
     found = answer(rows, ("effort",))
-    assert np.isfinite(found.low).sum() == np.isfinite(found.merit).sum() == 24 * best
+    assert np.isfinite(found.low).sum() == np.isfinite(found.merit).sum() == 29 * best
     assert found.best.sum() == pytest.approx(best)
 
 
@@ -110,9 +110,9 @@ def test_the_answer_of_a_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(scaling_study, "study_command", made_up)
     summary = scaling_study_command(tmp_path, repeats=3)
     assert summary == json.loads((tmp_path / "answer.json").read_text())
-    assert summary["runs"] == 3 * (5 + 3 * 25 + 5)
+    assert summary["runs"] == 3 * (5 + 3 * 30 + 5)
     assert summary["choice"]["effort"]["sigma"] == 0
     assert summary["choice"]["effort"]["merit"] == pytest.approx(0.5)
     assert [row["eta"] for row in summary["eta"]] == [0, 0.25, 0.5, 0.75, 1]
-    assert pl.read_csv(tmp_path / "answer.csv").height == 4 * 25
+    assert pl.read_csv(tmp_path / "answer.csv").height == 4 * 30
     assert (tmp_path / "answer.png").exists() and (tmp_path / "choice.png").exists()
