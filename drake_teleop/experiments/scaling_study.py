@@ -276,7 +276,7 @@ def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list
         for axes, (way, found) in zip(figure.subplots(1, len(WAYS)), answers.items(), strict=True):
             drawn = axes.imshow(found.merit, origin="lower", aspect="auto", cmap="viridis_r")
             axes.grid(False)
-            axes.set_xticks(range(len(gammas)), [f"{gamma:g}" for gamma in gammas])
+            axes.set_xticks(range(len(gammas)), [f"{gamma:g}" for gamma in gammas], fontsize=8)
             axes.set_yticks(range(len(sigmas)), [f"{sigma:g}" for sigma in sigmas])
             axes.set_xlabel("$\\gamma$")
             axes.set_ylabel("$\\sigma$")
