@@ -286,6 +286,7 @@ def draw_detection(found: DetectedLog) -> Any:
         top.plot(t, np.linalg.norm(eliminated.contact[:, :3], axis=1), color=BLUE, label="contact")
         top.axhline(found.force_threshold, color=BLACK, linewidth=0.8, linestyle=":")
         top.set_yscale("symlog", linthresh=1.0)
+        top.set_ylim(bottom=0.0)
         top.set_ylabel("$|F|$ [N]")
         top.set_title("dotted: the same threshold for all motions")
         below.plot(t, found.statistics[:, STATISTICS.index(found.statistic)], color=BLUE)
