@@ -27,8 +27,8 @@ COLUMNS = (
     ("least_energy", "Least energy [J]", 1.0, 3),
 )
 
-# What fits on a terminal of 80 columns; the page has all of them.
-_TERMINAL = ("hunting", "felt_force", "force_error", "drift", "free_force", "rise_delay")
+# What fits on a terminal of 80 columns, first of all what the verdict is from; the page has all.
+_TERMINAL = ("hunting", "turning", "felt_force", "force_error", "free_force", "rise_delay")
 
 Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
 
