@@ -72,7 +72,7 @@ def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figur
                 axes.set_xlim(-0.4, len(names) - 0.6)
             grid[-1, column].set_xlabel(factor.field)
         for axes, measure in zip(grid[:, 0], measures, strict=True):
-            axes.set_ylabel(measure)
+            axes.set_ylabel(measure, fontsize=7)
         figure.suptitle(
             f"Main effects{_caption(study, 'of a level against the mean')}", x=0.01, ha="left"
         )
