@@ -39,8 +39,8 @@ from drake_teleop.analysis.sampled_loop import (
     sampled_loop,
     sampled_two_port,
 )
-from drake_teleop.master.operator import GRIPS
-from drake_teleop.slave.sensor_chain import butterworth_sections
+from drake_teleop.operator.operator import GRIPS
+from drake_teleop.sensor.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
 

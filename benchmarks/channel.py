@@ -13,8 +13,8 @@ import json
 from pathlib import Path
 
 from drake_teleop.channel.channel import Channel
-from drake_teleop.experiments.speed import MakeMovingStation, cpu_seconds
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.reproduction.speed import MakeMovingStation, cpu_seconds
 from drake_teleop.scenario import LoadScenario, replace
 
 

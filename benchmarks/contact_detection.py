@@ -35,9 +35,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.load.batch import identify_batch
+from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.detection import (
+from drake_teleop.load.contact.detection import (
     STATISTICS,
     NoiseFloor,
     auc,

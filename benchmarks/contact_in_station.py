@@ -36,19 +36,19 @@ from numpy.typing import NDArray
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import PRESETS
-from drake_teleop.experiments.identification import (
+from drake_teleop.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.identification import (
     identification_scenario,
     identify_load,
     sensor_samples,
     slave_arm,
 )
-from drake_teleop.experiments.progress import progress_bars
-from drake_teleop.experiments.run import in_contact
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.detection import NoiseFloor
-from drake_teleop.master.operator import OperatorConfig, Sine
+from drake_teleop.load.contact.detection import NoiseFloor
+from drake_teleop.operator.operator import OperatorConfig, Sine
+from drake_teleop.pages.progress import progress_bars
 from drake_teleop.result import SimulationResult
-from drake_teleop.scaling.contact_detection import ContactDetectionConfig
+from drake_teleop.run import in_contact
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import accelerations

@@ -24,8 +24,8 @@ from drake_teleop.analysis.frequency_response import (
 )
 from drake_teleop.analysis.task_direction import task_direction
 from drake_teleop.environment.sheet_spring import SheetSpring
-from drake_teleop.experiments.identification import slave_arm
-from drake_teleop.master.operator import MinimumJerk
+from drake_teleop.identification import slave_arm
+from drake_teleop.operator.operator import MinimumJerk
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 
 _UP = (0.0, 0.0, 1.0)

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, lfilter
 
+from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.identification import PARAMETERS, Identification, identify
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.uncertainty import intervals
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ After 3 s, nothing happens, or 0.8 kg are grasped or released within 50 ms, or s
     hand     2 to 30 N that vary by 40 % with 0.3 to 3 Hz, any direction, 4 s
     along g  2 to 25 N, constant, up or down, 3 s: as a weight that has no inertia
 
-States are those of `drake_teleop.load.change`. Times are per sample in one compiled loop, against
-recursive least squares.
+States are those of `drake_teleop.load.online.change`. Times are per sample in one compiled loop,
+against recursive least squares.
 
     python benchmarks/load_change.py [--seeds 500] [--json FILE]
 """
@@ -25,13 +25,13 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.load.batch import identify_batch
-from drake_teleop.load.change import STATES, LoadChangeMonitor
+from drake_teleop.load.batch.methods import identify_batch
+from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.gripper import identified_object
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.moments import Noise
-from drake_teleop.load.recursive import RecursiveLeastSquares
+from drake_teleop.load.online.change import STATES, LoadChangeMonitor
+from drake_teleop.load.online.recursive import RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench
 
 PERIOD, DURATION, EVENT = 1e-3, 10.0, 3.0

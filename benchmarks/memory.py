@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.master.operator import Sine
+from drake_teleop.operator.operator import Sine
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation

@@ -28,16 +28,13 @@ from scipy.interpolate import make_interp_spline
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import identify
 from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.slave.arm import sensor_motion
-from drake_teleop.slave.inverse_kinematics import nearest_branch
-from drake_teleop.slave.motion_estimation import (
+from drake_teleop.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_into,
     motion_estimator,
     path_delays,
 )
-from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, home_position
-from drake_teleop.slave.sensor_chain import (
+from drake_teleop.sensor.sensor_chain import (
     NOISE_SIZE,
     PRESETS,
     WristSensorConfig,
@@ -45,6 +42,9 @@ from drake_teleop.slave.sensor_chain import (
     sensor_chain,
     without,
 )
+from drake_teleop.slave.arm import sensor_motion
+from drake_teleop.slave.inverse_kinematics import nearest_branch
+from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, home_position
 
 Array = NDArray[np.float64]
 

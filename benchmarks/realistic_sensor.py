@@ -27,22 +27,21 @@ from rich.console import Console
 from rich.table import Table
 
 from drake_teleop import scenario as scenarios
-from drake_teleop.experiments.identification import (
+from drake_teleop.identification import (
     batch_identification,
     identify_load,
     sensor_samples,
     slave_arm,
 )
+from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.excitation import FourierTrajectory
 from drake_teleop.load.identification import Identification, identify
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.load.uncertainty import intervals
+from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.motion_estimation import estimate_into, motion_estimator
-from drake_teleop.slave.sensor_chain import (
+from drake_teleop.sensor.motion_estimation import estimate_into, motion_estimator
+from drake_teleop.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
     PARTS,
@@ -51,6 +50,7 @@ from drake_teleop.slave.sensor_chain import (
     sensor_chain,
     without,
 )
+from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
 
 Array = NDArray[np.float64]

@@ -1,7 +1,7 @@
 """Does every method recover from every random network, and never push harder than it may?
 
 `python benchmarks/recovery.py [--json] [--networks N]` presses on a wall of 0.1 to 5 kN/m with
-`drake_teleop.experiments.one_dof` over N (10 000) pairs of random lines: delay up to 300 ms, jitter
+`drake_teleop.comparison.one_dof` over N (10 000) pairs of random lines: delay up to 300 ms, jitter
 up to 100 %, loss up to 50 %, bursts that lose 50 to 100 % and often last longer than the watchdog's
 0.1 s. At 4.5 s, in contact, the lines become good: 10 ms and no loss. The hand lets go and rests. A
 method has recovered if at the end the slave is within 2 mm of the hand, which is at rest within
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.experiments.one_dof import (
+from drake_teleop.comparison.one_dof import (
     PERIOD,
     OneDof,
     OneDofRun,

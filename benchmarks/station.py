@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from drake_teleop.experiments.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
-from drake_teleop.master.operator import MinimumJerk
+from drake_teleop.operator.operator import MinimumJerk
+from drake_teleop.reproduction.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import advance, simulate
 from drake_teleop.station import MakeTeleopStation

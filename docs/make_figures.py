@@ -18,15 +18,15 @@ from matplotlib.axes import Axes
 from matplotlib.patches import FancyBboxPatch
 from scipy.signal import welch
 
-from drake_teleop.experiments.reproduce import reproduce_command
-from drake_teleop.slave.sensor_chain import PRESETS, without
-from drake_teleop.slave.sensor_noise import (
+from drake_teleop.pages.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, house_style
+from drake_teleop.reproduction.reproduce import reproduce_command
+from drake_teleop.sensor.sensor_chain import PRESETS, without
+from drake_teleop.sensor.sensor_noise import (
     allan_deviation,
     predicted_allan_deviation,
     rest_record,
     spectral_density,
 )
-from drake_teleop.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, house_style
 
 FIGURES = Path(__file__).parent / "figures"
 

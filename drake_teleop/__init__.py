@@ -16,14 +16,14 @@ from drake_teleop._version import __version__
 from drake_teleop.errors import DrakeTeleopError
 
 if TYPE_CHECKING:
-    from drake_teleop.experiments.identification import identify_load
-    from drake_teleop.experiments.run import run_scenario
+    from drake_teleop.identification import identify_load
     from drake_teleop.load.compensation import contact_wrench, scaled_wrench
     from drake_teleop.load.identification import Identification, identify
     from drake_teleop.load.regressor import non_contact_wrench, regressor
     from drake_teleop.logs.processing import eliminate_log, identify_log
-    from drake_teleop.logs.reading import read_log
+    from drake_teleop.logs.read.reading import read_log
     from drake_teleop.result import SimulationResult
+    from drake_teleop.run import run_scenario
     from drake_teleop.scenario import LoadScenario, Scenario, ScenarioNames
     from drake_teleop.simulation import simulate
     from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
@@ -54,13 +54,13 @@ __all__ = [
 ]
 
 _HOMES = {
-    "experiments.identification": ("identify_load",),
-    "experiments.run": ("run_scenario",),
+    "identification": ("identify_load",),
+    "run": ("run_scenario",),
     "load.compensation": ("contact_wrench", "scaled_wrench"),
     "load.identification": ("Identification", "identify"),
     "load.regressor": ("non_contact_wrench", "regressor"),
     "logs.processing": ("eliminate_log", "identify_log"),
-    "logs.reading": ("read_log",),
+    "logs.read.reading": ("read_log",),
     "result": ("SimulationResult",),
     "scenario": ("LoadScenario", "Scenario", "ScenarioNames"),
     "simulation": ("simulate",),

@@ -93,7 +93,7 @@ def reproduce(out: Path, seed: int | None, quiet: bool) -> None:
 
     Writes the paper's figures and numbers next to ours, a replay and report.html.
     """
-    from drake_teleop.experiments.reproduce import reproduce_command
+    from drake_teleop.reproduction.reproduce import reproduce_command
 
     reproduce_command(out, seed=seed, quiet=quiet)
 
@@ -108,7 +108,7 @@ def run(scenario: str, out: Path, seed: int | None, quiet: bool) -> None:
 
     SCENARIO is the name of a shipped one or a YAML file. Writes its log and its pictures.
     """
-    from drake_teleop.experiments.run import run_command
+    from drake_teleop.run import run_command
 
     run_command(scenario, out, seed=seed, quiet=quiet)
 
@@ -292,7 +292,7 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
     LOG is a canonical log, a log description (.yaml), or a table of any columns, for which a draft
     description is written. Rates, gaps, noise, saturation and suspected errors of convention.
     """
-    from drake_teleop.logs.inspection import inspect_command
+    from drake_teleop.logs.check.inspection import inspect_command
 
     inspect_command(log, out, quiet=quiet)
 
@@ -327,7 +327,7 @@ def analyze(scenario: str, direction: str, out: Path, quiet: bool) -> None:
     SCENARIO is the name of a shipped one or a YAML file. Linearises the station itself: margins,
     passivity, felt impedance, maps over two parameters. Writes pictures and report.html.
     """
-    from drake_teleop.experiments.analyze import analyze_command
+    from drake_teleop.analysis.analyze import analyze_command
 
     analyze_command(scenario, out, direction=direction, quiet=quiet)
 
@@ -354,7 +354,7 @@ def compare_passivity(
     The whole station swings freely and presses on a leaf, soft and stiff; a one-degree-of-freedom
     reference says how long a round trip each method bears. Writes tables, pictures, report.html.
     """
-    from drake_teleop.experiments import compare_passivity as study
+    from drake_teleop.comparison import compare_passivity as study
 
     study.compare_command(
         out,
@@ -385,7 +385,7 @@ def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: 
     Writes one table with a row for each run, and pictures. If it was stopped or killed, the same
     command goes on where it was.
     """
-    from drake_teleop.experiments.study import study_command
+    from drake_teleop.studies.study import study_command
 
     study_command(study, out, jobs=jobs or -1, cluster=cluster, quiet=quiet)
 
@@ -410,7 +410,7 @@ def scaling_study(
     Studies its tasks over sigma, gamma and eta, in about 1000 runs. If it was stopped or
     killed, the same command goes on where it was.
     """
-    from drake_teleop.experiments.scaling_study import scaling_study_command
+    from drake_teleop.studies.scaling_study import scaling_study_command
 
     scaling_study_command(out, jobs=jobs or -1, cluster=cluster, repeats=repeats, quiet=quiet)
 
@@ -492,7 +492,7 @@ def excite(
     For the slave of SCENARIO, or with --model for another arm with SCENARIO's sensor. A Fourier
     series from rest to rest, optimised, and checked against every limit and for collisions.
     """
-    from drake_teleop.experiments.excite import excite_command
+    from drake_teleop.excitation.command import excite_command
 
     excite_command(
         scenario,

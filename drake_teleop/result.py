@@ -268,7 +268,7 @@ class SimulationResult:
         Raises:
             KeyError: for an unknown name.
         """
-        from drake_teleop.style import Picture, house_style, shade_contact
+        from drake_teleop.pages.style import Picture, house_style, shade_contact
 
         panels = [panel for name in names or self.signals for panel in self._panels(name)]
         with house_style():

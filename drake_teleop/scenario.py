@@ -17,20 +17,20 @@ from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.master.device import JointFriction
-from drake_teleop.master.operator import OperatorConfig
-from drake_teleop.master.task import check_task
+from drake_teleop.operator.operator import OperatorConfig
+from drake_teleop.operator.task import check_task
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.quantities import check_ranges, check_structure, choice, quantity
 from drake_teleop.resources import scenarios_dir
-from drake_teleop.scaling.contact_detection import ContactDetectionConfig
 from drake_teleop.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
+from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
+from drake_teleop.sensor.sensor_chain import WristSensorConfig, preset_of
 from drake_teleop.slave.joint_control import JointControlConfig
-from drake_teleop.slave.load_estimator import LoadEstimatorConfig
-from drake_teleop.slave.motion_estimation import MotionEstimationConfig
 from drake_teleop.slave.payload import Payload
-from drake_teleop.slave.sensor_chain import WristSensorConfig, preset_of
 
 #: What fixed steps need in contact [s]: ball on leaf vibrate at up to 700 Hz.
 _CONTACT_STEP = 1.25e-4

@@ -37,7 +37,10 @@ SIGNALS = {
             "offsets and phi, Eq. (7)",
         ),
         _signal(
-            "load_state", "state", "1", "learning, settled, disturbed, changed: load/watched.py"
+            "load_state",
+            "state",
+            "1",
+            "learning, settled, disturbed, changed: load/online/watched.py",
         ),
         _signal("scaled_wrench_S", *_WRENCH, "F' of Fig. 2, before the scale to the master"),
         _signal("contact_wrench_S", *_WRENCH, "Eq. (13), calculated contact wrench"),
@@ -51,7 +54,7 @@ SIGNALS = {
             "phase outcome noticed threshold trust",
             "1,1,1,N,1",
             "of the operator's task: phase, 1 done or -1 given up, 1 while contact is noticed, from"
-            " which felt force on it is, and trust: master/task.py",
+            " which felt force on it is, and trust: operator/task.py",
         ),
         _signal("pose_master", *_POSE, "of the stylus, X_BE"),
         _signal("twist_master", *_TWIST, "of the stylus in the device's base"),

@@ -16,27 +16,27 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer, PassThrough
 from drake_teleop.channel.channel import TeleopChannel
 from drake_teleop.channel.network import NetworkConfig, mean_delay
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.detection import NoiseFloor
-from drake_teleop.load.excitation import FourierTrajectory
+from drake_teleop.estimation.contact_detection import ContactDetection
+from drake_teleop.estimation.load_estimator import LoadEstimator
+from drake_teleop.load.contact.detection import NoiseFloor
+from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.master import device
 from drake_teleop.master.device import MasterDevice
 from drake_teleop.master.force_display import ForceDisplay
-from drake_teleop.master.operator import Operator
-from drake_teleop.master.task import Training
-from drake_teleop.scaling.contact_detection import ContactDetection
+from drake_teleop.operator.operator import Operator
+from drake_teleop.operator.task import Training
 from drake_teleop.scaling.force_scaling import ForceScaling
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.scenario import Scenario
+from drake_teleop.sensor.motion_estimation import estimated_motion_std
+from drake_teleop.sensor.wrist_sensor import AddWristSensor, sample_parts
 from drake_teleop.signals import LOG
 from drake_teleop.slave.inverse_kinematics import InverseKinematics
 from drake_teleop.slave.joint_control import JointControl
 from drake_teleop.slave.joint_trajectory import JointTrajectory
-from drake_teleop.slave.load_estimator import LoadEstimator
 from drake_teleop.slave.monitor import SlaveMonitor
-from drake_teleop.slave.motion_estimation import estimated_motion_std
 from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, SlavePlant
 from drake_teleop.slave.tool_contact import ToolContact
-from drake_teleop.slave.wrist_sensor import AddWristSensor, sample_parts
 
 _SLAVE_WIRES = (
     ("joint_control.joint_torque", "slave_plant.rx90_actuation"),

@@ -30,7 +30,7 @@ from drake_teleop.analysis.sampled_loop import (
 )
 from drake_teleop.analysis.task_direction import OneAxisFromScenario, task_direction
 from drake_teleop.analysis.two_port import absorb, hybrid
-from drake_teleop.experiments.identification import slave_arm
+from drake_teleop.identification import slave_arm
 from drake_teleop.scenario import LoadScenario
 from drake_teleop.scenario import replace as with_values
 

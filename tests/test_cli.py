@@ -106,7 +106,7 @@ def test_bad_input_is_one_error_line(capsys, install, exception, status, message
     def fail(*arguments, **options):
         raise exception
 
-    install("drake_teleop.experiments.run", "run_command", fail)
+    install("drake_teleop.run", "run_command", fail)
     assert run_main(capsys, "run", "x") == (status, "", message + "\n")
 
 
@@ -114,7 +114,7 @@ def test_ctrl_c_is_status_130_and_no_traceback(capsys, install):
     def interrupt(*arguments, **options):
         raise KeyboardInterrupt
 
-    install("drake_teleop.experiments.run", "run_command", interrupt)
+    install("drake_teleop.run", "run_command", interrupt)
     status, out, err = run_main(capsys, "run", "x")
     assert (status, out, err.split()) == (130, "", ["interrupted"])
 
@@ -123,7 +123,7 @@ def test_programming_mistakes_keep_their_traceback(install):
     def mistake(*arguments, **options):
         raise TypeError("a bug")
 
-    install("drake_teleop.experiments.run", "run_command", mistake)
+    install("drake_teleop.run", "run_command", mistake)
     with pytest.raises(TypeError, match="a bug"):
         cli.main(["run", "x"])
 
@@ -134,8 +134,8 @@ def test_options_reach_the_commands(capsys, install):
     def note(*arguments, **options):
         calls.append((arguments, options))
 
-    install("drake_teleop.experiments.run", "run_command", note)
-    install("drake_teleop.experiments.reproduce", "reproduce_command", note)
+    install("drake_teleop.run", "run_command", note)
+    install("drake_teleop.reproduction.reproduce", "reproduce_command", note)
     install("drake_teleop.logs.commands", "identify_command", note)
     status, out, err = run_main(capsys, "run", "contact_transition", "--seed", "7", "--quiet")
     assert (status, out, err) == (0, "", "")

@@ -24,7 +24,7 @@ from drake_teleop.resources import models_dir, scenarios_dir
 home = Path(drake_teleop.__file__).parent
 assert home.parent.name == "site-packages", home
 assert models_dir() == home / "models" and scenarios_dir() == home / "scenarios"
-assert files("drake_teleop.experiments").joinpath("report.html.j2").is_file()
+assert files("drake_teleop.reproduction").joinpath("report.html.j2").is_file()
 for name in drake_teleop.ScenarioNames():
     scenario = drake_teleop.LoadScenario(name)
     station = drake_teleop.MakeTeleopStation(scenario, load_estimate=[0.0] * 16)

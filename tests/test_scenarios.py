@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.experiments.identification import slave_arm
+from drake_teleop.identification import slave_arm
 from drake_teleop.master import device
 from drake_teleop.scenario import LoadScenario, ScenarioNames, replace
 from drake_teleop.simulation import simulate

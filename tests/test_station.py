@@ -14,14 +14,14 @@ from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.load.compensation import scaled_wrench
-from drake_teleop.load.detection import NoiseFloor
-from drake_teleop.load.excitation import FourierTrajectory
+from drake_teleop.load.contact.detection import NoiseFloor
+from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.master import device
 from drake_teleop.master.device import JointFriction
-from drake_teleop.master.operator import OperatorConfig, Sine
-from drake_teleop.master.task import Touch
-from drake_teleop.scaling.contact_detection import ContactDetectionConfig
+from drake_teleop.operator.operator import OperatorConfig, Sine
+from drake_teleop.operator.task import Touch
 from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.signals import SIGNALS
 from drake_teleop.simulation import MakeSimulator, advance, simulate

@@ -15,7 +15,7 @@ import pytest
 
 from drake_teleop import simulation
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master.operator import OperatorConfig, Sine
+from drake_teleop.operator.operator import OperatorConfig, Sine
 from drake_teleop.result import Signal, SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.simulation import MakeSimulator, advance, read_log, simulate

@@ -275,7 +275,7 @@ class ImpedanceRange:
 
 def range_of_grips() -> ImpedanceRange:
     """From the lightest to the firmest hand of the station's operator."""
-    from drake_teleop.master.operator import GRIPS
+    from drake_teleop.operator.operator import GRIPS
 
     mass, damping, stiffness = (
         (min(values), max(values))

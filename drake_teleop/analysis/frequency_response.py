@@ -23,7 +23,7 @@ from drake_teleop.analysis.linearization import delays, linearize_station
 from drake_teleop.analysis.one_axis import Complex
 from drake_teleop.analysis.task_direction import TaskDirection
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master.operator import MinimumJerk, OperatorConfig, Sine
+from drake_teleop.operator.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.simulation import simulate

@@ -46,9 +46,9 @@ from drake_teleop.master import device
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.scenario import Scenario, replace
+from drake_teleop.sensor.sensor_chain import without
 from drake_teleop.simulation import MakeSimulator
 from drake_teleop.slave.arm import ArmModelFromPlant, jacobian
-from drake_teleop.slave.sensor_chain import without
 from drake_teleop.station import MakeTeleopStation
 
 Array = NDArray[np.float64]

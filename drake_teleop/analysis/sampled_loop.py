@@ -39,7 +39,7 @@ from scipy.linalg import matrix_balance, schur
 
 from drake_teleop.analysis.one_axis import Complex, OneAxis
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.slave.sensor_chain import butterworth_sections
+from drake_teleop.sensor.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
 

@@ -56,8 +56,8 @@ from drake_teleop.passivity.safe_state import (
 )
 from drake_teleop.quantities import choice, quantity
 from drake_teleop.quaternions import quaternion_of
+from drake_teleop.sensor.wrist_sensor import sample_parts
 from drake_teleop.slave.arm import ArmModel, forward_kinematics
-from drake_teleop.slave.wrist_sensor import sample_parts
 
 _NETWORKS = ("custom", *PRESETS)
 
@@ -344,7 +344,7 @@ class TeleopChannel(LeafSystem):
         - pose_command: (7,) X_WS, after kinematic scaling
         - wrench_B: (6,) F_E_B, what the hand should feel, from force scaling [N, N m]
         - hand_wrench_E: (6,) of the hand on the stylus at E, in B [N, N m]
-        - sample: the wrist sensor's, see `drake_teleop.slave.wrist_sensor.sample_parts`
+        - sample: the wrist sensor's, see `drake_teleop.sensor.wrist_sensor.sample_parts`
         - contact: (1,) whether the slave's detector notices a contact; unconnected 0
         output_ports:
         - pose_received: (7,) X_WS that the slave shall follow

@@ -171,7 +171,7 @@ def mean_delay(config: NetworkConfig) -> float:
 def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
     """(N,) delays in steps, for packets sent one a period; -1 where the packet is lost."""
     # The reader of tables is not needed by those who have no trace, and takes its time to start.
-    from drake_teleop.logs.tables import read_table
+    from drake_teleop.logs.read.tables import read_table
 
     table = read_table(path)
     time = table.numbers(["time"], 1, str(path))[:, 0]

@@ -18,7 +18,7 @@ from pydrake.multibody.tree import BodyIndex, Frame, MultibodyForces, SpatialIne
 
 from drake_teleop.excitation.limits import LIMITS
 from drake_teleop.excitation.robot import Robot
-from drake_teleop.load.excitation import FourierTrajectory
+from drake_teleop.load.trajectory import FourierTrajectory
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.excitation.problem import Evaluation, Problem, Task
-from drake_teleop.load.excitation import FourierTrajectory
+from drake_teleop.load.trajectory import FourierTrajectory
 
 Array = NDArray[np.float64]
 

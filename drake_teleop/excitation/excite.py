@@ -23,7 +23,7 @@ from drake_teleop.excitation.limits import (
 from drake_teleop.excitation.prediction import predicted_deviations
 from drake_teleop.excitation.problem import Task
 from drake_teleop.excitation.robot import Robot
-from drake_teleop.load.excitation import FourierTrajectory
+from drake_teleop.load.trajectory import FourierTrajectory
 
 Array = NDArray[np.float64]
 

@@ -22,12 +22,12 @@ from scipy.signal import bilinear, lfilter
 
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.load.regressor import regressor
-from drake_teleop.slave.motion_estimation import (
+from drake_teleop.sensor.motion_estimation import (
     MotionEstimationConfig,
     SteadyState,
     motion_gains,
 )
-from drake_teleop.slave.sensor_chain import WristSensorConfig
+from drake_teleop.sensor.sensor_chain import WristSensorConfig
 
 Array = NDArray[np.float64]
 

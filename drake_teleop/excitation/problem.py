@@ -17,7 +17,7 @@ from drake_teleop.excitation.limits import (
     motions_of,
     sensor_vectors,
 )
-from drake_teleop.load.excitation import FourierTrajectory
+from drake_teleop.load.trajectory import FourierTrajectory
 
 Array = NDArray[np.float64]
 

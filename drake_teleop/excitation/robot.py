@@ -43,11 +43,11 @@ from drake_teleop.excitation.models import ParseModel
 from drake_teleop.excitation.prediction import SensorNoise, sensor_noise
 from drake_teleop.load.inertia import inertia_about_origin, phi_from_mass_com_inertia
 from drake_teleop.scenario import Scenario
+from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
+from drake_teleop.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.slave.arm import ArmModel, ArmModelFromPlant
-from drake_teleop.slave.motion_estimation import MotionEstimationConfig
 from drake_teleop.slave.payload import AddPayload
 from drake_teleop.slave.plant import AddEnvironment, ParseSlave, finalize, home_position
-from drake_teleop.slave.sensor_chain import WristSensorConfig
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ delay_source           "given", "estimated" (from this record), "load" (of the l
                        "static" (poses at rest have none)
 notes                  what had to be assumed, and the findings, in words
 findings               list of name and message: suspected errors of the description; see
-                       `drake_teleop.logs.inspection`. Only looked for if the fit is poor
+                       `drake_teleop.logs.check.inspection`. Only looked for if the fit is poor
 ====================== ==========================================================================
 
 ====================== ==========================================================================
@@ -84,13 +84,13 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.load.batch import DEFAULT_METHOD
+from drake_teleop.load.batch.methods import DEFAULT_METHOD
+from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.gripper import SIGNIFICANT, consistency_margin, identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
-from drake_teleop.load.uncertainty import intervals
-from drake_teleop.logs.canonical import WRENCH
 from drake_teleop.logs.contact import contacts_of, noise_floor
 from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog, eliminate_log, identify_log
+from drake_teleop.logs.read.canonical import WRENCH
 
 
 def identify_command(
@@ -109,7 +109,7 @@ def identify_command(
     pictures; report.png, both on one page.
 
     Args:
-        method: of the fit, one of `drake_teleop.load.batch.METHODS`.
+        method: of the fit, one of `drake_teleop.load.batch.methods.METHODS`.
         gripper: identification.json of the gripper alone; then the object's object.json, of the
             same format, is written too (see `drake_teleop.load.gripper`).
 

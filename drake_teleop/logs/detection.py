@@ -9,7 +9,7 @@ free                   the log of free motion that floor and threshold are of; n
                        of the log itself in which nothing stands out
                        (`drake_teleop.logs.contact.in_contact`)
 free_s                 how much free motion that was
-statistic, threshold   see `drake_teleop.load.detection`
+statistic, threshold   see `drake_teleop.load.contact.detection`
 noise                  [f; tau], standard deviation at rest
 per_acceleration       (6, 2) how it grows per m/s^2 and per rad/s^2
 above_threshold        share of the samples whose statistic reaches the threshold
@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.detection import (
+from drake_teleop.load.contact.detection import (
     MARGIN,
     STATISTICS,
     ContactDetector,
@@ -47,10 +47,10 @@ from drake_teleop.load.detection import (
     wrench_axis,
 )
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.alignment import low_pass
 from drake_teleop.logs.commands import common_figures, plain, print_results, write_summary
 from drake_teleop.logs.contact import contacts_of
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
+from drake_teleop.logs.read.alignment import low_pass
 
 # Where the orientation is not known, gravity is what is slower than this in the specific force.
 _GRAVITY_HZ = 0.5
@@ -261,7 +261,7 @@ def _contacts(found: DetectedLog) -> list[dict[str, Any]]:
 def _write_table(found: DetectedLog, path: Path) -> None:
     import polars as pl
 
-    from drake_teleop.logs.canonical import WRENCH
+    from drake_teleop.logs.read.canonical import WRENCH
 
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
     columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTICS)}
@@ -271,7 +271,7 @@ def _write_table(found: DetectedLog, path: Path) -> None:
 
 def draw_detection(found: DetectedLog) -> Any:
     """|F| without and with the load's own on top; below, the statistic and its threshold."""
-    from drake_teleop.style import BLACK, BLUE, ORANGE, Picture, house_style, shade_contact
+    from drake_teleop.pages.style import BLACK, BLUE, ORANGE, Picture, house_style, shade_contact
 
     eliminated = found.eliminated
     t = eliminated.log.t

@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.identification import VERDICTS, Identification, natural_scale
-from drake_teleop.load.uncertainty import intervals
-from drake_teleop.logs.canonical import Log
 from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
-from drake_teleop.style import (
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.pages.style import (
     BLACK,
     BLUE,
     GREEN,

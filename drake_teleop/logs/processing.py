@@ -10,21 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.batch import DEFAULT_METHOD, identify_batch
+from drake_teleop.load.batch.methods import DEFAULT_METHOD, identify_batch
+from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta
 from drake_teleop.load.gripper import identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.online.segments import Segment, segments
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.segments import Segment, segments
-from drake_teleop.load.uncertainty import BaseParameters, base_parameters
-from drake_teleop.logs.alignment import low_pass, low_passed, measured, undelayed
-from drake_teleop.logs.canonical import Log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
+from drake_teleop.logs.check.conventions import Finding, check_log, question_fit
 from drake_teleop.logs.contact import in_contact, noise_floor
-from drake_teleop.logs.conventions import Finding, check_log, question_fit
-from drake_teleop.logs.delay import estimate_delay
-from drake_teleop.logs.reading import read_log
+from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.delay import estimate_delay
+from drake_teleop.logs.read.reading import read_log
 
 _FEWEST_TO_TARE = 10
 
@@ -110,13 +110,13 @@ def identify_log(
 
     Args:
         path: canonical table or log description.
-        method: one of `drake_teleop.load.batch.METHODS`; the motion is taken as exact.
+        method: one of `drake_teleop.load.batch.methods.METHODS`; the motion is taken as exact.
         cutoff_hz: of the low-pass; None for none.
         delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
 
     Raises:
         DrakeTeleopError: if the log cannot be used, the method is unknown, or the result would be
-            worthless, see `drake_teleop.logs.conventions.question_fit`.
+            worthless, see `drake_teleop.logs.check.conventions.question_fit`.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz)
     delay_s, source = _delay(log, cutoff_hz, delay)

@@ -14,8 +14,8 @@ from drake_teleop.load.compensation import scaled_wrench_into, scales_from_eta
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.quantities import quantity
 from drake_teleop.scaling.wrench_mapping import wrench_to_master_into
+from drake_teleop.sensor.wrist_sensor import sample_parts
 from drake_teleop.slave.arm import ArmModel, forward_kinematics
-from drake_teleop.slave.wrist_sensor import sample_parts
 
 #: sigma_gripper, sigma_object, gamma that leave the contact wrench alone, Eq. (13).
 _ELIMINATION = np.array([0.0, 0.0, 1.0])
@@ -118,7 +118,7 @@ class ForceScaling(LeafSystem):
 
         name: ForceScaling
         input_ports:
-        - sample: the wrist sensor's, see `drake_teleop.slave.wrist_sensor.sample_parts`
+        - sample: the wrist sensor's, see `drake_teleop.sensor.wrist_sensor.sample_parts`
         - load_estimate: (16,) Eq. (7), [offsets; phi]
         output_ports:
         - scaled_wrench_S: F' of Fig. 2

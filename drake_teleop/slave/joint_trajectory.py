@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.lifetime import ONE_DICT, weak_callback
-from drake_teleop.load.excitation import FourierTrajectory
+from drake_teleop.load.trajectory import FourierTrajectory
 
 
 class JointTrajectory(LeafSystem):

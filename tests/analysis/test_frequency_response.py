@@ -13,8 +13,8 @@ from drake_teleop.analysis.frequency_response import (
 )
 from drake_teleop.analysis.task_direction import task_direction
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.experiments.identification import slave_arm
-from drake_teleop.master.operator import intent_at
+from drake_teleop.identification import slave_arm
+from drake_teleop.operator.operator import intent_at
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 
 UP = (0.0, 0.0, 1.0)

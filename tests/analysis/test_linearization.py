@@ -20,9 +20,9 @@ from drake_teleop.analysis.two_port import hybrid
 from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.experiments.identification import slave_arm
+from drake_teleop.identification import slave_arm
 from drake_teleop.master import device
-from drake_teleop.master.operator import MinimumJerk, OperatorConfig
+from drake_teleop.operator.operator import MinimumJerk, OperatorConfig
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import MakeSimulator, read_log

@@ -11,7 +11,7 @@ from drake_teleop.analysis.maps import StabilityMap, distortion, stability_map
 from drake_teleop.analysis.one_axis import OneAxis
 from drake_teleop.analysis.sampled_loop import Sampling, cut_loop, growth_rate, sampled_loop
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master.operator import GRIPS
+from drake_teleop.operator.operator import GRIPS
 
 JR3 = Sampling(low_pass_hz=500.0)
 MEDIUM = OneAxis()

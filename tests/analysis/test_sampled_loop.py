@@ -30,7 +30,7 @@ from drake_teleop.analysis.sampled_loop import (
     unstable_multipliers,
 )
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master.operator import GRIPS
+from drake_teleop.operator.operator import GRIPS
 
 STATION = Sampling()
 JR3 = Sampling(low_pass_hz=500.0)

@@ -8,7 +8,7 @@ from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.experiments.identification import slave_arm
+from drake_teleop.identification import slave_arm
 from drake_teleop.master import device
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 

@@ -10,7 +10,7 @@ from drake_teleop.channel import channel
 from drake_teleop.channel.channel import Channel, channel_step
 from drake_teleop.channel.network import PRESETS, NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master.operator import OperatorConfig, Sine
+from drake_teleop.operator.operator import OperatorConfig, Sine
 from drake_teleop.passivity.safe_state import RESUME, STOP
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.simulation import simulate

@@ -14,7 +14,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.environment.point_contact import ContactPairs, indentation
 from drake_teleop.environment.slot import PEG_RADIUS, TIP_BALL, UPPER_BALL, Slot, TouchAsSlot
-from drake_teleop.experiments.replay import ReplayScene
+from drake_teleop.replay import ReplayScene
 from drake_teleop.scenario import LoadScenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import forward_kinematics, jacobian

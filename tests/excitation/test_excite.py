@@ -19,18 +19,18 @@ from drake_teleop.excitation.excite import excite, sensor_motion
 from drake_teleop.excitation.limits import LIMITS, empty_motions, motions_of, sensor_vectors
 from drake_teleop.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
-from drake_teleop.experiments.identification import identify_load
-from drake_teleop.load.excitation import FourierTrajectory
+from drake_teleop.identification import identify_load
 from drake_teleop.load.identification import Identification, identify
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.slave.motion_estimation import (
+from drake_teleop.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_into,
     motion_estimator,
 )
-from drake_teleop.slave.sensor_chain import (
+from drake_teleop.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
     PRESETS,

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from load_cases import OFFSETS, TOOL, rich_motion, rotations
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.batch import METHODS, NAMES, Options, Record, identify_batch
-from drake_teleop.load.consistent import Prior
+from drake_teleop.load.batch.consistent import Prior
+from drake_teleop.load.batch.methods import METHODS, NAMES, Options, Record, identify_batch
+from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.identification import METHODS as KNOWN_NAMES
 from drake_teleop.load.identification import Identification, identify
 from drake_teleop.load.inertia import (
@@ -22,7 +23,6 @@ from drake_teleop.load.inertia import (
     phi_from_mass_com_inertia,
     transform_phi,
 )
-from drake_teleop.load.moments import Noise
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 TRUTH = np.concatenate([OFFSETS, TOOL])

@@ -11,11 +11,11 @@ import pytest
 from scipy.signal import lfilter
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.batch import identify_batch
-from drake_teleop.load.change import HOLD, STATES, WIDE, LoadChangeMonitor
+from drake_teleop.load.batch.methods import identify_batch
+from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.gripper import identified_object
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.moments import Noise
+from drake_teleop.load.online.change import HOLD, STATES, WIDE, LoadChangeMonitor
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 FILE = Path(__file__).parents[2] / "benchmarks" / "load_change.py"

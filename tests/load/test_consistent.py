@@ -7,16 +7,16 @@ import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.consistent import Ellipsoid, Prior, consistent_least_squares
+from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
+from drake_teleop.load.batch.moments import Moments, Noise
+from drake_teleop.load.batch.total_least_squares import total_least_squares
 from drake_teleop.load.inertia import (
     is_physically_consistent,
     mass_com_inertia,
     phi_from_mass_com_inertia,
     pseudo_inertia,
 )
-from drake_teleop.load.moments import Moments, Noise
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.total_least_squares import total_least_squares
 
 ROD = phi_from_mass_com_inertia(0.009, [0, 0.002, 0.06], np.diag([5e-5, 5e-5, 0.0]))
 PLATE = phi_from_mass_com_inertia(0.3, [0, 0.01, 0.1], np.diag([1e-3, 2e-3, 3e-3]))

@@ -16,7 +16,7 @@ from scipy.stats import chi2, norm
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.detection import (
+from drake_teleop.load.contact.detection import (
     LEAVE,
     SIZE,
     SLACK,

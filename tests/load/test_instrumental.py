@@ -8,8 +8,8 @@ from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.instrumental import RecursiveInstrumentalVariables
-from drake_teleop.load.recursive import PRIOR_STD, RecursiveLeastSquares
+from drake_teleop.load.online.instrumental import RecursiveInstrumentalVariables
+from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 NOISE = np.repeat([0.25, 0.012], 3)

@@ -8,7 +8,7 @@ from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import identify
-from drake_teleop.load.recursive import PRIOR_STD, RecursiveLeastSquares
+from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 NOISE = np.array([0.3, 0.3, 0.5, 0.01, 0.01, 0.005])

@@ -7,11 +7,11 @@ import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.batch import identify_batch
+from drake_teleop.load.batch.methods import identify_batch
+from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.identification import Identification, identify
-from drake_teleop.load.moments import Noise
-from drake_teleop.load.recursive import PRIOR_STD, RecursiveLeastSquares
-from drake_teleop.load.recursive_tls import RecursiveTotalLeastSquares
+from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
+from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench
 
 # The JR3 of the station: wrench [N, N m], s [m/s^2], omega [rad/s], alpha [rad/s^2].

@@ -12,7 +12,7 @@ from load_cases import rotations
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import transform_phi
-from drake_teleop.load.segments import segments
+from drake_teleop.load.online.segments import segments
 
 FILE = Path(__file__).parents[2] / "benchmarks" / "load_change.py"
 SEEDS = range(8)

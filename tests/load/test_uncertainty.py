@@ -15,6 +15,12 @@ from load_cases import OFFSETS, TOOL, rich_motion, rotations
 from scipy.signal import butter, lfilter
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.batch.uncertainty import (
+    base_parameters,
+    intervals,
+    prior_dominated,
+    wrench_standard_deviations,
+)
 from drake_teleop.load.identification import (
     PARAMETERS,
     Identification,
@@ -22,14 +28,8 @@ from drake_teleop.load.identification import (
     identify,
     natural_scale,
 )
-from drake_teleop.load.recursive import RecursiveLeastSquares
+from drake_teleop.load.online.recursive import RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor
-from drake_teleop.load.uncertainty import (
-    base_parameters,
-    intervals,
-    prior_dominated,
-    wrench_standard_deviations,
-)
 
 TRUTH = np.concatenate([OFFSETS, TOOL])
 NOISE = np.array([0.3, 0.3, 0.5, 0.01, 0.01, 0.005])

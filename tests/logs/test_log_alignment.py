@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from known_motion import motion_at
 
-from drake_teleop.logs.alignment import (
+from drake_teleop.logs.read.alignment import (
     angular_motion,
     low_pass,
     noise_gain,
@@ -13,7 +13,7 @@ from drake_teleop.logs.alignment import (
     undelayed,
     uniform_times,
 )
-from drake_teleop.logs.canonical import Log
+from drake_teleop.logs.read.canonical import Log
 
 
 def a_log(t: np.ndarray) -> Log:

@@ -7,9 +7,9 @@ import pytest
 from scipy.signal import lfilter
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.logs.alignment import low_pass
 from drake_teleop.logs.causal import causal_low_pass, causal_wrenches, filter_lag
 from drake_teleop.logs.contact import contacts_of, in_contact, noise_floor
+from drake_teleop.logs.read.alignment import low_pass
 
 DT, CUTOFF = 1e-3, 30.0
 

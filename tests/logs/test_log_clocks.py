@@ -14,12 +14,12 @@ from known_motion import motion_at
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.canonical import ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
-from drake_teleop.logs.clocks import Clock, gaps, read_clock, spread
-from drake_teleop.logs.description import Time
 from drake_teleop.logs.processing import eliminate_log, identify_log
-from drake_teleop.logs.reading import read_log
-from drake_teleop.logs.tables import Table
+from drake_teleop.logs.read.canonical import ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
+from drake_teleop.logs.read.clocks import Clock, gaps, read_clock, spread
+from drake_teleop.logs.read.description import Time
+from drake_teleop.logs.read.reading import read_log
+from drake_teleop.logs.read.tables import Table
 
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
 OFFSETS = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])

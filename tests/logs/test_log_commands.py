@@ -14,9 +14,9 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.canonical import WRENCH, Log, write_log
 from drake_teleop.logs.commands import eliminate_command, identify_command
 from drake_teleop.logs.processing import eliminate_log, identify_log, robust_offsets
+from drake_teleop.logs.read.canonical import WRENCH, Log, write_log
 
 PHI = phi_from_mass_com_inertia(3.13, [0.01, -0.02, 0.12], np.diag([0.02, 0.018, 0.006]))
 OFFSETS = np.array([3.0, -2.0, 7.0, 0.1, 0.2, -0.3])

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.logs.check.inspection import inspect_command
 from drake_teleop.logs.commands import identify_command
-from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 
 Tables = dict[str, pl.DataFrame]

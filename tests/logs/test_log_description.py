@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.logs.description import Description, load_description
+from drake_teleop.logs.read.description import Description, load_description
 
 PAGE = Path(__file__).parents[2] / "docs" / "logs.md"
 EXAMPLES = re.findall(r"```yaml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)

@@ -15,9 +15,9 @@ from drake_teleop.cli import cli
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.canonical import Log, write_log
 from drake_teleop.logs.detection import detect_command, detect_log
 from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.read.canonical import Log, write_log
 
 TOOL = phi_from_mass_com_inertia(1.5, [0.01, -0.02, 0.1], np.diag([0.01, 0.009, 0.004]))
 OFFSETS = np.array([3.0, -2.0, 7.0, 0.1, 0.2, -0.3])

@@ -14,9 +14,9 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.canonical import WRENCH, Log, write_log
 from drake_teleop.logs.commands import eliminate_command, identify_command
 from drake_teleop.logs.processing import eliminate_log
+from drake_teleop.logs.read.canonical import WRENCH, Log, write_log
 
 GRIPPER = phi_from_mass_com_inertia(1.2, [0.0, 0.01, 0.05], np.diag([0.004, 0.004, 0.002]))
 OBJECT = phi_from_mass_com_inertia(0.7, [0.01, -0.02, 0.16], np.diag([0.003, 0.002, 0.002]))

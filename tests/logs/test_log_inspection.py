@@ -14,8 +14,8 @@ import yaml
 from planted import NTNU_FRAME, Columns, findings, good, ntnu_log, written
 
 from drake_teleop.cli import main
-from drake_teleop.logs.description import load_description
-from drake_teleop.logs.inspection import inspect_command
+from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.read.description import load_description
 
 PLANTED: list[tuple[Callable[[Columns], None], str, str, dict[str, bool]]] = [
     (planted.sign, "sign", "wrench.sign: -1", {}),

@@ -11,15 +11,15 @@ import yaml
 from known_motion import motion_at
 from test_log_commands import GRAVITY, describe_poses, describe_record
 
-from drake_teleop.load.change import STATES, LoadChangeMonitor
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.online.change import STATES, LoadChangeMonitor
+from drake_teleop.load.online.segments import segments
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.segments import segments
-from drake_teleop.logs.alignment import low_passed
-from drake_teleop.logs.canonical import Log, write_log
 from drake_teleop.logs.commands import identify_command
 from drake_teleop.logs.processing import identify_log
-from drake_teleop.logs.reading import read_log
+from drake_teleop.logs.read.alignment import low_passed
+from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.logs.read.reading import read_log
 
 TOOL = phi_from_mass_com_inertia(3.13, [0.01, -0.02, 0.12], np.diag([0.02, 0.018, 0.006]))
 OBJECT = phi_from_mass_com_inertia(0.8, [0.04, 0.0, 0.2], np.diag([8e-4, 8e-4, 4e-4]))

@@ -19,12 +19,12 @@ from test_log_commands import GRAVITY, describe_poses, describe_record
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.description import Description, load_description
-from drake_teleop.logs.inspection import inspect_command
-from drake_teleop.logs.mounting import Mounting, find_mounting, lever_arm_from_wrench
+from drake_teleop.logs.check.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
-from drake_teleop.logs.reading import read_description, read_log
-from drake_teleop.logs.tables import Table
+from drake_teleop.logs.read.description import Description, load_description
+from drake_teleop.logs.read.mounting import Mounting, find_mounting, lever_arm_from_wrench
+from drake_teleop.logs.read.reading import read_description, read_log
+from drake_teleop.logs.read.tables import Table
 
 PHI = phi_from_mass_com_inertia(3.13, [0.01, -0.02, 0.12], np.diag([0.02, 0.018, 0.006]))
 OFFSETS = np.array([3.0, -2.0, 7.0, 0.1, 0.2, -0.3])

@@ -11,8 +11,8 @@ import yaml
 from known_motion import GRAVITY_W, Motion, motion_at, quaternions
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.logs.alignment import low_pass
-from drake_teleop.logs.canonical import (
+from drake_teleop.logs.read.alignment import low_pass
+from drake_teleop.logs.read.canonical import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
     ORIENTATION,
@@ -22,7 +22,7 @@ from drake_teleop.logs.canonical import (
     Log,
     write_log,
 )
-from drake_teleop.logs.reading import read_log
+from drake_teleop.logs.read.reading import read_log
 
 T = np.arange(0, 3, 0.002)
 TURNED = np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])

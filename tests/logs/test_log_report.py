@@ -14,11 +14,11 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import PARAMETERS, identify
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.canonical import Log, write_log
 from drake_teleop.logs.commands import identify_command
 from drake_teleop.logs.pictures import draw_fit, draw_knowledge, spectrum
 from drake_teleop.logs.processing import identify_log
-from drake_teleop.logs.reading import read_log
+from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.report import parameter_rows
 
 PHI = phi_from_mass_com_inertia(1.9, [0.0, 0.01, 0.09], np.diag([0.008, 0.007, 0.004]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from drake_teleop.logs.description import Description, json_schema
+from drake_teleop.logs.read.description import Description, json_schema
 
 SHIPPED = Path(__file__).parents[2] / "docs" / "log-description.schema.json"
 

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.logs.tables import read_table
+from drake_teleop.logs.read.tables import read_table
 
 
 def write(path: Path, text: str) -> Path:

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.experiments.one_dof import (
+from drake_teleop.comparison.one_dof import (
     OneDof,
     Task,
     figures,
     operators_intent,
     run_one_dof,
 )
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.passivity.memory import MEMORY
 from drake_teleop.passivity.methods import (
     METHODS,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.experiments.one_dof import (
+from drake_teleop.comparison.one_dof import (
     AT_THE_MOTOR,
     PERIOD,
     OneDof,

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.experiments.identification import (
+from drake_teleop.identification import (
     identification_scenario,
     identify_load,
     slave_arm,
 )
 from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
-from drake_teleop.master.operator import OperatorConfig, Sine
+from drake_teleop.operator.operator import OperatorConfig, Sine
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.simulation import MakeSimulator, advance
 from drake_teleop.slave.payload import Payload

@@ -1,0 +1,1 @@
+"""The passivity methods compared."""

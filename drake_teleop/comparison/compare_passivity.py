@@ -1,0 +1,258 @@
+"""`drake-teleop compare-passivity`: every method that keeps a station passive, over every network.
+
+Two studies, with the same channel:
+
+* The whole 6-DoF station presses on a leaf (`delayed_contact`), for each method, network and leaf.
+* One degree of freedom (`one_dof`) gives each method's longest round trip, for walls of three
+  stiffnesses, with and without jitter and loss.
+
+`summary.json` holds
+
+========= ======================================================================================
+station   list of runs: method, network, leaf, and the figures of `one_dof.Figures`; `error` says
+          why a run ended early (its other figures are then null)
+one_dof   list: method, wall_N_per_m, jitter, loss, longest_s: the longest round trip of the grid up
+          to which every one was stable (0: none was), and grid_s, the round trips tried
+covering  list: sigma, round_trip_s, wall_N_per_m, injected_J: energy that a loop without a method
+          has created in one run; damping_Ns_per_m: what the device needs so that it creates none
+networks, methods, seed  as asked for
+========= ======================================================================================
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.channel.channel import Channel
+from drake_teleop.channel.network import PRESETS, NetworkConfig
+from drake_teleop.comparison.active_elements import covering_damping
+from drake_teleop.comparison.delayed_contact import (
+    LEAVES,
+    delayed_contact,
+    station_figures,
+    vertical_traces,
+)
+from drake_teleop.comparison.one_dof import Figures, OneDof, figures, run_one_dof
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identification import identification_scenario, identify_load
+from drake_teleop.pages.progress import Stage, progress_bars
+from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.simulation import simulate
+from drake_teleop.station import MakeTeleopStation
+
+NETWORKS = ("lan", "internet", "geostationary", "lunar")
+#: Round trips that are tried in one degree of freedom [s].
+ROUND_TRIPS = (
+    *(0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0),
+)
+WALLS = (500.0, 5100.0, 20000.0)  #: N/m
+IMPAIRMENTS = ((0.0, 0.0), (0.0, 0.1), (0.0, 0.3), (0.5, 0.0), (0.5, 0.1), (0.5, 0.3))
+"""(jitter, loss) of the networks that are tried in one degree of freedom."""
+SIGMAS = (0.0, 0.5, 1.0)
+_COVERED = tuple(itertools.product(SIGMAS, (0.01, 0.05, 0.1, 0.3), (0.0, 5100.0)))
+
+
+def compare_command(
+    out: Path,
+    *,
+    networks: Sequence[str] = NETWORKS,
+    methods: Sequence[str] = METHODS,
+    seed: int = 0,
+    jobs: int = -1,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Compares the methods; writes summary.json, runs.parquet, report.html and its pictures.
+
+    Args:
+        out: the folder.
+        networks: names of presets.
+        methods: names of methods.
+        seed: of sensor and networks.
+        jobs: processes at once; -1: one for each core.
+        quiet: no progress bars and no tables.
+
+    Returns:
+        The summary, see the top of this module.
+
+    Raises:
+        DrakeTeleopError: for an unknown method or network.
+    """
+    _check("network", networks, tuple(PRESETS))
+    _check("method", methods, METHODS)
+    out.mkdir(parents=True, exist_ok=True)  # before the work: a bad path costs no time
+    with progress_bars(quiet) as stage:
+        limits = _one_dof_study(methods, seed, jobs, stage)
+        runs, traces = _station_study(networks, methods, seed, jobs, stage)
+        covering = _covering_study(stage)
+    summary = {
+        "networks": list(networks),
+        "methods": list(methods),
+        "seed": seed,
+        "station": runs,
+        "one_dof": limits,
+        "covering": covering,
+    }
+    from drake_teleop.comparison.report import print_tables, write_report
+
+    _write_table(runs, out / "runs.parquet")
+    (out / "summary.json").write_text(
+        json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8"
+    )
+    write_report(summary, traces, out)
+    if not quiet:
+        print_tables(summary, out)
+    return summary
+
+
+def longest_round_trip(
+    method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
+) -> float:
+    """The longest of `ROUND_TRIPS` [s] up to which every run is stable; 0 if none is."""
+    longest = 0.0
+    for round_trip in ROUND_TRIPS:
+        network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
+        for seed in seeds:
+            run = run_one_dof(model, PassivityConfig(method=method), network, seed=seed)
+            if not figures(run, model).stable:
+                return longest
+        longest = round_trip
+    return longest
+
+
+def station_run(
+    scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
+) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
+    """One run of the whole station: its row of the table, and what a picture shows of it.
+
+    Args:
+        scenario: rates, sensor, scales and grip.
+        method, network, leaf: by name.
+        estimate: (16,) of the load.
+    """
+    row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
+    names = [entry.name for entry in dataclasses.fields(Figures)]
+    setup, task = delayed_contact(
+        scenario, Channel(network=network), PassivityConfig(method=method), leaf
+    )
+    try:
+        result = simulate(MakeTeleopStation(setup, load_estimate=estimate), setup.simulation)
+    except DrakeTeleopError as error:
+        return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
+    found = dataclasses.asdict(station_figures(result, setup, task))
+    return row | _plain(found) | {"error": None}, vertical_traces(result, setup)
+
+
+def _one_dof_study(
+    methods: Sequence[str], seed: int, jobs: int, stage: Stage
+) -> list[dict[str, Any]]:
+    cases = list(itertools.product(methods, WALLS, IMPAIRMENTS))
+    # The first run compiles; side by side, processes would do that twice.
+    longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
+    seeds = range(seed, seed + 2)
+    found = _each(
+        longest_round_trip,
+        [(m, OneDof(wall_stiffness=wall), *how, seeds) for m, wall, how in cases],
+        jobs,
+        stage("One degree of freedom"),
+    )
+    return [
+        {
+            "method": method,
+            "wall_N_per_m": wall,
+            "jitter": jitter,
+            "loss": loss,
+            "longest_s": longest,
+            "grid_s": list(ROUND_TRIPS),
+        }
+        for (method, wall, (jitter, loss)), longest in zip(cases, found, strict=True)
+    ]
+
+
+def _station_study(
+    networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: Stage
+) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, NDArray[np.float64]]]]:
+    base = replace(LoadScenario("contact_transition"), simulation__seed=seed, rates__log_hz=500.0)
+    found = identify_load(identification_scenario(base, seed + 1), stage)
+    # The longest runs first, so that no process is left with one at the end.
+    slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
+    cases = list(itertools.product(slowest, LEAVES, methods))
+    results = _each(
+        station_run,
+        [(base, method, network, leaf, found.estimate) for network, leaf, method in cases],
+        jobs,
+        stage("The whole station"),
+    )
+    order = {name: list(names).index for name, names in (("network", networks), ("leaf", LEAVES))}
+    rows = sorted(
+        (row for row, _ in results),
+        key=lambda row: (order["network"](row["network"]), order["leaf"](row["leaf"])),
+    )
+    first = next(iter(LEAVES))
+    traces = {
+        (row["network"], row["method"]): shown
+        for row, shown in results
+        if row["leaf"] == first and shown
+    }
+    return rows, traces
+
+
+def _covering_study(stage: Stage) -> list[dict[str, Any]]:
+    progress, rows = stage("What the elimination puts in"), []
+    for done, (sigma, round_trip, wall) in enumerate(_COVERED):
+        model = OneDof(sigma=sigma, wall_stiffness=wall)
+        run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
+        rows.append(
+            {
+                "sigma": sigma,
+                "round_trip_s": round_trip,
+                "wall_N_per_m": wall,
+                "injected_J": max(0.0, -figures(run, model).least_energy),
+                "damping_Ns_per_m": covering_damping(model, round_trip),
+            }
+        )
+        progress((done + 1) / len(_COVERED))
+    return rows
+
+
+def _each(function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any) -> list[Any]:
+    """The function's result for each case, in order, in several processes."""
+    from joblib import Parallel, delayed
+
+    results = []
+    parallel = Parallel(n_jobs=min(jobs, len(cases)) if jobs > 0 else jobs, return_as="generator")
+    for result in parallel(delayed(function)(*case) for case in cases):
+        results.append(result)
+        progress(len(results) / len(cases))
+    return results
+
+
+def _check(what: str, wanted: Sequence[str], known: Sequence[str]) -> None:
+    for name in wanted:
+        if name not in known:
+            raise DrakeTeleopError(
+                f"there is no {what} '{name}'",
+                where=f"{what}s",
+                remedy=f"choose among {', '.join(known)}",
+            )
+
+
+def _plain(figures: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: None if isinstance(value, float) and not np.isfinite(value) else value
+        for name, value in figures.items()
+    }
+
+
+def _write_table(rows: list[dict[str, Any]], path: Path) -> None:
+    import polars as pl
+
+    pl.DataFrame(rows, infer_schema_length=None).write_parquet(path)

@@ -1,0 +1,135 @@
+"""One task for every method and network: swing freely, rest, press on the leaf, hold, let go, rest.
+
+The whole 6-DoF station does it; the times follow the network's round trip, so that a station over
+the moon has as many round trips to come to rest as one in a building.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.channel.channel import Channel
+from drake_teleop.comparison.one_dof import Figures, Task, figures_of
+from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.identification import slave_arm
+from drake_teleop.operator.operator import MinimumJerk, OperatorConfig, Sine
+from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.quaternions import quaternion_of
+from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import Scenario, replace
+from drake_teleop.slave.arm import forward_kinematics
+
+#: m, from the ball's tip to the origin of S (models/tool.sdf).
+_TIP = 0.2
+_GAP, _DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; how deep the operator presses
+#: Leaves by name: thickness [m] of a leaf of 120 mm x 50 mm, which is light enough not to rattle.
+LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
+
+
+def task_over(round_trip: float) -> Task:
+    """The task with three more round trips [s] for each rest and hold."""
+    wait = 3 * round_trip
+    return Task(
+        press=3.5 + wait,
+        pressed=4.5 + wait,
+        release=7.5 + 2 * wait,
+        released=8.5 + 2 * wait,
+        end=11.0 + 3 * wait,
+        judged=1.0,
+    )
+
+
+def delayed_contact(
+    base: Scenario, channel: Channel, passivity: PassivityConfig, leaf: str
+) -> tuple[Scenario, Task]:
+    """The scenario of the task.
+
+    Args:
+        base: rates, sensor, scales, grip of the operator.
+        channel: the network.
+        passivity: the method.
+        leaf: one of `LEAVES`.
+    """
+    task = task_over(sum(line.delay for line in channel.lines()))
+    settle = 0.5
+    swing = Sine(
+        t_start=settle + task.swing,
+        duration=2.0,
+        ramp=0.5,
+        frequency=1.5,
+        translation=[0.005, 0.0, 0.02],
+        rotation=[0.0, 0.05, 0.0],
+    )
+    reach = [0.0, 0.0, -(_GAP + _DEPTH)]
+    press = MinimumJerk(t_start=settle + task.press, duration=1.0, translation=reach)
+    back = MinimumJerk(t_start=settle + task.release, duration=1.0, translation=[-x for x in reach])
+    x, y, z = base.slave.position
+    sheet = SheetSpring(
+        position=[x, y, z - _TIP - _GAP], length=0.12, width=0.05, thickness=LEAVES[leaf]
+    )
+    return (
+        replace(
+            base,
+            simulation=dataclasses.replace(base.simulation, settle=settle, duration=task.end),
+            operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, back]),
+            channel=channel,
+            passivity=passivity,
+            sheet_spring=sheet,
+        ),
+        task,
+    )
+
+
+def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> Figures:
+    """The run in numbers: vertical motion and force, which the task is about, and the turning."""
+    heights, turned = _slave_motion(result, scenario)
+    scaling = scenario.force_scaling
+    return figures_of(
+        t=result.t,
+        master=result["pose_command"][:, 6],
+        slave=heights,
+        felt=result["force_to_master"][:, 2],
+        pressed=scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
+        energy=result["ports"][:, :4].sum(axis=1),
+        task=task,
+        turned=turned,
+    )
+
+
+def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, NDArray[np.float64]]:
+    """What a picture of the task shows: t [s], forces in the master's units [N], energy [J]."""
+    scaling = scenario.force_scaling
+    return {
+        "t": result.t,
+        "felt": result["force_to_master"][:, 2],
+        "pressed": scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
+        "energy": result["ports"][:, :4].sum(axis=1),
+    }
+
+
+def _slave_motion(
+    result: SimulationResult, scenario: Scenario
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N,) height of So [m] and (N, 3) rotation vector since the start of the log [rad]."""
+    table, q = slave_arm(scenario).table, np.ascontiguousarray(result["slave_state"][:, :6])
+    poses = _poses(table, q)
+    rotations = Rotation.from_quat(poses[:, [1, 2, 3, 0]])
+    return poses[:, 6], (rotations * rotations[0].inv()).as_rotvec()
+
+
+@njit(cache=True)
+def _poses(arm, q):
+    """(N, 7) X_WS at each row of q."""
+    R, p, poses = np.empty((3, 3)), np.empty(3), np.empty((q.shape[0], 7))
+    for k in range(q.shape[0]):
+        forward_kinematics(arm, q[k], R, p)
+        orientation = quaternion_of(R)
+        for i in range(4):
+            poses[k, i] = orientation[i]
+        poses[k, 4:] = p
+    return poses

@@ -1,0 +1,1 @@
+"""What the slave finds out from its sensor."""

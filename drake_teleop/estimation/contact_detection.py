@@ -1,0 +1,120 @@
+"""Contact at the slave: noticed in the eliminated wrench, sample by sample, and told to the hand.
+
+What is noticed, and why fast motion is not contact, says `drake_teleop.load.contact.detection`. The
+noise floor and the threshold come from free motion of the same load with the same sensor: the
+identification run that precedes the station.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from drake_teleop.lifetime import ONE_DICT
+from drake_teleop.load.compensation import scaled_wrench_into
+from drake_teleop.load.contact.detection import (
+    MARGIN,
+    STATISTICS,
+    ContactDetector,
+    NoiseFloor,
+    flag_update,
+)
+from drake_teleop.quantities import choice, quantity
+from drake_teleop.sensor.wrist_sensor import sample_parts
+from drake_teleop.slave.arm import ArmModel, acceleration_into
+
+
+@dataclass
+class ContactDetectionConfig:
+    """How contact is noticed; a scenario without this block has no detector."""
+
+    statistic: str = choice("glr", STATISTICS, "what is compared with the threshold")
+    margin: float = quantity(
+        MARGIN, "1", 1.0, 10.0, "threshold over the most that the identification's motion reached"
+    )
+    hold: float = quantity(0.02, "s", 0.0, 1.0, "quiet after which a contact is over")
+    drift_time: float = quantity(
+        5.0, "s", 0.5, 1e4, "within which the detector follows the offsets while nothing stands out"
+    )
+    recovery: float = quantity(
+        5e-3, "s", 0.0, 1.0, "for which a saturation still shows in the sensor's low-pass"
+    )
+
+
+@njit(cache=True)
+def _detected(memory, sample, estimate, arm, settings):
+    """Takes one sample; whether there is contact."""
+    contact, acceleration = np.empty(6), np.empty(3)
+    s, omega, alpha, phi = sample[6:9], sample[9:12], sample[12:15], estimate[6:]
+    scaled_wrench_into(
+        sample[:6], estimate[:6], s, omega, alpha, phi, np.zeros(10), 0.0, 0.0, 1.0, contact
+    )
+    acceleration_into(arm, sample[16:], s, acceleration)
+    return flag_update(memory, contact, s, omega, alpha, acceleration, *settings)
+
+
+class ContactDetection(LeafSystem):
+    """Says whether the slave touches something.
+
+    While the wrist sensor is saturated, and while that shows in its low-pass, nothing is known, and
+    the flag stays as it is.
+
+    .. pydrake_system::
+
+        name: ContactDetection
+        input_ports:
+        - sample: the wrist sensor's, see `drake_teleop.sensor.wrist_sensor.sample_parts`
+        - load_estimate: (16,) Eq. (7), [offsets; phi]
+        output_ports:
+        - contact: (1,) 1 in contact, else 0
+
+    Args:
+        config: how contact is noticed.
+        floor: of the free motion, fitted at the rate of this block.
+        arm: the slave's kinematics.
+        period: between samples [s].
+
+    Raises:
+        DrakeTeleopError: if the floor was not fitted to a motion.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self, config: ContactDetectionConfig, floor: NoiseFloor, arm: ArmModel, period: float
+    ) -> None:
+        super().__init__()
+        self._arm = arm.table
+        self._settings = ContactDetector(
+            floor,
+            floor.threshold(config.statistic, config.margin),
+            statistic=config.statistic,
+            hold=round(config.hold / period),
+            following=period / config.drift_time,
+        ).settings
+        parts = sample_parts(arm.num_joints)
+        self._saturated = sum(list(parts.values())[: list(parts).index("saturated")])
+        self._sample = self.DeclareVectorInputPort("sample", sum(parts.values()))
+        self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
+        self._flag = self.DeclareDiscreteState(1)
+        self._memory = self.DeclareDiscreteState(ContactDetector.initial_memory())
+        self._recovery = round(config.recovery / period)
+        self._blind = self.DeclareDiscreteState(1)  # samples for which nothing will be known
+        self.DeclareStateOutputPort("contact", self._flag)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        sample = self._sample.Eval(context)
+        blind = discrete_state.get_mutable_value(self._blind)
+        if sample[self._saturated] > 0.5:
+            blind[0] = self._recovery
+            return
+        if blind[0] > 0.0:
+            blind[0] -= 1.0
+            return
+        memory = discrete_state.get_mutable_value(self._memory)
+        estimate = self._estimate.Eval(context)
+        flag = discrete_state.get_mutable_value(self._flag)
+        flag[0] = _detected(memory, sample, estimate, self._arm, self._settings)

@@ -1,0 +1,266 @@
+"""`drake-teleop excite`: an excitation trajectory for the station's slave, or for any other arm.
+
+Writes into the folder
+
+=================== ============================================================================
+trajectory.csv      one period at 1 kHz: t [s], then by joint q_NAME, qd_NAME, qdd_NAME [rad, s]
+excitation.yaml     the coefficients of Eqs. (9)-(10), for `FourierTrajectory.load`
+excitation.png      joint angles, wrench against the sensor's range, how the criterion fell
+summary.json        the figures
+=================== ============================================================================
+
+`summary.json` holds the criterion that was minimised and the value of every criterion (what each
+is: `excitation/criteria.py`), the use of every limit as checked by Drake at 1 kHz, the predicted
+standard deviation of each parameter of the heaviest load after one period, from the noise of the
+sensor (`excitation/prediction.py`), and what was assumed.
+Nothing is written if no trajectory respects all limits.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import polars as pl
+from matplotlib.figure import Figure
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.excitation.check import RATE
+from drake_teleop.excitation.excite import Excitation, excite, sensor_motion
+from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.pages.progress import Stage, progress_bars
+from drake_teleop.pages.style import BLACK, BLUE, COLOURS, GREY, Picture, house_style
+from drake_teleop.scenario import LoadScenario
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: What each printed criterion is.
+WORDS = {
+    "kappa_w10": "condition number, ten columns, rows whitened, columns scaled by L = {L:.3g} m",
+    "kappa10": "condition number, ten columns, plain V in SI units",
+    "kappa16": "condition number, sixteen columns with offsets, SI units",
+    "A16": "rms of predicted errors over acceptable ones",
+    "D16": "geometric mean of predicted errors over acceptable ones",
+}
+_OFFSETS = ("f_ox", "f_oy", "f_oz", "tau_ox", "tau_oy", "tau_oz")
+_PHI = ("m", "m_cx", "m_cy", "m_cz", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz")
+_UNITS = (*3 * ["N"], *3 * ["N m"], "kg", *3 * ["kg m"], *6 * ["kg m^2"])
+
+
+def excite_command(
+    scenario: str | Path,
+    out: Path,
+    *,
+    model: Path | None = None,
+    sensor_frame: str | None = None,
+    package_paths: tuple[Path, ...] = (),
+    acceleration: tuple[float, ...] = (),
+    payload: float | None = None,
+    criterion: str = "kappa_w10",
+    period: float = 6.0,
+    harmonics: int = 5,
+    seconds: float | None = None,
+    seed: int = 0,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Designs, checks and writes an excitation trajectory; see the top of this module.
+
+    Args:
+        scenario: its slave moves, and its wrist sensor measures.
+        out: the folder.
+        model: another arm that moves instead, with the scenario's sensor; and then
+        sensor_frame: the frame or link at which it measures, needed with `model`.
+        package_paths, acceleration, payload: see `RobotFromModel`.
+        criterion, period, harmonics, seconds, seed: see `excite`.
+        quiet: no progress bars and no tables.
+
+    Returns:
+        The summary.
+
+    Raises:
+        DrakeTeleopError: if the input cannot be used, or nothing respects all limits.
+    """
+    setup = LoadScenario(scenario)
+    with progress_bars(quiet) as stage:
+        opened = stage("Read the robot")
+        if model is None:
+            _refuse(sensor_frame, package_paths, acceleration, payload)
+            robot = RobotFromScenario(setup)
+        elif sensor_frame is None:
+            raise DrakeTeleopError(
+                "the model does not say where the sensor is",
+                where="--sensor-frame",
+                remedy="name the frame or link at which it measures",
+            )
+        else:
+            robot = RobotFromModel(
+                model,
+                sensor_frame,
+                setup.wrist_sensor,
+                estimation=setup.motion_estimation,
+                sensor_hz=setup.rates.sensor_hz,
+                package_paths=package_paths,
+                acceleration=acceleration,
+                payload=payload,
+            )
+        opened(1.0)
+        found = _design(robot, stage, criterion, period, harmonics, seconds, seed)
+    summary = summarise(found) | {"seed": seed}
+    out.mkdir(parents=True, exist_ok=True)
+    table(found).write_csv(out / "trajectory.csv")
+    found.trajectory.save(out / "excitation.yaml", robot.arm.joint_names)
+    draw(found).savefig(out / "excitation.png")
+    text = json.dumps(summary, indent=2, allow_nan=False)
+    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    if not quiet:
+        _print(summary, out)
+    return summary
+
+
+def _refuse(*options: object) -> None:
+    names = ("--sensor-frame", "--package-path", "--acceleration", "--payload")
+    for name, value in zip(names, options, strict=True):
+        if value not in (None, ()):
+            raise DrakeTeleopError("needs --model", where=name)
+
+
+def _design(
+    robot: Robot,
+    stage: Stage,
+    criterion: str,
+    period: float,
+    harmonics: int,
+    seconds: float | None,
+    seed: int,
+) -> Excitation:
+    designing = stage("Design")
+    checking = stage("Check at 1 kHz")
+
+    def show(done: float, best: float) -> None:
+        designing(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
+
+    found = excite(
+        robot,
+        criterion=criterion,
+        period=period,
+        harmonics=harmonics,
+        seed=seed,
+        seconds=seconds,
+        designing=show,
+        checking=checking,
+    )
+    show(1.0, found.values[criterion])
+    return found
+
+
+def summarise(found: Excitation) -> dict[str, Any]:
+    """The figures of summary.json."""
+    robot, trajectory = found.robot, found.trajectory
+    names = (*_OFFSETS, *_PHI)
+    return {
+        "robot": robot.name,
+        "criterion": found.criterion,
+        **found.values,
+        "meaning": {name: _words(name, robot) for name in found.values},
+        "period_s": trajectory.period,
+        "harmonics": trajectory.rho.shape[1],
+        "design_s": float(found.history[-1, 0]),
+        "limit_use": {
+            use.limit: {"share": use.share, "where": use.what, "t": use.time} for use in found.uses
+        },
+        "predicted_std": {
+            f"{name} [{unit}]": float(std)
+            for name, unit, std in zip(names, _UNITS, found.deviations, strict=True)
+        },
+        "noise": {"force [N]": robot.scales.noise[0], "torque [N m]": robot.scales.noise[1]},
+        "heaviest_load_kg": float(robot.limits.phi[0]),
+        "assumed": list(robot.assumptions),
+    }
+
+
+def _words(name: str, robot: Robot) -> str:
+    return WORDS[name].format(L=robot.scales.length)
+
+
+def table(found: Excitation) -> pl.DataFrame:
+    """One period at 1 kHz, both ends included."""
+    period = found.trajectory.period
+    t = np.linspace(0, period, round(period * RATE) + 1)
+    columns = {"t": t}
+    joints = found.trajectory.evaluate(t)
+    for symbol, values in zip(("q", "qd", "qdd"), joints, strict=True):
+        for name, of_joint in zip(found.robot.arm.joint_names, values.T, strict=True):
+            columns[f"{symbol}_{name}"] = of_joint
+    return pl.DataFrame(columns)
+
+
+def draw(found: Excitation) -> Figure:
+    """Joint angles, wrench of the heaviest load against the limit, the criterion's fall."""
+    with house_style():
+        figure = Picture(figsize=(9, 8))
+        joints, forces, torques, progress = figure.subplots(4, 1, height_ratios=(3, 2, 2, 2))
+        _draw_joints(joints, found)
+        _draw_wrench(forces, torques, found)
+        progress.step(*found.history.T, where="post", color=BLUE)
+        progress.set(
+            title=f"{found.criterion} on the way to {found.values[found.criterion]:.4g}",
+            xlabel="CPU time [s]",
+            yscale="log",
+        )
+    return figure
+
+
+def _draw_joints(axes: Axes, found: Excitation) -> None:
+    t = np.linspace(0, found.trajectory.period, 1000)
+    q = np.degrees(found.trajectory.evaluate(t)[0])
+    for k, name in enumerate(found.robot.arm.joint_names):
+        colour, style = COLOURS[k % len(COLOURS)], ("-", "--")[k // len(COLOURS) % 2]
+        axes.plot(t, q[:, k], style, color=colour, label=name)
+    axes.set(title=f"Joints of {found.robot.name} [deg]", xlim=(0, found.trajectory.period))
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def _draw_wrench(forces: Axes, torques: Axes, found: Excitation) -> None:
+    limits = found.robot.limits
+    s, omega, alpha = sensor_motion(found.robot, found.trajectory)
+    wrench = non_contact_wrench(s, omega, alpha, limits.phi)
+    t = np.arange(len(wrench)) / RATE
+    for axes, part, limit, unit in (
+        (forces, wrench[:, :3], limits.sensor[0], "N"),
+        (torques, wrench[:, 3:], limits.sensor[1], "N m"),
+    ):
+        axes.plot(t, part, linewidth=0.9, label=list("xyz"))
+        axes.plot(t, np.linalg.norm(part, axis=1), color=GREY, label="norm")
+        axes.axhline(limit, color=BLACK, linestyle=":", label="limit")
+        axes.set(
+            title=f"{'Force' if unit == 'N' else 'Torque'} at the sensor, heaviest load [{unit}]",
+            xlim=(0, found.trajectory.period),
+        )
+    forces.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    torques.set_xlabel("t [s]")
+
+
+def _print(summary: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    values = Table("criterion", "value", "what it is")
+    for name, meaning in summary["meaning"].items():
+        marked = f"[bold]{name}[/]" if name == summary["criterion"] else name
+        values.add_row(marked, f"{summary[name]:.4g}", meaning)
+    uses = Table("limit, checked at 1 kHz", "use", "where", r"t \[s]")
+    for name, use in summary["limit_use"].items():
+        uses.add_row(name, f"{use['share']:.1%}", use["where"], f"{use['t']:.3f}")
+    deviations = Table("parameter", "predicted standard deviation")
+    for name, value in summary["predicted_std"].items():
+        deviations.add_row(name.replace("[", r"\["), f"{value:.2g}")
+    for part in (values, uses, deviations):
+        console.print(part)
+    for words in summary["assumed"]:
+        console.print(f"assumed: {words}", highlight=False, markup=False)
+    console.print(f"written to {out}", highlight=False, markup=False)

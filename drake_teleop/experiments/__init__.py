@@ -1,1 +1,0 @@
-"""Experiments: each one file; each is data, a picture and a table."""

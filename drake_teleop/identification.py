@@ -1,0 +1,232 @@
+"""The identification of section IV: the slave runs an excitation trajectory, the estimator learns.
+
+Nothing of the plant's truth is used: what is known comes from the wrist sensor's samples.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import Diagram, DiagramBuilder
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.excitation.check import check
+from drake_teleop.excitation.excite import criteria_of, excite
+from drake_teleop.excitation.robot import Robot, RobotFromScenario
+from drake_teleop.load.batch.methods import identify_batch
+from drake_teleop.load.batch.moments import Noise
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.contact.detection import NoiseFloor, finite_covariance, fit_noise_floor
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.pages.progress import Progress, Stage, silent
+from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
+from drake_teleop.sensor.motion_estimation import estimated_motion_std
+from drake_teleop.simulation import simulate
+from drake_teleop.slave.arm import ArmModel, accelerations
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.station import MakeIdentificationStation
+
+Array = NDArray[np.float64]
+
+# The trajectory belongs to the arm, not to the run's seed.
+_DESIGN_SEED = 0
+_RECURSIVE = {"rls": "recursive least squares", "rtls": "recursive total least squares"}
+
+
+@dataclass(frozen=True, eq=False)
+class LoadIdentification:
+    """What an identification run gives.
+
+    Attributes:
+        trajectory: the joint trajectory that was run.
+        result: the recorded signals.
+        estimate: (16,) Eq. (7), [offsets; phi] of the recursive estimator in the loop at the end.
+        batch: the same record by batch total least squares, see `batch_identification`.
+        kappa_w10: condition number of the motion, see `excitation/criteria.py`.
+        real_time_factor: of the simulation.
+        method: of the recursive estimator, one of `load.identification.METHODS`.
+    """
+
+    trajectory: FourierTrajectory
+    result: SimulationResult
+    estimate: Array
+    batch: Identification
+    kappa_w10: float
+    real_time_factor: float
+    method: str
+
+    @property
+    def identification(self) -> Identification:
+        """The recursive estimate, with the batch's uncertainties and residuals.
+
+        The batch judges its uncertainty from the residuals, the recursive estimator from what the
+        noise is said to be.
+        """
+        return dataclasses.replace(
+            self.batch, offsets=self.estimate[:6], phi=self.estimate[6:], method=self.method
+        )
+
+    def noise_floor(self, arm: ArmModel) -> NoiseFloor:
+        """How large the wrench is that the estimate leaves in this free motion, for detection.
+
+        Args:
+            arm: the slave's, for its kinematics.
+        """
+        usable = self.result["saturated"][:, 0] == 0
+        wrench, s, omega, alpha = (x[usable] for x in sensor_samples(self.result))
+        offsets, phi = self.estimate[:6], self.estimate[6:]
+        contact = contact_wrench(wrench, offsets, s, omega, alpha, phi)
+        a = accelerations(arm, self.result["joint_position"][usable], s)
+        P = finite_covariance(phi, self.batch.covariance)
+        return fit_noise_floor(contact, s, omega, alpha, a, P)
+
+    @property
+    def recursive_against_batch(self) -> float:
+        """Largest difference of the two estimates, in standard deviations."""
+        batch = np.concatenate([self.batch.offsets, self.batch.phi])
+        return float(np.max(np.abs(self.estimate - batch) / self.batch.standard_deviations))
+
+
+def slave_arm(scenario: Scenario) -> ArmModel:
+    """The arm of a scenario's slave, with tool and payload as its load."""
+    slave = scenario.slave
+    return AddSlavePlant(DiagramBuilder(), slave.position, None, payload=slave.payload).arm
+
+
+def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
+    """The shipped scenario "identification" with the slave and the sensor of another scenario.
+
+    If contact is to be detected, it is logged at the rate at which that is done: the noise floor
+    tells how alike samples are that follow each other.
+    """
+    rates = scenario.rates
+    if scenario.contact_detection is not None:
+        rates = dataclasses.replace(rates, log_hz=rates.estimator_hz)
+    return replace(
+        LoadScenario("identification"),
+        simulation__seed=seed,
+        rates=rates,
+        slave=scenario.slave,
+        joint_control=scenario.joint_control,
+        wrist_sensor=scenario.wrist_sensor,
+        motion_estimation=scenario.motion_estimation,
+    )
+
+
+def identify_load(
+    scenario: Scenario,
+    stage: Stage = silent,
+    *,
+    trajectory: FourierTrajectory | None = None,
+    log: Path | None = None,
+) -> LoadIdentification:
+    """Runs an excitation trajectory, and identifies.
+
+    Args:
+        scenario: with the load estimator enabled.
+        stage: where progress is shown.
+        trajectory: to run, of the scenario's duration; a new one is designed if there is none.
+        log: as `simulate` has it.
+
+    Raises:
+        DrakeTeleopError: if no trajectory respects the limits of arm and sensor, or the one that
+            was given does not, or has another duration.
+    """
+    robot = RobotFromScenario(scenario)
+    if trajectory is None:
+        trajectory = _designed(robot, scenario.simulation.duration, stage)
+    else:
+        _check_given(robot, trajectory, scenario.simulation.duration)
+    station = MakeIdentificationStation(scenario, trajectory)
+    result, factor = timed(station, scenario.simulation, stage("Identify the load"), log)
+    usable = result["saturated"][:, 0] == 0
+    wrench, s, omega, alpha = (signal[usable] for signal in sensor_samples(result))
+    batch = batch_identification(scenario, wrench, s, omega, alpha, scenario.rates.log_hz)
+    kappa = criteria_of(robot, trajectory)["kappa_w10"]
+    estimate = result["load_estimate"][-1]
+    method = _RECURSIVE[scenario.load_estimator.method]
+    return LoadIdentification(trajectory, result, estimate, batch, kappa, factor, method)
+
+
+def batch_identification(
+    scenario: Scenario, wrench: Array, s: Array, omega: Array, alpha: Array, rate_hz: float
+) -> Identification:
+    """The load and the offsets by total least squares, with the noise of the scenario's sensor.
+
+    White noise of wrench and motion as its data sheet has it, and its random walks: the offsets are
+    those at the start of the record.
+
+    Args:
+        scenario: with the sensor and the estimation of its motion.
+        wrench, s, omega, alpha: (N, 6), (N, 3) samples, as for `identify`.
+        rate_hz: of these samples.
+    """
+    sensor, rates = scenario.wrist_sensor, scenario.rates
+    motion = estimated_motion_std(
+        scenario.motion_estimation, sensor, slave_arm(scenario).num_joints, 1 / rates.sensor_hz
+    )
+    walk = sensor.random_walk()
+    if scenario.motion_estimation.source != "accelerometer":  # the encoders do not wander
+        walk[6:] = 0.0
+    noise = Noise(
+        wrench=sensor.wrench_std(),
+        s=motion[:3],
+        omega=motion[3:6],
+        alpha=motion[6:],
+        walk=walk / np.sqrt(rate_hz),
+    )
+    found = identify_batch(wrench, s, omega, alpha, method="total", noise=noise)
+    return found.identification
+
+
+def _designed(robot: Robot, period: float, stage: Stage) -> FourierTrajectory:
+    progress = stage("Design the excitation trajectory")
+    found = excite(
+        robot, period=period, seed=_DESIGN_SEED, designing=lambda done, best: progress(0.5 * done)
+    )
+    progress(1.0)
+    return found.trajectory
+
+
+def _check_given(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
+    if len(trajectory.q0) != robot.arm.num_joints:
+        raise DrakeTeleopError(
+            f"it moves {len(trajectory.q0)} joints, the arm has {robot.arm.num_joints}",
+            where="trajectory",
+        )
+    if not np.isclose(trajectory.period, duration, rtol=1e-9):
+        raise DrakeTeleopError(
+            f"its period is {trajectory.period:g} s, the simulation lasts {duration:g} s",
+            where="trajectory",
+            remedy="set simulation.duration to the period",
+        )
+    worst = check(robot, trajectory)[0]
+    if worst.share > 1:
+        raise DrakeTeleopError(f"it uses {worst}", where="trajectory")
+
+
+def timed(
+    station: Diagram, simulation: Simulation, progress: Progress, log: Path | None = None
+) -> tuple[SimulationResult, float]:
+    """`simulate`, and its real-time factor: simulated over elapsed time, compilation included."""
+    start = time.perf_counter()
+    result = simulate(station, simulation, progress=progress, log=log)
+    elapsed = time.perf_counter() - start
+    return result, (simulation.settle + simulation.duration) / elapsed
+
+
+def sensor_samples(result: SimulationResult) -> tuple[Array, Array, Array, Array]:
+    """What the wrist sensor gave: wrench (N, 6), s, omega, alpha (N, 3) in S."""
+    return (
+        result["measured_wrench_S"],
+        result["specific_force_S"],
+        result["angular_velocity_S"],
+        result["angular_acceleration_S"],
+    )

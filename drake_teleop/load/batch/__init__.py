@@ -1,0 +1,1 @@
+"""Estimation from a whole record."""

@@ -1,0 +1,463 @@
+"""Batch estimators by name, for the load and the sensor's offsets from a record.
+
+| name | what it does | when |
+|---|---|---|
+| `ordinary` | least squares, N and N m alike, Eqs. (7)-(8) | to compare with |
+| `whitened` | rows divided by each channel's noise, given or estimated | the plain weighted fit |
+| `total` | `whitened` with errors in variables (`total_least_squares`) | motion's noise is given |
+| `robust` | `total` without knocks and short contacts | |
+| `consistent` | `robust`, and a body can have these parameters (`consistent`) | default |
+
+A negative mass is no body's and stays as it is.
+
+The first three see the record only as a (19, 19) matrix of second moments (`moments`), in one
+pass. The noise of the wrench, if not given, comes from the residual of a first fit, without what
+the noise of the motion explains of it, and once more from the residual of the second.
+
+`robust` is iteratively reweighted least squares with Huber's weights (Huber, Robust Statistics,
+1981, chapter 7), which a few bad samples cannot lead far astray, then least squares on the samples
+within 4.5 robust standard deviations (1.4826 x median of the absolute residual) in all channels,
+repeated until they stay the same. Of normal noise it rejects one sample in 25000. In a record that
+rests most of the time all errors of the motion (delay, scale, mounting) look like disturbances, and
+the samples that say most would be rejected. Therefore nothing is, and `BatchResult.note` says so,
+where the rest of the samples would double some standard deviation: knocks and contacts raise it by
+15 %, motion taken for a disturbance by 30 % to a hundredfold. Nor is anything of less than 12
+samples.
+
+Averages over poses at rest leave no noise but errors of calibration and orientation, which turn
+with the pose and belong to no channel. With `shared_noise` the three forces have one estimated
+noise and the three torques one; weights of their own would make mass and centre of mass worse by
+10 to 30 % (simulated gain errors of 0.3 % and tilts of 4 mrad).
+
+The covariance is that of `identification.NormalEquations` with the same weights of the rows, so
+coloured noise is accounted for; where noise of the motion couples the channels, with the
+correlation that it predicts. Offsets that wander are no stationary noise, and a record is too short
+to show how much they do: if the noise says so (`Noise.walk`, which Allan deviations of a record at
+rest give), the effects of all steps of the walk on the solution are added up. The offsets that the
+covariance is about are then those at the start of the record. A walk that goes as far as the noise
+within a record counts twice, since it is in the residuals too: that is cautious. Errors in
+variables enlarge the covariance: with G theta_LS = b and (G - lambda C) theta = b it is
+K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of `consistent` is of the same fit
+without the constraint, which is cautious. A prior adds its information to that of the record, and
+parameters that it says most about are named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array, checked_rows
+from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
+from drake_teleop.load.batch.moments import (
+    Moments,
+    Noise,
+    excited_columns,
+    inverse_root,
+    normal_equations,
+    residual_covariance,
+)
+from drake_teleop.load.batch.total_least_squares import NormalForm, total_least_squares
+from drake_teleop.load.batch.uncertainty import prior_dominated
+from drake_teleop.load.identification import Identification, NormalEquations, worth_stating
+from drake_teleop.load.regressor import non_contact_wrench, regressor
+
+_CHUNK = 2**15
+# Least noise of a channel, relative to the wrench: what rounding leaves of a perfect record.
+_ROUNDING = 1e-7
+# A wrench's variance is at least this share of the residual's, whatever the motion's explains.
+_LEAST_SHARE = 0.01
+# Huber's limit and the rejection's, in robust standard deviations; fits at most; and how many
+# samples the median looks at.
+_HUBER, _REJECT, _FITS, _MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
+_NORMAL_MAD = 1.4826
+# Samples of which a median says something, samples from which to start, and how much a standard
+# deviation may grow by what is rejected.
+_FEWEST_TO_REJECT, _SOME, _MOST_LOSS = 12, 50_000, 2.0
+_NOTHING_REJECTED = (
+    "the residual is large where the load moves and small where it rests, so that disturbances"
+    " cannot be told from errors of the motion (delay, scale, mounting): no sample was rejected"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Options:
+    """What an estimator may know beyond the record.
+
+    Attributes:
+        noise: of wrench and motion.
+        offsets: whether to estimate the sensor's; otherwise they were subtracted before.
+        shared_noise: whether the forces, and the torques, have one estimated noise each.
+        prior, ellipsoid: for `consistent`.
+    """
+
+    noise: Noise
+    offsets: bool = True
+    shared_noise: bool = False
+    prior: Prior | None = None
+    ellipsoid: Ellipsoid | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A checked record: (N, 6), (N, 3), (N, 3), (N, 3), as for `identification.identify`."""
+
+    wrench: Array
+    s: Array
+    omega: Array
+    alpha: Array
+
+    @property
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
+        return self.wrench, self.s, self.omega, self.alpha
+
+    @cached_property
+    def moments(self) -> Moments:
+        moments = Moments()
+        moments.add(*self.arrays)
+        return moments
+
+    def every(self, step: int) -> Record:
+        """Every `step`th sample of it."""
+        return Record(*(table[::step] for table in self.arrays))
+
+    def residual(self, theta: Array, part: slice) -> Array:
+        """(n, 6) F - [E V] theta of a part of the samples [N, N m]."""
+        F, s, omega, alpha = (table[part] for table in self.arrays)
+        return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What an estimator found: the normal form, and of the wrench's noise (6,) what it used;
+    `rejected` are (N,) bools, the samples it did without; `note`, what a user has to know."""
+
+    form: NormalForm
+    wrench_noise: Array
+    moments: Moments
+    rejected: NDArray[np.bool_]
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class BatchResult:
+    """An identification by one of `METHODS`, and what it rests upon.
+
+    Attributes:
+        identification: the load.
+        noise: (6,) standard deviations of the wrench channels that gave the weights [N, N m].
+        rejected: (N,) bools, samples that the fit did without.
+        note: what a user has to know of the fit; mostly empty.
+        equations: of the samples that were used, with these weights: what
+            `uncertainty.base_parameters` asks for.
+    """
+
+    identification: Identification
+    noise: Array
+    rejected: NDArray[np.bool_]
+    note: str
+    equations: NormalEquations
+
+    @property
+    def rejected_fraction(self) -> float:
+        return float(self.rejected.mean())
+
+
+def _ordinary(record: Record, options: Options) -> Fit:
+    form = total_least_squares(record.moments, Noise(), np.ones(6), offsets=options.offsets)
+    return Fit(form, np.ones(6), record.moments, np.zeros(len(record.s), bool))
+
+
+def _whitened(record: Record, options: Options) -> Fit:
+    return _weighted(record.moments, replace(options, noise=Noise(options.noise.wrench)), record)
+
+
+def _total(record: Record, options: Options) -> Fit:
+    return _weighted(record.moments, options, record)
+
+
+def _consistent(record: Record, options: Options) -> Fit:
+    fit = _robust(record, options)
+    gram, right, theta = fit.form[:3]
+    if theta[6] < 0.0:
+        # An inverted sign, or no load: the nearest possible body, nothing at all, would hide it.
+        return fit
+    theta = consistent_least_squares(gram, right, theta, options.prior, options.ellipsoid)
+    return replace(fit, form=fit.form._replace(theta=theta))
+
+
+def _robust(record: Record, options: Options) -> Fit:
+    whole = _total(record, options)
+    n = len(record.s)
+    if n < _FEWEST_TO_REJECT:
+        return whole
+    # The start need not be better than what some of the samples say.
+    form = _huber(record.every(max(1, n // _SOME)), options)
+    rejected = np.zeros(n, bool)
+    for _ in range(_FITS):
+        last = rejected
+        rejected = _distances(record, form.theta, options.shared_noise) > _REJECT
+        moments = Moments()
+        moments.add(*record.arrays, weights=~rejected)
+        if _loss(whole, moments) > _MOST_LOSS:
+            return replace(whole, note=_NOTHING_REJECTED)
+        fit = _weighted(moments, options, record)
+        form = fit.form
+        if (rejected == last).all():
+            break
+    return replace(fit, rejected=rejected)
+
+
+def _huber(record: Record, options: Options) -> NormalForm:
+    """Iteratively reweighted, until the weights stay the same."""
+    moments, weights = record.moments, np.ones(len(record.s))
+    for _ in range(_FITS):
+        before = weights
+        form = _weighted(moments, options, record).form
+        distances = _distances(record, form.theta, options.shared_noise)
+        weights = np.minimum(1.0, _HUBER / np.maximum(distances, _HUBER))
+        if np.abs(weights - before).max() < 0.01:
+            break
+        moments = Moments()
+        moments.add(*record.arrays, weights=weights)
+    return form
+
+
+def _loss(whole: Fit, kept: Moments) -> float:
+    """By how much fewer samples enlarge the standard deviation that grows most, noise alike."""
+    if kept.samples < _FEWEST_TO_REJECT:
+        return np.inf
+    used = excited_columns(whole.moments.mean)
+    variances = []
+    for moments in (whole.moments, kept):
+        gram = moments.samples * normal_equations(moments.mean, whole.form.weights)[0]
+        variances.append(np.sum(inverse_root(gram, used) ** 2, axis=1)[used])
+    return float(np.sqrt(np.max(variances[1] / variances[0])))
+
+
+METHODS: dict[str, Callable[[Record, Options], Fit]] = {
+    "ordinary": _ordinary,
+    "whitened": _whitened,
+    "robust": _robust,
+    "total": _total,
+    "consistent": _consistent,
+}
+"""The estimators by name, all with one signature."""
+
+DEFAULT_METHOD = "consistent"
+
+NAMES = {
+    "ordinary": "batch least squares",
+    "whitened": "whitened least squares",
+    "robust": "robust least squares",
+    "total": "total least squares",
+    "consistent": "physically consistent least squares",
+}
+"""What `Identification.method` calls them."""
+
+
+def identify_batch(
+    wrench: ArrayLike,
+    s: ArrayLike,
+    omega: ArrayLike,
+    alpha: ArrayLike,
+    *,
+    method: str = DEFAULT_METHOD,
+    noise: Noise | None = None,
+    offsets: bool = True,
+    shared_noise: bool = False,
+    prior: Prior | None = None,
+    ellipsoid: Ellipsoid | None = None,
+    delay_s: float = 0.0,
+) -> BatchResult:
+    """Load and sensor offsets of a free motion by any of `METHODS`.
+
+    Args:
+        wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
+        s, omega, alpha: (N, 3) specific force a - g [m/s^2], angular velocity [rad/s] and angular
+            acceleration [rad/s^2] of S in S, in the order of time.
+        method: one of `METHODS`.
+        noise: of wrench and motion; default: that of the wrench is estimated, the motion is exact
+            and offsets do not wander.
+        offsets: whether to estimate the sensor's; otherwise they were subtracted before.
+        shared_noise: whether the three forces have one estimated noise, and the three torques one,
+            as is right for averages over poses at rest (module docstring).
+        prior, ellipsoid: what is known of the load, for "consistent".
+        delay_s: the delay that was taken out of the motion, for the record [s].
+
+    Raises:
+        DrakeTeleopError: for an unknown method, arrays of another shape, numbers that are not
+            finite, fewer than 3 samples, or a wrench that is zero throughout.
+    """
+    if method not in METHODS:
+        raise DrakeTeleopError(f"{method!r} is not one of {sorted(METHODS)}", where="method")
+    if method != "consistent" and (prior, ellipsoid) != (None, None):
+        raise DrakeTeleopError(
+            f"{method!r} takes no prior and no ellipsoid", where="method", remedy="use consistent"
+        )
+    _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+    record = Record(*rows)
+    fit = METHODS[method](
+        record, Options(noise or Noise(), offsets, shared_noise, prior, ellipsoid)
+    )
+    equations = NormalEquations(np.diag(fit.form.weights) ** -0.5)
+    kept = ~fit.rejected
+    equations.add(*(rows if kept.all() else [table[kept] for table in rows]))
+    plain = equations.solve(delay_s)
+    theta, Z = fit.form.theta, fit.moments.mean
+    steps = residual_covariance(Moments.walk_covariance(noise or Noise()), theta)
+    white = _white_covariance(plain.covariance, equations, fit)
+    covariance = _covariance(white + _walk_covariance(record, kept, fit, steps), fit.form, offsets)
+    dominated = np.zeros(16, bool)
+    if prior is not None:
+        covariance, dominated = _with_prior(covariance, prior.information(plain.samples))
+    deviations = np.sqrt(np.diag(covariance))
+    identification = replace(
+        plain,
+        phi=theta[6:],
+        offsets=theta[:6],
+        covariance=covariance,
+        identifiable=worth_stating(deviations, theta[6:]) & ~dominated,
+        prior_dominated=dominated,
+        residual_rms=np.sqrt(np.diag(residual_covariance(Z, theta)).clip(0.0)),
+        method=NAMES[method],
+    )
+    return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note, equations)
+
+
+def _with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Covariance (16, 16) of data and prior together, and which parameters are mostly the prior's.
+
+    With the information D of the data and P of the prior, (10, 10) of phi, the estimate is
+    (D + P)^-1 (D theta_data + P theta_prior): the diagonal of (D + P)^-1 D is the data's share. For
+    a single parameter it is 1 - (standard deviation over the prior's)^2.
+    """
+    known = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
+    used = known | (np.arange(16) >= 6)
+    # In units in which the entries are of one size.
+    scale = np.sqrt(np.where(known, np.diag(covariance), 1.0))
+    scale[6:] = np.diag(information) ** -0.5
+    data, total = np.zeros((2, 16, 16))
+    both, part = np.ix_(known, known), np.ix_(used, used)
+    data[both] = np.linalg.inv(covariance[both] / np.outer(scale, scale)[both])
+    total[6:, 6:] = information * np.outer(scale, scale)[6:, 6:]
+    total += data
+    posterior = np.where(np.diag(~used & np.isinf(np.diag(covariance))), np.inf, 0.0)
+    inverse = np.linalg.inv(total[part])
+    posterior[part] = inverse * np.outer(scale, scale)[part]
+    prior_share = np.zeros(16)
+    prior_share[used] = 1.0 - np.diag(inverse @ data[part])
+    return posterior, prior_dominated(np.sqrt(prior_share.clip(0.0)), np.ones(16))
+
+
+def _weighted(moments: Moments, options: Options, record: Record) -> Fit:
+    """Errors in variables with the noise that is given, or with the residual's."""
+    noise, Z = options.noise, moments.mean
+    if noise.wrench is not None:
+        std = np.asarray(noise.wrench, np.float64)
+    else:
+        std = np.ones(6)
+        floor = _ROUNDING * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
+        floor = np.where(floor > 0.0, floor, 1.0)
+        for known in (Noise(), noise):
+            theta = total_least_squares(moments, known, std, offsets=options.offsets).theta
+            squares = np.diag(residual_covariance(Z, theta))
+            motion = moments.noise_covariance(noise, np.zeros(6))
+            explained = np.diag(residual_covariance(motion, theta))
+            if options.shared_noise:
+                squares, explained = (
+                    x.reshape(2, 3).mean(axis=1).repeat(3) for x in (squares, explained)
+                )
+            std = np.sqrt(np.maximum(squares - explained, _LEAST_SHARE * squares).clip(floor**2))
+    form = total_least_squares(moments, noise, std, offsets=options.offsets)
+    return Fit(form, std, moments, np.zeros(len(record.s), bool))
+
+
+def _distances(record: Record, theta: Array, shared: bool) -> Array:
+    """(N,) largest residual of a sample's channels over the channel's robust deviation."""
+    n = len(record.s)
+    some = np.abs(record.residual(theta, slice(0, n, max(1, n // _MEDIAN_SAMPLES))))
+    median = np.median(some, axis=0)
+    if shared:
+        median = np.median(some.reshape(-1, 2, 3), axis=(0, 2)).repeat(3)
+    rms = np.sqrt(np.mean(record.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
+    scale = np.maximum(_NORMAL_MAD * median, _ROUNDING * rms)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    out = np.empty(n)
+    for start in range(0, n, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        out[part] = (np.abs(record.residual(theta, part)) / scale).max(axis=1)
+    return out
+
+
+def _white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Array:
+    """(16, 16) of least squares with weights W that couple the channels, if they do.
+
+    Noise of the motion is in several channels of the wrench at once, which `plain`, of
+    `NormalEquations`, does not know. Their correlation is the predicted one, that of W^-1.
+    """
+    W, Z = fit.form.weights, fit.moments.mean
+    predicted = np.linalg.inv(W)
+    if np.array_equal(W, np.diag(np.diag(W))):
+        return plain
+    scale = np.sqrt(equations.long_run_variances(fit.form.theta)[0] / np.diag(predicted))
+    of_sums = W @ (predicted * np.outer(scale, scale)) @ W
+    inverse = _inverse_gram(fit)
+    covariance = inverse @ (fit.moments.samples * normal_equations(Z, of_sums)[0]) @ inverse
+    unknown = np.isinf(np.diag(plain))
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = np.inf
+    return covariance
+
+
+def _inverse_gram(fit: Fit) -> Array:
+    """(16, 16) pseudo-inverse of the sum of [E V]^T W [E V] over the samples."""
+    Z = fit.moments.mean
+    root = inverse_root(normal_equations(Z, fit.form.weights)[0], excited_columns(Z))
+    return np.asarray(root @ root.T / fit.moments.samples)
+
+
+def _walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
+    """(16, 16) covariance of least squares from offsets that wander, about those at the start.
+
+    A step of the walk changes the wrench of all samples after it, and the solution by G^+ times
+    their share of the right-hand side. The steps are independent; `steps` (6, 6) is their
+    covariance, those of the motion's channels as changes of V phi.
+    """
+    covariance = np.zeros((16, 16))
+    if not steps.any():
+        return covariance
+    backwards, used = record.every(-1), kept[::-1]
+    after = np.zeros((6, 16))
+    for start in range(0, len(used), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        rows = np.zeros((len(used[part]), 6, 16))
+        rows[:, np.arange(6), np.arange(6)] = 1.0
+        rows[:, :, 6:] = regressor(*(table[part] for table in backwards.arrays[1:]))
+        rows = fit.form.weights @ (rows * used[part, None, None])
+        sums = after + np.cumsum(rows, axis=0)
+        after = sums[-1]
+        sums -= rows
+        covariance += np.einsum("nci,cd,ndj->ij", sums, steps, sums, optimize=True)
+    inverse = _inverse_gram(fit)
+    return inverse @ covariance @ inverse
+
+
+def _covariance(plain: Array, form: NormalForm, offsets: bool) -> Array:
+    """(16, 16) of the form's solution, from that of least squares (module docstring)."""
+    unknown = np.isinf(np.diag(plain))
+    covariance = np.where(unknown[:, None] | unknown, 0.0, plain)
+    if not offsets:  # what is left when the offsets are known
+        inner = np.linalg.pinv(covariance[:6, :6], hermitian=True)
+        covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
+        covariance[:6], covariance[:, :6] = 0.0, 0.0
+    covariance = form.transfer @ covariance @ form.transfer.T
+    unknown = unknown | form.undetermined
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = np.inf
+    return covariance

@@ -1,0 +1,1 @@
+"""Contact in what is left after elimination."""

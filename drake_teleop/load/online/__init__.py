@@ -1,0 +1,1 @@
+"""Estimation sample by sample, and what tells that the load has changed."""

@@ -1,0 +1,143 @@
+"""Recursive instrumental variables for the load and the offsets: a second view of the motion.
+
+Least squares correlates the equation errors with V of Eq. (5), which carries the noise that made
+them: hence its bias. Instrumental variables correlate them with V of another source whose noise is
+independent: the commanded motion, or derivatives of the encoders' readings (Kubus, Kroeger, Wahl:
+On-line rigid object recognition and pose estimation based on inertial parameters, IROS 2007; Ljung,
+System Identification, section 7.6). No noise level of the motion has to be known for the estimate
+to be free of bias, and the instruments may be off: a wrong instrument costs precision only, as long
+as its error has nothing to do with the noise of the measured motion.
+
+With the sums M = Y^T W Y, R = Y^T W X, g = Y^T W F over the samples, X = [E V] and
+Y = [E V(instruments)], the estimate is
+
+    (R^T M^-1 R + prior) theta = R^T M^-1 g + prior theta_0,
+
+which is R^-1 g as soon as the motion outweighs the prior, and unlike R^-1 g has no pole on the way.
+Weak instruments make R^T M^-1 R small: the estimate stays with the prior, and its variance large.
+W (6, 6) is the inverse covariance of the residuals so far, of all six rows together: three-stage
+least squares (Zellner, Theil: Econometrica 30, 1962), every sample anew, see `recursive_moments`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.load.online.recursive_moments import (
+    MomentEstimator,
+    add_product,
+    eliminate,
+    forget,
+    invert,
+    observe,
+    residual_products,
+    scratch,
+    solve,
+    terms,
+    weighted_gram,
+    weighted_right,
+)
+
+# Share of the instruments' own information by which M is raised, against rounding.
+_RIDGE = 1e-9
+# So many samples the stated noise of the wrench counts next to the residuals, which are too small
+# while there are hardly more of them than parameters.
+_STATED = 20.0
+# Share of the squared wrench below which a squared residual is rounding.
+_ROUNDING = 1e-13
+
+
+@njit(cache=True)
+def riv_normal_equations(memory, theta, noise_std, information, index, factors, space, MRg, A):
+    """Writes R^T M^-1 R + prior and R^T M^-1 g + prior theta_0 into A (16, 17).
+
+    Args:
+        memory: (58, 19) sums of z z^T, y z^T, y y^T (y of the instruments), and prior theta_0.
+        theta: (16,) estimate, for the weights.
+        noise_std: (6,) of the wrench [N, N m].
+        information: (16,) of the prior.
+        index, factors: from `terms`, space: from `scratch`, MRg: (16, 33) scratch.
+    """
+    E, g, L, LZ, inverse, S, W = space
+    measured, mixed, instruments = memory[:19], memory[19:38], memory[38:57]
+    residual_products(measured, theta, index, factors, L, LZ, S)
+    for c in range(6):
+        S[c, c] += _STATED * noise_std[c] ** 2 + _ROUNDING * measured[13 + c, 13 + c]
+        for d in range(6):
+            S[c, d] /= measured[0, 0] + _STATED
+    invert(S, inverse, W)
+    weighted_gram(instruments, W, index, factors, E, MRg, 0)
+    weighted_gram(mixed, W, index, factors, E, MRg, 16)
+    weighted_right(mixed[:, 13:].T, W, index, factors, g)
+    for i in range(16):
+        MRg[i, 32] = g[i]
+        MRg[i, i] += _RIDGE * MRg[i, i] + information[i]
+        for j in range(17):
+            A[i, j] = 0.0
+        A[i, i] = information[i]
+        A[i, 16] = memory[57, i]
+    eliminate(MRg)
+    for k in range(16):
+        pivot = 1.0 / MRg[k, k]
+        for i in range(16):
+            factor = pivot * MRg[k, 16 + i]
+            for j in range(17):
+                A[i, j] += factor * MRg[k, 16 + j]
+
+
+@njit(cache=True)
+def riv_update(theta, memory, samples, noise_std, forgetting, information, index, factors):
+    """One sample after the other, in place; compiled, checks nothing.
+
+    Args:
+        theta: (16,) [offsets; phi], updated.
+        memory: (58, 19), updated.
+        samples: (N, 24) [wrench, s, omega, alpha, instruments (s, omega, alpha)].
+        forgetting: factor per sample on the weight of the past.
+        noise_std, information, index, factors: as for `riv_normal_equations`.
+    """
+    space, MRg, A = scratch(), np.empty((16, 33)), np.empty((16, 17))
+    y, z = np.empty(19), np.empty(19)
+    for n in range(len(samples)):
+        if forgetting < 1.0:
+            forget(memory, theta, information, forgetting)
+        observe(samples[n], 6, z)
+        observe(samples[n], 15, y)
+        add_product(z, z, memory[:19])
+        add_product(y, z, memory[19:38])
+        add_product(y, y, memory[38:57])
+        riv_normal_equations(memory, theta, noise_std, information, index, factors, space, MRg, A)
+        solve(A)
+        theta[:] = A[:, 16]
+
+
+class RecursiveInstrumentalVariables(MomentEstimator):
+    """Recursive instrumental variables: `update` and `learn` need instruments; see the module.
+
+    Args:
+        noise_std: (6,) standard deviations of the wrench channels [N, N m], for the first weights.
+        forgetting: factor per sample on the weight of the past, 0 < forgetting <= 1.
+        prior_std: (16,) standard deviations of [offsets; phi] to begin with. With forgetting the
+            prior is about the present estimate and never vanishes.
+        bound: of `settled`.
+
+    Raises:
+        DrakeTeleopError: for other shapes or values.
+    """
+
+    method = "recursive instrumental variables"
+    sample_size = 24
+    _sums = 3
+
+    def covariance_of(self, theta: Array, memory: Array) -> Array:
+        """(16, 16) (R^T M^-1 R + prior)^-1: W is the inverse of the errors' covariance."""
+        A, MRg = np.empty((16, 17)), np.empty((16, 33))
+        options = (self._noise_std, 1.0 / self._prior, *terms())
+        riv_normal_equations(memory, theta, *options, scratch(), MRg, A)
+        return self._within_prior(np.linalg.inv(0.5 * (A[:, :16] + A[:, :16].T)))
+
+    def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
+        options = (self._noise_std, self._forgetting, 1.0 / self._prior, *terms())
+        riv_update(theta, memory, samples, *options)

@@ -1,0 +1,466 @@
+"""What `drake-teleop inspect` does: a log's quality, suspected errors, or a draft description.
+
+Names in the summary (and in summary.json):
+
+=============== =================================================================================
+log             the file that was read
+kind            "description", "canonical", "unknown" (a table without known columns) or "bag"
+topics          of a bag: type, messages and rate_hz of each; otherwise empty
+streams         of each: rows, rate_hz, duration_s, longest_gap_s, gaps, clock_jumps (time stamps
+                that stand still or go back), repeated_rows, nan_rows, nan_longest (rows of the
+                longest block), and columns: of each min, max, mean, noise (standard deviation of
+                white noise, from third differences), saturated (samples at the end of the range)
+findings        list of name and message: what is suspicious and what to change
+fit             of a load to the description as given: mass [kg] and unexplained, the share of the
+                wrench's variance; null if the log cannot be read
+mounting        of the IMU against the pose: R_SI, angle_deg, right_angled, lag_s (the best
+                constant), drift of the clock [s/s], unexplained; null without both
+delay_s         of the motion behind the wrench; null if the log does not determine it
+draft           the file with a draft description of an unknown table or a bag, or null
+=============== =================================================================================
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.check.conventions import Finding, check_conventions, white_noise
+from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
+from drake_teleop.logs.read.canonical import describe_canonical
+from drake_teleop.logs.read.clocks import shortest_gap
+from drake_teleop.logs.read.description import Description, load_description
+from drake_teleop.logs.read.tables import FORMATS, Table, read_table
+
+BANDWIDTH = 30.0
+"""Gaps are those that matter below this frequency [Hz]."""
+REPEATED = 0.05
+"""Repeated rows are mentioned from this share of all rows, or from a block of `BLOCK` rows."""
+BLOCK = 5
+_QUANTITIES = (
+    "force",
+    "torque",
+    "specific_force",
+    "angular_velocity",
+    "angular_acceleration",
+    "orientation",
+    "position",
+    "gravity",
+)
+
+
+def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, Any]:
+    """Inspects a log and writes summary.json, and draft.yaml for an unknown table, into `out`.
+
+    Args:
+        log: a canonical log, a description, any table, or a bag.
+        out: folder for the results.
+        quiet: print nothing.
+
+    Returns:
+        the summary, see the top of this module.
+
+    Raises:
+        DrakeTeleopError: if the log cannot be read.
+    """
+    summary: dict[str, Any] = {
+        "log": str(log),
+        "kind": "description",
+        "topics": {},
+        "streams": {},
+        "findings": [],
+        "fit": None,
+        "mounting": None,
+        "delay_s": None,
+        "draft": None,
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    description: Description | None = None
+    draft = ""
+    if is_bag(log):
+        topics = topics_of(log)
+        draft = draft_of_bag(log, topics, out)
+        summary["kind"] = "bag"
+        summary["topics"] = {
+            topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
+            for topic in topics
+        }
+    elif log.suffix.lower() in FORMATS:
+        table = read_table(log)
+        try:
+            description = describe_canonical(log, table)
+            summary["kind"] = "canonical"
+        except DrakeTeleopError:
+            known = "f_x" in table.columns and "tau_x" in table.columns
+            if known:
+                # A canonical log with NaN or a missing column: its own message is the best one.
+                description = describe_canonical(log, _finite(table, list(table.columns)))
+                summary["kind"] = "canonical"
+        tables = {log: table}
+        if description is None:
+            draft = draft_description(table, out)
+            summary["kind"] = "unknown"
+    else:
+        description = load_description(log)
+        tables = {}
+    if description is None:
+        summary["draft"] = str(out / "draft.yaml")
+        (out / "draft.yaml").write_text(draft, encoding="utf-8")
+    else:
+        _inspect(description, str(log), tables, summary)
+    text = json.dumps(summary, indent=2, allow_nan=False)
+    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    if not quiet:
+        _print(summary)
+    return summary
+
+
+def _inspect(
+    description: Description, source: str, tables: dict[Path, Table], summary: dict[str, Any]
+) -> None:
+    findings: list[Finding] = []
+    needed: dict[Path, list[str]] = {}
+    for name in ("wrench", "imu", "pose", "static"):
+        stream = getattr(description, name)
+        if stream is None:
+            continue
+        if stream.source not in tables:
+            tables[stream.source] = read_stream(stream)
+        figures, more, columns = _stream(name, stream, tables[stream.source], description, source)
+        summary["streams"][name] = figures
+        findings += more
+        needed.setdefault(stream.source, []).extend(columns)
+    clean = {path: _finite(tables[path], columns) for path, columns in needed.items()}
+    for name in ("wrench", "imu", "pose"):
+        stream = getattr(description, name)
+        if stream is not None and stream.time.column is not None:
+            clean[stream.source] = _increasing(clean[stream.source], str(stream.time.column))
+    try:
+        found = check_conventions(description, source, clean)
+    except DrakeTeleopError as error:
+        findings.append(Finding("unusable", str(error)))
+    else:
+        findings += found.findings
+        summary["delay_s"] = found.delay_s
+        summary["fit"] = {"mass": found.fit.mass, "unexplained": found.fit.unexplained}
+        if found.mounting is not None:
+            summary["mounting"] = {
+                "R_SI": found.mounting.R_SI.tolist(),
+                "angle_deg": found.mounting.angle_deg,
+                "right_angled": found.mounting.is_right_angled,
+                "lag_s": found.mounting.lag_s,
+                "drift": found.mounting.drift,
+                "unexplained": found.mounting.unexplained,
+            }
+    summary["findings"] = [{"name": f.name, "message": f.message} for f in findings]
+
+
+def _stream(
+    name: str, stream: Any, table: Table, description: Description, source: str
+) -> tuple[dict[str, Any], list[Finding], list[str]]:
+    """Figures and findings of one stream, and the columns that it uses."""
+    columns = [
+        str(column)
+        for field in _QUANTITIES
+        for column in getattr(getattr(stream, field, None), "columns", ())
+    ]
+    values = np.hstack([table.raw(c, f"{source}:{name}") for c in columns])
+    good = np.asarray(np.isfinite(values).all(axis=1))
+    findings: list[Finding] = []
+    figures: dict[str, Any] = {"rows": len(values)}
+    at = f"{name} ({table.path.name})"
+    time = getattr(stream, "time", None)
+    if time is not None:
+        findings += _clock(at, time, table, description, len(values), figures)
+    figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest(~good)
+    if not good.all():
+        first = int(np.argmin(good)) + table.first_row
+        findings.append(
+            Finding(
+                "nan",
+                f"{at}: {figures['nan_rows']} rows hold no finite number, the first is row {first},"
+                f" the longest block {figures['nan_longest']} rows; cut or repair them",
+            )
+        )
+    same = np.zeros(len(values), bool)
+    same[1:] = (values[1:] == values[:-1]).all(axis=1)
+    figures["repeated_rows"] = int(same.sum())
+    moving = name in ("wrench", "imu") and not same[1:].all()
+    if moving:
+        findings += _repeated(at, values, same, figures.get("rate_hz"), time)
+    figures["columns"] = {}
+    for column, x in zip(_labels(columns, table), values.T, strict=True):
+        finite = x[np.isfinite(x)]
+        if not len(finite):
+            continue
+        saturated = 0 if time is None or not moving else _saturated(x, same)
+        figures["columns"][column] = {
+            "min": float(finite.min()),
+            "max": float(finite.max()),
+            "mean": float(finite.mean()),
+            "noise": float(white_noise(finite[:, None])[0]),
+            "saturated": saturated,
+        }
+        if saturated:
+            findings.append(
+                Finding(
+                    "saturation",
+                    f"{at}: {column} stands at the end of its range ({finite.min():.4g} ..."
+                    f" {finite.max():.4g}) for {saturated} samples; cut them or move slower",
+                )
+            )
+    used = columns if time is None or time.column is None else [*columns, str(time.column)]
+    return figures, findings, used
+
+
+def _repeated(
+    at: str,
+    values: NDArray[np.float64],
+    same: NDArray[np.bool_],
+    rate: float | None,
+    time: Any,
+) -> list[Finding]:
+    """Whether rows were held by the recorder, and at what rate new ones came.
+
+    A coarse sensor at rest repeats rows by itself; but then the row after a repeated one differs in
+    a channel or two, whereas after a row that was held most channels are new at once.
+    """
+    held = int(same.sum())
+    news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
+    changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
+    differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
+    enough = same.mean() > REPEATED or _longest(same) >= BLOCK
+    if not enough or (len(differ) and np.median(differ) <= 0.5):
+        return []
+    longest = _longest(same)
+    fresh = np.flatnonzero(~same)
+    period = int(np.median(np.diff(fresh)))
+    news = "" if rate is None else f": new values come at {rate * len(fresh) / len(same):.4g} Hz"
+    if period > 1 and rate is not None:
+        what = f"every value is held for {period} rows{news}, not {rate:.4g} Hz"
+    else:
+        what = f"{held} rows repeat the one before in all channels, up to {longest} in a row{news}"
+    remedy = "delete the repeated rows"
+    if time is not None and time.column is None:
+        remedy = f"give time stamps (time.column) and {remedy}"
+    return [Finding("repeated rows", f"{at}: {what}; {remedy}")]
+
+
+def _clock(
+    at: str,
+    time: Any,
+    table: Table,
+    description: Description,
+    rows: int,
+    figures: dict[str, Any],
+) -> list[Finding]:
+    if time.column is None:
+        figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
+        return []
+    t = table.raw(time.column, at)[:, 0] * description.scale(time.unit)
+    t = t[np.isfinite(t)]
+    steps = np.diff(t)
+    forward = steps[steps > 0]
+    if not len(forward):
+        raise DrakeTeleopError(
+            "the time stamps never increase", where=at, remedy="name another column, or time.rate"
+        )
+    median = float(np.median(forward))
+    gaps, back = int((steps > shortest_gap(median, BANDWIDTH)).sum()), int((steps <= 0).sum())
+    figures |= {
+        "rate_hz": 1 / median,
+        "duration_s": float(t[-1] - t[0]),
+        "longest_gap_s": float(forward.max()),
+        "gaps": gaps,
+        "clock_jumps": back,
+    }
+    findings = []
+    if gaps:
+        where = float(t[int(np.argmax(steps))] - t[0])
+        findings.append(
+            Finding(
+                "gap",
+                f"{at}: {gaps} gaps, the longest {forward.max():.3g} s at {where:.3g} s: rows are"
+                " missing or the clock jumped; what lies there is not used",
+            )
+        )
+    if back:
+        row = int(np.argmax(steps <= 0)) + 1 + table.first_row
+        findings.append(
+            Finding(
+                "clock jump",
+                f"{at}: {back} time stamps stand still or go back, the first in row {row};"
+                " rows that share one are left out or spread evenly; a log that goes back is"
+                " refused: cut it there, or give time.rate",
+            )
+        )
+    return findings
+
+
+def _labels(columns: Sequence[str], table: Table) -> list[str]:
+    """One label for each number in a row; an array of an NPZ file has several."""
+    labels: list[str] = []
+    for column in columns:
+        width = table.raw(column, column).shape[1]
+        labels += [column] if width == 1 else [f"{column}[{i}]" for i in range(width)]
+    return labels
+
+
+def _longest(flags: NDArray[np.bool_]) -> int:
+    """Length of the longest run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
+
+
+def _saturated(x: NDArray[np.float64], same: NDArray[np.bool_]) -> int:
+    """Samples at the largest or smallest value, if they stand there as nowhere else."""
+    held = np.zeros(len(x), bool)
+    held[1:] = (x[1:] == x[:-1]) & ~same[1:]
+    ends = (x == np.nanmax(x)) | (x == np.nanmin(x))
+    inside, outside = _longest(held & ends), _longest(held & ~ends)
+    return int(ends.sum()) if inside >= BLOCK and inside > 2 * outside else 0
+
+
+def _finite(table: Table, names: Sequence[str]) -> Table:
+    """The table's rows in which all these columns are finite."""
+    if len({len(table.raw(name, name)) for name in names}) != 1:
+        return table
+    good = np.all([np.isfinite(table.raw(n, n)).all(axis=1) for n in names], axis=0)
+    if good.all():
+        return table
+    rows = len(good)
+    kept = {n: x[good] if len(x) == rows else x for n, x in table.columns.items()}
+    return replace(table, columns=kept)
+
+
+def _increasing(table: Table, column: str) -> Table:
+    """The table's rows whose time stamps are later than all before."""
+    t = table.raw(column, column)[:, 0]
+    later = np.ones(len(t), bool)
+    later[1:] = t[1:] > np.maximum.accumulate(t)[:-1]
+    if later.all():
+        return table
+    kept = {n: x[later] if len(x) == len(t) else x for n, x in table.columns.items()}
+    return replace(table, columns=kept)
+
+
+_NAMES = {
+    "time": r"^(t|time|timestamp|stamp|time_?stamp|sec|secs)(_?(s|ms|us|ns))?$",
+    "force": r"^(f|force|forces?)[._ ]?[xyz]$",
+    "torque": r"^(t|m|tau|torque|moment)[._ ]?[xyz]$",
+    "specific_force": r"^(a|s|acc|accel|acceleration|linear_acceleration)[._ ]?[xyz]$",
+    "angular_velocity": r"^(w|g|omega|gyro|gyr|angular_velocity)[._ ]?[xyz]$",
+    "orientation": r"^(q|quat|quaternion|orientation)[._ ]?[wxyz]$",
+    "position": r"^(p|pos|position)?[._ ]?[xyz]$",
+}
+
+
+def draft_description(table: Table, folder: Path) -> str:
+    """A draft of a log description, guessed from names and magnitudes of a table's columns.
+
+    Args:
+        table: any table.
+        folder: where the draft will be, which its path to the table starts from.
+
+    Returns:
+        YAML text whose first line says that it is a draft, and what was not found.
+    """
+    import yaml
+
+    columns: dict[str, list[str]] = {
+        key: [name for name in table.columns if re.match(pattern, name, re.IGNORECASE)]
+        for key, pattern in _NAMES.items()
+    }
+    file = os.path.relpath(table.path, folder)
+    time: dict[str, Any] = {"column": "FILL IN"}
+    if columns["time"]:
+        time = {"column": columns["time"][0], "unit": _time_unit(table, columns["time"][0])}
+    wrench = {
+        "file": file,
+        "time": time,
+        "force": {"columns": columns["force"] or ["FILL IN"] * 3},
+        "torque": {"columns": columns["torque"] or ["FILL IN"] * 3},
+        "sign": 1,
+    }
+    draft: dict[str, Any] = {"wrench": wrench}
+    imu: dict[str, Any] = {}
+    if len(columns["specific_force"]) == 3:
+        size = float(np.median(_norm(table, columns["specific_force"])))
+        unit = "g" if size < 3 else "m/s^2"
+        imu["specific_force"] = {"columns": columns["specific_force"], "unit": unit}
+    if len(columns["angular_velocity"]) == 3:
+        size = float(np.nanmax(_norm(table, columns["angular_velocity"])))
+        unit = "deg/s" if size > 15 else "rad/s"
+        imu["angular_velocity"] = {"columns": columns["angular_velocity"], "unit": unit}
+    if imu:
+        draft["imu"] = {"file": file, "time": dict(time)} | imu
+    if len(columns["orientation"]) == 4:
+        first = columns["orientation"][0].lower().endswith("w")
+        form = "quaternion_wxyz" if first else "quaternion_xyzw"
+        pose = {"columns": columns["orientation"], "form": form}
+        draft["pose"] = {"file": file, "time": dict(time), "orientation": pose}
+        if len(columns["position"]) == 3:
+            size = float(np.nanmax(_norm(table, columns["position"])))
+            unit = "mm" if size > 20 else "m"
+            draft["pose"]["position"] = {"columns": columns["position"], "unit": unit}
+    unused = [n for n in table.columns if not any(n in found for found in columns.values())]
+    head = [
+        "# DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
+        "# above all wrench.sign, units and frames, and inspect it.",
+        f"# Columns without a guess: {', '.join(unused) or 'none'}.",
+    ]
+    return "\n".join(head) + "\n" + yaml.safe_dump(draft, sort_keys=False)
+
+
+def _norm(table: Table, names: Sequence[str]) -> NDArray[np.float64]:
+    return np.linalg.norm(np.hstack([table.raw(n, n) for n in names]), axis=1)
+
+
+def _time_unit(table: Table, column: str) -> str:
+    """The unit in which the median step is between 50 us and 1 s, the longest such step."""
+    step = float(np.median(np.abs(np.diff(table.raw(column, column)[:, 0]))))
+    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
+        if step * scale <= 0.3:
+            return unit
+    return "ns"
+
+
+def _print(summary: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table as Grid
+
+    console = Console()
+    grid = Grid(
+        "stream", "rows", "rate [Hz]", r"span \[s]", r"longest step \[s]", "NaN", "repeated"
+    )
+    for name, figures in summary["streams"].items():
+        shown = (figures.get(key) for key in ("rate_hz", "duration_s", "longest_gap_s"))
+        grid.add_row(
+            *(name, str(figures["rows"])),
+            *("" if x is None else f"{x:.4g}" for x in shown),
+            *(str(figures["nan_rows"]), str(figures["repeated_rows"])),
+        )
+    if summary["streams"]:
+        console.print(grid)
+    for finding in summary["findings"]:
+        console.print(f"[bold]{escape(finding['name'])}[/bold]: {escape(finding['message'])}")
+    if summary["topics"]:
+        grid = Grid("topic", "type", "messages", "rate [Hz]")
+        for name, topic in summary["topics"].items():
+            rate = f"{topic['rate_hz']:.4g}"
+            grid.add_row(name, topic["type"], str(topic["messages"]), rate)
+        console.print(grid)
+    if summary["draft"]:
+        console.print(f"a draft description is in {escape(summary['draft'])}")
+    elif not summary["findings"]:
+        console.print("nothing suspicious")

@@ -1,0 +1,235 @@
+"""Signals on one clock: resampling, low-pass, differentiation, moving the motion in time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import next_fast_len
+
+from drake_teleop.logs.read.canonical import Log
+
+_SMOOTHER_SAMPLES = 9
+_SMOOTHER_DEGREE = 5
+SMOOTHER_WINDOW = 1.8
+"""Length of the smoother's window [s] times the bandwidth [Hz]."""
+
+
+def spacing(t: NDArray[np.float64]) -> float:
+    """Mean step of (N,) times."""
+    return float(t[-1] - t[0]) / (len(t) - 1)
+
+
+def uniform_times(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Equidistant times over the same span at the median rate; `t` itself if it is so already.
+
+    Args:
+        t: (N,) increasing times.
+    """
+    even = np.linspace(t[0], t[-1], len(t))
+    if np.abs(t - even).max() < 1e-3 * spacing(t):
+        return t
+    dt = float(np.median(np.diff(t)))
+    return t[0] + dt * np.arange(int((t[-1] - t[0]) / dt + 1e-6) + 1)
+
+
+def resample(
+    t_new: NDArray[np.float64], t: NDArray[np.float64], x: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Linear interpolation of (N, ...) signals at the times `t` to `t_new`; ends are held."""
+    if np.array_equal(t_new, t):
+        return x
+    # One search serves all columns; np.interp would search, and copy, for each.
+    after = np.clip(np.searchsorted(t, t_new, side="right"), 1, len(t) - 1)
+    share = np.clip((t_new - t[after - 1]) / (t[after] - t[after - 1]), 0.0, 1.0)
+    share = share.reshape(-1, *[1] * (x.ndim - 1))
+    before = x[after - 1]
+    return before + share * (x[after] - before)
+
+
+def low_pass(x: NDArray[np.float64], dt: float, cutoff_hz: float | None) -> NDArray[np.float64]:
+    """Zero-phase low-pass along the first axis, done in the frequency domain.
+
+    The gain is 1 / (1 + (f / cutoff)^4): a second-order Butterworth filter run forward and
+    backward, half the amplitude at `cutoff_hz`. The ends are continued by point reflection
+    (2 x_0 - x_k), which keeps value and slope.
+
+    Args:
+        x: (N, ...) samples.
+        dt: their spacing [s].
+        cutoff_hz: None, or anything above the Nyquist rate, leaves `x` as it is.
+    """
+    if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
+        return x
+    n = len(x)
+    pad = min(n - 1, math.ceil(3 / (cutoff_hz * dt)))
+    # A length without large prime factors is several times faster. What it takes more than the
+    # record and its continuations leads from the one's end to the other's start.
+    length = next_fast_len(n + 2 * pad, real=True)
+    gain = 1 / (1 + (np.fft.rfftfreq(length, dt) / cutoff_hz) ** 4)
+    out, padded = np.empty((n, x.size // n)), np.empty(length)
+    for column, filtered in zip(x.reshape(n, -1).T, out.T, strict=True):
+        padded[pad : pad + n] = column
+        padded[:pad] = 2 * column[0] - column[pad:0:-1]
+        padded[pad + n : 2 * pad + n] = 2 * column[-1] - column[-2 : -2 - pad : -1]
+        padded[2 * pad + n :] = np.linspace(
+            padded[2 * pad + n - 1], padded[0], length - 2 * pad - n
+        )
+        filtered[:] = np.fft.irfft(np.fft.rfft(padded) * gain, length)[pad : pad + n]
+    return out.reshape(x.shape)
+
+
+def smooth_derivatives(
+    x: NDArray[np.float64], dt: float, bandwidth_hz: float | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Signals and their first two derivatives, by sliding least-squares fits of quintics.
+
+    The smoother of Savitzky and Golay (1964): around each sample a polynomial of degree 5 is
+    fitted to a window of 1.8 / `bandwidth_hz`, at least 9 samples; at the ends the outermost
+    polynomials are continued. White noise of standard deviation sigma comes out, away from the
+    ends, as sigma * `noise_gain`.
+
+    Args:
+        x: (N, ...) equidistant samples, N >= 9.
+        dt: their spacing [s].
+        bandwidth_hz: where the gain of the second derivative has fallen to 0.43 (it is 0.985 at a
+            third of that; the lower derivatives are wider); None for the shortest window.
+
+    Returns:
+        x, dx/dt, d^2x/dt^2, each shaped as `x`.
+    """
+    n = len(x)
+    weights = _smoother(n, dt, bandwidth_hz)
+    half = weights.shape[1] // 2
+    flat = x.reshape(n, -1)
+    inner = [
+        np.stack([np.convolve(column, row[::-1], mode="valid") for column in flat.T], axis=1)
+        for row in weights
+    ]
+    tau = dt * np.arange(1, half + 1)
+    derivatives = []
+    for order in range(3):
+        before = _polynomial([c[0] for c in inner], -tau[::-1], order)
+        after = _polynomial([c[-1] for c in inner], tau, order)
+        middle = math.factorial(order) * inner[order]
+        derivatives.append(np.concatenate([before, middle, after]).reshape(x.shape))
+    return derivatives[0], derivatives[1], derivatives[2]
+
+
+def noise_gain(dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
+    """(3,) white-noise gains of `smooth_derivatives`: of x [1], dx/dt [1/s], d^2x/dt^2 [1/s^2]."""
+    weights = _smoother(10**9, dt, bandwidth_hz)
+    return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
+
+
+def _smoother(n: int, dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
+    """(6, w) weights of a window's samples in the coefficients of its polynomial."""
+    window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW / bandwidth_hz
+    half = max(_SMOOTHER_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
+    powers = np.vander(np.arange(-half, half + 1) / half, _SMOOTHER_DEGREE + 1, increasing=True)
+    # Fitted on -1 ... 1, where the powers are of one size, then scaled to seconds.
+    return np.linalg.pinv(powers) / (half * dt) ** np.arange(_SMOOTHER_DEGREE + 1)[:, None]
+
+
+def _polynomial(
+    coefficients: list[NDArray[np.float64]], tau: NDArray[np.float64], order: int
+) -> NDArray[np.float64]:
+    """(len(tau), k) derivative of the polynomials with coefficients (k,), lowest power first."""
+    terms = [
+        math.perm(power, order) * np.outer(tau ** (power - order), c)
+        for power, c in enumerate(coefficients)
+        if power >= order
+    ]
+    return np.sum(terms, axis=0)
+
+
+def angular_motion(
+    R_WS: NDArray[np.float64], dt: float, bandwidth_hz: float | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Angular velocity and acceleration in S from equidistant orientations.
+
+    omega is the skew part of R' dR/dt. As its derivative, R' d^2R/dt^2 + (dR/dt)' dR/dt, has a
+    symmetric second term, alpha is the skew part of R' d^2R/dt^2. Derivatives as in
+    `smooth_derivatives`.
+
+    Args:
+        R_WS: (N, 3, 3) rotations.
+        dt: their spacing [s].
+        bandwidth_hz: of the smoother.
+
+    Returns:
+        omega_WS_S (N, 3) [rad/s], alpha_WS_S (N, 3) [rad/s^2].
+    """
+    _, first, second = smooth_derivatives(R_WS, dt, bandwidth_hz)
+    R_SW = np.swapaxes(R_WS, 1, 2)
+    return _skew_part(R_SW @ first), _skew_part(R_SW @ second)
+
+
+def _skew_part(A: NDArray[np.float64]) -> NDArray[np.float64]:
+    return 0.5 * np.stack(
+        [A[:, 2, 1] - A[:, 1, 2], A[:, 0, 2] - A[:, 2, 0], A[:, 1, 0] - A[:, 0, 1]], axis=1
+    )
+
+
+def low_passed(log: Log, cutoff_hz: float | None) -> Log:
+    """The log with wrench and motion through the same zero-phase `low_pass`; poses untouched."""
+    if log.static:
+        return log
+    return replace(
+        log,
+        wrench=low_pass(log.wrench, log.dt, cutoff_hz),
+        specific_force=low_pass(log.specific_force, log.dt, cutoff_hz),
+        angular_velocity=low_pass(log.angular_velocity, log.dt, cutoff_hz),
+        angular_acceleration=low_pass(log.angular_acceleration, log.dt, cutoff_hz),
+    )
+
+
+def undelayed(log: Log, delay_s: float) -> Log:
+    """The log with its motion moved forward in time by `delay_s`, at the instants of the wrench.
+
+    Args:
+        log: the log.
+        delay_s: how far the motion lags behind the wrench [s]; negative if it leads. The samples
+            whose motion is then unknown (one end of the record) are dropped.
+    """
+    if log.static or delay_s == 0:
+        return log
+    at = log.t + delay_s
+    known = (at >= log.t[0]) & (at <= log.t[-1])
+    s, omega, alpha = (resample(at[known], log.t, x) for x in log.motion)
+    bridged = None
+    if log.bridged is not None:
+        # A gap may be one of the wrench or one of the motion: where either would now be.
+        moved = resample(at[known], log.t, log.bridged.astype(float)) > 0
+        bridged = log.bridged[known] | moved
+    return replace(
+        log.only(known),
+        specific_force=s,
+        angular_velocity=omega,
+        angular_acceleration=alpha,
+        bridged=bridged,
+    )
+
+
+def measured(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
+    """(N,) samples that owe nothing to a bridged gap, even after `low_pass`.
+
+    Two periods of the cut-off beside a gap are left out as well: beyond them its impulse response
+    has fallen to 1e-4 of its peak.
+
+    Args:
+        log: the log.
+        cutoff_hz: of the low-pass; None for none.
+    """
+    if log.bridged is None:
+        return np.ones(len(log), bool)
+    return ~widened(log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt)))
+
+
+def widened(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+    """`flags` (N,), true also where one within `by` samples is."""
+    count = np.concatenate([[0], np.cumsum(flags)])
+    at = np.arange(len(flags))
+    return count[np.minimum(at + by + 1, len(flags))] > count[np.maximum(at - by, 0)]

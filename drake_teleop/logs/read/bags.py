@@ -1,0 +1,312 @@
+"""ROS bags and MCAP files: a topic becomes a table whose columns are the messages' fields.
+
+A bag is a folder with metadata.yaml (sqlite3 or mcap storage), a lone .mcap or .db3 file, or a .bag
+of ROS 1. Message types are read from the bag itself, so that anybody's own will do; only bags
+without definitions (sqlite3 before ROS 2 Iron) have to do with the standard types. It takes the
+library rosbags, extra `ros`, but no ROS.
+
+Columns of a topic's table:
+
+==================== =============================================================================
+wrench.force.x       a number, by the path of its field
+covariance, data.0   an array of up to 64 numbers as a whole, and each of them
+force.x              short for a path that ends so, if only one does; of the standard groups force,
+                     torque, linear_acceleration, angular_velocity, orientation (also for a
+                     transform's rotation) and position (also for its translation)
+received             s, when the recorder received the message
+header.stamp         s, the stamp of its sender, unless all are zero; so any other time
+stamp                header.stamp, or received where there is none
+==================== =============================================================================
+
+Fields whose covariance begins with -1 in every message are not there: that is how ROS says that
+a sensor does not have them. Messages that hold `transforms` (TF) are taken apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.read.description import Imu, Pose, Static, Wrench
+from drake_teleop.logs.read.tables import Table, read_table
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+SUFFIXES = (".mcap", ".db3", ".bag")
+_LONGEST_ARRAY = 64
+_GROUPS = {
+    "force": "force",
+    "torque": "torque",
+    "linear_acceleration": "linear_acceleration",
+    "angular_velocity": "angular_velocity",
+    "orientation": "orientation",
+    "rotation": "orientation",
+    "position": "position",
+    "translation": "position",
+}
+_TYPES = {
+    "wrench": ("WrenchStamped", "Wrench"),
+    "imu": ("Imu",),
+    "pose": (
+        "PoseStamped",
+        "PoseWithCovarianceStamped",
+        "TransformStamped",
+        "Odometry",
+        "Pose",
+        "TFMessage",
+    ),
+}
+"""The types that a stream may be, the likeliest first."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of a bag.
+
+    Args:
+        name: such as "/ft/wrench".
+        type: of its messages, such as "geometry_msgs/msg/WrenchStamped".
+        messages: how many there are.
+        rate_hz: messages over the duration of the bag; 0 for an empty one.
+    """
+
+    name: str
+    type: str
+    messages: int
+    rate_hz: float
+
+
+def is_bag(path: Path) -> bool:
+    """Whether the path looks like a bag: a folder with metadata.yaml, or one of `SUFFIXES`."""
+    return (path / "metadata.yaml").is_file() or path.suffix.lower() in SUFFIXES
+
+
+def topics_of(path: Path) -> list[Topic]:
+    """The topics of a bag by name.
+
+    Raises:
+        DrakeTeleopError: if there is no such bag, it cannot be read, or rosbags is missing.
+    """
+    with _opened(path) as reader:
+        seconds = reader.duration * 1e-9
+        return [
+            Topic(name, info.msgtype or "several", info.msgcount, info.msgcount / seconds)
+            if seconds > 0
+            else Topic(name, info.msgtype or "several", info.msgcount, 0.0)
+            for name, info in sorted(reader.topics.items())
+        ]
+
+
+def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
+    """The messages of a topic as a table, see the top of this module.
+
+    Args:
+        path: the bag.
+        topic: its name.
+        child_frame: of transforms and odometry, only those whose child_frame_id this is; may be
+            left out if there is one only.
+
+    Raises:
+        DrakeTeleopError: if the bag cannot be read, rosbags is missing, the topic is none of its or
+            empty, or the child frame is not or not clearly one of its.
+    """
+    with _opened(path) as reader:
+        connections = [entry for entry in reader.connections if entry.topic == topic]
+        if not connections:
+            known = [f"{name} ({info.msgtype})" for name, info in sorted(reader.topics.items())]
+            raise DrakeTeleopError(
+                f"has no topic {topic!r}",
+                where=str(path),
+                remedy=f"its topics are {', '.join(known)}",
+            )
+        pairs = [
+            (received, part)
+            for connection, received, raw in reader.messages(connections)
+            for part in _parts(reader.deserialize(raw, connection.msgtype))
+        ]
+    pairs = _of_child(pairs, child_frame, f"{path}:{topic}")
+    if not pairs:
+        raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
+    received = np.array([time for time, _ in pairs]) * 1e-9
+    columns = _columns([part for _, part in pairs])
+    absent = _take_absent(columns)
+    columns |= _short(columns)
+    columns["received"] = received
+    if "header.stamp" in columns and not columns["header.stamp"].any():
+        del columns["header.stamp"]
+    columns["stamp"] = columns.get("header.stamp", received)
+    return Table(path / topic.lstrip("/"), columns, absent=absent)
+
+
+def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
+    """The table behind a stream of a description: its file, or a topic of the bag.
+
+    Args:
+        stream: with an absolute path.
+
+    Raises:
+        DrakeTeleopError: if it cannot be read, or is a bag without a topic.
+    """
+    if not isinstance(stream, Static) and stream.topic is not None:
+        return read_topic(stream.file, stream.topic, stream.child_frame)
+    if is_bag(stream.file):
+        raise topic_missing(stream.file)
+    return read_table(stream.file, header=stream.header)
+
+
+def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
+    """A draft of a log description: the topics whose types suit the streams.
+
+    Args:
+        path: the bag.
+        topics: what is in it.
+        folder: where the draft will be, which its path to the bag starts from.
+
+    Returns:
+        YAML text whose first lines say that it is a draft, and which other topics would do.
+    """
+    draft: dict[str, Any] = {}
+    others: list[str] = []
+    file = os.path.relpath(path, folder)
+    for stream, types in _TYPES.items():
+        kinds = {topic.name: topic.type.split("/")[-1] for topic in topics if topic.messages}
+        suited = [name for kind in types for name in kinds if kinds[name] == kind]
+        if suited or stream == "wrench":
+            draft[stream] = {"file": file, "topic": suited[0] if suited else "FILL IN"}
+        if suited and kinds[suited[0]] == "TFMessage":
+            draft[stream]["child_frame"] = "FILL IN"
+        others += [f"{name} ({stream})" for name in suited[1:]]
+    draft["wrench"]["sign"] = 1
+    head = [
+        "# DRAFT, guessed from the types of topics by `drake-teleop inspect`: check every line,",
+        "# above all wrench.sign and the frames, and inspect it.",
+        f"# Other topics that would do: {', '.join(others) or 'none'}.",
+    ]
+    return "\n".join(head) + "\n" + yaml.safe_dump(draft, sort_keys=False)
+
+
+def topic_missing(path: Path) -> DrakeTeleopError:
+    """The error for a bag of which no topic is named."""
+    return DrakeTeleopError(
+        "is a bag, which does not say what its topics are",
+        where=str(path),
+        remedy="describe it, with `topic` in each stream; `drake-teleop inspect` drafts that",
+    )
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[AnyReader]:
+    if not path.exists():
+        raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
+    if not is_bag(path):
+        raise DrakeTeleopError(
+            "is no bag",
+            where=str(path),
+            remedy="give a folder with metadata.yaml, or a .mcap, .db3 or .bag file",
+        )
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise DrakeTeleopError(
+            "bags are read by the library rosbags, which is not installed",
+            where=str(path),
+            remedy="install the extra `ros`: pip install '.[ros]' in the clone of this project",
+        ) from error
+    try:
+        standard = get_typestore(Stores.LATEST)
+        with AnyReader([path], default_typestore=standard) as reader:
+            yield reader
+    except DrakeTeleopError:
+        raise
+    # A damaged file fails somewhere in rosbags, or in the libraries below it, in many ways.
+    except Exception as error:
+        text = (str(error).splitlines() or [""])[0] or type(error).__name__
+        raise DrakeTeleopError(
+            f"cannot be read: {text}", where=str(path), remedy="check it with `ros2 bag info`"
+        ) from error
+
+
+def _parts(message: Any) -> list[Any]:
+    return getattr(message, "transforms", [message])
+
+
+def _of_child(
+    pairs: list[tuple[int, Any]], child_frame: str | None, where: str
+) -> list[tuple[int, Any]]:
+    children = sorted({getattr(part, "child_frame_id", "") for _, part in pairs})
+    if child_frame is None and len(children) <= 1:
+        return pairs
+    if child_frame not in children:
+        named = ", ".join(filter(None, children))
+        what = "several child frames" if child_frame is None else f"no child frame {child_frame!r}"
+        raise DrakeTeleopError(
+            f"has {what}",
+            where=where,
+            remedy=f"give child_frame, one of {named}" if named else "leave it out",
+        )
+    return [(time, part) for time, part in pairs if part.child_frame_id == child_frame]
+
+
+def _columns(messages: list[Any]) -> dict[str, NDArray]:
+    """Every number, time and short array of the messages by its path."""
+    columns: dict[str, NDArray] = {}
+    for path, sample in _leaves(messages[0], ""):
+        get = attrgetter(path)
+        values = [get(message) for message in messages]
+        if hasattr(sample, "nanosec"):
+            columns[path] = np.array([v.sec for v in values]) + 1e-9 * np.array(
+                [v.nanosec for v in values]
+            )
+        elif not isinstance(sample, np.ndarray):
+            columns[path] = np.array(values)
+        elif all(len(v) == len(sample) for v in values):
+            columns[path] = np.stack(values)
+            columns |= {f"{path}.{i}": columns[path][:, i] for i in range(len(sample))}
+    return columns
+
+
+def _leaves(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    for field in dataclasses.fields(message):
+        value, path = getattr(message, field.name), prefix + field.name
+        if hasattr(value, "nanosec") or isinstance(value, (bool, int, float, np.number)):
+            yield path, value
+        elif isinstance(value, np.ndarray):
+            if value.dtype.kind in "fiu" and 0 < len(value) <= _LONGEST_ARRAY:
+                yield path, value
+        elif dataclasses.is_dataclass(value):
+            yield from _leaves(value, f"{path}.")
+
+
+def _take_absent(columns: dict[str, NDArray]) -> tuple[str, ...]:
+    """The groups that their covariance calls not provided; they are taken out of `columns`."""
+    absent = tuple(
+        name.removesuffix("_covariance")
+        for name, values in columns.items()
+        if name.endswith("_covariance") and (values[:, 0] == -1).all()
+    )
+    for name in [name for name in columns if name.rpartition(".")[0] in absent]:
+        del columns[name]
+    return absent
+
+
+def _short(columns: dict[str, NDArray]) -> dict[str, NDArray]:
+    """The standard groups by their short names, where only one path ends so."""
+    found: dict[str, list[str]] = {}
+    for path in columns:
+        *_, group, axis = ["", *path.split(".")]
+        if group in _GROUPS and axis in ("x", "y", "z", "w"):
+            found.setdefault(f"{_GROUPS[group]}.{axis}", []).append(path)
+    return {short: columns[paths[0]] for short, paths in found.items() if len(paths) == 1}

@@ -1,0 +1,418 @@
+"""Log descriptions: YAML files that say where a foreign log keeps what, in which units and frames.
+
+Every field is documented in docs/logs.md. A number x of a file becomes a quantity in S by
+
+    x_S = sign * R_S,stream * (x * unit - bias)
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import types
+import typing
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    WithJsonSchema,
+    model_validator,
+)
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
+
+STANDARD_GRAVITY = 9.80665
+ROTATION_TOLERANCE = 0.01
+
+UNITS = {
+    "s": 1.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "ns": 1e-9,
+    "N": 1.0,
+    "lbf": 4.4482216152605,
+    "N m": 1.0,
+    "N mm": 1e-3,
+    "lbf in": 0.1129848290276167,
+    "m/s^2": 1.0,
+    "rad": 1.0,
+    "deg": np.pi / 180,
+    "rad/s": 1.0,
+    "deg/s": np.pi / 180,
+    "rad/s^2": 1.0,
+    "deg/s^2": np.pi / 180,
+    "m": 1.0,
+    "mm": 1e-3,
+}
+"""SI value of each unit; "g" is the magnitude of the description's gravity."""
+
+
+def _frame(value: Any) -> Any:
+    if value in ("sensor", "base"):
+        return value
+    try:
+        matrix = np.asarray(value, float)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (3, 3):
+        raise ValueError("must be sensor, base, or a 3x3 rotation matrix from the stream to S")
+    if rotation_error(matrix) > ROTATION_TOLERANCE:
+        raise ValueError("is not a rotation: rows must be orthonormal with determinant +1")
+    return tuple(map(tuple, nearest_rotation(matrix).tolist()))
+
+
+def _imu_frame(value: Any) -> Any:
+    return value if value == "auto" else _frame(value)
+
+
+def _place(value: Any) -> Any:
+    if isinstance(value, str) and value != "auto":
+        raise ValueError("must be three numbers [m], or auto")
+    return value
+
+
+def _gravity(value: Any) -> Any:
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        value = [0.0, 0.0, -float(value)]
+    return value
+
+
+Column = str | int
+Vector = Annotated[tuple[float, float, float], Field(strict=False)]
+Rotation = tuple[Vector, Vector, Vector]
+_GRAVITY_SCHEMA = {
+    "anyOf": [
+        {"type": "number"},
+        {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
+    ],
+    "description": "magnitude, or the vector in the world, m/s^2",
+}
+Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_frame)]
+ImuFrame = Annotated[Literal["sensor", "base", "auto"] | Rotation, BeforeValidator(_imu_frame)]
+Place = Annotated[Vector | Literal["auto"], BeforeValidator(_place)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Time(_Strict):
+    """When the rows of a stream were taken: a column of time stamps, or a nominal rate."""
+
+    column: Column | None = None
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+    rate: float | None = Field(default=None, gt=0, description="Hz, if there is no column")
+    offset: float = Field(default=0.0, description="s, added to the stream's clock")
+    scale: float = Field(
+        default=1.0, gt=0, description="of the time since the first row, for a clock that drifts"
+    )
+
+    @model_validator(mode="after")
+    def _one_of(self) -> Time:
+        if (self.column is None) == (self.rate is None):
+            raise ValueError("give either column or rate")
+        return self
+
+
+class Force(_Strict):
+    columns: tuple[Column, ...]
+    unit: Literal["N", "lbf"] = "N"
+
+
+class Torque(_Strict):
+    columns: tuple[Column, ...]
+    unit: Literal["N m", "N mm", "lbf in"] = "N m"
+
+
+class Acceleration(_Strict):
+    columns: tuple[Column, ...]
+    unit: Literal["m/s^2", "g"] = "m/s^2"
+    bias: Vector = (0.0, 0.0, 0.0)
+
+
+class AngularVelocity(_Strict):
+    columns: tuple[Column, ...]
+    unit: Literal["rad/s", "deg/s"] = "rad/s"
+    bias: Vector = (0.0, 0.0, 0.0)
+
+
+class AngularAcceleration(_Strict):
+    columns: tuple[Column, ...]
+    unit: Literal["rad/s^2", "deg/s^2"] = "rad/s^2"
+    bias: Vector = (0.0, 0.0, 0.0)
+
+
+class Orientation(_Strict):
+    """R_WS, or of the stream's frame if `frame` is a rotation."""
+
+    columns: tuple[Column, ...]
+    form: Literal["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector"]
+    unit: Literal["rad", "deg"] = "rad"
+    inverse: bool = Field(default=False, description="the columns hold R_SW, the world in S")
+
+
+class Position(_Strict):
+    columns: tuple[Column, ...]
+    unit: Literal["m", "mm"] = "m"
+
+
+def _named(group: str, axes: str = "xyz") -> list[str]:
+    return [f"{group}.{axis}" for axis in axes]
+
+
+_OF_TOPIC: dict[str, dict[str, Any]] = {
+    "force": {"columns": _named("force")},
+    "torque": {"columns": _named("torque")},
+    "specific_force": {"columns": _named("linear_acceleration")},
+    "angular_velocity": {"columns": _named("angular_velocity")},
+    "orientation": {"columns": _named("orientation", "wxyz"), "form": "quaternion_wxyz"},
+    "position": {"columns": _named("position")},
+}
+
+
+class _Stream(_Strict):
+    file: Path
+    header: bool = True
+
+    @property
+    def source(self) -> Path:
+        """The file, or, in a bag, the file and the topic behind it."""
+        return self.file
+
+
+class _Recorded(_Stream):
+    """A stream with a clock: a table, or a topic of a bag, for which much has defaults."""
+
+    topic: str | None = Field(default=None, description="of a ROS bag or MCAP file")
+    child_frame: str | None = Field(default=None, description="which transform of the topic")
+    time: Time
+
+    _defaults: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_topic(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or data.get("topic") is None:
+            return data
+        data = {"time": {}, **{name: {} for name in cls._defaults}, **data}
+        time = data["time"]
+        if isinstance(time, dict) and not {"column", "rate"} & set(time):
+            data["time"] = {"column": "stamp", **time}
+        for name in cls._defaults:
+            given = data[name]
+            if isinstance(given, dict) and not {"columns", "form"} & set(given):
+                data[name] = {**_OF_TOPIC[name], **given}
+        return data
+
+    @property
+    def source(self) -> Path:
+        if self.topic is None:
+            return self.file
+        return self.file.joinpath(*f"{self.topic}/{self.child_frame or ''}".split("/"))
+
+
+class Wrench(_Recorded):
+    _defaults = ("force", "torque")
+
+    force: Force
+    torque: Torque
+    sign: Literal[1, -1] = 1
+    frame: Frame = "sensor"
+
+
+class Imu(_Recorded):
+    _defaults = ("specific_force", "angular_velocity")
+
+    specific_force: Acceleration | None = None
+    angular_velocity: AngularVelocity | None = None
+    angular_acceleration: AngularAcceleration | None = None
+    sign: Literal[1, -1] = Field(default=1, description="of the specific force; -1 for g - a")
+    frame: ImuFrame = Field(default="sensor", description="auto: the rotation is found")
+    position: Place = Field(
+        default=(0.0, 0.0, 0.0),
+        description="p_SoIo_S of the accelerometer, m; auto: it is found",
+    )
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Imu:
+        if not (self.specific_force or self.angular_velocity):
+            raise ValueError("give specific_force, angular_velocity, or both")
+        if self.automatic and not self.specific_force:
+            raise ValueError(
+                "auto: frame and position are found from specific_force; give it, or them"
+            )
+        return self
+
+    @property
+    def automatic(self) -> bool:
+        """Whether the data shall tell the frame or the position."""
+        return self.frame == "auto" or self.position == "auto"
+
+
+class Pose(_Recorded):
+    _defaults = ("orientation", "position")
+
+    orientation: Orientation
+    position: Position | None = None
+    frame: Frame = "sensor"
+
+    @model_validator(mode="after")
+    def _not_base(self) -> Pose:
+        if self.frame == "base":
+            raise ValueError("frame must be sensor, or the rotation from the posed frame to S")
+        return self
+
+
+class Static(_Stream):
+    """Averages over separate poses at rest, one a row."""
+
+    force: Force
+    torque: Torque
+    sign: Literal[1, -1] = 1
+    frame: Frame = "sensor"
+    gravity: Acceleration | None = Field(default=None, description="g_S in S")
+    orientation: Orientation | None = None
+
+    @model_validator(mode="after")
+    def _one_of(self) -> Static:
+        if (self.gravity is None) == (self.orientation is None):
+            raise ValueError("give either gravity (in S) or orientation")
+        return self
+
+
+class Description(_Strict):
+    """A whole log: a wrench stream with imu, pose, or both; or static poses."""
+
+    gravity: Annotated[Vector, BeforeValidator(_gravity), WithJsonSchema(_GRAVITY_SCHEMA)] = (
+        0.0,
+        0.0,
+        -STANDARD_GRAVITY,
+    )
+    wrench: Wrench | None = None
+    imu: Imu | None = None
+    pose: Pose | None = None
+    static: Static | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> Description:
+        if self.static is not None:
+            if self.wrench or self.imu or self.pose:
+                raise ValueError("static poses stand alone: remove wrench, imu and pose")
+            return self
+        if self.wrench is None:
+            raise ValueError("no wrench: give wrench with imu or pose, or give static")
+        if self.imu is None and self.pose is None:
+            raise ValueError("a wrench without kinematics: add imu or pose")
+        if self.pose is None and (self.imu is None or self.imu.angular_velocity is None):
+            raise ValueError("nothing gives the angular velocity: add imu.angular_velocity or pose")
+        if self.pose is None and (self.imu is None or self.imu.specific_force is None):
+            raise ValueError("nothing gives the specific force: add imu.specific_force or pose")
+        if self.pose is None and self.imu is not None and self.imu.frame == "auto":
+            raise ValueError("imu.frame: auto compares the IMU with a pose: add pose")
+        return self
+
+    @property
+    def gravity_W(self) -> NDArray[np.float64]:
+        """(3,) gravity in W [m/s^2]."""
+        return np.array(self.gravity)
+
+    def scale(self, unit: str) -> float:
+        """SI value of a unit; "g" is the magnitude of this description's gravity."""
+        return float(np.linalg.norm(self.gravity)) if unit == "g" else UNITS[unit]
+
+
+def json_schema() -> str:
+    """The JSON schema of a description, as text: what docs/log-description.schema.json holds."""
+    schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    schema |= Description.model_json_schema()
+    # With a topic a stream needs its file and nothing else.
+    for name in ("Wrench", "Imu", "Pose"):
+        stream = schema["$defs"][name]
+        without = [field for field in stream["required"] if field != "file"]
+        stream |= {"required": ["file"], "anyOf": [{"required": ["topic"]}, {"required": without}]}
+    for name in ("Force", "Torque", "Acceleration", "AngularVelocity", "Position"):
+        del schema["$defs"][name]["required"]
+    return json.dumps(schema, indent=2) + "\n"
+
+
+def load_description(path: str | Path) -> Description:
+    """Reads a log description.
+
+    Args:
+        path: the YAML file. Relative paths in it are relative to its folder.
+
+    Raises:
+        DrakeTeleopError: naming file and field, if it is absent, no YAML, or does not fit.
+    """
+    path = Path(path)
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise DrakeTeleopError("no such file", where=str(path), remedy="check the path") from error
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise DrakeTeleopError(
+            f"is not YAML: {error}", where=str(path), remedy="see docs/logs.md for an example"
+        ) from error
+    if not isinstance(data, dict):
+        raise DrakeTeleopError(
+            "holds no fields", where=str(path), remedy="see docs/logs.md for an example"
+        )
+    try:
+        description = Description.model_validate(data)
+    except ValidationError as error:
+        raise _explained(error, path) from error
+    return _resolved(description, path.parent)
+
+
+def _resolved(description: Description, folder: Path) -> Description:
+    streams = {
+        name: stream.model_copy(update={"file": folder / stream.file})
+        for name in ("wrench", "imu", "pose", "static")
+        if (stream := getattr(description, name)) is not None
+    }
+    return description.model_copy(update=streams)
+
+
+def _explained(error: ValidationError, path: Path) -> DrakeTeleopError:
+    # A misspelt field is also a missing one: name what stands there first.
+    first = min(error.errors(), key=lambda entry: entry["type"] == "missing")
+    location = [part for part in first["loc"] if _is_field(part)]
+    where = f"{path}:{'.'.join(map(str, location))}" if location else str(path)
+    remedy = "see docs/logs.md for the fields and their units"
+    if first["type"] == "extra_forbidden":
+        known = list(_fields_at(location[:-1]))
+        near = difflib.get_close_matches(str(location[-1]), known, n=1)
+        what = f"unknown field {location[-1]!r}"
+        remedy = f"did you mean {near[0]!r}" if near else f"the fields are {', '.join(known)}"
+    elif first["type"] == "missing":
+        what, remedy = "is missing", f"add {location[-1]}"
+    elif first["type"] == "value_error":
+        what = str(first["ctx"]["error"])
+    else:
+        what = f"{first['msg']}, found {first['input']!r}"
+    return DrakeTeleopError(what, where=where, remedy=remedy)
+
+
+def _is_field(part: str | int) -> bool:
+    # Pydantic adds the tried branch of a union to the location, such as "tuple[...]".
+    return isinstance(part, int) or part.isidentifier()
+
+
+def _fields_at(location: Sequence[str | int]) -> Iterator[str]:
+    model: Any = Description
+    for part in location:
+        options = typing.get_args(model.model_fields[part].annotation) or (
+            model.model_fields[part].annotation,
+        )
+        model = next(option for option in options if option is not types.NoneType)
+    yield from model.model_fields

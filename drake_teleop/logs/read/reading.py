@@ -1,0 +1,476 @@
+"""From a file to a `Log`: canonical tables and log descriptions go the same way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.read.alignment import (
+    SMOOTHER_WINDOW,
+    angular_motion,
+    low_pass,
+    resample,
+    smooth_derivatives,
+    spacing,
+    uniform_times,
+)
+from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
+from drake_teleop.logs.read.canonical import Log, describe_canonical
+from drake_teleop.logs.read.clocks import Clock, gaps, read_clock
+from drake_teleop.logs.read.description import (
+    ROTATION_TOLERANCE,
+    Description,
+    Imu,
+    Orientation,
+    Pose,
+    Static,
+    Wrench,
+    load_description,
+)
+from drake_teleop.logs.read.mounting import describe_mounting
+from drake_teleop.logs.read.rotations import (
+    WIDTHS,
+    nearest_rotation,
+    rotation_error,
+    rotation_matrices,
+)
+from drake_teleop.logs.read.tables import FORMATS, Table, read_table
+
+MINIMUM_SAMPLES = 16
+MINIMUM_POSES = 3
+
+
+@dataclass(frozen=True)
+class _Stream:
+    """Signals on one clock. Arrays (N, ...) or None; `t` is [s] on the common clock."""
+
+    name: str
+    t: NDArray[np.float64]
+    specific_force: NDArray[np.float64] | None = None
+    angular_velocity: NDArray[np.float64] | None = None
+    angular_acceleration: NDArray[np.float64] | None = None
+    R_WS: NDArray[np.float64] | None = None
+
+    @property
+    def dt(self) -> float:
+        return spacing(self.t)
+
+
+def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
+    """Reads a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
+
+    Streams are brought to the wrench's clock and its median rate by linear interpolation, over the
+    time that all of them cover; faster streams pass a zero-phase low-pass first, so that nothing is
+    folded down. What becomes of doubtful time stamps, and what a gap is, stands in
+    `drake_teleop.logs.read.clocks`; gaps are marked in `Log.bridged`. Angular velocity is taken
+    from the gyroscope if there is one, else from the orientation; angular acceleration from the
+    file, else by differentiating the angular velocity, else the orientation; the specific force
+    from the accelerometer (moved to the origin of S by its lever arm), else from the position, else
+    it is minus gravity, and a note says so.
+
+    Args:
+        path: the file.
+        bandwidth_hz: of the smoother that differentiates; see `smooth_derivatives`.
+
+    Raises:
+        DrakeTeleopError: naming file and field and what to do, if the log cannot be used.
+    """
+    path = Path(path)
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return _Reader(load_description(path), str(path), bandwidth_hz).log()
+    if path.suffix.lower() in FORMATS:
+        table = read_table(path)
+        description = describe_canonical(path, table)
+        reader = _Reader(description, str(path), bandwidth_hz, {path: table})
+        return reader.log(keep_origin=True)
+    if is_bag(path):
+        raise topic_missing(path)
+    raise DrakeTeleopError(
+        f"format {path.suffix!r} is not known",
+        where=str(path),
+        remedy=f"give a canonical log ({', '.join(FORMATS)}) or a log description (.yaml)",
+    )
+
+
+def read_description(
+    description: Description,
+    source: str,
+    *,
+    tables: dict[Path, Table] | None = None,
+    bandwidth_hz: float | None = 30.0,
+) -> Log:
+    """The log of a description in memory; arguments as those of `read_log`.
+
+    Args:
+        description: with absolute paths.
+        source: the file, for messages.
+        tables: files that are read already.
+        bandwidth_hz: of the smoother that differentiates.
+
+    Raises:
+        DrakeTeleopError: if the log cannot be used.
+    """
+    return _Reader(description, source, bandwidth_hz, tables).log()
+
+
+class _Reader:
+    """Reads the streams of one description; holds what they have in common."""
+
+    def __init__(
+        self,
+        description: Description,
+        source: str,
+        bandwidth_hz: float | None,
+        tables: dict[Path, Table] | None = None,
+    ) -> None:
+        self._description = description
+        self._source = source
+        self._bandwidth_hz = bandwidth_hz
+        self._notes: list[str] = []
+        self._gaps: list[NDArray[np.float64]] = []
+        self._tables = dict(tables or {})
+
+    def log(self, *, keep_origin: bool = False) -> Log:
+        if self._description.static is not None:
+            return self._static(self._description.static)
+        assert self._description.wrench is not None
+        if self._description.imu is not None and self._description.imu.automatic:
+            self._find_mounting()
+        wrench_t, wrench = self._wrench(self._description.wrench)
+        pose = imu = None
+        if self._description.pose is not None:
+            pose = self._pose(self._description.pose)
+        if self._description.imu is not None:
+            imu = self._imu(self._description.imu, pose)
+        streams = [stream for stream in (imu, pose) if stream is not None]
+        t = self._common_time(wrench_t, streams)
+        log = self._assembled(t, resample(t, wrench_t, wrench), imu, pose)
+        return log if keep_origin else replace(log, t=log.t - wrench_t[0])
+
+    def _find_mounting(self) -> None:
+        """Puts what the data say in the place of `auto`."""
+        for name in ("wrench", "imu", "pose"):
+            if (stream := getattr(self._description, name)) is not None:
+                self._table(stream)
+        self._description, notes = describe_mounting(
+            self._description,
+            self._source,
+            lambda description: _Reader(description, self._source, 30.0, self._tables).log(),
+        )
+        self._notes += notes
+
+    def _table(self, stream: Wrench | Imu | Pose | Static) -> Table:
+        if stream.source not in self._tables:
+            self._tables[stream.source] = read_stream(stream)
+        return self._tables[stream.source]
+
+    def _wrench(self, stream: Wrench) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        table = self._table(stream)
+        clock = self._clock("wrench", stream, table)
+        return clock.t, self._forces("wrench", stream, table, clock.total)[clock.rows]
+
+    def _forces(
+        self, name: str, stream: Wrench | Static, table: Table, rows: int
+    ) -> NDArray[np.float64]:
+        both = [
+            table.numbers(quantity.columns, 3, f"{self._source}:{name}.{field}.columns", rows)
+            * (stream.sign * self._description.scale(quantity.unit))
+            for field, quantity in (("force", stream.force), ("torque", stream.torque))
+        ]
+        if isinstance(stream.frame, tuple):
+            R = np.array(stream.frame)
+            both = [vectors @ R.T for vectors in both]
+        return np.hstack(both)
+
+    def _pose(self, stream: Pose) -> _Stream:
+        table = self._table(stream)
+        clock = self._clock("pose", stream, table)
+        raw_t = clock.t
+        raw_R = self._rotations("pose", stream.orientation, table, clock.total)[clock.rows]
+        if isinstance(stream.frame, tuple):
+            raw_R = raw_R @ np.array(stream.frame).T
+        t = uniform_times(raw_t)
+        dt = spacing(t)
+        R_WS = nearest_rotation(resample(t, raw_t, raw_R))
+        acceleration = np.zeros(3)
+        if stream.position is not None:
+            where = f"{self._source}:pose.position.columns"
+            position = table.numbers(stream.position.columns, 3, where, clock.total)
+            position = resample(t, raw_t, position[clock.rows]) * self._description.scale(
+                stream.position.unit
+            )
+            acceleration = smooth_derivatives(position, dt, self._bandwidth_hz)[2]
+        return _Stream(
+            "pose",
+            t,
+            _in_S(R_WS, acceleration - self._description.gravity_W),
+            *angular_motion(R_WS, dt, self._bandwidth_hz),
+            R_WS,
+        )
+
+    def _imu(self, stream: Imu, pose: _Stream | None) -> _Stream:
+        table = self._table(stream)
+        clock = self._clock("imu", stream, table)
+        raw_t = clock.t
+        t = uniform_times(raw_t)
+        dt = spacing(t)
+
+        def vectors(field: str, sign: float = 1.0) -> NDArray[np.float64] | None:
+            quantity = getattr(stream, field)
+            if quantity is None:
+                return None
+            where = f"{self._source}:imu.{field}.columns"
+            values = table.numbers(quantity.columns, 3, where, clock.total)
+            unbiased = values[clock.rows] - quantity.bias
+            scaled = resample(t, raw_t, unbiased) * (sign * self._description.scale(quantity.unit))
+            return self._to_S("imu", stream.frame, scaled, t, pose)
+
+        s = vectors("specific_force", stream.sign)
+        omega, alpha = vectors("angular_velocity"), vectors("angular_acceleration")
+        if omega is not None and alpha is None:
+            alpha = smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
+        assert stream.position != "auto"
+        if s is not None and any(stream.position):
+            s = self._at_S(s, np.array(stream.position), t, omega, alpha, pose)
+        return _Stream("imu", t, s, omega, alpha)
+
+    def _at_S(
+        self,
+        s: NDArray[np.float64],
+        p_SoIo_S: NDArray[np.float64],
+        t: NDArray[np.float64],
+        omega: NDArray[np.float64] | None,
+        alpha: NDArray[np.float64] | None,
+        pose: _Stream | None,
+    ) -> NDArray[np.float64]:
+        """Specific force of So from the one measured at Io, a point of the same rigid body."""
+        if omega is None or alpha is None:
+            assert pose is not None and pose.angular_velocity is not None
+            assert pose.angular_acceleration is not None
+            omega = resample(t, pose.t, pose.angular_velocity)
+            alpha = resample(t, pose.t, pose.angular_acceleration)
+        return s - np.cross(alpha, p_SoIo_S) - np.cross(omega, np.cross(omega, p_SoIo_S))
+
+    def _to_S(
+        self,
+        name: str,
+        frame: str | tuple,
+        vectors: NDArray[np.float64],
+        t: NDArray[np.float64],
+        pose: _Stream | None,
+    ) -> NDArray[np.float64]:
+        if isinstance(frame, tuple):
+            return vectors @ np.array(frame).T
+        if frame == "sensor":
+            return vectors
+        if pose is None or pose.R_WS is None:
+            raise DrakeTeleopError(
+                "base axes cannot be turned to S without an orientation",
+                where=f"{self._source}:{name}.frame",
+                remedy="add a pose stream",
+            )
+        return _in_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
+
+    def _static(self, stream: Static) -> Log:
+        table = self._table(stream)
+        wrench = self._forces("static", stream, table, table.rows)
+        if stream.gravity is not None:
+            where = f"{self._source}:static.gravity.columns"
+            gravity = table.numbers(stream.gravity.columns, 3, where, table.rows)
+            scale = self._description.scale(stream.gravity.unit)
+            gravity = (gravity - stream.gravity.bias) * scale
+            R_SW = None
+        else:
+            assert stream.orientation is not None
+            R_WS = self._rotations("static", stream.orientation, table, table.rows)
+            R_SW = np.swapaxes(R_WS, 1, 2)
+            gravity = R_SW @ self._description.gravity_W
+        if stream.frame == "base":
+            if R_SW is None:
+                raise DrakeTeleopError(
+                    "base axes cannot be turned to S without an orientation",
+                    where=f"{self._source}:static.frame",
+                    remedy="give static.orientation instead of static.gravity",
+                )
+            wrench = _turned(R_SW, wrench)
+        n = len(wrench)
+        if n < MINIMUM_POSES:
+            raise DrakeTeleopError(
+                f"{n} poses are too few",
+                where=f"{self._source}:static",
+                remedy=f"record at least {MINIMUM_POSES}, better 12, with different orientations",
+            )
+        rest = np.zeros((n, 3))
+        return Log(
+            *(np.arange(float(n)), wrench, -gravity, rest, rest),
+            gravity=gravity,
+            static=True,
+            source=self._source,
+        )
+
+    def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
+        """Strictly increasing times of a stream, and the rows of the table that they belong to."""
+        columns = [
+            column
+            for field in type(stream).model_fields
+            for column in getattr(getattr(stream, field), "columns", ())
+        ]
+        clock = read_clock(stream.time, table, columns, f"{self._source}:{name}.time")
+        t = clock.t
+        if len(t) < MINIMUM_SAMPLES or len(uniform_times(t)) < MINIMUM_SAMPLES:
+            raise DrakeTeleopError(
+                f"{len(t)} samples in {table.path.name} are too few",
+                where=f"{self._source}:{name}",
+                remedy=f"record at least {MINIMUM_SAMPLES}, evenly spaced",
+            )
+        self._notes += [f"{name}: {note}" for note in clock.notes]
+        if stream.topic and stream.time.column == "stamp" and "header.stamp" not in table.columns:
+            self._notes.append(
+                f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
+            )
+        holes = gaps(t, self._bandwidth_hz)
+        if len(holes):
+            start, stop = holes[int(np.argmax(holes[:, 1] - holes[:, 0]))]
+            self._notes.append(
+                f"{name}: {len(holes)} gaps, the longest of {stop - start:.3g} s at"
+                f" {start - t[0]:.3g} s; what lies in them and close by is not used"
+            )
+            # A derivative has seen half a smoother's window.
+            window = SMOOTHER_WINDOW / self._bandwidth_hz if self._bandwidth_hz else 0.0
+            seen = max(4 * float(np.median(np.diff(t))), 0.5 * window)
+            self._gaps.append(holes + np.array([-seen, seen]))
+        return clock
+
+    def _rotations(
+        self, name: str, orientation: Orientation, table: Table, rows: int
+    ) -> NDArray[np.float64]:
+        where = f"{self._source}:{name}.orientation"
+        width = WIDTHS[orientation.form]
+        columns = table.numbers(orientation.columns, width, f"{where}.columns", rows)
+        if orientation.form == "rotation_vector":
+            columns = columns * self._description.scale(orientation.unit)
+        R = rotation_matrices(columns, orientation.form)
+        errors = rotation_error(R)
+        worst = int(np.argmax(errors))
+        if errors[worst] > ROTATION_TOLERANCE:
+            raise DrakeTeleopError(
+                f"row {worst + table.first_row} of {table.path.name} is not a rotation",
+                where=where,
+                remedy=f"check the columns and their order; form is {orientation.form}",
+            )
+        return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
+
+    def _common_time(
+        self, wrench_t: NDArray[np.float64], streams: Sequence[_Stream]
+    ) -> NDArray[np.float64]:
+        """Uniform times at the wrench's rate, over the time that all streams cover."""
+        start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
+        stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])
+        spans = "; ".join(
+            f"{name} {t[0]:.6g} to {t[-1]:.6g} s"
+            for name, t in [("wrench", wrench_t), *((s.name, s.t) for s in streams)]
+        )
+        if stop <= start:
+            raise DrakeTeleopError(
+                f"the streams do not overlap in time ({spans})",
+                where=self._source,
+                remedy="check time.unit of each stream, or shift its clock by time.offset",
+            )
+        uniform = uniform_times(wrench_t)
+        dt = spacing(uniform)
+        # A rounding error of the clocks must not cost the first and the last sample.
+        inside = (uniform >= start - 1e-6 * dt) & (uniform <= stop + 1e-6 * dt)
+        t = uniform[inside]
+        if len(t) < MINIMUM_SAMPLES:
+            raise DrakeTeleopError(
+                f"the streams have only {len(t)} samples in common ({spans})",
+                where=self._source,
+                remedy=f"record at least {MINIMUM_SAMPLES}, or check time.offset",
+            )
+        return t
+
+    def _assembled(
+        self,
+        t: NDArray[np.float64],
+        wrench: NDArray[np.float64],
+        imu: _Stream | None,
+        pose: _Stream | None,
+    ) -> Log:
+        def signal(field: str) -> NDArray[np.float64]:
+            for stream in (imu, pose):
+                values = None if stream is None else getattr(stream, field)
+                if stream is not None and values is not None:
+                    return _on_clock(t, stream, values)
+            raise AssertionError(field)
+
+        gravity = None
+        if pose is not None and pose.R_WS is not None:
+            R_WS = nearest_rotation(_on_clock(t, pose, pose.R_WS))
+            gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
+            described = self._description.wrench
+            if described is not None and described.frame == "base":
+                wrench = _turned(np.swapaxes(R_WS, 1, 2), wrench)
+        self._check_base_wrench(pose)
+        self._note_rest(imu)
+        return Log(
+            *(t, wrench, signal("specific_force"), signal("angular_velocity")),
+            signal("angular_acceleration"),
+            gravity=gravity,
+            bridged=self._bridged(t),
+            notes=tuple(self._notes),
+            source=self._source,
+        )
+
+    def _bridged(self, t: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+        """(N,) samples that a gap of any stream has touched; None without gaps."""
+        if not self._gaps:
+            return None
+        flags = np.zeros(len(t), bool)
+        for start, stop in np.concatenate(self._gaps):
+            flags[slice(*np.searchsorted(t, [start, stop]))] = True
+        if (~flags).sum() < MINIMUM_SAMPLES:
+            raise DrakeTeleopError(
+                f"only {int((~flags).sum())} samples are outside of gaps",
+                where=self._source,
+                remedy="record without interruptions",
+            )
+        return flags
+
+    def _check_base_wrench(self, pose: _Stream | None) -> None:
+        described = self._description.wrench
+        if described is not None and described.frame == "base" and pose is None:
+            raise DrakeTeleopError(
+                "base axes cannot be turned to S without an orientation",
+                where=f"{self._source}:wrench.frame",
+                remedy="add a pose stream",
+            )
+
+    def _note_rest(self, imu: _Stream | None) -> None:
+        posed = self._description.pose
+        if (imu is None or imu.specific_force is None) and posed and posed.position is None:
+            self._notes.append(
+                "neither accelerometer nor position: the acceleration of S is taken as zero"
+            )
+
+
+def _on_clock(
+    t: NDArray[np.float64], stream: _Stream, values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """`values` of a stream at times `t`, without what is too fast for their spacing."""
+    rate = 1 / spacing(t)
+    faster = stream.dt * rate < 0.9
+    return resample(t, stream.t, low_pass(values, stream.dt, 0.4 * rate if faster else None))
+
+
+def _in_S(R_WS: NDArray[np.float64], vectors_W: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
+
+
+def _turned(R_SW: NDArray[np.float64], wrench_W: NDArray[np.float64]) -> NDArray[np.float64]:
+    both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
+    return both.reshape(-1, 6)

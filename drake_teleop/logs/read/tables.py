@@ -1,0 +1,217 @@
+"""Tables of numbers from CSV, Parquet and NPZ files, with messages that name file, column, row.
+
+Topics of bags become the same kind of table in `drake_teleop.logs.read.bags`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+
+if TYPE_CHECKING:
+    import polars as pl
+
+FORMATS = (".csv", ".parquet", ".npz")
+
+
+@dataclass(frozen=True)
+class Table:
+    """The columns of one file.
+
+    Args:
+        path: the file, for messages.
+        columns: name to array (N,) or, from an NPZ file, (N, ...); of any type as yet.
+        first_row: number of the first data row in the file as a reader counts, for messages.
+        absent: groups of columns, such as "orientation", that the file says it does not have.
+    """
+
+    path: Path
+    columns: dict[str, NDArray]
+    first_row: int = 1
+    absent: tuple[str, ...] = ()
+
+    @property
+    def rows(self) -> int:
+        """Rows of the longest column."""
+        return max(len(column) for column in self.columns.values())
+
+    def numbers(
+        self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
+    ) -> NDArray[np.float64]:
+        """(N, width) finite numbers from the named columns side by side.
+
+        An array with several columns (NPZ) counts as that many, row-major.
+
+        Args:
+            names: of the columns.
+            width: how many they have to be.
+            where: the field that names them, for messages.
+            rows: how many rows they have to have; None for the same number in all of them.
+
+        Raises:
+            DrakeTeleopError: if a column is absent, a cell is no finite number, or the numbers of
+                columns and rows are not these.
+        """
+        columns = [self._column(str(name), where) for name in names]
+        rows = len(columns[0]) if columns and rows is None else rows
+        for name, column in zip(names, columns, strict=True):
+            if len(column) != rows:
+                raise DrakeTeleopError(
+                    f"{name!r} of {self.path.name} has {len(column)} rows where {rows} are needed",
+                    where=where,
+                    remedy="name columns that belong together",
+                )
+        found = sum(column.shape[1] for column in columns)
+        if found != width:
+            raise DrakeTeleopError(
+                f"{found} columns where {width} are needed",
+                where=where,
+                remedy=f"list {width} columns of {self.path.name}",
+            )
+        return np.hstack(columns)
+
+    def raw(self, name: str | int, where: str) -> NDArray[np.float64]:
+        """(N, k) numbers of one column, whatever they are: NaN and infinity included.
+
+        Args:
+            name: of the column.
+            where: the field that names it, for messages.
+
+        Raises:
+            DrakeTeleopError: if the column is absent or a cell is no number.
+        """
+        name = str(name)
+        if name not in self.columns:
+            return self._column(name, where)
+        column = self.columns[name]
+        return _as_numbers(column, lambda row, cell: self._bad(name, row, cell)).reshape(
+            len(column), -1
+        )
+
+    def _column(self, name: str, where: str) -> NDArray[np.float64]:
+        if name not in self.columns:
+            if name.rpartition(".")[0] in self.absent:
+                raise DrakeTeleopError(
+                    f"{self.path.name} says that it does not provide {name!r} (covariance -1)",
+                    where=where,
+                    remedy="name another column, or leave this out",
+                )
+            near = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
+            hint = "did you mean" if near else "its columns are"
+            raise DrakeTeleopError(
+                f"{self.path.name} has no column {name!r}",
+                where=where,
+                remedy=f"{hint} {_listed(near or list(self.columns))}",
+            )
+        numbers = _as_numbers(self.columns[name], lambda row, cell: self._bad(name, row, cell))
+        bad = ~np.isfinite(numbers).reshape(len(numbers), -1).all(axis=1)
+        if bad.any():
+            first = int(np.argmax(bad))
+            raise DrakeTeleopError(
+                f"no finite number in {int(bad.sum())} rows, the first is row"
+                f" {first + self.first_row}",
+                where=f"{self.path}:{name}",
+                remedy="cut the log before it or repair the rows",
+            )
+        return numbers.reshape(len(numbers), -1)
+
+    def _bad(self, name: str, row: int, cell: object) -> DrakeTeleopError:
+        return DrakeTeleopError(
+            f"{cell!r} in row {row + self.first_row} is not a number",
+            where=f"{self.path}:{name}",
+            remedy="correct the cell or delete the row",
+        )
+
+
+def read_table(path: Path, *, header: bool = True) -> Table:
+    """Reads a CSV, Parquet or NPZ file, told apart by its suffix.
+
+    Args:
+        path: the file.
+        header: whether the first line of a CSV file holds names; if not, the columns are named by
+            their numbers, from "0".
+
+    Raises:
+        DrakeTeleopError: if the file is absent, of another kind, or cannot be parsed.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise DrakeTeleopError(
+            f"format {path.suffix!r} is not known",
+            where=str(path),
+            remedy=f"convert it to one of {', '.join(FORMATS)}",
+        )
+    if not path.is_file():
+        raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
+    try:
+        table = _read_npz(path) if path.suffix.lower() == ".npz" else _read_frame(path, header)
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, error) from error
+    if not table.columns or not all(len(c) for c in table.columns.values()):
+        raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
+    return table
+
+
+def _read_frame(path: Path, header: bool) -> Table:
+    import polars as pl
+
+    is_csv = path.suffix.lower() == ".csv"
+    try:
+        if is_csv:
+            frame = pl.read_csv(path, has_header=header, infer_schema_length=None)
+            names = [name.strip() if header else str(i) for i, name in enumerate(frame.columns)]
+            found = [_frame_column(series) for series in frame.get_columns()]
+        else:
+            # One column at a time: the whole table would be in memory twice.
+            names = list(pl.read_parquet_schema(path))
+            found = [_frame_column(pl.read_parquet(path, columns=[n]).to_series()) for n in names]
+    except pl.exceptions.PolarsError as error:
+        raise _unreadable(path, error) from error
+    columns = {name.strip(): column for name, column in zip(names, found, strict=True)}
+    return Table(path, columns, first_row=2 if is_csv and header else 1)
+
+
+def _frame_column(series: pl.Series) -> NDArray:
+    import polars as pl
+
+    # Floats keep their empty cells as NaN, which is reported with its row later on.
+    return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
+
+
+def _read_npz(path: Path) -> Table:
+    with np.load(path, allow_pickle=False) as archive:
+        return Table(path, {key: archive[key] for key in archive.files if archive[key].ndim})
+
+
+def _as_numbers(
+    column: NDArray, bad: Callable[[int, object], DrakeTeleopError]
+) -> NDArray[np.float64]:
+    if column.dtype.kind in "fiu":
+        return column.astype(float, copy=False)
+    numbers = np.empty(len(column))
+    for row, cell in enumerate(column):
+        try:
+            numbers[row] = np.nan if cell is None else float(cell)
+        except (TypeError, ValueError) as error:
+            raise bad(row, cell) from error
+    return numbers
+
+
+def _unreadable(path: Path, error: Exception) -> DrakeTeleopError:
+    return DrakeTeleopError(
+        f"cannot be read: {str(error).splitlines()[0]}",
+        where=str(path),
+        remedy=f"check that it is a valid {path.suffix} file",
+    )
+
+
+def _listed(names: Sequence[str], most: int = 12) -> str:
+    shown = ", ".join(names[:most])
+    return f"{shown}, ..." if len(names) > most else shown

@@ -1,0 +1,1 @@
+"""Look of pages, pictures and terminal."""

@@ -1,0 +1,327 @@
+"""`drake-teleop run SCENARIO`: one scenario, its log, its picture and its figures.
+
+What the station knows about its load, by one rule:
+
+- A scenario whose load estimator is enabled starts from nothing and learns while it runs. If its
+  operator wants nothing either (the shipped "identification"), the slave alone runs an excitation
+  trajectory as long as the scenario.
+- Every other scenario does what an honest user would: it first identifies the load with that
+  trajectory and its own sensor, from the sensor's samples alone.
+
+`summary.json` holds, beside what was run:
+
+=========================== =====================================================================
+peak_measured_force_N       largest measured |f|, offsets removed; likewise peak_measured_torque_Nm;
+                            this and the next two with the load estimate of the end
+peak_contact_force_N        largest calculated contact force; likewise peak_contact_torque_Nm
+residual_force_max_N        largest contact force calculated while there was no contact; null if
+                            there was contact throughout; likewise residual_torque_max_Nm
+true_contact_s              [start, end] of each contact
+contact_noticed_ms          with contact_detection: how long after the beginning of each contact the
+                            detector noticed it, null if it did not; likewise contact_at_hand_ms
+false_contacts              how often the detector began to notice a contact that there was not
+success, task_time_s, ...   with a task, see `drake_teleop.task_measures`; null for
+                            what did not happen
+peak_force_to_master_N      largest force that the device displayed
+joint_speed_use             largest share of a joint's speed limit; likewise joint_torque_use
+mass_error_percent          of the estimate at the end; likewise com_error_mm
+real_time_factor            simulated over elapsed time, this machine, compilation included
+warnings                    what was beyond the reach of sensor, arm or leaf, and when
+=========================== =====================================================================
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from drake_teleop.identification import (
+    identification_scenario,
+    identify_load,
+    sensor_samples,
+    slave_arm,
+    timed,
+)
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.identification import Identification
+from drake_teleop.pages.progress import Stage, progress_bars, silent
+from drake_teleop.pages.style import contact_spans
+from drake_teleop.result import SimulationResult, remove_log
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.slave.inverse_kinematics import IkStatus
+from drake_teleop.station import MakeTeleopStation
+from drake_teleop.task_measures import task_measures
+
+Array = NDArray[np.float64]
+
+# After a contact has ended the sensor's filter still shows it for this long [s].
+FILTER_TAIL = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioRun:
+    """A scenario that was run.
+
+    Attributes:
+        scenario: with the seed that was used.
+        result: the recorded signals.
+        identification: what was found beforehand; None if the scenario learnt while it ran.
+        real_time_factor: simulated over elapsed time.
+    """
+
+    scenario: Scenario
+    result: SimulationResult
+    identification: Identification | None
+    real_time_factor: float
+
+
+def run_command(
+    scenario: str | Path, out: Path, *, seed: int | None = None, quiet: bool = False
+) -> dict[str, Any]:
+    """Runs one scenario.
+
+    Writes log.parquet, sensor_log.parquet (canonical, for `drake-teleop identify`), overview.png,
+    identification.json (unless the scenario learnt while it ran) and summary.json into `out`. The
+    log is a folder, written while the station runs; the others follow at the end, the summary last.
+
+    Args:
+        scenario: the name of a shipped one, or a YAML file.
+        out: the folder.
+        seed: instead of the scenario's.
+        quiet: no progress bars and no table.
+
+    Returns:
+        The summary.
+
+    Raises:
+        DrakeTeleopError: if the scenario cannot be used or a joint leaves its range.
+        KeyboardInterrupt: saying what was recorded until then.
+    """
+    setup = LoadScenario(scenario)
+    if seed is not None:
+        setup = replace(setup, simulation__seed=seed)
+    log = out / "log.parquet"
+    # What stays of an earlier run must not be taken for this one's, should this one be interrupted.
+    remove_log(log)
+    (out / "summary.json").unlink(missing_ok=True)
+    try:
+        with progress_bars(quiet) as stage:
+            run = run_scenario(setup, stage, log)
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt(_kept(log)) from interrupt
+    summary = {"scenario": str(scenario)} | summarise(run)
+    run.result.sensor_log().write_parquet(out / "sensor_log.parquet")
+    if run.identification is not None:
+        run.identification.save(out / "identification.json")
+    overview(run.result).savefig(out / "overview.png")
+    text = json.dumps(summary, indent=2, allow_nan=False)
+    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    if not quiet:
+        _print(summary, out)
+    return summary
+
+
+def run_scenario(scenario: Scenario, stage: Stage = silent, log: Path | None = None) -> ScenarioRun:
+    """Runs a scenario by the rule at the top of this module.
+
+    Args:
+        scenario: what to run.
+        stage: where progress is shown.
+        log: as `simulate` has it.
+    """
+    learns = scenario.load_estimator.enabled
+    if learns and not scenario.operator.intent and scenario.operator.task is None:
+        found = identify_load(scenario, stage, log=log)
+        return ScenarioRun(scenario, found.result, found.identification, found.real_time_factor)
+    identification, estimate, floor = None, None, None
+    if not learns:
+        # Another seed: the noise of the run must not be the one that was learnt from.
+        before = identification_scenario(scenario, scenario.simulation.seed + 1)
+        found = identify_load(before, stage)
+        identification, estimate = found.identification, found.estimate
+        if scenario.contact_detection is not None:
+            floor = found.noise_floor(slave_arm(scenario))
+    station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
+    result, factor = timed(station, scenario.simulation, stage("Run the scenario"), log)
+    return ScenarioRun(scenario, result, identification, factor)
+
+
+def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
+    """(N,) whether the tool touches something, from the simulation's truth.
+
+    A touch with its bounces is one contact: gaps shorter than FILTER_TAIL are closed.
+    """
+    if "true_contact_wrench_W" not in result:
+        return np.zeros(len(result.t), dtype=bool)
+    touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
+    return _time_since(touching, result.t) + _time_until(touching, result.t) < FILTER_TAIL
+
+
+def calculated_contact_wrench(result: SimulationResult) -> Array:
+    """(N, 6) Eq. (13) from the recorded samples and the load estimate of the end."""
+    estimate = result["load_estimate"][-1]
+    wrench, s, omega, alpha = sensor_samples(result)
+    return contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
+
+
+def summarise(run: ScenarioRun) -> dict[str, Any]:
+    """The figures of summary.json (see the top of this module)."""
+    result, arm = run.result, slave_arm(run.scenario)
+    estimate = result["load_estimate"][-1]
+    measured = result["measured_wrench_S"] - estimate[:6]
+    calculated = calculated_contact_wrench(result)
+    contact = in_contact(result)
+    # Of the bounces that a touch begins with, the first may have been between two samples.
+    free = _time_since(contact, result.t) > FILTER_TAIL
+    free &= _time_until(contact, result.t) > FILTER_TAIL
+    mass, com = _mass_and_com(estimate[6:])
+    true_mass, true_com = _mass_and_com(arm.phi_load)
+    n = arm.num_joints
+    summary = {
+        "description": run.scenario.description,
+        "seed": run.scenario.simulation.seed,
+        "duration_s": round(float(result.t[-1]), 6),
+        "samples": len(result.t),
+        **_peaks("peak_measured", "", measured),
+        **_peaks("peak_contact", "", calculated),
+        **_peaks("residual", "_max", calculated[free]),
+        "true_contact_s": [list(span) for span in contact_spans(result.t, contact)],
+        "joint_speed_use": _use(result["slave_state"][:, n:], arm.velocity_limit),
+        "joint_torque_use": _use(result["joint_torque"], arm.effort_limit),
+        "mass_error_percent": 100 * abs(mass / true_mass - 1),
+        "com_error_mm": 1e3 * float(np.linalg.norm(com - true_com)),
+        "real_time_factor": run.real_time_factor,
+    }
+    if "force_to_master" in result:
+        summary |= _peaks("peak", "_to_master", result["force_to_master"])
+    if "contact" in result:
+        summary |= _detection_figures(result, contact_spans(result.t, contact))
+    if run.scenario.operator.task is not None:
+        figures = task_measures(result, run.scenario)
+        summary |= {name: None if np.isnan(x) else x for name, x in figures.items()}
+    return summary | {"warnings": list(_warnings(run, summary))}
+
+
+def overview(result: SimulationResult) -> Figure:
+    """The picture of a run: the wrenches, the motion, what the hand feels; contact shaded."""
+    wanted = ("measured_wrench_S", "contact_wrench_S", "pose_command", "force_to_master")
+    if "contact_wrench_S" not in result:
+        wanted = ("measured_wrench_S", "specific_force_S", "angular_velocity_S", "load_estimate")
+    figure = result.plot(*wanted, contact=in_contact(result))
+    figure.align_ylabels()
+    return figure
+
+
+def _warnings(run: ScenarioRun, summary: dict[str, Any]) -> Iterator[str]:
+    result, sheet = run.result, run.scenario.sheet_spring
+    yield from _since("the wrist sensor saturates", result, result["saturated"])
+    if "ik_status" in result:
+        for status in list(IkStatus)[1:]:
+            happened = result["ik_status"] == status
+            yield from _since(f"inverse kinematics: {status.name}", result, happened)
+    for name, words in (("joint_speed_use", "speed"), ("joint_torque_use", "torque")):
+        if summary[name] >= 1:
+            yield f"a joint of the slave reaches {summary[name]:.0%} of its largest {words}"
+    if sheet is not None:
+        limit = sheet.largest_small_deflection
+        yield from _since(
+            f"the leaf bends by more than {1e3 * limit:.0f} mm, where its model is no longer good",
+            result,
+            np.abs(result["sheet_state"][:, :1]) > limit,
+        )
+
+
+def _since(what: str, result: SimulationResult, happened: NDArray[Any]) -> Iterator[str]:
+    """A warning with the time since when, if (N, 1) `happened` is ever true."""
+    if np.any(happened):
+        first = result.t[np.argmax(happened)]
+        yield f"{what} from {first:.3f} s on, for {np.mean(happened != 0):.1%} of the time"
+
+
+def _detection_figures(
+    result: SimulationResult, spans: list[tuple[float, float]]
+) -> dict[str, Any]:
+    """When each contact was noticed, at the slave and by the hand, and what was none."""
+    t, summary = result.t, {}
+    for name, key in (("contact", "contact_noticed_ms"), ("contact_at_hand", "contact_at_hand_ms")):
+        flagged = t[result[name][:, 0] > 0]
+        ends = [start for start, _ in spans[1:]] + [np.inf]
+        found = [
+            flagged[(flagged >= start) & (flagged < end)]
+            for (start, _), end in zip(spans, ends, strict=True)
+        ]
+        summary[key] = [
+            1e3 * float(times[0] - start) if len(times) else None
+            for times, (start, _) in zip(found, spans, strict=True)
+        ]
+    onsets = t[1:][np.diff(result["contact"][:, 0]) > 0]
+    false = [x for x in onsets if not any(a <= x <= b + FILTER_TAIL for a, b in spans)]
+    return summary | {"false_contacts": len(false)}
+
+
+def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
+    names = (f"{prefix}_force{suffix}_N", f"{prefix}_torque{suffix}_Nm")
+    if not len(wrench):
+        return dict.fromkeys(names)
+    norms = (np.linalg.norm(part, axis=1).max() for part in (wrench[:, :3], wrench[:, 3:]))
+    return {name: float(norm) for name, norm in zip(names, norms, strict=True)}
+
+
+def _time_since(contact: NDArray[np.bool_], t: Array) -> Array:
+    """(N,) time since the last sample in contact; 0 in contact, inf before the first."""
+    last = np.maximum.accumulate(np.where(contact, np.arange(len(t)), -1))
+    return np.where(last < 0, np.inf, t - t[last])
+
+
+def _time_until(contact: NDArray[np.bool_], t: Array) -> Array:
+    """(N,) time until the next sample in contact; 0 in contact, inf after the last."""
+    return _time_since(contact[::-1], -t[::-1])[::-1]
+
+
+def _kept(log: Path) -> str:
+    if not log.exists():
+        return ""
+    return f"{log} has the {len(SimulationResult.scan_parquet(log).t)} samples until then"
+
+
+def _mass_and_com(phi: Array) -> tuple[float, Array]:
+    return float(phi[0]), phi[1:4] / phi[0]
+
+
+def _use(values: Array, limit: Array) -> float:
+    return float(np.max(np.abs(values) / limit))
+
+
+def _print(summary: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(show_header=False)
+    table.add_column()
+    table.add_column(justify="right")
+    for name, value in summary.items():
+        if isinstance(value, (int, float)):
+            table.add_row(name, f"{value:.4g}")
+    console = Console()
+    console.print(summary["description"] or summary["scenario"], style="bold", markup=False)
+    console.print(table)
+    for k, (start, stop) in enumerate(summary["true_contact_s"]):
+        noticed = ""
+        if "contact_noticed_ms" in summary:
+            slave, hand = (summary[f"contact_{at}_ms"][k] for at in ("noticed", "at_hand"))
+            noticed = f", noticed after {_ms(slave)}, at the hand after {_ms(hand)}"
+        console.print(f"contact from {start:.4f} to {stop:.4f} s{noticed}", highlight=False)
+    for warning in summary["warnings"]:
+        console.print(f"[bold yellow]warning:[/] {warning}", highlight=False)
+    console.print(f"written to {out}", highlight=False, markup=False)
+
+
+def _ms(delay: float | None) -> str:
+    return "never" if delay is None else f"{delay:.1f} ms"

@@ -1,0 +1,504 @@
+"""The wrist sensor in the station: when it samples, what is true then, and what it makes of it.
+
+    truth --[sensor_chain]--> reading --[motion_estimation]--> sample
+
+The truth is rigid-body mechanics: the wrench that the sensor exerts on the tool is V phi of the
+tool minus what the environment exerts on it (Eqs. 1, 2), and the motion is that of S.
+
+The plant takes steps of its own, cut only where something drives it. When a step is over the sensor
+looks back: at each instant in it at which it samples, position and velocity are interpolated
+(Hermite), and the accelerations follow from the dynamics under the torque that the motors held. So
+8 kHz need no events, and what is sampled is exact for the state it belongs to.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydrake.common import RandomDistribution
+from pydrake.common.value import Value
+from pydrake.multibody.plant import ContactResults
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    DiscreteValues,
+    EventStatus,
+    LeafSystem,
+)
+from pydrake.systems.primitives import Demultiplexer, RandomSource
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.lifetime import ONE_DICT, weak_callback
+from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.sensor.motion_estimation import (
+    MotionEstimationConfig,
+    estimate_into,
+    motion_estimator,
+)
+from drake_teleop.sensor.sensor_chain import (
+    FILTERED,
+    NOISE_BLOCK,
+    NOISE_SIZE,
+    OFFSET,
+    WristSensorConfig,
+    read_into,
+    sensor_chain,
+)
+from drake_teleop.slave.arm import (
+    MOTION_SIZE,
+    ArmModel,
+    forward_dynamics,
+    sensor_motion,
+)
+from drake_teleop.slave.plant import SlavePlant
+from drake_teleop.slave.tool_contact import add_force, environment_wrench
+
+Array = NDArray[np.float64]
+
+_SAMPLE = 16
+#: A part of a period, within which two instants are one.
+_SAME = 1e-6
+#: Steps of the plant that wait to be sampled, at most.
+_LONGEST = 16
+#: How often the plant is asked whether it moves as the dynamics here say [s], and how alike they
+#: have to be: rounding is 1e-12, in a stiff contact 1e-9.
+_CHECK_PERIOD, _ALIKE = 0.05, 1e-6
+
+
+def sample_parts(num_joints: int) -> dict[str, int]:
+    """The parts of a sample, in the order of the output port `sample`, with their sizes."""
+    return {
+        "measured_wrench_S": 6,
+        "specific_force_S": 3,
+        "angular_velocity_S": 3,
+        "angular_acceleration_S": 3,
+        "saturated": 1,
+        "joint_position": num_joints,
+    }
+
+
+@njit(cache=True)
+def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
+    """Writes [f, tau, s, omega, alpha] of S into `out` (15,); `motion` (21,) is scratch.
+
+    The wrench is Eqs. (1)-(2) minus `contact_W` (6,), the wrench of the environment on the tool
+    about the world's origin, in W.
+    """
+    sensor_motion(arm, q, v, vdot, motion)
+    out[6:15] = motion[:9]
+    non_contact_wrench_into(out[6:9], out[9:12], out[12:15], phi, out[:6])
+    # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
+    f, tau, p = contact_W[:3], contact_W[3:], motion[9:12]
+    tx = tau[0] - (p[1] * f[2] - p[2] * f[1])
+    ty = tau[1] - (p[2] * f[0] - p[0] * f[2])
+    tz = tau[2] - (p[0] * f[1] - p[1] * f[0])
+    for i in range(3):  # the columns of R_WS are the axes of S
+        x, y, z = motion[12 + i], motion[15 + i], motion[18 + i]
+        out[i] -= x * f[0] + y * f[1] + z * f[2]
+        out[3 + i] -= x * tx + y * ty + z * tz
+
+
+@njit(cache=True)
+def _accelerations(physics, x, tau, applied_W, wrench_W, xdot):
+    """Time derivative of x = [q, sheet's deflection, v, its rate], and the environment's wrench."""
+    half = tau.shape[0] + 1
+    q, v = x[: half - 1], x[half:-1]
+    environment_wrench(physics[0], physics[2], applied_W, q, v, x[half - 1 :: half], wrench_W)
+    _motion(physics, x, tau, applied_W, wrench_W, xdot)
+
+
+@njit(cache=True)
+def _motion(physics, x, tau, applied_W, wrench_W, xdot):
+    """Time derivative of x, see `_accelerations`, under the environment's wrench."""
+    arm, _, pairs, leaf = physics
+    half = tau.shape[0] + 1
+    forward_dynamics(arm, x[: half - 1], x[half:-1], tau, wrench_W, xdot[half:-1])
+    xdot[:half] = x[half:]
+    push = 0.0
+    if pairs.shape[0] > 0:  # which all are of one body, the leaf, or of what does not move
+        for i in range(3):
+            push -= pairs[0, 19 + i] * (wrench_W[i] - applied_W[i])
+    xdot[-1] = (push - leaf[1] * x[half - 1] - leaf[2] * x[-1]) / leaf[0] + leaf[3]
+
+
+@njit(cache=True)
+def _interpolate(h, u, x, xdot, end, end_dot, out):
+    """Hermite: positions from values and two derivatives, velocities from values and one."""
+    half = x.shape[0] // 2
+    for i in range(half):
+        q, v, a = x[i], x[half + i], xdot[half + i]
+        dq = end[i] - q - h * v - 0.5 * h * h * a
+        dv = h * (end[half + i] - v) - h * h * a
+        da = h * h * (end_dot[half + i] - a)
+        c3 = 10.0 * dq - 4.0 * dv + 0.5 * da
+        c4 = -15.0 * dq + 7.0 * dv - da
+        c5 = 6.0 * dq - 3.0 * dv + 0.5 * da
+        out[i] = q + u * (h * v + u * (0.5 * h * h * a + u * (c3 + u * (c4 + u * c5))))
+        d2, d3 = 3.0 * dv - da, da - 2.0 * dv
+        out[half + i] = v + u * (h * h * a + u * (d2 + u * d3)) / h
+
+
+@njit(cache=True)
+def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
+    """One sample of the state x and what follows from it, into `memory`, see `sample_step`."""
+    arm, phi, _, _ = physics
+    constants, motion_constants, middle, end, ideal = sensor
+    half = x.shape[0] // 2
+    n = half - 1
+    truth = np.empty(15 + n)
+    v, vdot = x[half : half + n], xdot[half : half + n]
+    true_sample(arm, phi, x[:n], v, vdot, wrench_W, np.empty(MOTION_SIZE), truth[:15])
+    truth[15:] = x[:n]
+    size = _SAMPLE + n
+    sample = memory[:size]
+    memory[size : 2 * size] = sample
+    if ideal:
+        sample[:15], sample[15], sample[16:] = truth[:15], 0.0, truth[15:]
+        return
+    reading = np.empty(13 + n)
+    read_into(constants, memory[2 * size : middle], noise, truth, reading)
+    estimate_into(motion_constants, memory[middle:end], arm, reading, sample)
+
+
+@njit(cache=True)
+def _join(state, sheet, x):
+    """x = [q, sheet's deflection, v, its rate] of [q; v] and [deflection, rate]."""
+    n = state.shape[0] // 2
+    x[:n], x[n] = state[:n], sheet[0]
+    x[n + 1 : -1], x[-1] = state[n:], sheet[1]
+
+
+@njit(cache=True)
+def remember_step(tail, time, state, sheet):
+    """Puts a step's end into the queue that `sample_step` works off; see its `memory`."""
+    width = state.shape[0] + 3
+    entry = tail[2 + int(tail[1]) * width :][:width]
+    entry[0] = time
+    _join(state, sheet, entry[1:])
+    tail[1] += 1.0
+
+
+@njit(cache=True)
+def sample_step(
+    physics, sensor, period, time, state, sheet, tau, applied_W, noise, memory, until_now,
+    touching_W, result,
+):  # fmt: skip
+    """Takes the samples that have become due in the steps since the last call.
+
+    Args:
+        physics: (arm's table, phi of the tool, contact pairs, leaf (4,): mass, stiffness, damping,
+            acceleration by gravity).
+        sensor: (chain's constants, estimator's, where its memory begins, where the tail does,
+            ideal).
+        period: of the sensor [s].
+        time: now [s], the end of a step.
+        state: (2 n,) [q; v] now.
+        sheet: (2,) deflection and its rate now.
+        tau: (n,) torque that was held during these steps.
+        applied_W: (6,), see `environment_wrench`.
+        noise: for the chain.
+        memory: [last sample (16 + n) | the one before (16 + n) | chain's | estimator's | tail:
+            samples taken, length of the queue, time and x of each step's end in it].
+        until_now: whether the sample that may be due this very instant is taken.
+        touching_W: (6,) what contacts exert on the tool now, as the plant says, about the world's
+            origin, in W; used if `until_now`. A stiff contact multiplies the last digit of a
+            position by 2e5 N/m: what has the plant's own penetration is the plant's to 1e-12 N.
+        result: filled: [last sample before now (16 + n) | memory, its queue now's end alone].
+    """
+    size, width, half = _SAMPLE + tau.shape[0], state.shape[0] + 3, tau.shape[0] + 1
+    after = result[size:]
+    after[:] = memory
+    tail = after[sensor[3] :]
+    count, queued = tail[0], int(tail[1])
+    now, now_dot, now_wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
+    between, between_dot, wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
+    start_dot, end_dot = np.empty(2 * half), now_dot
+    _join(state, sheet, now)
+    if until_now:
+        none, n = physics[2][:0], half - 1
+        environment_wrench(physics[0], none, applied_W, state[:n], state[n:], sheet, now_wrench_W)
+        now_wrench_W += touching_W
+        _motion(physics, now, tau, applied_W, now_wrench_W, now_dot)
+    else:
+        _accelerations(physics, now, tau, applied_W, now_wrench_W, now_dot)
+    for k in range(queued):
+        start = tail[2 + k * width :][:width]
+        until, end, end_dot = time, now, now_dot
+        if k < queued - 1:
+            following = tail[2 + (k + 1) * width :][:width]
+            until, end, end_dot = following[0], following[1:], np.empty(2 * half)
+        if (count + _SAME) * period >= until:
+            continue
+        _accelerations(physics, start[1:], tau, applied_W, wrench_W, start_dot)
+        if k < queued - 1:
+            _accelerations(physics, end, tau, applied_W, wrench_W, end_dot)
+        h = until - start[0]
+        while (count + _SAME) * period < until:
+            u = (count * period - start[0]) / h
+            _interpolate(h, u, start[1:], start_dot, end, end_dot, between)
+            _accelerations(physics, between, tau, applied_W, wrench_W, between_dot)
+            _take(physics, sensor, between, between_dot, wrench_W, noise, after)
+            count += 1.0
+    # A step that is all rounding may have ended a little before, and have taken this sample.
+    taken = (count - 1.0 + _SAME) * period > time
+    result[:size] = after[size : 2 * size] if taken else after[:size]
+    if until_now and (count - _SAME) * period < time:
+        _take(physics, sensor, now, now_dot, now_wrench_W, noise, after)
+        count += 1.0
+    tail[0], tail[1] = count, 0.0
+    remember_step(tail, time, state, sheet)
+
+
+class WristSensor(LeafSystem):
+    """Samples force, torque, motion of S and joint angles at the sensor's rate.
+
+    .. pydrake_system::
+
+        name: WristSensor
+        input_ports:
+        - slave_state: [q; v] of the arm
+        - joint_torque: (n,) that the motors hold [N m]
+        - slave_acceleration: vdot of the arm, to see that nothing else moves it
+        - sheet_state: [z; v_z] of the sheet spring (only if there is one)
+        - contact_results: the plant's (only with something to touch)
+        - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
+        - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, of whatever pushes it besides
+          contacts [N, N m] (may be left unconnected)
+        output_ports:
+        - step: [the last sample before now: the parts of `sample_parts` (16 + n) | memory]
+
+    Args:
+        slave: the plant, for its numbers: the tool's true inertial parameters, shapes that touch.
+        config: the sensor.
+        motion: how the motion of S is estimated from its readings.
+        period: sampling period [s].
+        held: for how long the motors hold a torque [s].
+        q_start: (n,) where the arm rests before the first sample [rad].
+
+    Raises:
+        DrakeTeleopError: from the simulation, if something moves the arm that the sensor is not
+            told of: its samples would be wrong.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self,
+        slave: SlavePlant,
+        config: WristSensorConfig,
+        motion: MotionEstimationConfig,
+        period: float,
+        held: float,
+        q_start: Array,
+    ) -> None:
+        super().__init__()
+        arm = slave.arm
+        n = self._n = arm.num_joints
+        constants, chain = sensor_chain(config, n, period)
+        motion_constants, estimator = motion_estimator(motion, config, n, period)
+        self._offset = constants[OFFSET]
+        # A copy, because something may be grasped; the joint control knows nothing of that.
+        carried = arm.with_load(arm.phi_load)
+        self._physics = (carried.table, carried.load, slave.contact_pairs, slave.leaf)
+        first = sample_at_rest(arm, q_start)
+        if not config.ideal:
+            first[:6] += config.offset
+        # Contact takes many steps for one torque, and to work off the queue takes longer than them.
+        self._longest = _LONGEST if slave.can_touch else 1
+        tail = np.zeros(2 + self._longest * (2 * n + 3))
+        memory = np.concatenate([first, first, chain, estimator, tail])
+        ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
+        self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
+        self._period = period
+        self._holds = (held, NOISE_BLOCK * period)
+        self._no_noise, self._nothing = np.zeros(NOISE_SIZE), np.zeros(6)
+
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
+        self._torque = self.DeclareVectorInputPort("joint_torque", n)
+        self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
+        self._applied = self.DeclareVectorInputPort("applied_wrench_W", 6)
+        self._sheet = self._contacts = self._noise = None
+        if slave.sheet is not None:
+            self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
+        if slave.can_touch:
+            contacts = Value[ContactResults]()
+            self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
+            self._tool = slave.tool
+        if not config.ideal:
+            self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
+        self.DeclareDiscreteState(memory)
+        self._result = np.zeros(len(first) + len(memory))
+        self._step = self.DeclareVectorOutputPort(
+            "step", len(self._result), weak_callback(self._calc_step)
+        )
+        self.DeclarePerStepDiscreteUpdateEvent(self._update)
+        self.DeclarePeriodicPublishEvent(_CHECK_PERIOD, 0.0, self._check)
+
+    @property
+    def offset(self) -> Array:
+        """(6,) of force and torque [N, N m], a view: an offset may drift during a simulation."""
+        return self._offset
+
+    @property
+    def phi(self) -> Array:
+        """(10,) of what hangs on the sensor, a view: something may be grasped in a simulation."""
+        return self._physics[1]
+
+    @property
+    def contact_pairs(self) -> Array:
+        """(k, 27) what may touch, see `ContactPairs`, a view."""
+        return self._physics[2]
+
+    @property
+    def remembered(self) -> NDArray[np.intp]:
+        """Where in the discrete state stands what the motion has left there.
+
+        Not counters and flags, nor random walks, nor the sample before the last one.
+        """
+        _, _, chain_end, end, _ = self._sensor
+        size, flag = _SAMPLE + self._n, 15
+        before_and_walks = range(size, 2 * size + FILTERED)
+        others = [flag, *before_and_walks, chain_end, chain_end + 1]
+        return np.delete(np.arange(end), others)
+
+    def take_samples(self, context: Context) -> None:
+        """Takes the samples before now, for who wants to see the state that results."""
+        sample_step(*self._inputs(context), False, self._nothing, self._result)
+        context.SetDiscreteState(self._result[_SAMPLE + self._n :])
+
+    def bring_up_to_date(self, context: Context) -> None:
+        """Makes now the end of the last step, with the samples before now taken.
+
+        For who sets states by hand: as if the simulation had arrived here.
+        """
+        memory = context.get_mutable_discrete_state_vector().get_mutable_value()
+        tail, time = memory[self._sensor[3] :], context.get_time()
+        tail[0], tail[1] = np.ceil(time / self._period - _SAME), 0.0
+        remember_step(tail, time, self._state.Eval(context), self._sheet_state(context))
+
+    def _sheet_state(self, context: Context) -> Array:
+        return self._nothing[:2] if self._sheet is None else self._sheet.Eval(context)
+
+    def _applied_W(self, context: Context) -> Array:
+        return self._applied.Eval(context) if self._applied.HasValue(context) else self._nothing
+
+    def _touching_W(self, context: Context) -> Array:
+        if self._contacts is None:
+            return self._nothing
+        results = self._contacts.Eval(context)
+        contacts = results.num_point_pair_contacts()
+        if contacts == 0:
+            return self._nothing
+        wrench_W = np.zeros(6)
+        for k in range(contacts):
+            contact = results.point_pair_contact_info(k)
+            force = contact.contact_force()  # on body B
+            if contact.bodyB_index() != self._tool:
+                force = -force
+            add_force(wrench_W, contact.contact_point(), force)
+        return wrench_W
+
+    def _inputs(self, context: Context) -> tuple[object, ...]:
+        return (
+            self._physics,
+            self._sensor,
+            self._period,
+            context.get_time(),
+            self._state.Eval(context),
+            self._sheet_state(context),
+            self._torque.Eval(context),
+            self._applied_W(context),
+            self._no_noise if self._noise is None else self._noise.Eval(context),
+            context.get_discrete_state_vector().value(),
+        )
+
+    def _calc_step(self, context: Context, output: BasicVector) -> None:
+        touching_W = self._touching_W(context)
+        sample_step(*self._inputs(context), True, touching_W, output.get_mutable_value())
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        if self._longest > 1 and not self._is_due(context.get_time()):
+            tail = discrete_state.get_mutable_value(0)[self._sensor[3] :]
+            if tail[1] < self._longest:
+                state, sheet = self._state.Eval(context), self._sheet_state(context)
+                remember_step(tail, context.get_time(), state, sheet)
+                return
+        discrete_state.set_value(0, self._step.Eval(context)[_SAMPLE + self._n :])
+
+    def _is_due(self, time: float) -> bool:
+        """Whether now the torque may change, or the noise."""
+        margin = _SAME * self._period
+        return any(abs(time - hold * round(time / hold)) < margin for hold in self._holds)
+
+    def _check(self, context: Context) -> EventStatus:
+        n = self._n
+        x, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2)
+        _join(self._state.Eval(context), self._sheet_state(context), x)
+        torque, applied = self._torque.Eval(context), self._applied_W(context)
+        _accelerations(self._physics, x, torque, applied, np.empty(6), xdot)
+        vdot = self._acceleration.Eval(context)
+        if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ALIKE * (1.0 + np.abs(vdot).max()):
+            raise DrakeTeleopError(
+                f"at {context.get_time():g} s something moves the slave that it knows nothing of",
+                where="wrist_sensor.applied_wrench_W",
+                remedy="connect whatever pushes the tool to this port too",
+            )
+        return EventStatus.Succeeded()
+
+
+def sample_at_rest(arm: ArmModel, q: Array) -> Array:
+    """The true sample (16 + n,) of the arm that rests at q (n,) [rad]: what stands before t = 0."""
+    sample, still = np.zeros(_SAMPLE + len(q)), np.zeros(len(q))
+    touching, motion = np.zeros(6), np.zeros(MOTION_SIZE)
+    true_sample(arm.table, arm.phi_load, q, still, still, touching, motion, sample[:15])
+    sample[16:] = q
+    return sample
+
+
+def AddWristSensor(
+    builder: DiagramBuilder,
+    slave: SlavePlant,
+    config: WristSensorConfig,
+    motion: MotionEstimationConfig,
+    period: float,
+    held: float,
+    q_start: Array,
+) -> None:
+    """Adds "wrist_sensor" and its noise, and what divides its port: for each part of a sample
+    "sample_parts" has a port, for all of them "wrist_sample".
+
+    What remains to be connected is the state and the torque of the arm.
+
+    Args:
+        builder: the diagram that holds the plant.
+        slave: the plant.
+        config: the sensor.
+        motion: how the motion of S is estimated.
+        period: sampling period [s].
+        held: for how long the motors hold a torque [s].
+        q_start: (n,) where the arm rests before the first sample [rad].
+    """
+    sensor = WristSensor(slave, config, motion, period, held, q_start)
+    builder.AddNamedSystem("wrist_sensor", sensor)
+    if not config.ideal:
+        noise = builder.AddNamedSystem(
+            "wrist_sensor_noise",
+            RandomSource(RandomDistribution.kGaussian, NOISE_SIZE, NOISE_BLOCK * period),
+        )
+        builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
+    if slave.sheet is not None:
+        builder.Connect(
+            slave.plant.get_state_output_port(slave.sheet), sensor.GetInputPort("sheet_state")
+        )
+    if slave.can_touch:
+        builder.Connect(
+            slave.plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")
+        )
+    sizes = list(sample_parts(slave.arm.num_joints).values())
+    step = sensor.GetOutputPort("step")
+    rest = step.size() - sum(sizes)
+    for name, split in (("wrist_sample", [sum(sizes), rest]), ("sample_parts", [*sizes, rest])):
+        splitter = builder.AddNamedSystem(name, Demultiplexer(split))
+        builder.Connect(step, splitter.get_input_port())

@@ -1,0 +1,174 @@
+"""The runs of a study: from the design through the processes into the store."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop._version import __version__
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.pages.progress import Progress, progress_bars
+from drake_teleop.studies.design import Study, Values
+from drake_teleop.studies.processes import Chunk, processes
+from drake_teleop.studies.store import Store, open_store
+
+if TYPE_CHECKING:
+    import polars as pl
+
+Array = NDArray[np.float64]
+Work: TypeAlias = Callable[[Values, int], dict[str, float]]
+"""The measures of one run, from its factors' values and its seed."""
+
+# A part of the store: what a kill costs, and what is handed to a process at once. Small next to
+# the study, so that at its end no process waits long for another.
+_LARGEST_CHUNK = 8
+_CHUNKS = 512
+
+
+def run_study(
+    study: Study,
+    out: Path,
+    work: Work,
+    basis: dict[str, Any],
+    *,
+    jobs: int = -1,
+    cluster: str | None = None,
+    quiet: bool = True,
+) -> pl.DataFrame:
+    """Runs what the folder does not hold yet of a study.
+
+    Args:
+        study: that was checked.
+        out: the folder.
+        work: one run; it goes to other processes, so it can be pickled.
+        basis: what its results depend on beside the study, for JSON.
+        jobs, cluster, quiet: as for `study_command`.
+
+    Returns:
+        All rows, sorted by run.
+
+    Raises:
+        DrakeTeleopError: as `study_command`, or if no process begins.
+        KeyboardInterrupt: saying what is kept.
+    """
+    points = study.points()
+    first_rows = study.rows(points)
+    digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
+    identity = dataclasses.asdict(study) | basis | {"design_sha256": digest, "version": __version__}
+    schema = _schema(study, first_rows[0])
+    run = partial(_run_chunk, work, [factor.field for factor in study.factors])
+    with open_store(out, identity) as store:
+        told = _Told(study.size() * study.repeats)
+        try:
+            with progress_bars(quiet) as stage, processes(store, jobs, cluster) as rows_of:
+                told.start(stage("Study"))
+                new = points
+                while new:
+                    chunks = _chunks(study.rows(new, len(points) - len(new)), store, told)
+                    for found in rows_of(run, chunks):
+                        _keep(store, found, schema)
+                        told.more(len(found))
+                    new = study.next_points(points, _objective(study, store, len(points)))
+                    points += new
+        except KeyboardInterrupt as interrupt:
+            kept = f"{out} keeps {told.done} of {told.total} runs; the same command goes on"
+            raise KeyboardInterrupt(kept) from interrupt
+        return store.read()
+
+
+def _chunks(rows: Chunk, store: Store, told: _Told) -> list[Chunk]:
+    """The chunks of some runs that the store does not hold yet."""
+    size = min(max(len(rows) // _CHUNKS, 1), _LARGEST_CHUNK)
+    chunks = [rows[first : first + size] for first in range(0, len(rows), size)]
+    finished = store.finished()
+    left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
+    told.found(len(rows) - sum(map(len, left)))
+    return left
+
+
+def _objective(study: Study, store: Store, points: int) -> Array:
+    """(points,) the mean of the objective at each of the first points; nan where no run has one."""
+    if not study.objective:
+        return np.empty(0)
+    import polars as pl
+
+    # What is not a number is no measure, but would be of all the mean.
+    value = pl.col(study.objective).fill_nan(None).mean()
+    means = store.read().filter(pl.col("point") < points).group_by("point").agg(value).sort("point")
+    return means[study.objective].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+
+
+class _Told:
+    """Tells the progress bar how many runs are done, and how long the others will take."""
+
+    def __init__(self, total: int) -> None:
+        self.total, self.done, self._new = total, 0, 0
+
+    def start(self, progress: Progress) -> None:
+        self._progress, self._start = progress, time.monotonic()
+
+    def found(self, runs: int) -> None:
+        """Runs that were done before."""
+        self.done += runs
+        self._progress(self.done / self.total, f"{self.done}/{self.total}")
+
+    def more(self, runs: int) -> None:
+        """Runs that were done now."""
+        self.done, self._new = self.done + runs, self._new + runs
+        seconds = (time.monotonic() - self._start) / self._new * (self.total - self.done)
+        eta = f"{self.done}/{self.total}, {_duration(seconds)} left"
+        self._progress(self.done / self.total, eta)
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
+
+
+def _run_chunk(
+    work: Work, names: Sequence[str], rows: Sequence[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """The rows with their measures, or with the reason why a run has none.
+
+    With one thread of BLAS: sums over two differ in their last digits from those over one.
+    """
+    import scipy.linalg  # noqa: F401, what comes in later would have its threads
+    from threadpoolctl import threadpool_limits
+
+    found = []
+    with threadpool_limits(1):
+        for row in rows:
+            values = {name: row[name] for name in names}
+            try:
+                measures: dict[str, Any] = work(values, row["seed"])
+            except DrakeTeleopError as error:
+                measures = {"error": str(error)}
+            except Exception as error:  # whatever it is, the other runs go on
+                measures = {"error": " ".join(f"{type(error).__name__}: {error}".split())}
+            found.append(row | measures)
+    return found
+
+
+def _keep(store: Store, rows: list[dict[str, Any]], schema: dict[str, Any]) -> None:
+    import polars as pl
+
+    columns = {name: [row.get(name) for row in rows] for name in schema}
+    store.write(pl.DataFrame(columns, schema=schema))
+
+
+def _schema(study: Study, row: dict[str, Any]) -> dict[str, Any]:
+    import polars as pl
+
+    vector = pl.List(pl.Float64)
+    types = {int: pl.Int64, float: pl.Float64, str: pl.String, bool: pl.Boolean, list: vector}
+    columns = {name: types[type(value)] for name, value in row.items()}
+    return columns | dict.fromkeys(study.measures, pl.Float64) | {"error": pl.String}

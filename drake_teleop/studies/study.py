@@ -1,0 +1,291 @@
+"""`drake-teleop study STUDY.yaml`: one scenario over a design of its fields, as a table of runs.
+
+A study file::
+
+    scenario: contact_transition         # shipped, or a file beside the study's
+    factors:
+      - {field: force_scaling.sigma, values: [0.0, 0.5, 1.0]}
+      - {field: force_scaling.gamma, low: 0.5, high: 2.0}
+      - {field: wrist_sensor.preset, words: [ideal, jr3_85m35a3]}
+    design: sobol
+    samples: 64
+    repeats: 3
+
+A factor of one value sets a field for all runs; beside numbers there are words, flags (true, false)
+and vectors. Every run follows the rule of `drake-teleop run`; runs with the same slave, sensor and
+seed share one identification of the load, which the folder keeps. An adaptive design looks for the
+point whose `objective` is smallest, in batches that follow from the rows of those before.
+
+The folder holds
+
+============ =====================================================================================
+study.json   all that the rows depend on
+runs.parquet a folder of parts, one table: run (the key, its place in the design), point, repeat,
+             seed, a column for each factor and each measure, and error: why a run failed; its
+             measures are then null
+summary.json runs, failed, and of each measure mean, least and largest
+effects.csv  of each level of each factor: mean of each measure, effect (its difference from the
+             mean of all levels), and half the widths of their 95 % intervals over the seeds
+*.png        main_effects, interactions of two factors, and the front of effort against task time
+             and overshoot of the contact force, as far as the study has what they show
+============ =====================================================================================
+
+A study that was stopped or killed goes on where it was when the same command is given again. The
+rows are the same bytes for any number of processes, here or on a cluster. A run that ends its
+process is a failed run; only if there is one process for all does it end the study, too.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import os
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identification import (
+    identification_scenario,
+    identify_load,
+    slave_arm,
+)
+from drake_teleop.load.contact.detection import NoiseFloor
+from drake_teleop.quantities import check_ranges, check_structure
+from drake_teleop.resources import studies_dir
+from drake_teleop.result import SimulationResult
+from drake_teleop.run import run_scenario
+from drake_teleop.scenario import ReadScenario, Scenario, ScenarioFromData, ScenarioNames
+from drake_teleop.simulation import simulate
+from drake_teleop.station import MakeTeleopStation
+from drake_teleop.studies.design import Factor, Study, Values
+from drake_teleop.studies.effects import effects
+from drake_teleop.studies.measures import measured
+from drake_teleop.studies.pictures import write_pictures
+from drake_teleop.studies.runs import run_study
+
+if TYPE_CHECKING:
+    import polars as pl
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StationWork:
+    """One run of the station: what `run_study` hands to the processes.
+
+    Args:
+        data: of the base scenario's file.
+        where: the file's name for messages.
+        measures: by name.
+        threshold: force [N] of time_above_force_s.
+        loads: folder of the loads that were identified, for all processes that see it.
+    """
+
+    data: Any
+    where: str
+    measures: Sequence[str]
+    threshold: float
+    loads: Path
+
+    def scenario(self, values: Values, seed: int) -> Scenario:
+        """The scenario of one run."""
+        changes = values | {"simulation.seed": seed}
+        return ScenarioFromData(_changed(self.data, changes), self.where)
+
+    def __call__(self, values: Values, seed: int) -> dict[str, float]:
+        """The measures of one run."""
+        scenario = self.scenario(values, seed)
+        return measured(self._simulated(scenario), scenario, self.measures, self.threshold)
+
+    def _simulated(self, scenario: Scenario) -> SimulationResult:
+        """`run_scenario`, which identifies a load only once in a study."""
+        if scenario.load_estimator.enabled:
+            return run_scenario(scenario).result
+        estimate, floor = self._identified(scenario)
+        station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
+        return simulate(station, scenario.simulation)
+
+    def _identified(self, scenario: Scenario) -> tuple[Array, NoiseFloor | None]:
+        """The load's estimate, and the noise floor if the station detects contact."""
+        before = identification_scenario(scenario, scenario.simulation.seed + 1)
+        detects = scenario.contact_detection is not None
+        key = hashlib.sha256(repr((before, detects)).encode()).hexdigest()
+        path = self.loads / f"{key}.pickle"
+        if path not in _identified and path.exists():
+            _identified[path] = pickle.loads(path.read_bytes())
+        if path not in _identified:
+            found = identify_load(before)
+            floor = found.noise_floor(slave_arm(before)) if detects else None
+            _identified[path] = found.estimate, floor
+            if self.loads.parent.is_dir():  # not so on another machine of a cluster
+                _keep(path, pickle.dumps(_identified[path]))
+        return _identified[path]
+
+
+_identified: dict[Path, tuple[Array, NoiseFloor | None]] = {}
+
+
+def _keep(path: Path, content: bytes) -> None:
+    """Writes it, complete or not at all, whoever else does the same now."""
+    path.parent.mkdir(exist_ok=True)
+    unfinished = path.with_suffix(f".{os.getpid()}.unfinished")
+    unfinished.write_bytes(content)
+    unfinished.replace(path)
+
+
+def study_command(
+    path: str | Path,
+    out: Path,
+    *,
+    jobs: int = -1,
+    cluster: str | None = None,
+    quiet: bool = False,
+    repeats: int | None = None,
+    loads: Path | None = None,
+) -> dict[str, Any]:
+    """Runs a study, or what is left of it.
+
+    Args:
+        path: the study's file, or the name of one that is shipped.
+        out: the folder.
+        jobs: processes at once on this machine; -1: one for each core.
+        cluster: address of a Dask scheduler instead, or "local" for one of this machine's own.
+        quiet: no progress bar and no table.
+        repeats: instead of the file's.
+        loads: folder of the loads that were identified, if studies share them.
+
+    Returns:
+        The summary, see the top of this module.
+
+    Raises:
+        DrakeTeleopError: for a bad file, a folder of another study, or Dask that is not installed.
+        KeyboardInterrupt: saying what is kept.
+    """
+    study, path = LoadStudy(path), study_file(path)
+    data, where = ReadScenario(_scenario_of(study, path))
+    ScenarioFromData(data, where)
+    for index, factor in enumerate(study.factors):
+        _check_values(factor, f"{path}:factors[{index}]")
+    study.repeats = repeats or study.repeats
+    loads = loads or out / "loads"
+    work = StationWork(data, where, tuple(study.measures), study.force_threshold, loads)
+    rows = run_study(study, out, work, {"data": data}, jobs=jobs, cluster=cluster, quiet=quiet)
+    summary = _summary(study, rows)
+    text = json.dumps(summary, indent=2, allow_nan=False)
+    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    effects(study, rows).write_csv(out / "effects.csv")
+    write_pictures(study, rows, out)
+    if not quiet:
+        _print(study, summary, out)
+    return summary
+
+
+def study_file(name_or_path: str | Path) -> Path:
+    """The file of a study that is shipped, by its name, or the path as it is.
+
+    Raises:
+        DrakeTeleopError: if there is neither.
+    """
+    shipped = studies_dir() / f"{name_or_path}.yaml"
+    path = shipped if shipped.is_file() else Path(name_or_path)
+    if not path.is_file():
+        names = sorted(file.stem for file in studies_dir().glob("*.yaml"))
+        raise DrakeTeleopError(
+            f"there is no study '{name_or_path}'",
+            remedy=f"give a YAML file or one of {', '.join(names)}",
+        )
+    return path
+
+
+def LoadStudy(path: str | Path) -> Study:
+    """Loads and checks a study's file; its factors are checked when the scenario is known.
+
+    Args:
+        path: or the name of one that is shipped.
+
+    Raises:
+        DrakeTeleopError: naming file and field of what is wrong.
+    """
+    path = study_file(path)
+    try:
+        text = Path(path).read_text()
+        data = yaml_load(data=text)
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise DrakeTeleopError(f"is not YAML ({error})", where=str(path)) from None
+    check_structure(Study, data, str(path))
+    study = yaml_load_typed(schema=Study, data=text, defaults=Study())
+    study.check(str(path))
+    return study
+
+
+def _scenario_of(study: Study, path: Path) -> str | Path:
+    known = study.scenario in ScenarioNames()
+    return study.scenario if known else path.parent / study.scenario
+
+
+def _check_values(factor: Factor, where: str) -> None:
+    """Checks each value by itself: whether it goes with the others is known in a run."""
+    ranged = factor.low is not None and factor.high is not None
+    for value in (factor.low, factor.high) if ranged else factor.listed():
+        data = _changed({}, {factor.field: value})
+        check_structure(Scenario, data, where)
+        check_ranges(yaml_load_typed(schema=Scenario, data=yaml_dump(data)), where)
+
+
+def _changed(data: Any, changes: dict[str, Any]) -> Any:
+    """A copy of a scenario's data with some fields, `block.field`, changed or added."""
+    data = copy.deepcopy(data)
+    for name, value in changes.items():
+        *blocks, last = name.split(".")
+        inner = data
+        for block in blocks:
+            if not isinstance(inner.get(block), dict):
+                inner[block] = {}
+            inner = inner[block]
+        # Fields that are whole numbers take no 3.0; those that are not take a 3.
+        whole = isinstance(value, float) and value.is_integer()
+        inner[last] = int(value) if whole else value
+    return data
+
+
+def _summary(study: Study, rows: pl.DataFrame) -> dict[str, Any]:
+    figures = {}
+    for name in study.measures:
+        column = rows[name].drop_nulls()
+        column = column.filter(column.is_finite())
+        figures[name] = {"mean": column.mean(), "least": column.min(), "largest": column.max()}
+    failed = rows["error"].drop_nulls()
+    return {
+        "description": study.description,
+        "runs": rows.height,
+        "points": rows.height // study.repeats,
+        "failed": len(failed),
+        "first_error": failed[0] if len(failed) else None,
+        "measures": figures,
+    }
+
+
+def _print(study: Study, summary: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("", "mean", "least", "largest")
+    for name, figures in summary["measures"].items():
+        table.add_row(name, *("" if v is None else f"{v:.4g}" for v in figures.values()))
+    console = Console()
+    console.print(study.description or study.scenario, style="bold", markup=False)
+    console.print(table)
+    console.print(f"{summary['runs']} runs, {summary['failed']} failed", highlight=False)
+    if summary["failed"]:
+        console.print("[bold yellow]warning:[/] the first one:", highlight=False)
+        console.print(summary["first_error"], highlight=False, markup=False)
+    console.print(f"written to {out}", highlight=False, markup=False)

@@ -1,0 +1,148 @@
+"""How well a simulated operator did its task: figures from the log of one run.
+
+============================ ====================================================================
+success                      1 if the operator ended its task, and the truth agrees: the tip is in
+                             the target; the tool touches; the force was held within its tolerance;
+                             the tip is within 2 mm of the slot's floor
+task_time_s                  from the task's start until the operator has done it
+contact_force_overshoot_N    largest contact force at the tool, less the force that was wanted
+effort_Ns                    integral of |force of the hand|: what tires an arm that pushes or holds
+task_work_J                  integral of |power of the hand|: pushing and braking both count
+detection_time_s             from the first contact until the operator answers to it; nan if never
+false_notices                times that contact was noticed before there was one
+press_error_N                root mean square error of the force while it was held; nan if not held
+============================ ====================================================================
+
+All of them are of the time from the task's start until it was done or given up, or the log's end.
+Of a task that failed, also where the operator believes that it is done, there are only the success
+and what was noticed; the others are nan, for little effort in vain is no merit.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.operator.task import DONE, FELT, PHASE, WAITING, Insert, Press, Task, Touch
+from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import Scenario
+from drake_teleop.slave.arm import forward_kinematics
+from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant
+
+Array = NDArray[np.float64]
+
+_ON_THE_FLOOR = 2e-3  # m
+
+TASK_MEASURES = (
+    "success",
+    "task_time_s",
+    "contact_force_overshoot_N",
+    "effort_Ns",
+    "task_work_J",
+    "detection_time_s",
+    "false_notices",
+    "press_error_N",
+)
+"""Names of the measures, in the order of `task_measures`."""
+
+
+def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:
+    """The measures above, of one run of a scenario with a task.
+
+    Args:
+        result: with the signal task_state.
+        scenario: that was run.
+
+    Raises:
+        DrakeTeleopError: if the scenario has no task.
+    """
+    task = scenario.operator.task
+    if task is None:
+        raise DrakeTeleopError(
+            "there is no task to measure",
+            where="operator.task",
+            remedy="give the operator a task: !Reach, !Touch, !Press or !Insert",
+        )
+    state = result["task_state"]
+    t, outcome = result.t, state[:, DONE]
+    ended = int(np.argmax(outcome != 0.0)) if outcome.any() else len(t) - 1
+    begun = int(np.argmax(state[:, PHASE] != WAITING))
+    span = slice(begun, ended + 1)
+    done = outcome[ended] > 0.0
+    force = contact_force(result)
+    held = _held(t, force, task, ended) if done and isinstance(task, Press) else np.empty(0)
+    wanted = _wanted_force(task)
+    hand, twist = result["hand_wrench_E"][span], result["twist_master"][span]
+    power = np.abs(np.sum(hand * twist, axis=1))
+    noticed, touching = state[span, FELT] > 0.0, force[span] > 0.0
+    # The log may begin later than the task.
+    taken = float(t[ended]) + scenario.simulation.settle - task.t_start
+    success = done and _truly(result, scenario, task, ended, force, held)
+    done_well = {
+        "task_time_s": taken,
+        "contact_force_overshoot_N": max(float(force[span].max()) - wanted, 0.0),
+        "effort_Ns": float(np.trapezoid(np.linalg.norm(hand[:, :3], axis=1), t[span])),
+        "task_work_J": float(np.trapezoid(power, t[span])),
+        "press_error_N": float(np.sqrt(np.mean((held - wanted) ** 2))) if held.size else math.nan,
+    }
+    if not success:
+        done_well = dict.fromkeys(done_well, math.nan)
+    figures = done_well | {
+        "success": float(success),
+        "detection_time_s": detection_time(t[span], touching, noticed),
+        "false_notices": float(_false_notices(touching, noticed)),
+    }
+    return {name: figures[name] for name in TASK_MEASURES}
+
+
+def _wanted_force(task: Task) -> float:
+    if isinstance(task, Press):
+        return task.force
+    return task.push if isinstance(task, Insert) else 0.0
+
+
+def contact_force(result: SimulationResult) -> Array:
+    """(N,) size of the true contact force at the tool [N]; zeros if there is nothing to touch."""
+    if "true_contact_wrench_W" not in result:
+        return np.zeros(len(result.t))
+    return np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
+
+
+def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
+    """From the first contact until it is noticed [s]; nan if there is none, or it never is."""
+    if not touching.any():
+        return math.nan
+    contact = int(np.argmax(touching))
+    after = noticed[contact:]
+    return float(t[contact + int(np.argmax(after))] - t[contact]) if after.any() else math.nan
+
+
+def _false_notices(touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> int:
+    before = int(np.argmax(touching)) if touching.any() else len(touching)
+    return int(np.count_nonzero(np.diff(noticed[:before].astype(int), prepend=0) == 1))
+
+
+def _held(t: Array, force: Array, task: Press, ended: int) -> Array:
+    """The true force in the time for which the operator believed to hold it."""
+    return force[: ended + 1][t[: ended + 1] >= t[ended] - task.hold]
+
+
+def _truly(
+    result: SimulationResult, scenario: Scenario, task: Task, ended: int, force: Array, held: Array
+) -> bool:
+    if isinstance(task, Press):
+        return bool(abs(held.mean() - task.force) <= task.tolerance)
+    if isinstance(task, Touch):
+        return bool(force[ended] > 0.0)
+    slave = AddSlavePlant(DiagramBuilder(), scenario.slave.position, None)
+    R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+    forward_kinematics(slave.arm.table, result["slave_state"][ended, :6], R_WS, p_WS)
+    start = np.array(scenario.slave.position) + R_WS_HOME.matrix() @ slave.tip
+    off = p_WS + R_WS @ slave.tip - start - np.array(task.translation)
+    if isinstance(task, Insert):
+        return bool(off[2] <= _ON_THE_FLOOR - task.depth)
+    return bool(np.linalg.norm(off) <= task.width / 2)

@@ -1,0 +1,145 @@
+"""`drake-teleop analyze`: the report's figures agree with one another and with a simulation."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from drake_teleop.analysis import analyze
+from drake_teleop.analysis.maps import stability_map
+from drake_teleop.analysis.task_direction import task_direction
+from drake_teleop.analysis.verdict import verdict
+from drake_teleop.cli import main
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.pages.progress import silent
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+
+PICTURES = ("bode", "nyquist", "passive", "widths", "maps")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def coarse_maps():
+    """Maps of few pixels: they are tested by themselves."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(analyze, "_PIXELS", 12)
+        yield
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The command on the paper's contact: its summary and its folder."""
+    out = tmp_path_factory.mktemp("analyze")
+    with pytest.raises(SystemExit) as exit:
+        main(["analyze", "contact_transition", "--out", str(out), "--quiet"])
+    assert exit.value.code == 0
+    return json.loads((out / "summary.json").read_text()), out
+
+
+def test_it_writes_a_page_with_all_of_its_pictures(run):
+    summary, out = run
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png") == len(PICTURES)
+    for name in PICTURES:
+        assert (out / f"{name}.png").stat().st_size > 10_000
+    for sentence in summary["verdict"]:
+        assert sentence.split("'")[0][:30] in page
+
+
+def test_the_diagram_is_the_sampled_model_of_one_axis(run):
+    """The hand holds all other directions; what couples with them is left in h11."""
+    assert max(run[0]["two_port"]["sampled"].values()) < 1e-4
+
+
+def test_what_dies_last_dies_as_on_one_axis(run):
+    """Of this scenario it is the vertical motion, which the wrist's coupling changes by 1 %."""
+    for point in run[0]["diagram"]:
+        for name in ("decay_1_per_s", "frequency_Hz"):
+            assert point[name] == pytest.approx(point["one_axis"][name], rel=0.02)
+
+
+def test_the_nonlinear_simulation_feels_as_the_linearised_diagram(run):
+    measured = run[0]["measured"]
+    assert max(measured["frequency_Hz"]) > 29.9
+    assert measured["greatest_error"] < 0.02 and measured["greatest_error_deg"] < 2.0
+    assert min(measured["coherence"]) > 0.95
+
+
+def test_what_is_said_of_stability_is_one_story(run):
+    """The linearised Diagram, the margins, the stiffest walls and the maps agree."""
+    summary, _ = run
+    assert all(point["stable"] for point in summary["diagram"])
+    for row in summary["margins"]:
+        limit = summary["bounded"]["each"][row["grip"]]
+        assert row["stable"] == (limit is None or row["wall_N_per_m"] < limit)
+        assert row["stable"] or (row["gain"], row["round_trip_s"]) == (1.0, 0.0)
+    # A range of hands holds no stiffer a wall than the worst of its members.
+    assert summary["bounded"]["grips"] <= 1.02 * min(summary["bounded"]["each"].values())
+    (walls,) = (m for m in summary["maps"] if m["x"] == "delay" and m["y"] == "wall_stiffness")
+    for grip, limit in summary["bounded"]["each"].items():
+        without_delay = [y for x, y in walls["boundary"][grip] if x == 0.0]
+        assert without_delay == pytest.approx([limit], rel=0.02)
+
+
+def test_the_verdict_follows_the_figures(run):
+    summary, _ = run
+    assert summary["verdict"] == verdict(summary)
+    other = summary | {"absolute": summary["absolute"] | {"absolutely_stable": True}}
+    assert any("stable: no passive" in sentence for sentence in verdict(other))
+
+
+def figures(scenario: Scenario, direction: str = "z"):
+    return analyze.analyze(scenario, direction, silent)[0]
+
+
+def test_delay_and_a_light_grip_make_it_unstable_and_that_is_said():
+    """sigma = 1 is unstable in free motion at round trips between 190 and 339 ms."""
+    scenario = replace(
+        LoadScenario("free_motion_force"),
+        operator__grip="light",
+        force_scaling__sigma=1.0,
+        channel__delay=0.13,
+    )
+    found = figures(scenario)
+    (free,) = found["diagram"]
+    assert not free["stable"] and free["decay_1_per_s"] < 0
+    assert any("unstable: it doubles every" in sentence for sentence in found["verdict"])
+    assert found["bounded"]["each"]["light"] == 0.0
+    # With the tool's inertia eliminated there is nothing that comes back late.
+    (sigmas,) = (m for m in found["maps"] if m["title"] == "Delay and σ, in free motion")
+    assert min(sigma for _, sigma in sigmas["boundary"]["light"]) > 0.3
+
+
+def test_another_direction_and_a_method_that_is_not_linear():
+    scenario = replace(
+        LoadScenario("free_motion_force"), passivity__method="tdpa", channel__delay=0.01
+    )
+    found = figures(scenario, "x")
+    assert "tdpa is not linear" in found["verdict"][0]
+    assert found["direction"] == "x" and found["delay_s"] == 0.01
+    # Sideways, a push turns the tool; that one axis does not know it is said.
+    assert found["two_port"]["sampled"]["h22"] > 0.1
+    assert any("is not one axis" in sentence for sentence in found["verdict"])
+
+
+def test_eta_has_no_single_sigma():
+    scenario = replace(
+        LoadScenario("free_motion_force"),
+        force_scaling__sigma=0.0,
+        force_scaling__eta=0.5,
+        force_scaling__gripper_phi=[1.0, *[0.0] * 9],
+    )
+    with pytest.raises(DrakeTeleopError, match="eta"):
+        figures(scenario)
+
+
+def test_maps_are_of_the_scenario(run):
+    """A map's share of stable cells is what a map made anew says."""
+    scenario = LoadScenario("contact_transition")
+    found = run[0]["maps"][-1]
+    axis = task_direction(scenario, (0.0, 0.0, 1.0)).axis
+    x, y = (sorted({point[i] for point in found["boundary"]["firm"]}) for i in (0, 1))
+    one = stability_map(
+        axis, analyze.sampling_of(scenario), "rate", [x[0], x[-1]], "wall_stiffness", [100.0, 1e5]
+    )
+    assert one.stable[0].all() and not one.stable[1].any() and y

@@ -1,0 +1,62 @@
+"""The damping that covers delay: enough, and not more than enough, for the hand in simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.comparison.active_elements import covering_damping, worst_frequency
+from drake_teleop.comparison.one_dof import PERIOD, OneDof, run_one_dof
+from drake_teleop.passivity.methods import PassivityConfig
+
+#: A hand that forces its motion on the device, which has no friction.
+FIRM = OneDof(hand_stiffness=2e5, hand_damping=500.0, device_friction=0.0)
+
+
+def work_of_the_hand(model: OneDof, round_trip: float, frequency: float, damping: float) -> float:
+    """What hand and covering damping have put in, over whole periods of a small steady swing [J].
+
+    The swing is around a point in the wall, or far from it if there is no wall.
+    """
+    t = np.arange(12000) * PERIOD
+    fade = np.minimum(t / 2.0, 1.0)
+    rest = 0.02 if model.wall_stiffness else -0.5
+    x = rest + 1e-3 * fade * np.sin(2 * np.pi * frequency * t)
+    intent = np.stack([x, np.gradient(x, PERIOD)], axis=1)
+    run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2), intent=intent)
+    periods = np.floor(6.0 * frequency)
+    last = slice(len(t) - 1 - round(periods / frequency / PERIOD), len(t))
+    moved = np.diff(run.master[last])
+    return float(-np.sum(run.felt[last][:-1] * moved) + damping * np.sum(moved**2) / PERIOD)
+
+
+@pytest.mark.parametrize("wall", [0.0, 5100.0])
+@pytest.mark.parametrize("round_trip", [0.02, 0.1])
+def test_it_covers_what_delay_puts_in_and_little_more(wall, round_trip):
+    model = dataclasses.replace(FIRM, wall_stiffness=wall, sigma=1.0)
+    damping = covering_damping(model, round_trip)
+    # Before a wall the worst frequency is nearly 0, which takes too long to swing.
+    frequency = max(worst_frequency(model, round_trip), 0.5)
+    assert damping > 1.0
+    without = work_of_the_hand(model, round_trip, frequency, 0.0)
+    assert without < 0.0
+    assert work_of_the_hand(model, round_trip, frequency, damping) == pytest.approx(
+        0.0, abs=0.05 * abs(without)
+    )
+
+
+def test_elimination_takes_what_free_motion_puts_in():
+    free = dataclasses.replace(FIRM, wall_stiffness=0.0)
+    needed = [covering_damping(dataclasses.replace(free, sigma=s), 0.1) for s in (0.0, 0.5, 1.0)]
+    assert needed[0] == 0.0
+    assert needed[2] == pytest.approx(2 * needed[1])
+
+
+def test_a_held_wall_needs_stiffness_times_delay():
+    """Re K e^(-j w R) / (j w) = -K R sin(w R) / (w R), which is -K R at w = 0."""
+    model = OneDof(ideal_servo=True, sigma=0.0)
+    needed = covering_damping(model, 0.1)
+    assert needed == pytest.approx(5100 / 17.5 * (0.1 + 1.5 * PERIOD), rel=1e-3)

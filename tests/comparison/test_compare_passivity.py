@@ -1,0 +1,71 @@
+"""The comparison as a whole, small: its table, its page, and that it can tell stable from not."""
+
+from __future__ import annotations
+
+import json
+
+import polars as pl
+import pytest
+
+from drake_teleop.channel.network import PRESETS
+from drake_teleop.comparison import compare_passivity as study
+from drake_teleop.comparison.one_dof import OneDof
+from drake_teleop.errors import DrakeTeleopError
+
+
+def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
+    monkeypatch.setattr(study, "WALLS", (5100.0,))
+    monkeypatch.setattr(study, "IMPAIRMENTS", ((0.0, 0.0),))
+    monkeypatch.setattr(study, "LEAVES", {"contact": study.LEAVES["contact"]})
+    summary = study.compare_command(
+        tmp_path, networks=["lan"], methods=["none", "tdpa"], jobs=1, quiet=True
+    )
+    assert summary == json.loads((tmp_path / "summary.json").read_text())
+    runs = {row["method"]: row for row in summary["station"]}
+    # Without a method the wrist keeps turning to and fro before the leaf.
+    assert {name: row["stable"] for name, row in runs.items()} == {"none": False, "tdpa": True}
+    assert runs["none"]["turning"] > 2.5e-3 > 10 * runs["tdpa"]["turning"]
+    for row in runs.values():
+        assert row["hunting"] < 0.1e-3
+        assert row["error"] is None
+        assert abs(row["force_error"]) < 0.01
+        assert abs(row["drift"]) < 0.5e-3
+    limits = {row["method"]: row["longest_s"] for row in summary["one_dof"]}
+    assert limits["none"] < 0.015 < limits["tdpa"]
+    injected = {
+        (row["sigma"], row["round_trip_s"]): row["damping_Ns_per_m"]
+        for row in summary["covering"]
+        if row["wall_N_per_m"] == 0
+    }
+    assert injected[0.0, 0.1] == 0.0 < injected[1.0, 0.1]
+    assert pl.read_parquet(tmp_path / "runs.parquet").height == 2
+    page = (tmp_path / "report.html").read_text()
+    assert "round trip 1 ms" in page
+    for name in ("runs", "energy", "limits"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"networks": ["mars"]}, r"networks.*no network 'mars'.*lunar"),
+        ({"methods": ["magic"]}, r"methods.*no method 'magic'.*tdpa"),
+    ],
+)
+def test_unknown_names_are_one_clear_error(tmp_path, arguments, message):
+    with pytest.raises(DrakeTeleopError, match=message):
+        study.compare_command(tmp_path, **arguments)
+
+
+def test_presets_reach_around_the_earth_and_to_the_moon():
+    assert {name: round(2e3 * PRESETS[name].delay) for name in study.NETWORKS} == {
+        "lan": 1,
+        "internet": 100,
+        "geostationary": 600,
+        "lunar": 2600,
+    }
+
+
+def test_the_longest_round_trip_ends_at_the_first_that_is_not_stable():
+    assert study.longest_round_trip("none", OneDof(wall_stiffness=500.0), 0.0, 0.0, [0]) == 1.0
+    assert study.longest_round_trip("none", OneDof(wall_stiffness=20000.0), 0.0, 0.0, [0]) == 0.0

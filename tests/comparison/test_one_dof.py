@@ -1,0 +1,139 @@
+"""The one-degree-of-freedom reference against closed forms of the theory of delay."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.comparison.one_dof import PERIOD, OneDof, figures, run_one_dof
+from drake_teleop.operator.operator import GRIPS
+from drake_teleop.passivity.methods import PassivityConfig
+
+DEVICE_MASS, DEVICE_DAMPING = 0.15, 0.5
+
+
+def held(grip: str, **changes: float) -> OneDof:
+    """A hand on a device without friction, in front of a slave that is where it is told to be."""
+    hand = GRIPS[grip]
+    return OneDof(
+        hand_mass=hand.mass,
+        hand_damping=hand.damping + DEVICE_DAMPING,
+        hand_stiffness=hand.stiffness,
+        device_mass=DEVICE_MASS,
+        device_friction=0.0,
+        ideal_servo=True,
+        **changes,
+    )
+
+
+def grows(model: OneDof, round_trip: int, rest: float) -> bool:
+    """Whether a small push grows around `rest` [m], for a round trip of so many periods."""
+    steps = 12000
+    intent = np.full((steps, 2), 0.0)
+    intent[:, 0] = rest * np.minimum(np.arange(steps) / 1000, 1.0)
+    intent[1500:1520, 0] += 1e-4
+    forward, backward = round_trip // 2, round_trip - round_trip // 2
+    run = run_one_dof(
+        model,
+        PassivityConfig(),
+        NetworkConfig(delay=forward * PERIOD),
+        NetworkConfig(delay=backward * PERIOD),
+        intent=intent,
+    )
+    if not np.isfinite(run.master).all():
+        return True
+    swing = [np.ptp(run.master[start : start + 2000]) for start in (2000, 10000)]
+    return bool(swing[1] > swing[0])
+
+
+def longest_round_trip(model: OneDof, rest: float, low: int, high: int) -> int:
+    """The largest round trip in periods at which nothing grows, which starts below `high`."""
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if grows(model, middle, rest) else (middle, high)
+    return low
+
+
+def contact_limit(grip: str, wall: float) -> float:
+    """RTT at which m s^2 + b s + k + K e^(-s RTT) has its first root on the imaginary axis [s]."""
+    hand = GRIPS[grip]
+    m, b, k, K = hand.mass + DEVICE_MASS, hand.damping + DEVICE_DAMPING, hand.stiffness, wall / 17.5
+
+    def excess(w: float) -> float:
+        return math.hypot(k - m * w * w, b * w) - K
+
+    w = brentq(excess, math.sqrt(k / m), 1e4)
+    return math.atan2(b * w, m * w * w - k) / w
+
+
+@pytest.mark.parametrize(
+    ("grip", "wall"), [("light", 5100.0), ("medium", 5100.0), ("light", 1000.0), ("firm", 20000.0)]
+)
+def test_the_longest_delay_in_contact_is_that_of_the_closed_form(grip, wall):
+    model = held(grip, wall_stiffness=wall)
+    # The command is interpolated over a period, the force held for one.
+    expected = contact_limit(grip, wall) / PERIOD - 1.5
+    found = longest_round_trip(model, 0.02, 1, round(2 * expected) + 4)
+    assert found == pytest.approx(expected, abs=1.0)
+
+
+def free_windows(grip: str) -> list[float]:
+    """RTT at which m s^2 + b s + k + mu s^2 e^(-s RTT) has roots on the imaginary axis [s]."""
+    hand = GRIPS[grip]
+    m, b, k, mu = (
+        hand.mass + DEVICE_MASS,
+        hand.damping + DEVICE_DAMPING,
+        hand.stiffness,
+        3.13 / 17.5,
+    )
+
+    def excess(w: float) -> float:
+        return math.hypot(k - m * w * w, b * w) - mu * w * w
+
+    edges = []
+    grid = np.linspace(1.0, 200.0, 4000)
+    for low, high in itertools.pairwise(grid):
+        if excess(low) * excess(high) < 0:
+            w = brentq(excess, low, high)
+            # k - m w^2 + j b w = mu w^2 e^(-j w RTT)
+            angle = -math.atan2(b * w, k - m * w * w)
+            edges.append((angle % (2 * math.pi)) / w)
+    return sorted(edges)
+
+
+def test_the_light_hand_meets_its_unstable_window_in_free_motion():
+    """With the whole inertia fed back: unstable between 190 and 339 ms, and not without it."""
+    first, last = (edge / PERIOD for edge in free_windows("light"))
+    assert (first, last) == (pytest.approx(190, abs=1), pytest.approx(339, abs=1))
+    model = held("light", sigma=1.0)
+    # The second difference of the interpolated command is 2 periods late, the force is held.
+    below, above = (round(edge - 2.5) for edge in (first, last))
+    assert [grows(model, below + step, -0.5) for step in (-4, 4)] == [False, True]
+    assert [grows(model, above + step, -0.5) for step in (-7, 7)] == [True, False]
+    without = held("light", sigma=0.0)
+    assert not any(grows(without, delay, -0.5) for delay in (190, 260, 330))
+
+
+def test_without_a_method_the_station_is_unstable_from_15_ms_on():
+    model, none = OneDof(), PassivityConfig()
+    stable = {}
+    for delay in (0.002, 0.015, 0.05):
+        run = run_one_dof(model, none, NetworkConfig(delay=delay / 2))
+        stable[delay] = figures(run, model)
+    assert [result.stable for result in stable.values()] == [True, False, False]
+    assert abs(stable[0.002].force_error) < 1e-3
+    assert stable[0.05].least_energy < -1.0
+
+
+def test_the_same_seed_gives_the_same_run():
+    network = NetworkConfig(delay=0.05, jitter=0.5, loss=0.3)
+    first, again, other = (
+        run_one_dof(OneDof(), PassivityConfig(), network, seed=seed).felt for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 0

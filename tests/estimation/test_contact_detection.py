@@ -1,0 +1,121 @@
+"""The detector in the station: the log's detector sample by sample, and when the hand knows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import BasicVector, DiagramBuilder
+
+from drake_teleop.channel.channel import Channel
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.estimation.contact_detection import ContactDetection, ContactDetectionConfig
+from drake_teleop.identification import identification_scenario, identify_load
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.contact.detection import ContactDetector, NoiseFloor
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.run import in_contact, slave_arm
+from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.simulation import simulate
+from drake_teleop.slave.arm import accelerations
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.station import MakeTeleopStation
+
+NOISE = np.repeat([0.1, 0.01], 3)
+OFFSETS = np.array([5.0, -3.0, 2.0, 0.1, 0.2, 0.3])
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm
+
+
+def floor() -> NoiseFloor:
+    return NoiseFloor(
+        NOISE,
+        1e-6 * np.eye(16),
+        np.full((6, 2), 0.01),
+        np.eye(6),
+        np.full(6, 0.2),
+        reached=np.array([5.0, 8.0, 6.0]),
+    )
+
+
+@pytest.mark.parametrize("statistic", ["level", "glr"])
+def test_the_block_says_what_the_detector_of_logs_says(arm, statistic):
+    """Samples of a load that moves, and is pushed; some of them saturated, which change nothing."""
+    rng, n = np.random.default_rng(4), 400
+    s, omega, alpha = (5.0 * rng.normal(size=(n, 3)) for _ in range(3))
+    wrench = OFFSETS + non_contact_wrench(s, omega, alpha, arm.phi_load)
+    wrench += rng.normal(size=(n, 6)) * NOISE
+    wrench[150:250, 1] -= 3.0
+    saturated = np.zeros(n)
+    saturated[200:220] = 1.0
+    wrench[210, 0] = wrench[224, 0] = 1e5
+    q = rng.normal(size=(n, 6))
+    samples = np.column_stack([wrench, s, omega, alpha, saturated, q])
+
+    config = ContactDetectionConfig(
+        statistic=statistic, margin=1.5, hold=0.05, drift_time=2.0, recovery=0.005
+    )
+    block = ContactDetection(config, floor(), arm, 1e-3)
+    context = block.CreateDefaultContext()
+    port = block.GetInputPort("sample").FixValue(context, samples[0])
+    estimate = np.concatenate([OFFSETS, arm.phi_load])
+    block.GetInputPort("load_estimate").FixValue(context, estimate)
+    flags = []
+    for sample in samples:
+        port.GetMutableData().set_value(BasicVector(sample))
+        context.SetDiscreteState(block.EvalUniquePeriodicDiscreteUpdate(context))
+        flags.append(block.GetOutputPort("contact").Eval(context)[0] > 0)
+
+    good = np.ones(n, bool)
+    good[200:225] = False
+    contact = contact_wrench(wrench, OFFSETS, s, omega, alpha, arm.phi_load)
+    detector = ContactDetector(
+        floor(),
+        1.5 * {"level": 5.0, "glr": 6.0}[statistic],
+        statistic=statistic,
+        hold=50,
+        following=1e-3 / 2.0,
+    )
+    rows = (contact, s, omega, alpha, accelerations(arm, q, s))
+    expected = detector.detect(*(x[good] for x in rows))
+    assert expected.any() and not expected.all()
+    np.testing.assert_array_equal(np.array(flags)[good], expected)
+    assert all(flags[199:225])
+
+
+@pytest.fixture(scope="module")
+def identified():
+    scenario = replace(
+        LoadScenario("contact_transition"), contact_detection=ContactDetectionConfig()
+    )
+    found = identify_load(identification_scenario(scenario, 1))
+    return scenario, found.estimate, found.noise_floor(slave_arm(scenario))
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.015, 0.05])
+def test_the_papers_contact_is_noticed_and_the_hand_knows_after_the_delay(identified, delay):
+    scenario, estimate, noise_floor = identified
+    scenario = replace(scenario, channel=Channel(delay=delay))
+    station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=noise_floor)
+    result = simulate(station, scenario.simulation)
+    touched, slave, hand = in_contact(result), result["contact"], result["contact_at_hand"]
+    # In samples of 1 ms.
+    assert 0 <= slave.argmax() - touched.argmax() <= 4
+    assert np.count_nonzero(np.diff(slave[:, 0])) == 2
+    late = hand.argmax() - slave.argmax()
+    assert late == pytest.approx(1e3 * delay, abs=1)
+    np.testing.assert_array_equal(hand[late:], slave[: len(slave) - late])
+
+
+def test_a_station_without_a_detector_has_none_of_it(identified):
+    scenario, estimate, _ = identified
+    plain = replace(scenario, contact_detection=None)
+    station = MakeTeleopStation(plain, load_estimate=estimate)
+    assert not station.HasSubsystemNamed("contact_detection")
+    with pytest.raises(DrakeTeleopError, match=r"contact_detection: .*pass the noise_floor"):
+        MakeTeleopStation(scenario, load_estimate=estimate)
+    unfitted = NoiseFloor(NOISE, np.zeros((16, 16)), np.zeros((6, 2)), np.eye(6), np.zeros(6))
+    with pytest.raises(DrakeTeleopError, match="reached"):
+        MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=unfitted)

@@ -1,0 +1,235 @@
+"""A load that is watched in the Diagram: settled, grasped and found again; contacts; offsets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.multibody.tree import RotationalInertia, SpatialInertia
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.online.change import change_parameters
+from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
+from drake_teleop.load.online.watched import (
+    DISTURBED,
+    FADE,
+    LEARNING,
+    OTHER_LOAD,
+    SETTLED,
+    watched_memory,
+    watched_state,
+    watched_update,
+)
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.operator.operator import MinimumJerk, OperatorConfig, Sine
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.simulation import MakeSimulator, advance, read_log, simulate
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
+
+GRASP = 3.0
+MASS, COM, INERTIA = 0.8, [0.04, 0.0, 0.16], [8e-4, 8e-4, 4e-4]
+OBJECT = phi_from_mass_com_inertia(MASS, COM, np.diag(INERTIA))
+SCENARIO = replace(
+    LoadScenario("identification"), load_estimator__watch=True, load_estimator__method="rtls"
+)
+SENSOR = SCENARIO.wrist_sensor
+# What `excite` finds for the station's slave, rounded.
+TRAJECTORY = FourierTrajectory(
+    np.array([-0.1481, -0.5268, -1.2922, 1.9415, -0.2313, -1.2508]),
+    np.array([
+        [-0.0466, 0.8201, -0.1875, -0.1524, -0.0843],
+        [-0.2318, -0.0590, -0.1094, 0.0173, 0.1217],
+        [0.9075, 0.3388, -0.2934, -0.1014, -0.0599],
+        [0.2967, -0.9075, 0.9049, -0.1706, -0.1028],
+        [0.1729, -0.0176, -0.2405, -0.4501, 0.4768],
+        [-1.1637, 2.0826, -0.4508, -0.6788, 0.2132],
+    ]),
+    np.array([
+        [0.2455, 0.1155, 0.1626, -0.1764, 0.0261],
+        [0.1543, 0.3254, 0.2734, -0.2099, -0.0223],
+        [0.2886, -0.5100, -0.2092, 0.1108, 0.0744],
+        [1.4384, 0.8749, -0.5934, -0.0993, 0.0797],
+        [0.2852, -0.0029, -0.1267, -0.2926, 0.2219],
+        [-1.3576, -1.4207, 0.0871, 0.0948, 0.1896],
+    ]),
+    1 / 6,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def tool():
+    """phi of the plant's tool, which only the tests know."""
+    return AddSlavePlant(DiagramBuilder(), SCENARIO.slave.position, None).arm.phi_load
+
+
+def grasp(station, simulator):
+    """From now on the tool holds the object: in the plant, and in what the sensor feels."""
+    plant = station.GetSubsystemByName("slave_plant")
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    body = plant.GetBodyByName("tool")
+    inertia = body.CalcSpatialInertiaInBodyFrame(context)
+    inertia += SpatialInertia.MakeFromCentralInertia(MASS, COM, RotationalInertia(*INERTIA))
+    body.SetSpatialInertiaInBodyFrame(context, inertia)
+    station.GetSubsystemByName("wrist_sensor").phi[:] += OBJECT
+
+
+@pytest.fixture(scope="module")
+def grasped():
+    """The excitation, with a grasp in the middle of it."""
+    station = MakeIdentificationStation(SCENARIO, TRAJECTORY)
+    simulator = MakeSimulator(station, SCENARIO.simulation)
+    simulator.Initialize()
+    advance(simulator, GRASP)
+    grasp(station, simulator)
+    advance(simulator, SCENARIO.simulation.duration)
+    return read_log(simulator, 0.0)
+
+
+@pytest.fixture(scope="module")
+def known(grasped):
+    """The tool by the samples before the grasp: [offsets; phi] and its covariance."""
+    names = ("measured_wrench_S", "specific_force_S", "angular_velocity_S")
+    estimator = RecursiveTotalLeastSquares(SENSOR.wrench_std(), SENSOR.motion_std())
+    rows = [grasped[name][:2900] for name in (*names, "angular_acceleration_S")]
+    estimator.learn(*rows)
+    return np.concatenate([estimator.offsets, estimator.phi]), estimator.covariance
+
+
+def first(result, state, after=0.0):
+    """When the state is `state` for the first time after a time [s]."""
+    return result.t[np.argmax((result["load_state"][:, 0] == state) & (result.t >= after))]
+
+
+def test_it_settles_and_freezes(grasped, tool):
+    settled = first(grasped, SETTLED)
+    assert 0.1 < settled < 1.5
+    during = (grasped.t >= settled) & (grasped.t < GRASP)
+    assert (grasped["load_state"][during] == SETTLED).all()
+    assert (grasped["load_state"][grasped.t < settled] == LEARNING).all()
+    estimate = grasped["load_estimate"][during]
+    np.testing.assert_array_equal(
+        estimate[:, 6:], np.broadcast_to(estimate[0, 6:], (len(estimate), 10))
+    )
+    assert estimate[0, 6] == pytest.approx(tool[0], rel=0.002)
+    com = estimate[0, 7:10] / estimate[0, 6]
+    np.testing.assert_allclose(com, tool[1:4] / tool[0], atol=1e-3)
+
+
+def test_a_grasp_is_noticed_and_the_object_is_found(grasped):
+    """It is known half a second later that it is another load, and soon which one."""
+    assert first(grasped, DISTURBED) - GRASP < 0.05
+    changed = first(grasped, OTHER_LOAD)
+    assert changed - GRASP < 0.5
+    again = first(grasped, SETTLED, changed)
+    assert changed < again < changed + 2.0
+    before, after = (grasped["load_estimate"][k, 6:] for k in (2900, -1))
+    assert (after - before)[0] == pytest.approx(MASS, rel=0.01)
+    found = (after - before)[1:4] / (after - before)[0]
+    np.testing.assert_allclose(found, COM, atol=2e-3)
+    assert grasped["load_state"][-1] == SETTLED
+
+
+def test_what_is_handed_out_fades_without_a_step(grasped):
+    """Between two known loads nothing is eliminated; each sample goes a hundredth of the way."""
+    phi = grasped["load_estimate"][:, 6:]
+    faded = phi[grasped.t < first(grasped, SETTLED, first(grasped, OTHER_LOAD))][-1]
+    assert np.abs(faded[0]) < 0.01 * phi[2900, 0]
+    watched = grasped.t > first(grasped, SETTLED) + 0.01
+    steps = np.abs(np.diff(phi[watched], axis=0))
+    assert (steps <= 1e-3 / FADE * np.ptp(phi[watched], axis=0) * 1.02).all()
+
+
+def test_contacts_are_no_change(known):
+    """Fig. 8, and pressing down on the leaf for good, still and sliding: nothing fades."""
+    touch = replace(LoadScenario("contact_transition"), load_estimator__watch=True)
+    press = MinimumJerk(t_start=0.2, duration=0.5, translation=[0.0, 0.0, -0.075])
+    hold = replace(
+        touch,
+        operator=OperatorConfig(grip="firm", intent=[press]),
+        simulation__settle=0.0,
+        simulation__duration=2.0,
+    )
+    sway = Sine(t_start=0.9, duration=9.0, ramp=0.5, frequency=1.0, translation=[0.0, 0.003, 0.0])
+    slide = replace(
+        hold,
+        operator=OperatorConfig(grip="firm", intent=[press, sway]),
+        simulation__duration=2.6,
+    )
+    for scenario, last in ((touch, SETTLED), (hold, DISTURBED), (slide, DISTURBED)):
+        station = MakeTeleopStation(scenario, load_estimate=known[0], load_covariance=known[1])
+        result = simulate(station, scenario.simulation)
+        states = result["load_state"][:, 0]
+        assert states[0] == SETTLED and states[-1] == last
+        assert set(states) == {SETTLED, DISTURBED}
+        touched = np.any(result["true_contact_wrench_W"] != 0.0, axis=1)
+        assert result.t[states == DISTURBED][0] - result.t[touched][0] < 0.1
+        np.testing.assert_array_equal(
+            result["load_estimate"][:, 6:], np.broadcast_to(known[0][6:], (len(states), 10))
+        )
+
+
+def at_rest(theta, added, seed):
+    """(N, 15) samples at 1 kHz with the arm at rest, `added` (N, 6) to the wrench."""
+    rng, n = np.random.default_rng(seed), len(added)
+    s, zero = np.tile([0.0, 3.0, 9.34], (n, 1)), np.zeros((n, 3))
+    wrench = theta[:6] + non_contact_wrench(s, zero, zero, theta[6:]) + added
+    std = np.concatenate([SENSOR.wrench_std(), SENSOR.motion_std()])
+    return np.hstack([wrench, s, zero, zero]) + std / np.sqrt(8.0) * rng.normal(size=(n, 15))
+
+
+def watch(known, rows, fallback=None):
+    """What is handed out (N, 16), and the states (N,)."""
+    theta, covariance = known
+    out, memory = theta.copy(), watched_memory(theta, covariance)
+    options = change_parameters(SENSOR.wrench_std(), SENSOR.motion_std(), 1e-3)
+    handed, states = np.empty((len(rows), 16)), np.empty(len(rows))
+    rest = np.zeros(10) if fallback is None else fallback
+    for k, row in enumerate(rows):
+        watched_update(out, memory, row, rest, 1e-3, *options)
+        handed[k], states[k] = out, watched_state(memory)
+    return handed, states
+
+
+def test_offsets_are_kept_at_rest(known):
+    """They drift by more than a newton, within 3 s by less than what is a contact."""
+    t = np.arange(0.0, 30.0, 1e-3)[:, None]
+    drift = t / 30.0 * np.array([1.5, -1.0, 1.5, 0.05, -0.05, 0.05])
+    handed, states = watch(known, at_rest(known[0], drift, 0))
+    assert (states == SETTLED).all()
+    wrong = handed[-1, :6] - known[0][:6] - drift[-1]
+    assert (np.abs(wrong) < 0.15 * np.abs(drift[-1]) + np.repeat([0.05, 0.002], 3)).all()
+    np.testing.assert_allclose(handed[-1, 6:], known[0][6:], rtol=1e-12)
+
+
+def test_a_push_at_rest_is_neither_an_offset_nor_a_load(known):
+    added = np.zeros((6000, 6))
+    added[1000:] = [0.0, -1.5, -4.67, 0.3, 0.0, 0.0]  # along gravity, as half a kilogram would pull
+    handed, states = watch(known, at_rest(known[0], added, 1))
+    assert states[900] == SETTLED
+    assert (states[1100:] == DISTURBED).all()
+    assert (np.abs(handed[-1, :6] - known[0][:6]) < np.repeat([0.1, 0.005], 3)).all()
+    np.testing.assert_allclose(handed[-1, 6:], known[0][6:], rtol=1e-12)
+
+
+def test_the_gripper_that_is_known_otherwise_stays_eliminated(known, grasped):
+    names = ("measured_wrench_S", "specific_force_S", "angular_velocity_S")
+    rows = np.hstack([grasped[name] for name in (*names, "angular_acceleration_S")])[2500:]
+    gripper = 0.5 * known[0][6:]
+    handed, states = watch(known, rows, gripper)
+    faded = handed[states == OTHER_LOAD][-1, 6]
+    assert faded == pytest.approx(gripper[0], rel=0.02)
+    assert handed[-1, 6] == pytest.approx(known[0][6] + MASS, rel=0.01)
+
+
+def test_what_cannot_be_watched_is_refused():
+    with pytest.raises(DrakeTeleopError, match=r"load_estimator.method: .*too small.*rtls"):
+        replace(SCENARIO, load_estimator__method="rls").check()
+    with pytest.raises(DrakeTeleopError, match=r"load_estimator.watch: .*no load to watch"):
+        MakeTeleopStation(replace(Scenario(), load_estimator__watch=True))
+
+
+def test_a_station_that_does_not_watch_has_no_such_signal():
+    assert not MakeTeleopStation(Scenario()).HasOutputPort("load_state")

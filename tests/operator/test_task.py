@@ -1,0 +1,235 @@
+"""The simulated operator's tasks, in the whole station."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identification import slave_arm
+from drake_teleop.master.device import JointFriction
+from drake_teleop.noise import random_normal
+from drake_teleop.operator import task as tasks
+from drake_teleop.operator.perception import NOTICED, Perception, perceive
+from drake_teleop.operator.task import DONE, OVER, PHASE, SEEKING, Insert, Press, Reach, Touch
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.simulation import simulate
+from drake_teleop.station import MakeTeleopStation
+from drake_teleop.task_measures import contact_force, detection_time, task_measures
+
+#: Rates of a study: the operator notices no difference.
+FAST = {
+    "rates__sensor_hz": 2000.0,
+    "rates__hand_hz": 1000.0,
+    "rates__joint_control_hz": 1000.0,
+    "wrist_sensor__ideal": True,
+}
+
+
+def run(name: str, **changes):
+    """The scenario, with a load that is known."""
+    scenario = replace(LoadScenario(name), **(FAST | changes))
+    estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+    station = MakeTeleopStation(scenario, load_estimate=estimate)
+    result = simulate(station, scenario.simulation)
+    return result, task_measures(result, scenario)
+
+
+def with_task(task, **changes):
+    return {"operator__task": task} | changes
+
+
+@pytest.fixture(scope="module")
+def touch():
+    return {sigma: run("touch", force_scaling__sigma=sigma) for sigma in (0.0, 1.0)}
+
+
+@pytest.fixture(scope="module")
+def reach():
+    return run("reach")
+
+
+def test_reaching_ends_in_the_target(reach):
+    result, measures = reach
+    assert measures["success"] == 1.0
+    assert 0.5 < measures["task_time_s"] < 2.0
+    state = result["task_state"]
+    ended = np.argmax(state[:, DONE] != 0.0)
+    assert (state[ended:, PHASE] == OVER).all()
+    assert np.isnan(measures["detection_time_s"]) and measures["contact_force_overshoot_N"] == 0.0
+
+
+def test_a_smaller_target_takes_longer():
+    """Fitts: noise in the movements makes corrections necessary."""
+    mean = {}
+    for width in (0.003, 0.02):
+        task = Reach(translation=[0.0, 0.08, -0.06], width=width)
+        times = [
+            run("reach", **with_task(task, simulation__seed=seed))[1]["task_time_s"]
+            for seed in (1, 2, 3)
+        ]
+        mean[width] = np.mean(times)
+    assert mean[0.003] > mean[0.02] + 0.3
+
+
+def test_the_hand_knows_how_its_base_lies_and_how_motion_is_scaled():
+    result, measures = run(
+        "reach",
+        kinematic_scaling__alignment=[0.0, 0.0, -0.7],
+        kinematic_scaling__translation_scale=1.5,
+    )
+    assert measures["success"] == 1.0
+    way = result["pose_master"][-1, 4:] - result["pose_master"][0, 4:]
+    assert np.linalg.norm(way) == pytest.approx(0.1 / 1.5, rel=0.1)
+
+
+def test_what_happens_is_the_seeds(reach):
+    again, _ = run("reach")
+    other, _ = run("reach", simulation__seed=5)
+    assert np.array_equal(again["hand_wrench_E"], reach[0]["hand_wrench_E"])
+    assert not np.array_equal(other["hand_wrench_E"], reach[0]["hand_wrench_E"])
+
+
+def test_the_picture_is_as_late_as_the_line():
+    """One movement is enough for a large target; that it is there, is seen both ways later."""
+    task = with_task(Reach(translation=[0.0, 0.08, -0.06], width=0.04))
+    near, far = (
+        run("reach", channel__delay=delay, **task)[1]["task_time_s"] for delay in (0.05, 0.2)
+    )
+    assert far - near == pytest.approx(2 * 0.15, abs=0.02)
+
+
+def test_contact_is_noticed_and_the_hand_stops(touch):
+    for result, measures in touch.values():
+        assert measures["success"] == 1.0
+        # Not before the reaction time is over.
+        assert 0.16 < measures["detection_time_s"] < 0.5
+        assert measures["false_notices"] == 0
+        # It has stopped: what the tool does to the leaf no longer changes.
+        force = contact_force(result)
+        assert force[-1] > 0.5 and np.ptp(force[-200:]) < 2.0
+        # And the run ends with the task.
+        assert 0.0 <= result.t[-1] - measures["task_time_s"] < 0.03
+
+
+def test_weight_that_is_felt_makes_one_slow_and_blunt(touch):
+    """sigma = 1: the threshold follows the load's displayed weight, and with it trust."""
+    without, with_load = touch[0.0][1], touch[1.0][1]
+    assert with_load["task_time_s"] > without["task_time_s"]
+    assert with_load["effort_Ns"] > 2 * without["effort_Ns"]
+    limit = [result["task_state"][-1, tasks.LIMIT] for result, _ in touch.values()]
+    assert limit[0] == pytest.approx(0.06, abs=0.005)
+    assert limit[1] == pytest.approx(0.1 * 3.13 * 9.81 / 17.5, rel=0.1)
+
+
+def test_the_peg_is_felt_into_the_slot():
+    _, measures = run("insert")
+    assert measures["success"] == 1.0
+    assert measures["false_notices"] == 0
+
+
+def test_who_misses_the_mouth_looks_around():
+    """The chamfers reach 4 mm to each side; who sees the mouth farther off lands beside them."""
+    task = Insert(translation=[0.0, 0.0085, -0.02], depth=0.04)
+    result, measures = run("insert", **with_task(task))
+    assert measures["success"] == 1.0
+    assert (result["task_state"][:, PHASE] == SEEKING).any()
+    # It stood on the top first: at the force of a push, above the mouth.
+    assert measures["detection_time_s"] < 0.5
+
+
+def test_who_feels_nothing_gives_up():
+    result, measures = run("touch", force_scaling__gamma=0.0, sheet_spring=None)
+    assert measures["success"] == 0.0 and np.isnan(measures["task_time_s"])
+    assert np.isnan(measures["detection_time_s"])
+    assert result["task_state"][-1, DONE] <= 0.0
+
+
+def test_a_set_force_is_held():
+    """Without friction in the device, which hides 1 N at the tool: as exactly as one can judge."""
+    smooth = {"master__friction": JointFriction([0.0] * 6, [5e-4] * 3 + [5e-5] * 3)}
+    for force in (5.0, 12.0):
+        task = Press(translation=[0.0, 0.0, -0.08], force=force, tolerance=0.1 * force)
+        _, measures = run("press", **with_task(task, **smooth))
+        assert measures["task_time_s"] < 5.5
+        # The Weber fraction is a standard deviation.
+        assert measures["press_error_N"] < (0.1 + 2 * 0.1) * force
+
+
+def test_a_press_that_takes_too_long_is_given_up():
+    task = Press(translation=[0.0, 0.0, -0.08], timeout=1.0)
+    result, measures = run("press", **with_task(task, simulation__duration=1.5))
+    assert measures["success"] == 0.0
+    assert result["task_state"][-1, DONE] == -1.0
+
+
+def test_a_human_notices_the_papers_contact_and_nothing_before():
+    """Fig. 8 without inertia: the fast motion before is expected, the touch of 50 ms is not."""
+    scenario = LoadScenario("contact_transition")
+    changes = FAST | {"simulation__settle": 0.0, "simulation__duration": 1.7}
+    scenario = replace(scenario, **changes)
+    estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+    result = simulate(MakeTeleopStation(scenario, load_estimate=estimate), scenario.simulation)
+    hand, velocity = result["hand_wrench_E"][:, :3], result["twist_master"][:, :3]
+    mass = scenario.operator.hand.mass
+    noticed = perceive(result.t, hand, velocity, Perception(), mass, 1.0)[:, NOTICED] > 0.0
+    touching = contact_force(result) > 0.0
+    assert not noticed[: np.argmax(touching)].any()
+    assert detection_time(result.t, touching, noticed) < 0.03
+
+
+def test_every_movement_goes_on_from_the_one_before():
+    """Place, velocity and acceleration have no steps, and each ends where it was to end."""
+    memory, time, rng = tasks.initial_memory(), 0.0, np.random.default_rng(3)
+    expected = np.zeros(3)
+
+    def wanted(at):
+        pose, twist = np.zeros(7), np.zeros(6)
+        tasks.add_plan_into(memory, at, pose, twist)
+        return pose[4:], twist[:3]
+
+    for _ in range(5):
+        change, length = rng.normal(size=3) * 0.1, rng.uniform(0.2, 0.5)
+        now, _ = wanted(time)
+        before = wanted(time - 1e-6), wanted(time)
+        tasks._plan_move(memory, time, length, change, np.zeros(3))
+        after = wanted(time), wanted(time + 1e-6)
+        for place_or_speed in (0, 1):
+            slope_before = (before[1][place_or_speed] - before[0][place_or_speed]) / 1e-6
+            slope_after = (after[1][place_or_speed] - after[0][place_or_speed]) / 1e-6
+            np.testing.assert_allclose(slope_after, slope_before, atol=2e-3)
+        np.testing.assert_allclose(after[0][0], before[1][0], atol=1e-14)
+        expected = now + change
+        np.testing.assert_allclose(wanted(time + length)[0], expected, atol=1e-14)
+        time += 0.7 * length  # the next one begins before this one is over
+    np.testing.assert_allclose(wanted(time + 1.0)[0], expected, atol=1e-14)
+    np.testing.assert_allclose(wanted(time + 1.0)[1], 0.0, atol=1e-13)
+
+
+def test_the_operators_noise_is_normal():
+    key = np.uint64(12345)
+    draws = np.array([random_normal(key, k) for k in range(20000)])
+    assert abs(draws.mean()) < 4 / np.sqrt(len(draws))
+    assert draws.std() == pytest.approx(1.0, abs=0.03)
+    assert (np.abs(draws) > 1.96).mean() == pytest.approx(0.05, abs=0.01)
+    assert abs(np.mean(draws[1:] * draws[:-1])) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (with_task(Reach(width=0.4)), r"operator\.task\.translation: the target is 0\.1 m away"),
+        (with_task(Insert(translation=[0.0, 0.0, -0.01])), r"operator\.task\.translation"),
+        (with_task(Touch(standoff=0.3)), r"operator\.task\.translation"),
+        (with_task(Press(force=-1.0)), r"operator\.task\.force"),
+        (with_task(Reach(), kinematic_scaling__translation_scale=0.0), "translation_scale"),
+    ],
+)
+def test_a_task_that_cannot_be_done_is_refused(changes, message):
+    with pytest.raises(DrakeTeleopError, match=message):
+        replace(Scenario(), **changes).check()
+
+
+def test_a_scenario_without_task_has_nothing_to_measure(reach):
+    with pytest.raises(DrakeTeleopError, match=r"operator\.task"):
+        task_measures(reach[0], Scenario())

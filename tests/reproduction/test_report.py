@@ -1,0 +1,132 @@
+"""The report: verdicts follow from the numbers, the page stands alone, nothing is made up."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from drake_teleop.reproduction.report import (
+    ReportFigure,
+    captions,
+    compare_with_paper,
+    parameter_rows,
+    write_report,
+)
+
+SUMMARY = {
+    "free_force.peak_raw_N": 99.4,
+    "free_force.peak_raw_master_N": 5.68,
+    "free_force.half_ratio": 0.5003,
+    "free_force.residual_max_N": 1.21,
+    "free_force.residual_ideal_max_N": 3.2e-13,
+    "free_torque.peak_raw_Nm": 5.1,
+    "free_torque.half_ratio": 0.501,
+    "free_torque.residual_max_Nm": 0.071,
+    "free_torque.residual_ideal_max_Nm": 2e-14,
+    "contact.true_s": 0.2204,
+    "contact.detected_s": 0.2229,
+    "contact.raw_detectable": False,
+    "contact.false_alarm_0_6_s": False,
+    "contact.peak_contact_N": 35.2,
+    "contact.peak_inertial_N": 91.0,
+    "identification.mass_error_percent": 0.031,
+    "identification.com_error_mm": 0.08,
+}
+TRUE = np.arange(1.0, 17.0)
+STD = np.full(16, 0.012)
+
+
+def figure() -> Figure:
+    picture = Figure(figsize=(2, 1))
+    picture.subplots().plot([0, 1])
+    return picture
+
+
+def write(path, summary=SUMMARY, replay="replay.html", setup=None) -> str:
+    write_report(
+        path,
+        setup=setup or {"Seed": "7"},
+        summary=summary,
+        figures=[ReportFigure("Fig. 6", figure(), captions(summary)["fig6"])],
+        parameters=parameter_rows(TRUE, TRUE + 0.01, STD),
+        replay=replay,
+    )
+    return path.read_text(encoding="utf-8")
+
+
+def test_a_good_run_agrees_everywhere_it_can_be_compared():
+    rows = compare_with_paper(SUMMARY)
+    assert {row.verdict for row in rows} == {"agrees", "for the record"}
+    assert rows[0].ours == "99.4 N"
+    assert rows[0].accepted == "90 to 115 N"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "what"),
+    [
+        ("free_force.peak_raw_N", 130.0, "peak force at the slave"),
+        ("free_force.peak_raw_N", float("nan"), "peak force at the slave"),
+        ("free_force.half_ratio", 0.6, "σ = 0.5 over σ = 1"),
+        ("free_force.residual_max_N", 5.1, "largest force left"),
+        ("free_force.residual_ideal_max_N", 1e-3, "ideal sensor"),
+        ("contact.detected_s", 0.2404, "found in the contact force"),
+        ("contact.raw_detectable", True, "threshold on the raw force"),
+        ("contact.false_alarm_0_6_s", True, "false alarm"),
+        ("contact.peak_contact_N", 90.0, "over inertial peak"),
+        ("identification.mass_error_percent", 0.3, "Mass"),
+    ],
+)
+def test_each_figure_that_goes_wrong_differs_and_only_that_one(name, value, what):
+    rows = [row for row in compare_with_paper(SUMMARY | {name: value}) if row.agrees is False]
+    assert len(rows) == 1
+    assert what in rows[0].what
+
+
+def test_captions_speak_of_this_run():
+    text = captions(SUMMARY)
+    assert "99.4 N" in text["fig6"] and "1.21 N remain" in text["fig6"]
+    assert "5.10 N m" in text["fig7"]
+    assert "at 220 ms" in text["fig8"] and "2.5 ms after" in text["fig8"]
+    assert "no threshold on it tells" in text["fig8"]
+    other = captions(SUMMARY | {"contact.raw_detectable": True, "contact.false_alarm_0_6_s": True})
+    assert "a threshold on it tells" in other["fig8"]
+    assert "it also crosses it" in other["fig8"]
+
+
+def test_parameters_are_printed_to_the_digits_that_mean_something():
+    rows = parameter_rows(TRUE, TRUE + 0.01, STD)
+    assert (rows[0].symbol, rows[0].index, rows[0].unit) == ("f", "o,x", "N")
+    assert (rows[0].true, rows[0].estimate) == ("1.000", "1.010")
+    assert (rows[0].error, rows[0].deviation) == ("+0.010", "0.012")
+    assert (rows[6].symbol, rows[6].unit, rows[6].true) == ("m", "kg", "7.000")
+    # Moments and inertias are printed in g m and g m^2.
+    assert (rows[7].true, rows[7].error) == ("8000", "+10")
+    assert [row.index for row in rows[10:]] == ["xx", "xy", "xz", "yy", "yz", "zz"]
+
+
+def test_the_page_stands_alone(tmp_path):
+    page = write(tmp_path / "report.html")
+    sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)
+    assert [s for s in sources if not s.startswith("data:image/png;base64,")] == 2 * ["replay.html"]
+    assert "http" not in page
+    assert "drake_teleop" in page and "Python" in page
+    for name in SUMMARY:
+        assert f"<code>{name}</code>" in page
+
+
+def test_no_replay_no_frame(tmp_path):
+    assert "<iframe" not in write(tmp_path / "report.html", replay=None)
+
+
+def test_the_same_run_gives_the_same_page(tmp_path):
+    first, again = write(tmp_path / "a.html"), write(tmp_path / "b.html")
+    assert first == again
+    assert first != write(tmp_path / "c.html", SUMMARY | {"free_force.peak_raw_N": 98.0})
+
+
+def test_text_is_escaped(tmp_path):
+    page = write(tmp_path / "report.html", setup={"Scenario": "<script>alert(1)</script>"})
+    assert "<script>" not in page

@@ -1,0 +1,236 @@
+"""`drake-teleop reproduce`: the figures of the paper, and that they follow from the physics."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from drake_teleop.identification import slave_arm
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.identification import Identification
+from drake_teleop.reproduction.report import compare_with_paper
+from drake_teleop.reproduction.reproduce import (
+    SIGMAS,
+    ContactMotion,
+    contact_figures,
+    flat,
+    free_figures,
+    free_motion,
+    raw_excess,
+    reproduce_command,
+)
+from drake_teleop.result import Signal, SimulationResult
+from drake_teleop.run import in_contact
+from drake_teleop.scenario import LoadScenario, replace
+
+FORCE_SCALE = 1 / 17.5
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("reproduce")
+    return reproduce_command(out, quiet=True), out
+
+
+def log(out, name: str) -> SimulationResult:
+    return SimulationResult.read_parquet(out / "logs" / f"{name}.parquet")
+
+
+def test_free_motion_is_as_in_figure_6(run):
+    figures = run[0]["free_force"]
+    assert 90 <= figures["peak_raw_N"] <= 115
+    assert figures["peak_raw_master_N"] == pytest.approx(5.7, abs=0.3)
+    assert 0.48 <= figures["half_ratio"] <= 0.52
+    assert figures["residual_max_N"] <= figures["residual_norm_max_N"] <= 1.5
+    assert figures["residual_ideal_max_N"] <= 1e-6
+
+
+def test_free_motion_is_as_in_figure_7(run):
+    figures = run[0]["free_torque"]
+    assert 3 <= figures["peak_raw_Nm"] <= 12
+    assert figures["peak_raw_master_Nm"] == pytest.approx(FORCE_SCALE * figures["peak_raw_Nm"])
+    assert 0.48 <= figures["half_ratio"] <= 0.52
+    assert figures["residual_max_Nm"] <= 0.03 * figures["peak_raw_Nm"]
+    assert figures["residual_ideal_max_Nm"] <= 1e-6
+
+
+def test_the_contact_is_as_in_figure_8(run):
+    figures = run[0]["contact"]
+    assert 0.205 <= figures["true_s"] <= 0.235
+    assert 0 <= figures["detected_s"] - figures["true_s"] <= 0.010
+    assert figures["threshold_N"] > figures["free_residual_norm_max_N"]
+    assert figures["raw_detectable"] is False
+    assert figures["false_alarm_0_6_s"] is False
+    assert 10 <= figures["peak_contact_N"] <= 25
+    assert figures["peak_contact_N"] < 0.5 * figures["peak_inertial_N"]
+
+
+def test_the_load_is_found_from_the_sensors_samples(run):
+    figures = run[0]["identification"]
+    assert figures["mass_error_percent"] <= 0.2
+    assert figures["com_error_mm"] <= 0.5
+    assert figures["offset_error_N"] <= 0.05
+    assert figures["recursive_against_batch_std"] < 1
+
+
+def test_the_speed_was_measured(run):
+    """No bound: a test is never timed."""
+    speed = run[0]["speed"]
+    assert speed["real_time_factor"] > 0
+    assert speed["cost_over_bare_plant"] > 1
+
+
+def test_everything_agrees_with_the_paper(run):
+    rows = compare_with_paper(flat(run[0]))
+    assert [row.what for row in rows if row.agrees is False] == []
+
+
+def test_everything_is_written(run):
+    summary, out = run
+    assert json.loads((out / "summary.json").read_text(encoding="utf-8")) == summary
+    for name in ("fig6", "fig7", "fig8"):
+        assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    table = (out / "table.md").read_text(encoding="utf-8")
+    assert len(table.splitlines()) == 2 + len(compare_with_paper(flat(summary)))
+    assert table.count("agrees") >= 14
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert 'src="replay.html"' in page
+    assert page.count("data:image/png;base64,") == 3
+    assert "contact.true_s" in page
+    assert (out / "replay.html").stat().st_size > 1e6
+    load = Identification.load(out / "identification.json")
+    assert load.mass == summary["identification"]["mass_kg"]
+    assert load.method == "recursive total least squares"
+
+
+def test_the_bottom_plots_are_what_the_hand_gets(run):
+    """Computed afterwards from the samples, they are the loop's own output, scaled."""
+    _, out = run
+    load = Identification.load(out / "identification.json")
+    for name in ("free_motion_force", "free_motion_torque", "contact_transition"):
+        result = log(out, name)
+        bottom = contact_wrench(
+            result["measured_wrench_S"],
+            load.offsets,
+            result["specific_force_S"],
+            result["angular_velocity_S"],
+            result["angular_acceleration_S"],
+            load.phi,
+        )
+        np.testing.assert_allclose(bottom, result["scaled_wrench_S"], atol=1e-12)
+        for part in (slice(0, 3), slice(3, 6)):
+            felt = np.linalg.norm(result["force_to_master"][:, part], axis=1)
+            left = np.linalg.norm(bottom[:, part], axis=1)
+            np.testing.assert_allclose(felt, FORCE_SCALE * left, atol=1e-12)
+
+
+def test_the_estimators_in_loop_and_on_the_log_had_only_the_sensor(run):
+    """The identification's log, without the states of the plant, gives the same load."""
+    _, out = run
+    result = log(out, "identification")
+    assert "contact_wrench_S" not in result
+    np.testing.assert_array_equal(result["load_estimate"][0], 0.0)
+    load = Identification.load(out / "identification.json")
+    np.testing.assert_array_equal(
+        result["load_estimate"][-1], np.concatenate([load.offsets, load.phi])
+    )
+
+
+# What the figures do when something is wrong.
+
+
+def force(*components: float) -> np.ndarray:
+    return np.array([*components, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture
+def motion() -> ContactMotion:
+    """100 N of swing, and 15 N of contact at 0.22 s, at 2 kHz without noise but for 0.5 N."""
+    t = np.arange(0.0, 0.8, 5e-4)
+    free = np.zeros((len(t), 6))
+    free[:, 2] = -30 + 70 * np.cos(2 * np.pi * (t - 0.05) / 0.38)
+    residual = np.outer(np.sin(40 * t), force(0.0, 0.0, 0.5))
+    touch = np.outer((t >= 0.22) & (t < 0.26), force(0.0, 0.0, 15.0))
+    spec = Signal("true_contact_wrench_W", tuple("abcdef"), "N")
+    sheet = Signal("sheet_state", ("z", "v"), ("m", "m/s"))
+    result = SimulationResult(
+        t, {spec.name: touch, sheet.name: np.zeros((len(t), 2))}, [spec, sheet]
+    )
+    return ContactMotion(
+        scenario=LoadScenario("contact_transition"),
+        touched=result,
+        free=result,
+        raw=free + touch + residual,
+        calculated=touch + residual,
+        raw_free=free + residual,
+        calculated_free=residual,
+        contact=in_contact(result),
+        threshold=0.75,
+    )
+
+
+def test_a_clean_contact_is_detected_at_once_and_hidden_in_the_raw_force(motion):
+    figures = contact_figures(motion)
+    assert figures["true_s"] == figures["detected_s"] == pytest.approx(0.22)
+    assert figures["raw_detectable"] is False
+    assert np.all(raw_excess(motion) <= 0)
+    assert figures["false_alarm_0_6_s"] is False
+    assert figures["duration_s"] == pytest.approx(0.04)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_any_axis_of_the_raw_force_that_tells_the_contact_counts(motion, axis):
+    told = motion.raw.copy()
+    told[motion.contact, axis] += 180.0
+    figures = contact_figures(dataclasses.replace(motion, raw=told))
+    assert figures["raw_detectable"] is True
+
+
+def test_the_length_of_the_raw_force_counts_too(motion):
+    """Each component inside its range, but never so long all together."""
+    free, told = motion.raw_free.copy(), motion.raw.copy()
+    free[:100, 0] = told[:100, 0] = 80.0
+    told[motion.contact, 0] = 80.0
+    excess = raw_excess(dataclasses.replace(motion, raw=told, raw_free=free))
+    assert np.all(excess[:3] <= 0)
+    assert excess[3] > 0
+
+
+def test_a_crossing_at_the_second_turn_is_a_false_alarm(motion):
+    calculated = motion.calculated.copy()
+    calculated[np.argmin(np.abs(motion.touched.t - 0.6)), 2] = 2.0
+    figures = contact_figures(dataclasses.replace(motion, calculated=calculated))
+    assert figures["false_alarm_0_6_s"] is True
+
+
+def test_without_elimination_nothing_is_detected(motion):
+    largest = 1.5 * np.abs(motion.raw_free[:, 2]).max()
+    figures = contact_figures(dataclasses.replace(motion, calculated=motion.raw, threshold=largest))
+    assert figures["detected_s"] is None
+    assert np.isnan(flat({"contact": figures})["contact.detected_s"])
+
+
+def test_without_contact_there_is_no_time_of_it(motion):
+    nothing = np.zeros(len(motion.touched.t), dtype=bool)
+    figures = contact_figures(
+        dataclasses.replace(motion, contact=nothing, calculated=motion.calculated_free)
+    )
+    assert figures["true_s"] is figures["detected_s"] is None
+    assert figures["raw_detectable"] is False
+
+
+def test_a_wrong_mass_is_seen_in_what_is_left():
+    """The figures follow from the physics: 10 % of mass too much leaves 10 % of the force."""
+    scenario = replace(
+        LoadScenario("free_motion_force"), simulation__settle=0.7, simulation__duration=0.4
+    )
+    estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
+    estimate[6:] *= 1.1
+    motion = free_motion(scenario, estimate, lambda done: None)
+    assert tuple(motion.scaled) == SIGMAS
+    figures = free_figures(motion, motion.result, 2, "N")
+    assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)
+    assert figures["half_ratio"] == pytest.approx(0.45, abs=0.01)

@@ -1,0 +1,514 @@
+"""The wrist sensor's chain: each part alone does its formula, and the noise is what is stated."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numba import njit
+from pydrake.common.yaml import yaml_load, yaml_load_typed
+from scipy import signal
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.quantities import check_ranges
+from drake_teleop.sensor.sensor_chain import (
+    NOISE_BLOCK,
+    NOISE_SIZE,
+    OFFSET,
+    PARTS,
+    PRESETS,
+    WristSensorConfig,
+    calibration_matrices,
+    preset_of,
+    read_into,
+    sensor_chain,
+    without,
+)
+from drake_teleop.sensor.sensor_noise import (
+    allan_deviation,
+    predicted_allan_deviation,
+    rest_record,
+    spectral_density,
+)
+
+RATE, PERIOD, JOINTS = 8000.0, 125e-6, 3
+BARE = without(WristSensorConfig(), *PARTS)
+QUIET = ("noise", "random_walk")
+RECORDS = Path(__file__).parents[2] / ".." / "shared" / "data"
+ATI_AT_REST = RECORDS / "ntnu_fts_imu_contact"
+UR5_AT_REST = RECORDS / "ur5_imu_fts_contact"
+
+
+def readings(config, truths, noise=None, period=PERIOD):
+    """(N, 13 + n) of `truths` (N, 15 + n); `noise` (blocks, NOISE_SIZE) or none."""
+    blocks = np.zeros((-(-len(truths) // NOISE_BLOCK), NOISE_SIZE)) if noise is None else noise
+    constants, memory = sensor_chain(config, truths.shape[1] - 15, period)
+    out = np.empty((len(truths), truths.shape[1] - 2))
+    for k, truth in enumerate(truths):
+        read_into(constants, memory, blocks[k // NOISE_BLOCK], truth, out[k])
+    return out
+
+
+def part(**changes):
+    return dataclasses.replace(BARE, **changes)
+
+
+def random_truths(count, seed=0, joints=JOINTS):
+    scale = np.repeat([20.0, 1.0, 10.0, 1.0, 20.0, 1.0], [3, 3, 3, 3, 3, joints])
+    return np.random.default_rng(seed).normal(size=(count, 15 + joints)) * scale
+
+
+def random_noise(count, seed=1):
+    blocks = -(-count // NOISE_BLOCK)
+    return np.random.default_rng(seed).standard_normal((blocks, NOISE_SIZE))
+
+
+def as_read(truths):
+    """The reading of a perfect sensor at So."""
+    flag = np.zeros((len(truths), 1))
+    return np.hstack([truths[:, :9], truths[:, 12:15], flag, truths[:, 15:]])
+
+
+@pytest.mark.parametrize("config", [PRESETS["ideal"], BARE], ids=["ideal", "all parts off"])
+def test_without_its_parts_the_sensor_reads_the_truth(config):
+    truths = random_truths(70)
+    np.testing.assert_allclose(readings(config, truths, random_noise(70)), as_read(truths), 1e-14)
+
+
+def test_every_field_that_can_be_off_belongs_to_a_part():
+    fields = {field.name for field in dataclasses.fields(WristSensorConfig)}
+    in_parts = [name for values in PARTS.values() for name in values]
+    ranges = {name for name in fields if name.endswith("_range")}
+    assert len(in_parts) == len(set(in_parts))
+    assert fields - set(in_parts) - ranges == {"preset", "ideal", "unit", "bandwidth_hz"}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_plausible_and_settle_at_the_first_sample(name):
+    config = PRESETS[name]
+    check_ranges(config, "sensor")
+    config.check("sensor", RATE)
+    truths = np.repeat(random_truths(1), 400, axis=0)
+    found = readings(without(config, *QUIET, "drift"), truths)
+    # The low-pass keeps what the converter rounded, so that it moves within a quantum.
+    quantum = config.resolution * config.ranges()
+    assert np.all(np.ptp(found[:, :12], axis=0) <= quantum)
+    assert np.ptp(found[:, 12:], axis=0).max() == 0.0
+
+
+def test_the_default_is_the_sensor_of_the_paper():
+    assert WristSensorConfig() == PRESETS["jr3_85m35a3"]
+
+
+# Calibration and place
+
+
+@given(unit=st.integers(0, 2**32), bound=st.floats(1e-4, 0.05))
+@settings(max_examples=50, deadline=None)
+def test_calibration_errors_stay_inside_their_bounds(unit, bound):
+    ranges = BARE.ranges()[:6]
+    gains, force_gains, _ = calibration_matrices(
+        part(unit=unit, gain_error=bound, acceleration_gain_error=bound)
+    )
+    assert np.count_nonzero(gains - np.diag(np.diag(gains))) == 0
+    assert np.abs(np.diag(gains) - 1).max() <= bound
+    assert 0 < np.abs(np.diag(force_gains) - 1).max() <= bound
+    talk, _, _ = calibration_matrices(part(unit=unit, cross_talk=bound))
+    np.testing.assert_array_equal(np.diag(talk), 1.0)
+    of_full_scale = (talk - np.eye(6)) * ranges / ranges[:, None]
+    assert 0 < np.abs(of_full_scale).max() <= bound * (1 + 1e-12)
+    turned, s, alpha = calibration_matrices(
+        part(unit=unit, misalignment=bound, acceleration_misalignment=2 * bound)
+    )
+    np.testing.assert_array_equal(turned[:3, :3], turned[3:, 3:])
+    assert np.count_nonzero(turned[:3, 3:]) == np.count_nonzero(turned[3:, :3]) == 0
+    assert Rotation.from_matrix(turned[:3, :3]).magnitude() == pytest.approx(bound, rel=1e-6)
+    assert Rotation.from_matrix(s).magnitude() == pytest.approx(2 * bound, rel=1e-6)
+    np.testing.assert_array_equal(s, alpha)
+
+
+def test_calibration_errors_are_linear_constant_and_independent_of_each_other():
+    truths, errors = random_truths(40), {"gain_error": 0.01, "misalignment": 0.02}
+    config = part(unit=7, cross_talk=0.01, acceleration_gain_error=0.01, **errors)
+    wrench, s, alpha = calibration_matrices(config)
+    found = readings(config, truths)
+    np.testing.assert_allclose(found[:, :6], truths[:, :6] @ wrench.T, 1e-12, 1e-12)
+    np.testing.assert_allclose(found[:, 6:9], truths[:, 6:9] @ s.T, 1e-12, 1e-12)
+    np.testing.assert_allclose(found[:, 9:12], truths[:, 12:15] @ alpha.T, 1e-12, 1e-12)
+    alone = calibration_matrices(part(unit=7, gain_error=0.01))[0]
+    turned = calibration_matrices(part(unit=7, misalignment=0.02))[0]
+    talk = calibration_matrices(part(unit=7, cross_talk=0.01))[0]
+    np.testing.assert_allclose(wrench, (alone + talk - np.eye(6)) @ turned, 1e-12, 1e-15)
+
+
+def test_an_accelerometer_on_the_axis_of_rotation_feels_gravity_only():
+    """S runs on a circle about a vertical axis, which goes through the accelerometer."""
+    radius, speed, growth = 0.12, 3.0, 5.0
+    truth = np.zeros((1, 15))
+    truth[0, 6:9] = [-(speed**2) * radius, growth * radius, 9.81]
+    truth[0, 11], truth[0, 14] = speed, growth
+    R_SA = Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix()
+    config = part(p_SoAo_S=[-radius, 0.0, 0.0], R_SA=R_SA.ravel().tolist())
+    found = readings(config, truth)[0]
+    np.testing.assert_allclose(R_SA @ found[6:9], [0, 0, 9.81], atol=1e-13)
+    np.testing.assert_allclose(R_SA @ found[9:12], [0, 0, growth], atol=1e-13)
+
+
+# Low-pass
+
+
+def filtered(values, bandwidth):
+    sections = signal.butter(4, bandwidth, fs=RATE, output="sos")
+    start = signal.sosfilt_zi(sections)[..., None] * values[0]
+    return signal.sosfilt(sections, values, axis=0, zi=start)[0]
+
+
+@pytest.mark.parametrize("place", ["before_noise", "after_converter"])
+def test_the_low_pass_is_a_butterworth_that_starts_settled(place):
+    truths = random_truths(300)
+    found = readings(part(low_pass=place, bandwidth_hz=300.0), truths)
+    expected = as_read(truths)
+    expected[:, :12] = filtered(expected[:, :12], 300.0)
+    np.testing.assert_allclose(found, expected, 1e-9, 1e-9)
+
+
+def test_the_place_of_the_low_pass_decides_what_it_filters():
+    truths, noise = np.repeat(random_truths(1), 300, axis=0), random_noise(300)
+    raw = part(force_noise=0.2, resolution=1e-3)
+    unfiltered = readings(raw, truths, noise)
+    after = readings(dataclasses.replace(raw, low_pass="after_converter"), truths, noise)
+    before = readings(dataclasses.replace(raw, low_pass="before_noise"), truths, noise)
+    np.testing.assert_allclose(before, unfiltered, 1e-9, 1e-9)
+    # It settled on the truth, not on the first noisy sample.
+    start = np.vstack([as_read(truths[:1])[:, :12], unfiltered[:, :12]])
+    np.testing.assert_allclose(after[:, :12], filtered(start, 500.0)[1:], 1e-9, 1e-9)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_ramp_is_read_as_late_as_the_delays_say(name):
+    config = without(PRESETS[name], *QUIET, "offset", "drift", "quantisation", "place")
+    config = dataclasses.replace(config, encoder_latency=1e-3)
+    slopes = np.linspace(1.0, 3.0, 15 + JOINTS)
+    t = PERIOD * np.arange(500)
+    late = t[-1] - readings(config, t[:, None] * slopes)[-1] / as_read(slopes[None])[0].clip(1e-9)
+    force, acceleration, encoders = config.delays(PERIOD)
+    np.testing.assert_allclose(late[:6], force, atol=1e-9)
+    np.testing.assert_allclose(late[6:12], acceleration, atol=1e-9)
+    np.testing.assert_allclose(late[13:], encoders, atol=1e-9)
+
+
+# Noise, offset, converter
+
+
+def test_white_noise_and_walk_are_the_numbers_that_were_given_times_their_sizes():
+    count = 3 * NOISE_BLOCK + 5
+    truths, noise = random_truths(count), random_noise(count)
+    deviations = np.repeat([0.3, 0.02, 0.1, 2.0], 3)
+    walks = np.repeat([0.4, 0.03, 0.2, 3.0], 3)
+    config = part(
+        force_noise=0.3, torque_noise=0.02, acceleration_noise=0.1, angular_acceleration_noise=2.0,
+        force_walk=0.4, torque_walk=0.03, acceleration_walk=0.2, angular_acceleration_walk=3.0,
+    )  # fmt: skip
+    white = noise[:, :-12].reshape(-1, 12)[:count]
+    steps = np.cumsum(noise[:, -12:], axis=0) * np.sqrt(NOISE_BLOCK * PERIOD)
+    expected = as_read(truths)
+    expected[:, :12] += deviations * white + walks * np.repeat(steps, NOISE_BLOCK, 0)[:count]
+    np.testing.assert_allclose(readings(config, truths, noise), expected, 1e-12, 1e-12)
+
+
+def test_the_offset_drifts_at_its_rate_and_may_be_changed_while_the_sensor_runs():
+    offset, bias = [1.0, 2.0, 3.0, 0.1, 0.2, 0.3], [0.3, 0.2, 0.1, 3.0, 2.0, 1.0]
+    drift = [0.5, -0.4, 0.3, 0.02, -0.01, 0.03]
+    truths = random_truths(100)
+    found = readings(part(offset=offset, acceleration_offset=bias, drift=drift), truths)
+    error = found[:, :12] - as_read(truths)[:, :12]
+    expected = np.outer(np.arange(100) * PERIOD, [*drift, *[0.0] * 6])
+    expected += np.array([*offset, *bias])
+    np.testing.assert_allclose(error, expected, atol=1e-12)
+
+    constants, memory = sensor_chain(part(offset=offset), JOINTS, PERIOD)
+    constants[OFFSET] += 5.0
+    reading = np.empty(13 + JOINTS)
+    read_into(constants, memory, np.zeros(NOISE_SIZE), truths[0], reading)
+    np.testing.assert_allclose(reading[:6], truths[0, :6] + offset + 5.0, 1e-12)
+
+
+def test_quantisation_rounds_to_the_nearest_step():
+    truths = random_truths(200)
+    config = part(resolution=1e-3, encoder_resolution=0.01)
+    steps = np.concatenate([config.resolution * config.ranges(), [1.0], [0.01] * JOINTS])
+    found, expected = readings(config, truths), as_read(truths)
+    np.testing.assert_allclose(found / steps, np.rint(found / steps), atol=1e-9)
+    assert np.all(np.abs(found - expected) <= steps * 0.5 * (1 + 1e-12))
+
+
+def test_saturation_clips_and_says_so_with_the_latency_of_its_path():
+    config = part(saturates=True, force_latency=3 * PERIOD, acceleration_latency=PERIOD)
+    truths = np.zeros((12, 15 + JOINTS))
+    truths[2, 0] = -1.5 * config.force_range[0]
+    truths[7, 14] = 2 * config.angular_acceleration_range
+    found = readings(config, truths)
+    assert np.flatnonzero(found[:, 12]).tolist() == [5, 8]
+    assert found[5, 0] == -config.force_range[0]
+    assert found[8, 11] == config.angular_acceleration_range
+    assert np.count_nonzero(found[:, :12]) == 2
+    free = readings(dataclasses.replace(config, saturates=False), truths)
+    assert free[5, 0] == -1.5 * config.force_range[0] and not free[:, 12].any()
+
+
+# Latency
+
+
+@given(late=st.lists(st.integers(0, 40), min_size=3, max_size=3), joints=st.integers(1, 7))
+@settings(max_examples=25, deadline=None)
+def test_each_path_is_late_by_its_whole_samples(late, joints):
+    force, acceleration, encoders = late
+    config = part(
+        force_latency=(force + 0.4) * PERIOD,
+        acceleration_latency=max(acceleration - 0.4, 0) * PERIOD,
+        encoder_latency=encoders * PERIOD,
+    )
+    assert config.latencies(PERIOD).tolist() == late
+    truths = random_truths(100, joints=joints)
+    found, expected = readings(config, truths), as_read(truths)
+    columns = np.repeat(late[:2], 6).tolist() + [0] + [encoders] * joints
+    before = np.arange(100)[:, None] - np.array(columns)
+    rows = np.maximum(before, 0)  # before the first sample it rested there
+    np.testing.assert_array_equal(found, np.take_along_axis(expected, rows, axis=0))
+
+
+def test_the_ideal_sensor_is_never_late():
+    config = dataclasses.replace(PRESETS["ati_gamma_imu"], ideal=True)
+    assert not config.delays(PERIOD).any() and not config.latencies(PERIOD).any()
+    place, axes = config.accelerometer()
+    assert not place.any() and np.array_equal(axes, np.eye(3))
+
+
+# Spectrum and Allan deviation
+
+LONG = 2**18
+#: What stands alone, and the two sensors with all of it.
+AT_REST = {
+    "white": part(force_noise=0.25, torque_noise=0.01),
+    "white and quantum": part(  # noise of 0.8 quanta: rounding adds 13 % to the power
+        force_noise=0.032,
+        force_range=[200.0] * 3,
+        torque_noise=1.92e-3,
+        acceleration_noise=8e-3,
+        angular_acceleration_noise=0.08,
+        resolution=2e-4,
+    ),
+    "walk": part(force_walk=0.05, angular_acceleration_walk=0.3),
+    "jr3_85m35a3": without(PRESETS["jr3_85m35a3"], "drift"),
+    "ati_gamma_imu": without(PRESETS["ati_gamma_imu"], "drift"),
+    "before the noise": without(
+        dataclasses.replace(PRESETS["jr3_85m35a3"], low_pass="before_noise"), "drift"
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def records():
+    return {name: rest_record(config, LONG, PERIOD, 3) for name, config in AT_REST.items()}
+
+
+@pytest.mark.parametrize("name", [name for name in AT_REST if name != "walk"])
+def test_the_spectrum_at_rest_is_the_one_that_was_predicted(records, name):
+    """Averaged over bands, to five standard deviations of the estimate."""
+    config, length = AT_REST[name], 2048
+    f, found = signal.welch(records[name], RATE, nperseg=length, noverlap=0, axis=0)
+    for low, high in ((20, 60), (60, 200), (200, 400), (400, 600), (600, 1000), (1000, 2000)):
+        band = (f >= low) & (f < high)
+        predicted = spectral_density(config, f[band], PERIOD)
+        noisy = predicted.mean(axis=1) > 0
+        ratio = (found[band].T[noisy] / predicted[noisy]).mean(axis=1)
+        # The Hann window correlates neighbouring lines: 1 + 2 (2/3)^2 + 2 (1/6)^2 = 1.94 times the
+        # variance of independent ones.
+        deviation = np.sqrt(1.94 / (band.sum() * (LONG // length)))
+        assert noisy.any() and np.abs(ratio - 1).max() <= 5 * deviation, (low, ratio)
+
+
+@pytest.mark.parametrize("name", AT_REST)
+def test_the_allan_deviation_at_rest_is_the_one_that_was_predicted(records, name):
+    lengths = 2 ** np.arange(0 if name != "walk" else 5, 14)
+    found = allan_deviation(records[name], lengths)
+    predicted = predicted_allan_deviation(AT_REST[name], lengths, PERIOD)
+    noisy = predicted[:, 0] > 0
+    assert noisy.any() and found[~noisy].max(initial=0.0) < 1e-9
+    # Of differences that do not overlap, which the estimate is better than; for white noise, which
+    # is the worse of the two.
+    deviation = np.sqrt(0.75 / (LONG / lengths - 1))
+    assert np.all(np.abs(found[noisy] / predicted[noisy] - 1) <= 5 * deviation)
+
+
+def test_the_predictions_have_the_textbook_slopes():
+    lengths = np.array([1, 2, 10, 100, 3000])
+    white = predicted_allan_deviation(part(force_noise=0.25), lengths, PERIOD)[0]
+    np.testing.assert_allclose(white, 0.25 / np.sqrt(lengths), 1e-10)
+    walk = predicted_allan_deviation(part(force_walk=0.05), lengths, PERIOD)[0]
+    # IEEE 952: K sqrt(tau / 3); the second term is that of a walk in steps.
+    closed = 0.05 * np.sqrt(lengths * PERIOD / 3 * (1 + 0.5 / lengths**2))
+    np.testing.assert_allclose(walk, closed, 1e-10)
+    f = np.array([0.1, 10.0])
+    np.testing.assert_allclose(
+        spectral_density(part(force_noise=0.25), f, PERIOD)[0], 0.25**2 / (RATE / 2), 1e-12
+    )
+    walks = spectral_density(part(force_walk=0.05), f, PERIOD)[0]
+    np.testing.assert_allclose(walks, 2 * (0.05 / (2 * np.pi * f)) ** 2, 1e-4)
+
+
+@given(st.integers(1, 400), st.floats(30.0, 3000.0))
+@settings(max_examples=20, deadline=None)
+def test_the_predicted_allan_deviation_is_that_of_the_filters_impulse_response(m, bandwidth):
+    config = part(force_noise=1.0, low_pass="after_converter", bandwidth_hz=bandwidth)
+    tail = int(8 * RATE / bandwidth)
+    impulse = np.zeros(2 * m + tail)
+    impulse[0] = 1.0
+    sections = signal.butter(4, bandwidth, fs=RATE, output="sos")
+    response = signal.sosfilt(sections, impulse)
+    differences = np.convolve(response, np.repeat([1.0, -1.0], m) / m)[: 2 * m + tail]
+    expected = np.sqrt(0.5 * np.sum(differences**2))
+    found = predicted_allan_deviation(config, [m], PERIOD)[0, 0]
+    assert found == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    first, second = (rest_record(WristSensorConfig(), 1000, PERIOD, 5) for _ in range(2))
+    assert first.tobytes() == second.tobytes()
+    assert first.tobytes() != rest_record(WristSensorConfig(), 1000, PERIOD, 6).tobytes()
+
+
+@pytest.mark.skipif(not ATI_AT_REST.is_dir(), reason="the recordings are not here")
+@pytest.mark.parametrize(
+    ("file", "figures", "unit"),
+    [("wrench", {"force": slice(0, 3), "torque": slice(3, 6)}, 1.0),
+     ("accel", {"acceleration": slice(0, 3)}, 9.80665)],
+)  # fmt: skip
+def test_the_ati_gamma_is_as_noisy_as_it_was_recorded(file, figures, unit):
+    record = pl.read_csv(ATI_AT_REST / f"0-steady-state_{file}.csv").to_numpy() * unit
+    step = allan_deviation(record, [1])[:, 0]
+    for name, axes in figures.items():
+        stated = getattr(PRESETS["ati_gamma_imu"], f"{name}_noise")
+        assert stated == pytest.approx(np.sqrt(np.mean(step[axes] ** 2)), rel=0.03)
+
+
+@pytest.mark.skipif(not UR5_AT_REST.is_dir(), reason="the recordings are not here")
+def test_the_force_wanders_as_it_was_recorded():
+    """Two averaging times only, and drift in them: to 30 %."""
+    file = UR5_AT_REST / "No10_Standstill_ForceSensor_All2__log_force_sensor.csv"
+    record = pl.read_csv(file, has_header=False).to_numpy()
+    quiet = record[record[:, 0] < 8.7]  # until the first push
+    lengths = np.array([256, 512])
+    found = allan_deviation(quiet[:, 1:], lengths)
+    third = np.sqrt(lengths * np.median(np.diff(quiet[:, 0])) / 3)
+    for stated, axes in (
+        (WristSensorConfig().force_walk, slice(0, 3)),
+        (WristSensorConfig().torque_walk, slice(3, 6)),
+    ):
+        np.testing.assert_allclose(np.sqrt(np.mean(found[axes] ** 2, 0)), stated * third, rtol=0.3)
+
+
+# Configuration
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"R_SA": [1.0, 0, 0, 0, 1.1, 0, 0, 0, 1]}, r"^sensor\.R_SA: is not a rotation"),
+        ({"R_SA": [1.0, 0, 0, 0, 1, 0, 0, 0, -1]}, r"^sensor\.R_SA: is not a rotation"),
+        ({"bandwidth_hz": 3700.0}, r"^sensor\.bandwidth_hz: .*rates.sensor_hz"),
+    ],
+)
+def test_what_cannot_be_is_refused(changes, message):
+    with pytest.raises(DrakeTeleopError, match=message):
+        dataclasses.replace(WristSensorConfig(), **changes).check("sensor", RATE)
+
+
+def loaded(text):
+    config = yaml_load_typed(
+        schema=WristSensorConfig, data=text, defaults=preset_of(yaml_load(data=text))
+    )
+    check_ranges(config, "sensor")
+    return config
+
+
+def test_a_preset_is_named_in_a_file_and_its_fields_overridden():
+    ati = PRESETS["ati_gamma_imu"]
+    config = loaded("{preset: ati_gamma_imu, force_noise: 0.5}")
+    assert config == dataclasses.replace(ati, force_noise=0.5) and config.preset == "ati_gamma_imu"
+    assert ati.force_noise != 0.5
+    assert loaded("{preset: ideal}") == loaded("{ideal: true}") == PRESETS["ideal"]
+    assert loaded("{force_noise: 0.5}") == WristSensorConfig(force_noise=0.5)
+    with pytest.raises(DrakeTeleopError, match=r"sensor:preset: 'jr3' is not known; choose one"):
+        loaded("{preset: jr3}")
+
+
+def test_a_preset_cannot_be_named_where_nothing_would_follow_from_it():
+    with pytest.raises(TypeError, match="preset"):
+        WristSensorConfig(preset="ati_gamma_imu")
+    with pytest.raises((TypeError, ValueError), match="preset"):
+        dataclasses.replace(WristSensorConfig(), preset="ati_gamma_imu")
+
+
+@njit
+def _read_often(constants, memory, noise, truth, reading, count):
+    for _ in range(count):
+        read_into(constants, memory, noise, truth, reading)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_sample_takes_little_time(name):
+    constants, memory = sensor_chain(PRESETS[name], 6, PERIOD)
+    noise, truth, reading = random_noise(1)[0], random_truths(1, joints=6)[0], np.empty(19)
+    _read_often(constants, memory, noise, truth, reading, 1)
+    times = []
+    for _ in range(5):
+        start = time.thread_time()
+        _read_often(constants, memory, noise, truth, reading, 2000)
+        times.append(time.thread_time() - start)
+    assert min(times) / 2000 < 2.5e-6
+
+
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "sensor.md").read_text(encoding="utf-8")
+
+
+def section(title):
+    return DOCUMENT.partition(f"## {title}\n")[2].partition("\n## ")[0]
+
+
+def test_the_document_names_every_part_with_its_fields():
+    rows = re.findall(r"^\| (\w+) \| (`.*?) \|", section("The parts"), re.MULTILINE)
+    assert [name for name, _ in rows] == list(PARTS)
+    fields = {field.name for field in dataclasses.fields(WristSensorConfig)}
+    for name, text in rows:
+        named = re.findall(r"`(\w+)`", text)
+        assert set(named) <= fields
+        assert set(PARTS[name]) <= set(named) or "…" in text
+
+
+def test_the_documents_figures_are_those_of_the_presets():
+    row = re.compile(r"^\| `(\w+)` \|[^|]*\| ([^|]*) \| ([^|]*) \|", re.MULTILINE)
+    rows = row.findall(section("The presets"))
+    assert len(rows) == 18
+    for field, *values in rows:
+        for name, value in zip(("jr3_85m35a3", "ati_gamma_imu"), values, strict=True):
+            stated = getattr(PRESETS[name], field)
+            if isinstance(stated, str):
+                assert value == stated, (field, name)
+            else:
+                numbers = [float(number) for number in value.split(",")]
+                assert numbers == np.atleast_1d(stated).tolist(), (field, name)
+
+
+def test_the_documents_script_runs(capsys):
+    script = re.search(r"```python\n(.*?)```", DOCUMENT, re.DOTALL).group(1)
+    exec(compile(script, "sensor.md", "exec"), {})
+    assert capsys.readouterr().out.strip() == script.rpartition("# ")[2].strip()

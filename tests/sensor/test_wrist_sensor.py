@@ -1,0 +1,109 @@
+"""The wrist sensor: what each part of the chain does to the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.scenario import Scenario, replace
+from drake_teleop.sensor.sensor_chain import WristSensorConfig, butterworth_sections, without
+from drake_teleop.simulation import simulate
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.station import MakeTeleopStation
+
+QUIET = without(
+    WristSensorConfig(), "place", "noise", "random_walk", "offset", "drift", "quantisation"
+)
+
+
+def at_rest(config: WristSensorConfig, **changes):
+    """The station at rest: nothing is fed back that could move it; every sample is logged."""
+    scenario = replace(
+        Scenario(),
+        wrist_sensor=config,
+        motion_estimation__source="accelerometer",
+        force_scaling__force_scale=0.0,
+        rates__log_hz=8000.0,
+        simulation__settle=0.2,
+        simulation__duration=0.5,
+        **changes,
+    )
+    arm = AddSlavePlant(DiagramBuilder(), scenario.slave.position, None).arm
+    estimate = np.concatenate([config.offset, arm.phi_load])
+    return simulate(MakeTeleopStation(scenario, load_estimate=estimate), scenario.simulation)
+
+
+def response(cutoff: float, rate: float, frequency: float) -> complex:
+    z = np.exp(2j * np.pi * frequency / rate)
+    return np.prod(
+        [
+            (b0 + b1 / z + b2 / z**2) / (1 + a1 / z + a2 / z**2)
+            for b0, b1, b2, a1, a2 in butterworth_sections(cutoff, rate)
+        ]
+    )
+
+
+@pytest.mark.parametrize("rate", [1500.0, 8000.0])
+def test_the_low_pass_is_a_fourth_order_butterworth(rate):
+    cutoff = 500.0
+    for frequency in (0.0, 50.0, 300.0, 500.0, 700.0):
+        warped = np.tan(np.pi * frequency / rate) / np.tan(np.pi * cutoff / rate)
+        expected = 1 / np.sqrt(1 + warped**8)
+        assert abs(response(cutoff, rate, frequency)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_at_rest_it_reads_weight_and_offset():
+    offset = [6.0, -3.0, 8.0, 0.3, -0.4, 0.1]
+    result = at_rest(dataclasses.replace(QUIET, offset=offset))
+    # S points down: Eq. (1) is -m g, which is m * 9.81 upwards, -z_S.
+    weight = np.array([0, 0, -9.81])
+    centre = np.array([0.004, -0.003, 0.085])
+    force = 3.13 * weight
+    expected = offset + np.concatenate([force, np.cross(centre, force)])
+    np.testing.assert_allclose(result["measured_wrench_S"][-1], expected, atol=1e-3)
+    np.testing.assert_allclose(result["specific_force_S"][-1], weight, atol=1e-3)
+
+
+def test_the_filtered_noise_has_the_variance_of_white_noise_through_the_filter():
+    config = dataclasses.replace(QUIET, force_noise=0.25, angular_acceleration_noise=1.5)
+    result = at_rest(config)
+    frequencies = np.arange(4000) + 0.5
+    gain = np.mean([abs(response(500.0, 8000.0, f)) ** 2 for f in frequencies])
+    force = result["measured_wrench_S"][:, :3] - result["measured_wrench_S"][:, :3].mean(axis=0)
+    assert force.std() == pytest.approx(0.25 * np.sqrt(gain), rel=0.05)
+    assert result["angular_acceleration_S"].std() == pytest.approx(1.5 * np.sqrt(gain), rel=0.05)
+    assert result["specific_force_S"].std(axis=0).max() < 1e-6
+
+
+def test_channels_are_independent_and_other_seeds_give_other_noise():
+    config = dataclasses.replace(QUIET, force_noise=0.25, torque_noise=0.01)
+    first, second = at_rest(config), at_rest(config, simulation__seed=1)
+    wrench = first["measured_wrench_S"]
+    correlation = np.corrcoef(wrench.T) - np.eye(6)
+    assert np.abs(correlation).max() < 0.15
+    assert not np.array_equal(wrench, second["measured_wrench_S"])
+    np.testing.assert_array_equal(wrench, at_rest(config)["measured_wrench_S"])
+
+
+def test_the_converter_quantises_before_the_filter():
+    """The reading at rest is a whole number of quanta, whatever the truth is."""
+    result = at_rest(dataclasses.replace(QUIET, resolution=2.5e-4))
+    force = result["measured_wrench_S"][-1, 2] / (2.5e-4 * 400.0)
+    assert force == pytest.approx(round(force), abs=1e-6)
+    assert result["measured_wrench_S"][-1, 2] != pytest.approx(-3.13 * 9.81, abs=1e-3)
+
+
+def test_a_saturated_sample_is_clipped_and_flagged():
+    result = at_rest(dataclasses.replace(QUIET, force_range=[200.0, 200.0, 25.0]))
+    assert (result["saturated"] == 1.0).all()
+    np.testing.assert_allclose(result["measured_wrench_S"][:, 2], -25.0, atol=1e-9)
+    assert (at_rest(QUIET)["saturated"] == 0.0).all()
+
+
+def test_angular_velocity_comes_from_the_encoders_with_their_resolution():
+    rough = at_rest(dataclasses.replace(QUIET, encoder_resolution=1e-3))
+    assert np.abs(rough["angular_velocity_S"]).max() < 1e-9  # rounding of the low-pass
+    assert np.abs(at_rest(QUIET)["angular_velocity_S"]).max() < 0.05

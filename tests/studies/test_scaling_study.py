@@ -1,0 +1,118 @@
+"""The answer: what is put into the rows comes out of it, and it says how sure it is."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+
+from drake_teleop.resources import studies_dir
+from drake_teleop.scenario import ScenarioNames
+from drake_teleop.studies import scaling_study
+from drake_teleop.studies.scaling_study import TASKS, answer, scaling_study_command
+from drake_teleop.studies.study import LoadStudy
+
+STUDIES = sorted(path.stem for path in studies_dir().glob("*.yaml"))
+
+
+def tables(seeds: int = 20, spread: float = 0.05) -> dict[str, dict[str, np.ndarray]]:
+    """Effort rises with both, force falls with gamma, time has its least in the middle."""
+    noise = np.random.default_rng(0)
+    sigma, gamma = np.meshgrid([0, 0.1, 0.25, 0.5, 1], [0.25, 0.5, 1, 2, 4, 8], indexing="ij")
+    means = {
+        "effort": 1 + 4 * sigma + 0.2 * gamma,
+        "time": 3 + (np.log2(gamma) - 1) ** 2 + sigma,
+        "force": 10 / gamma,
+    }
+    return {
+        task: {
+            name: means[name][..., None] * (1 + spread * noise.normal(size=(5, 6, seeds)))
+            for name in criteria
+        }
+        | {"success": np.ones((5, 6, seeds))}
+        for task, criteria in TASKS.items()
+    }
+
+
+def test_the_best_point_of_each_way_of_counting():
+    # (sigma, gamma) as indices: no inertia always; little, medium and much contact.
+    for criteria, best in ((("effort",), (0, 0)), (("time",), (0, 3)), (("force",), None)):
+        found = answer(tables(), criteria)
+        place = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
+        assert place[1] == 5 if best is None else place == best
+        assert np.all((found.low <= found.merit) & (found.merit <= found.high))
+        assert found.merit[4, 2] == pytest.approx(1.0)  # the reference against itself
+        assert found.best.sum() == pytest.approx(1.0)
+    assert answer(tables(), ("effort",)).best[0, 0] > 0.95
+    # Nothing there depends on sigma, and it does not pretend to know.
+    assert answer(tables(), ("force",)).best.max() < 0.95
+
+
+def test_points_that_fail_too_often_are_no_choice():
+    failing = tables()
+    failing["press"]["success"][0, 0, :2] = 0.0  # one in ten
+    failing["press"]["effort"][0, 0, :2] = np.nan
+    found = answer(failing, ("effort",))
+    assert np.isnan(found.merit[0, 0])
+    assert found.best[0, 0] == 0.0
+
+
+@pytest.mark.parametrize(("failing", "best"), [(2, 1.0), (3, 0.0)])
+def test_a_reference_that_fails_leaves_the_seeds_at_which_it_does_not(failing, best):
+    rows = tables(seeds=3)
+    rows["press"]["success"][4, 2, :failing] = 0.0
+    rows["press"]["effort"][4, 2, :failing] = np.nan
+    found = answer(rows, ("effort",))
+    assert np.isfinite(found.low).sum() == np.isfinite(found.merit).sum() == 29 * best
+    assert found.best.sum() == pytest.approx(best)
+
+
+def test_more_seeds_make_surer():
+    widths = [np.mean(found.high - found.low) for found in (
+        answer(tables(seeds, 0.3), ("effort", "time", "force")) for seeds in (10, 160)
+    )]  # fmt: skip
+    assert widths[1] < 0.5 * widths[0]
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_the_shipped_studies_load(name):
+    study = LoadStudy(name)
+    assert study.description
+    assert study.scenario in ScenarioNames()
+
+
+def test_they_are_a_thousand_runs_over_the_same_scales():
+    studies = {name: LoadStudy(name) for name in STUDIES}
+    assert sum(study.size() * study.repeats for study in studies.values()) >= 1000
+    scales = [
+        [f for f in studies[f"scaling_{task}"].factors if f.field.startswith("force_scaling.")]
+        for task in ("touch", "press", "insert", "reach")
+    ]
+    assert scales[0] == scales[1] == scales[2]
+    assert scales[3] == scales[0][:1]
+
+
+def test_the_answer_of_a_folder(tmp_path, monkeypatch):
+    """The studies are not run here; their rows are made up."""
+
+    def made_up(name, out, *, repeats, **others):
+        study = LoadStudy(name)
+        study.repeats = repeats
+        noise, rows = np.random.default_rng(0), study.rows(study.points())
+        for row in rows:
+            row |= {measure: 1 + noise.random() for measure in study.measures}
+            row |= {"success": 1.0, "effort_Ns": 1 + row.get("force_scaling.sigma", 0)}
+        (out / "runs.parquet").mkdir(parents=True)
+        pl.DataFrame(rows).write_parquet(out / "runs.parquet" / "run_00000000.parquet")
+
+    monkeypatch.setattr(scaling_study, "study_command", made_up)
+    summary = scaling_study_command(tmp_path, repeats=3)
+    assert summary == json.loads((tmp_path / "answer.json").read_text())
+    assert summary["runs"] == 3 * (5 + 3 * 30 + 5)
+    assert summary["choice"]["effort"]["sigma"] == 0
+    assert summary["choice"]["effort"]["merit"] == pytest.approx(0.5)
+    assert [row["eta"] for row in summary["eta"]] == [0, 0.25, 0.5, 0.75, 1]
+    assert pl.read_csv(tmp_path / "answer.csv").height == 4 * 30
+    assert (tmp_path / "answer.png").exists() and (tmp_path / "choice.png").exists()

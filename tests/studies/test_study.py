@@ -1,0 +1,524 @@
+"""`drake-teleop study`: the design, the store that survives a kill, the same rows everywhere."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import Scenario
+from drake_teleop.signals import SIGNALS
+from drake_teleop.studies import study as studies
+from drake_teleop.studies.design import Factor, Study
+from drake_teleop.studies.measures import default_measures, measured
+from drake_teleop.studies.runs import run_study
+from drake_teleop.studies.store import open_store
+from drake_teleop.studies.study import LoadStudy, study_command
+
+# Learns while it moves, so that no identification comes first.
+SCENARIO = """
+simulation: {duration: 0.05, settle: 0.02}
+operator:
+  grip: firm
+  intent: [!Sine {duration: 10.0, ramp: 0.1, frequency: 3.0, translation: [0.01, 0.01, 0.02]}]
+load_estimator: {enabled: true}
+"""
+STUDY = """
+scenario: tiny.yaml
+factors:
+  - {field: force_scaling.sigma, values: [0, 0.5, 1]}
+  - {field: operator.grip, words: [light, firm]}
+  - {field: simulation.max_step, values: [1e-3]}
+repeats: 2
+"""
+# A study without a station, killed 20 times; its runs take 1 ms, and every seventh fails.
+FAKE = """
+import json, os, random, signal, sys, time
+from pathlib import Path
+import joblib, polars
+from drake_teleop.studies.runs import run_study
+from drake_teleop.studies.design import Factor, Study
+
+def work(values, seed):
+    time.sleep(pause)
+    if seed % 7 == 3:
+        raise ValueError("a seventh\\nof them")
+    return {"hand_work_J": values["a.b"] / (1 + seed)}
+
+def run(out):
+    factor = Factor("a.b", low=0.0, high=1.0, levels=100)
+    study = Study(factors=[factor], repeats=30, measures=["hand_work_J"])
+    return run_study(study, out, work, {}, jobs=1)
+
+killed, whole, report = map(Path, sys.argv[1:])
+pause = 0.001
+pauses, kept = random.Random(0), []
+def parts():
+    return len(list((killed / "runs.parquet").glob("*")))
+
+for k in range(20):
+    before, child = parts(), os.fork()
+    if not child:
+        run(killed)
+        os._exit(0)
+    # Every other one falls into the work; a run that was killed twice has a process of its own,
+    # which takes its time to begin.
+    deadline = time.monotonic() + 60.0
+    while k % 2 and parts() == before and time.monotonic() < deadline:
+        time.sleep(0.001)
+    time.sleep(pauses.uniform(0.0, 0.2))
+    os.kill(child, signal.SIGKILL)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL, "it has ended by itself"
+    kept.append(parts())
+report.write_text(json.dumps(kept))
+pause = 0.0
+run(killed)
+run(whole)
+"""
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    (folder / "tiny.yaml").write_text(SCENARIO)
+    (folder / "study.yaml").write_text(STUDY)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def serial(files):
+    out = files / "serial"
+    return study_command(files / "study.yaml", out, jobs=1, quiet=True), out
+
+
+def parts(out: Path) -> dict[str, bytes]:
+    return {part.name: part.read_bytes() for part in (out / "runs.parquet").iterdir()}
+
+
+def test_a_row_for_each_run(serial):
+    summary, out = serial
+    rows = pl.read_parquet(out / "runs.parquet").sort("run")
+    assert rows["run"].to_list() == list(range(12))
+    assert rows.columns == [
+        *("run", "point", "repeat", "seed"),
+        *("force_scaling.sigma", "operator.grip", "simulation.max_step"),
+        *default_measures(),
+        "error",
+    ]
+    assert summary["runs"] == 12
+    assert summary["points"] == 6
+    assert summary["failed"] == rows["error"].count() == 0
+    # Seeds are those of the repeats, for every point; another one gives other noise.
+    assert rows["seed"].to_list() == [0, 2] * 6
+    assert rows["rms_force_to_master_N"].n_unique() == 12
+    # A load that is felt in full is heavier than one that is not.
+    mean = rows.group_by("force_scaling.sigma").agg(pl.col("rms_force_to_master_N").mean())
+    assert np.all(np.diff(mean.sort("force_scaling.sigma")["rms_force_to_master_N"]) > 0.1)
+
+
+def test_processes_give_the_same_bytes(serial, files):
+    out = files / "parallel"
+    summary = study_command(files / "study.yaml", out, jobs=2, quiet=True)
+    assert summary == serial[0]
+    assert parts(out) == parts(serial[1])
+
+
+def test_a_dask_cluster_gives_the_same_bytes(serial, files):
+    out = files / "dask"
+    summary = study_command(files / "study.yaml", out, jobs=2, cluster="local", quiet=True)
+    assert summary == serial[0]
+    assert parts(out) == parts(serial[1])
+
+
+def test_without_dask_the_extra_is_named(files, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(DrakeTeleopError, match=r"drake_teleop\[cluster\]"):
+        study_command(files / "study.yaml", files / "none", cluster="local", quiet=True)
+
+
+def test_a_killed_study_of_stations_goes_on(serial, files):
+    out = files / "killed"
+    command = "from drake_teleop.cli import main; main()"
+    arguments = ["study", str(files / "study.yaml"), "--jobs", "1", "--quiet", "--out", str(out)]
+    kill_after([sys.executable, "-c", command, *arguments], out, new_parts=4, pause=0.05)
+    kept = parts(out)
+    assert 4 <= len(kept) < 12
+    assert study_command(files / "study.yaml", out, jobs=1, quiet=True) == serial[0]
+    assert parts(out) == parts(serial[1])
+
+
+def test_kills_lose_and_double_no_row(tmp_path):
+    names = ("fake.py", "killed", "whole", "kept.json")
+    script, killed, whole, report = (tmp_path / name for name in names)
+    script.write_text(FAKE)
+    # What it prints is also what processes of its own print whose parent is killed.
+    answer = subprocess.run(
+        [sys.executable, *map(str, (script, killed, whole, report))],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert answer.returncode == 0, answer.stderr
+    kept = json.loads(report.read_text())
+    assert kept == sorted(kept)
+    assert len(set(kept)) >= 10
+    assert parts(killed) == parts(whole)
+    rows = pl.read_parquet(killed / "runs.parquet").sort("run")
+    assert rows["run"].to_list() == list(range(3000))
+    failed = rows.filter(pl.col("error").is_not_null())
+    assert set(failed["seed"] % 7) == {3}
+    assert set(failed["error"]) == {"ValueError: a seventh of them"}
+    assert rows["hand_work_J"].null_count() == failed["hand_work_J"].null_count() == failed.height
+
+
+def kill_after(command: list[str], out: Path, new_parts: int, pause: float) -> None:
+    """Kills a study when it has written some more parts, and a little later."""
+    folder = out / "runs.parquet"
+    before = len(list(folder.glob("*")))
+    process = subprocess.Popen(command, env=os.environ)
+    deadline = time.monotonic() + 120
+    while len(list(folder.glob("*"))) < before + new_parts:
+        assert process.poll() is None, "the study has ended by itself"
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    time.sleep(pause)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+
+
+def test_a_run_that_fails_is_a_row(files):
+    (files / "failing.yaml").write_text(
+        STUDY.replace(
+            "values: [1e-3]", "values: [1e-3]}\n  - {field: force_scaling.eta, values: [1]"
+        )
+    )
+    out = files / "failing"
+    summary = study_command(files / "failing.yaml", out, jobs=1, quiet=True)
+    rows = pl.read_parquet(out / "runs.parquet")
+    assert rows.height == summary["failed"] == 12
+    assert rows["error"].str.contains("tiny.yaml:force_scaling.eta: ").all()
+    assert summary["measures"]["hand_work_J"] == {"mean": None, "least": None, "largest": None}
+
+
+def test_another_study_does_not_mix_with_the_rows(serial, files):
+    before = parts(serial[1])
+    (files / "other.yaml").write_text(STUDY + "seed: 1\n")
+    with pytest.raises(DrakeTeleopError, match="another study"):
+        study_command(files / "other.yaml", serial[1], quiet=True)
+    assert parts(serial[1]) == before
+
+
+def test_two_processes_do_not_write_at_once(tmp_path):
+    with (
+        open_store(tmp_path, {}),
+        pytest.raises(DrakeTeleopError, match="another process"),
+        open_store(tmp_path, {}),
+    ):
+        pass
+    with open_store(tmp_path, {}):
+        pass
+
+
+def test_an_interrupt_says_what_is_kept(tmp_path):
+    calls = []
+
+    def work(values, seed):
+        calls.append(values)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return {}
+
+    study = Study(factors=[Factor("a.b", values=[1.0, 2.0, 3.0, 4.0])])
+    with pytest.raises(KeyboardInterrupt, match="keeps 2 of 4 runs"):
+        run_study(study, tmp_path, work, {}, jobs=1)
+    assert run_study(study, tmp_path, work, {}, jobs=1).height == 4
+    assert len(calls) == 5  # the third one again
+
+
+def dying(own: int, at: float):
+    """A run that ends its process at one value; a closure, so that nobody has to import this."""
+
+    def work(values, seed):
+        assert os.getpid() != own
+        if values["a.b"] == at:
+            os._exit(1)
+        return {"hand_work_J": values["a.b"]}
+
+    return work
+
+
+@pytest.mark.parametrize("cluster", [None, "local"])
+def test_a_run_that_ends_its_process_is_a_row(tmp_path, cluster):
+    factor = Factor("a.b", low=0.0, high=9.0, levels=10)
+    study = Study(factors=[factor], measures=["hand_work_J"])
+    rows = run_study(study, tmp_path, dying(os.getpid(), at=3.0), {}, jobs=2, cluster=cluster)
+    assert rows["run"].to_list() == list(range(10))
+    failed = rows.filter(pl.col("error").is_not_null())
+    assert failed["a.b"].to_list() == [3.0]
+    assert failed["error"].to_list() == ["the run has ended its process"]
+    assert rows["hand_work_J"].drop_nulls().to_list() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+    assert not list(tmp_path.glob("running/*"))
+
+
+def test_processes_that_never_begin_are_an_error(tmp_path):
+    study = Study(factors=[Factor("a.b", values=[1.0, 2.0, 3.0])])
+    with pytest.raises(DrakeTeleopError, match="processes end before they begin"):
+        run_study(study, tmp_path, Unreadable(), {}, jobs=2)
+
+
+class Unreadable:
+    """A work that ends each process that receives it."""
+
+    def __reduce__(self):
+        return os._exit, (1,)
+
+
+ORPHANS = """
+import os, sys, time
+from pathlib import Path
+from drake_teleop.studies.runs import run_study
+from drake_teleop.studies.design import Factor, Study
+
+out = Path(sys.argv[1])
+
+def work(values, seed):
+    (out / str(os.getpid())).touch()
+    time.sleep(600)
+
+run_study(Study(factors=[Factor("a.b", values=[1.0, 2.0])]), out / "out", work, {}, jobs=2)
+"""
+
+
+def test_processes_end_with_a_study_that_is_killed(tmp_path):
+    script = tmp_path / "orphans.py"
+    script.write_text(ORPHANS)
+    process = subprocess.Popen([sys.executable, str(script), str(tmp_path)])
+    wait_for(lambda: sum(path.name.isdigit() for path in tmp_path.iterdir()) == 2)
+    process.kill()
+    process.wait()
+    children = [int(path.name) for path in tmp_path.iterdir() if path.name.isdigit()]
+    wait_for(lambda: not any(alive(pid) for pid in children))
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # One that has ended and that nobody has buried yet.
+    return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
+
+
+def wait_for(condition, seconds=60.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_factors_over_flags_and_vectors(files, tmp_path):
+    """They reach the scenario, and the table has a column of their kind."""
+    path = files / "kinds.yaml"
+    path.write_text("""
+scenario: tiny.yaml
+factors:
+  - {field: wrist_sensor.ideal, flags: [true, false]}
+  - {field: slave.position, vectors: [[0.55, 0, 0.45], [0.5, 0.1, 0.45]]}
+  - {field: slave.payload.mass, values: [0, 2]}
+""")
+    out = tmp_path / "out"
+    assert study_command(path, out, jobs=1, quiet=True)["failed"] == 0
+    rows = pl.read_parquet(out / "runs.parquet").sort("run")
+    assert rows["wrist_sensor.ideal"].to_list() == [True] * 4 + [False] * 4
+    assert rows["slave.position"].to_list() == [[0.55, 0, 0.45]] * 2 + [[0.5, 0.1, 0.45]] * 2 + (
+        [[0.55, 0, 0.45]] * 2 + [[0.5, 0.1, 0.45]] * 2
+    )
+    assert rows["rms_force_to_master_N"].n_unique() == 8
+    heavy = rows.filter(pl.col("wrist_sensor.ideal"))["rms_force_to_master_N"].to_list()
+    # All that is felt of a load that is being learnt is in proportion to it, offsets apart.
+    assert heavy[1] / heavy[0] == pytest.approx((3.13 + 2) / 3.13, rel=0.1)
+
+
+def bowl(values, seed):
+    """Smallest at (0.3, "b"), with noise that is the same at all points."""
+    away = (values["a.x"] - 0.3) ** 2 + (values["a.w"] != "b")
+    if values["a.w"] == "c" and values["a.x"] > 0.9:
+        raise ValueError("out of reach")
+    return {"hand_work_J": away + 0.01 * seed}
+
+
+BOWL = Study(
+    factors=[Factor("a.x", low=-1.0, high=1.0), Factor("a.w", words=["a", "b", "c"])],
+    design="adaptive",
+    samples=40,
+    batch=4,
+    repeats=2,
+    measures=["hand_work_J"],
+    objective="hand_work_J",
+)
+
+
+def test_an_adaptive_design_finds_the_best_point(tmp_path):
+    rows = run_study(BOWL, tmp_path, bowl, {}, jobs=1)
+    assert rows["point"].max() == 39 and rows.height == 80
+    best = (
+        rows.filter(pl.col("repeat") == 0).sort("hand_work_J", nulls_last=True).row(0, named=True)
+    )
+    assert best["a.w"] == "b"
+    assert best["a.x"] == pytest.approx(0.3, abs=0.01)
+    # It looks where it is good: chance would have a third of the points there.
+    late = rows.filter(pl.col("point") >= 20)
+    assert (late["a.w"] == "b").mean() > 0.5
+    assert len(rows.select("a.x", "a.w").unique()) == 40
+
+
+def test_an_adaptive_design_goes_on_after_any_stop(tmp_path):
+    run_study(BOWL, tmp_path / "whole", bowl, {}, jobs=1)
+    calls = []
+
+    def stopping(values, seed):
+        calls.append(values)
+        if len(calls) % 7 == 0:
+            raise KeyboardInterrupt
+        return bowl(values, seed)
+
+    while True:
+        try:
+            run_study(BOWL, tmp_path / "stopped", stopping, {}, jobs=1)
+            break
+        except KeyboardInterrupt:
+            pass
+    assert len(calls) > 85
+    assert parts(tmp_path / "stopped") == parts(tmp_path / "whole")
+
+
+def test_an_adaptive_design_ends_when_it_has_every_combination(tmp_path):
+    factors = [Factor("a.x", values=[0.0, 1.0]), Factor("a.w", words=["a", "b", "c"])]
+    rows = run_study(dataclasses.replace(BOWL, factors=factors), tmp_path, bowl, {}, jobs=1)
+    assert len(rows.select("a.x", "a.w").unique()) == 6
+
+
+def test_sobol_points_are_balanced():
+    factors = [Factor("a.b", low=-1.0, high=3.0), Factor("a.c", words=["x", "y"])]
+    study = Study(factors=factors, design="sobol", samples=64, seed=5)
+    points = study.points()
+    numbers = np.array([point["a.b"] for point in points])
+    # One in each of 64 equal parts of the range, and every half has as many of both words.
+    np.testing.assert_array_equal(np.sort((numbers + 1) / 4 * 64 // 1), np.arange(64))
+    words = np.array([point["a.c"] for point in points])
+    assert [sum(words[numbers < 1] == word) for word in "xy"] == [16, 16]
+    assert points == study.points()
+    study.seed = 6
+    assert points != study.points()
+
+
+def test_a_factorial_design_has_every_combination_once():
+    factors = [Factor("a.b", low=0.0, high=1.0, levels=5), Factor("a.c", words=["x", "y"])]
+    points = Study(factors=factors).points()
+    assert len({tuple(point.values()) for point in points}) == len(points) == 10
+    assert {point["a.b"] for point in points} == {0.0, 0.25, 0.5, 0.75, 1.0}
+
+
+def test_measures_of_a_known_motion():
+    """A hand pulls with (3, 4, 0) N at 0.2 m/s along x; the display shows 2 sin t along z."""
+    t = np.linspace(0.0, 2 * math.pi, 20001)
+    signals = {name: np.zeros((len(t), 6)) for name in ("hand_wrench_E", "twist_master")}
+    signals |= {
+        name: np.zeros((len(t), 6)) for name in ("force_to_master", "true_contact_wrench_W")
+    }
+    signals["hand_wrench_E"][:, :2] = 3.0, 4.0
+    signals["hand_wrench_E"][:, 5] = 0.1
+    signals["twist_master"][:, 0], signals["twist_master"][:, 5] = 0.2, 0.5
+    signals["force_to_master"][:, 2] = 2 * np.sin(t)
+    signals["force_to_master"][:, 3] = 9.0  # torques do not count
+    signals["true_contact_wrench_W"][100, :3] = 2.0, -3.0, 6.0
+    result = SimulationResult(t, signals, [SIGNALS[name] for name in signals])
+    found = measured(result, Scenario(), default_measures(), 1.0)
+    assert found == pytest.approx(
+        {
+            "peak_force_to_master_N": 2.0,
+            "rms_force_to_master_N": math.sqrt(2.0),
+            "peak_contact_force_N": 7.0,
+            "hand_work_J": (3.0 * 0.2 + 0.1 * 0.5) * 2 * math.pi,
+            "time_above_force_s": 4 / 3 * math.pi,
+        },
+        rel=1e-3,
+    )
+
+
+def test_a_preset_brings_its_values(files):
+    """A factor acts as if it stood in the file: a preset is more than its name."""
+    work = studies.StationWork({}, "x", (), 1.0, files / "loads")
+    ideal = work.scenario({"wrist_sensor.preset": "ideal"}, 3)
+    assert ideal.simulation.seed == 3
+    assert ideal.wrist_sensor != work.scenario({}, 3).wrist_sensor
+    assert ideal.wrist_sensor.ideal
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            ("force_scaling.sigma", "force_scaling.sigm"),
+            "factors[0].force_scaling.sigm: there is no",
+        ),
+        (("[0, 0.5, 1]", "[0, -0.5]"), "factors[0].force_scaling.sigma: -0.5"),
+        (("[light, firm]", "[light, iron]"), "factors[1].operator.grip: 'iron' is not known"),
+        (("words", "values"), "factors[1].values[0]: expected a number"),
+        (("values: [0, 0.5, 1]", "low: 1"), "factors[0]: what it varies over"),
+        (("values: [0, 0.5, 1]", "values: []"), "factors[0]: what it varies over"),
+        (("values: [0, 0.5, 1]", "low: 1, high: 0"), "factors[0].high: the range ends at 0"),
+        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: a value stands there twice"),
+        (("operator.grip, words: [light, firm]", "force_scaling.sigma, values: [1]"), "twice"),
+        (("force_scaling.sigma", "simulation.seed"), "factors[0].field: the seed is no factor"),
+        (("tiny.yaml", "none.yaml"), "there is no scenario"),
+        (("repeats: 2", "repeats: 0"), "repeats: 0 1 is outside"),
+        (("repeats: 2", "repeat: 2"), "did you mean 'repeats'"),
+        (("repeats: 2", "design: taguchi"), "design: 'taguchi' is not known"),
+        (("repeats: 2", "{design: sobol, samples: 48}"), "is not YAML"),
+        (("repeats: 2", "design: sobol\nsamples: 48"), "samples: 48 Sobol points"),
+        (("repeats: 2", "measures: [joy]"), "there is no measure 'joy'"),
+        (("repeats: 2", "design: adaptive"), "objective: '' is no objective"),
+        (("repeats: 2", "objective: hand_work_J"), "no objective for a design that is factorial"),
+        ((STUDY, "scenario: tiny.yaml"), "factors: nothing is varied"),
+        ((STUDY, "- 1"), "expected a mapping"),
+    ],
+)
+def test_a_bad_file_is_one_line_with_its_field(files, tmp_path, change, message):
+    path = files / "bad.yaml"
+    path.write_text(STUDY.replace(*change))
+    with pytest.raises(DrakeTeleopError) as error:
+        study_command(path, tmp_path / "out", quiet=True)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(DrakeTeleopError, match=r"none\.yaml'; give a YAML file or one of scaling_"):
+        LoadStudy(tmp_path / "none.yaml")
+
+
+def threads(values, seed):
+    return {"hand_work_J": float(max(library["num_threads"] for library in threadpool_info()))}
+
+
+def test_a_run_has_one_thread_of_blas_so_that_its_bytes_are_the_same_in_any_process(tmp_path):
+    study = Study(factors=[Factor("a.b", values=[0.0, 1.0])], measures=["hand_work_J"])
+    with threadpool_limits(2):
+        rows = run_study(study, tmp_path, threads, {}, jobs=1)
+        assert threads({}, 0) == {"hand_work_J": 2.0}
+    assert rows["hand_work_J"].to_list() == [1.0, 1.0]

@@ -1,0 +1,115 @@
+"""What a study's rows say: intervals that hold what they promise, the front, the pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drake_teleop.studies.design import Factor, Study
+from drake_teleop.studies.effects import PARETO, effects, estimated, front, pareto
+from drake_teleop.studies.pictures import write_pictures
+
+MEASURES = ["success", *PARETO]
+STUDY = Study(
+    factors=[
+        Factor("force_scaling.sigma", values=[0.0, 0.5, 1.0]),
+        Factor("force_scaling.gamma", low=1.0, high=2.0, levels=2),
+        Factor("operator.grip", words=["firm"]),
+    ],
+    repeats=6,
+    measures=MEASURES,
+)
+
+
+def table(study: Study = STUDY, failing: int = -1) -> pl.DataFrame:
+    """Effort falls with sigma and time rises; gamma does nothing; each seed moves all points."""
+    rows, noise = study.rows(study.points()), np.random.default_rng(0)
+    for row in rows:
+        sigma, seed = row.get("force_scaling.sigma", 0.0), row["seed"]
+        row["success"] = 1.0
+        row["effort_Ns"] = 5.0 - 2.0 * sigma + seed + noise.normal(0, 0.1)
+        row["task_time_s"] = 1.0 + sigma + noise.normal(0, 0.1)
+        row["contact_force_overshoot_N"] = 3.0
+        if row["point"] == failing:
+            row |= dict.fromkeys(PARETO)
+    return pl.DataFrame(rows)
+
+
+def test_intervals_hold_what_they_promise():
+    """Of 2000 studies of 5 seeds, 95 % have the true mean, and the true effect, in the interval."""
+    noise, levels = np.random.default_rng(1), np.tile([0, 1, 2], 5)
+    seeds, truth = np.repeat(np.arange(5.0), 3), np.array([1.0, 2.0, 6.0])
+    inside, effect_inside, widths = [], [], []
+    for _ in range(2000):
+        values = truth[levels] + np.repeat(noise.normal(0, 3.0, 5), 3) + noise.normal(0, 0.5, 15)
+        found = estimated(values, levels, seeds, 3)
+        inside.append(np.abs(found.mean - truth) <= found.half)
+        effect = found.mean - found.mean.mean() - (truth - truth.mean())
+        effect_inside.append(np.abs(effect) <= found.effect_half)
+        widths.append(found.effect_half / found.half)
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.01)
+    assert np.mean(effect_inside) == pytest.approx(0.95, abs=0.01)
+    assert np.median(widths) < 0.3  # what a seed does to all levels cancels
+
+
+def test_what_is_not_a_number_does_not_count():
+    values, levels, seeds = np.array([1.0, np.nan, 3.0, 5.0]), np.zeros(4, int), np.arange(4.0)
+    assert estimated(values, levels, seeds, 1).mean[0] == 3.0
+    nothing = estimated(np.full(4, np.nan), levels, seeds, 1)
+    assert np.isnan(nothing.mean[0]) and np.isnan(nothing.half[0])
+
+
+def test_effects_are_those_that_were_put_in():
+    found = effects(STUDY, table())
+    assert set(found["factor"]) == {"force_scaling.sigma", "force_scaling.gamma"}
+    sigma = found.filter(measure="effort_Ns", factor="force_scaling.sigma")
+    np.testing.assert_allclose(sigma["effect"], [1.0, 0.0, -1.0], atol=0.1)
+    assert (sigma["effect_half"] < 0.15).all()
+    assert (sigma["mean_half"] > 1.0).all()  # seeds differ by 10
+    gamma = found.filter(measure="effort_Ns", factor="force_scaling.gamma")
+    assert (gamma["effect"].abs() < 2 * gamma["effect_half"]).all()
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4), st.booleans()), max_size=30))
+def test_the_front_is_what_nothing_dominates(points):
+    values = np.array([point[:2] for point in points], dtype=float).reshape(-1, 2)
+    complete = np.array([point[2] for point in points], dtype=bool)
+    expected = [
+        full and not any(
+            c and x <= a and y <= b and (x, y) != (a, b) for x, y, c in points
+        )
+        for a, b, full in points
+    ]  # fmt: skip
+    assert front(values, complete).tolist() == expected
+
+
+def test_points_with_failures_are_not_on_the_front():
+    found = pareto(STUDY, table(failing=5))
+    assert found["complete"].to_list() == [True] * 5 + [False]
+    assert not found["front"][5]
+    assert found["front"].sum() >= 3  # each sigma has a point there
+    assert pareto(Study(factors=STUDY.factors, measures=["success"]), table()) is None
+
+
+def test_pictures_are_those_that_mean_something(tmp_path):
+    (tmp_path / "old.png").touch()
+    names = sorted(path.stem for path in write_pictures(STUDY, table(), tmp_path))
+    assert names == sorted(["main_effects", "pareto", *(f"interactions_{m}" for m in MEASURES)])
+    assert sorted(path.stem for path in tmp_path.glob("*.png")) == names
+    alone = Study(factors=STUDY.factors[:1], measures=["success"])
+    names = [path.stem for path in write_pictures(alone, table(alone), tmp_path)]
+    assert names == ["main_effects"]
+    failed = table(alone).with_columns(success=pl.lit(None))
+    assert write_pictures(alone, failed, tmp_path) == []
+
+
+def test_a_range_with_points_anywhere_is_cut_into_equal_parts():
+    factor = Factor("force_scaling.gamma", low=1.0, high=2.0)
+    study = Study(factors=[factor], design="sobol", samples=16, measures=["success"])
+    found = effects(study, table(study))
+    assert found["level"].to_list() == ["1.1", "1.3", "1.5", "1.7", "1.9"]
+    assert found["runs"].sum() == 16
+    assert found["mean_half"].is_nan().all()  # one repeat

@@ -1,0 +1,189 @@
+"""`drake-teleop run`: what it writes, that it warns, and that it is the same every time."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identification import slave_arm
+from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.inertia import mass_com_inertia
+from drake_teleop.logs.processing import identify_log
+from drake_teleop.resources import scenarios_dir
+from drake_teleop.result import Signal, SimulationResult
+from drake_teleop.run import in_contact, run_command
+from drake_teleop.scenario import LoadScenario
+
+# Learns while it moves, so that no identification comes first.
+QUICK = """
+simulation: {duration: 0.15, settle: 0.05, seed: 4}
+operator:
+  grip: firm
+  intent: [!Sine {duration: 10.0, ramp: 0.1, frequency: 3.0, translation: [0.01, 0.01, 0.02]}]
+load_estimator: {enabled: true}
+"""
+
+
+@pytest.fixture(scope="module")
+def contact(tmp_path_factory):
+    out = tmp_path_factory.mktemp("contact")
+    return run_command("contact_transition", out, quiet=True), out
+
+
+@pytest.fixture(scope="module")
+def identification(tmp_path_factory):
+    out = tmp_path_factory.mktemp("identification")
+    return run_command("identification", out, quiet=True), out
+
+
+@pytest.fixture
+def quick(tmp_path):
+    """Runs QUICK, with further lines, into a new folder."""
+
+    def run(name: str, more: str = "", seed: int | None = None):
+        path = tmp_path / "quick.yaml"
+        path.write_text(QUICK + more)
+        return run_command(path, tmp_path / name, seed=seed, quiet=True), tmp_path / name
+
+    return run
+
+
+def test_the_contact_is_run_with_an_identified_load(contact):
+    summary, out = contact
+    assert summary["warnings"] == []
+    assert summary["mass_error_percent"] < 0.2
+    assert summary["com_error_mm"] < 0.5
+    ((start, stop),) = summary["true_contact_s"]
+    assert 0.205 < start < 0.235 < stop < 0.3
+    assert 10 < summary["peak_contact_force_N"] < 25
+    assert 90 < summary["peak_measured_force_N"] < 115
+    assert summary["residual_force_max_N"] < 1.5
+    load = Identification.load(out / "identification.json")
+    assert load.mass == pytest.approx(3.13, rel=2e-3)
+    assert load.identifiable.all()
+    assert load.method == "recursive total least squares"
+
+
+def test_everything_is_written(contact):
+    summary, out = contact
+    assert json.loads((out / "summary.json").read_text()) == summary
+    result = SimulationResult.read_parquet(out / "log.parquet")
+    assert len(result.t) == summary["samples"] == 801
+    assert {"measured_wrench_S", "sheet_state", "force_to_master"} <= set(result)
+    log = pl.read_parquet(out / "sensor_log.parquet")
+    np.testing.assert_array_equal(log["f_z"], result["measured_wrench_S"][:, 2])
+    assert (out / "overview.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_shipped_identification_is_the_identification(identification):
+    """Its sensor log gives the same load to the tools for recorded logs."""
+    summary, out = identification
+    assert summary["duration_s"] == 6.0
+    assert summary["residual_force_max_N"] < 1.5
+    load = Identification.load(out / "identification.json")
+    again = identify_log(out / "sensor_log.parquet", cutoff_hz=None, delay=0.0).identification
+    found = np.concatenate([load.offsets, load.phi])
+    from_log = np.concatenate([again.offsets, again.phi])
+    # One weights the channels by their noise, the other does not know it.
+    assert np.all(np.abs(found - from_log) < 5 * again.standard_deviations)
+
+
+def test_the_load_is_known_as_well_as_it_says(identification):
+    _, out = identification
+    load = Identification.load(out / "identification.json")
+    scenario = LoadScenario("identification")
+    mass, com, inertia = mass_com_inertia(slave_arm(scenario).phi_load)
+    _, found_com, found_inertia = mass_com_inertia(load.phi)
+    assert abs(load.mass / mass - 1) < 1e-3
+    assert np.linalg.norm(found_com - com) < 3e-4
+    principal = np.linalg.eigvalsh(found_inertia) / np.linalg.eigvalsh(inertia)
+    assert np.abs(principal - 1).max() < 0.05
+    error = np.abs(load.offsets - scenario.wrist_sensor.offset)
+    assert np.all(error < [0.1, 0.1, 0.1, 0.005, 0.005, 0.005])
+    low, high = intervals(load)
+    truth = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
+    # Of 16 intervals of 95 % four or more miss once in a hundred times.
+    assert np.sum((low <= truth) & (truth <= high)) >= 13
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(quick):
+    _, first = quick("first")
+    _, again = quick("again")
+    summary, other = quick("other", seed=5)
+    assert summary["seed"] == 5
+    logs = [
+        [part.read_bytes() for part in sorted((out / "log.parquet").iterdir())]
+        for out in (first, again, other)
+    ]
+    assert logs[0] == logs[1]
+    assert logs[0] != logs[2]
+
+
+def test_a_scenario_that_learns_needs_no_identification_before(quick):
+    summary, out = quick("learning")
+    assert not (out / "identification.json").exists()
+    assert summary["seed"] == 4
+    assert summary["true_contact_s"] == []
+
+
+def test_a_saturated_sensor_is_reported_with_its_time(quick):
+    summary, _ = quick("saturated", "wrist_sensor: {force_range: [100, 100, 31]}")
+    (warning,) = summary["warnings"]
+    assert warning.startswith("the wrist sensor saturates from 0.")
+
+
+def test_a_pose_out_of_reach_is_reported_with_its_time(quick):
+    summary, _ = quick(
+        "far", "kinematic_scaling: {translation_scale: 30}\nslave: {position: [0.6, 0, 0.6]}"
+    )
+    assert any(
+        warning.startswith("inverse kinematics: ") and " s on, for " in warning
+        for warning in summary["warnings"]
+    )
+
+
+def test_the_table_says_the_warnings(tmp_path, capsys):
+    path = tmp_path / "loud.yaml"
+    path.write_text(QUICK + "wrist_sensor: {force_range: [100, 100, 31]}")
+    run_command(path, tmp_path / "loud")
+    said = capsys.readouterr().out
+    assert "peak_measured_force_N" in said
+    assert "warning: the wrist sensor saturates" in said
+    assert "written to" in said
+
+
+def test_an_unknown_scenario_names_those_that_exist(tmp_path):
+    with pytest.raises(DrakeTeleopError, match="contact_transition"):
+        run_command("no_such_scenario", tmp_path, quiet=True)
+
+
+def test_bounces_belong_to_one_contact():
+    t = np.arange(0.0, 0.1, 0.001)
+    force = np.zeros((len(t), 6))
+    force[10:15, 2] = force[18:22, 2] = 5.0  # a bounce of 3 ms
+    force[60, 2] = 5.0
+    spec = Signal("true_contact_wrench_W", tuple("abcdef"), "N")
+    contact = in_contact(SimulationResult(t, {spec.name: force}, [spec]))
+    np.testing.assert_array_equal(np.flatnonzero(contact), [*range(10, 22), 60])
+
+
+def test_a_touch_is_noticed_by_the_detector_and_then_by_the_operator(tmp_path, capsys):
+    text = (scenarios_dir() / "touch.yaml").read_text()
+    path = tmp_path / "touch.yaml"
+    path.write_text(text.replace("duration: 5.0", "duration: 3.0") + "contact_detection: {}\n")
+    summary = run_command(path, tmp_path / "out")
+    assert summary["success"] == 1
+    noticed, at_hand = summary["contact_noticed_ms"], summary["contact_at_hand_ms"]
+    assert len(noticed) == len(summary["true_contact_s"])
+    assert 0 < noticed[0] <= at_hand[0] < 10
+    assert at_hand[0] < 1e3 * summary["detection_time_s"]
+    assert summary["false_contacts"] == summary["false_notices"] == 0
+    assert summary["press_error_N"] is None
+    printed = " ".join(capsys.readouterr().out.split())
+    assert f"noticed after {noticed[0]:.1f} ms, at the hand after {at_hand[0]:.1f} ms" in printed
+    assert "task_time_s" in printed

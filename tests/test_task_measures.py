@@ -1,0 +1,81 @@
+"""The measures of a task against closed forms, on a log that was made by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from drake_teleop.operator.operator import OperatorConfig
+from drake_teleop.operator.task import MOVING, OVER, STATE, Press, Touch
+from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import Scenario, replace
+from drake_teleop.signals import SIGNALS
+from drake_teleop.task_measures import TASK_MEASURES, task_measures
+
+T = np.arange(0.0, 4.0 + 1e-9, 1e-3)
+START, END, CONTACT, NOTICED = 0.5, 3.0, 1.5, 1.75  # s, in the log
+SETTLE = 0.25
+
+
+def measures(task, *, done: float = 1.0, force: float = 6.0, early: bool = False):
+    """A hand of 2 N that goes to and fro at 0.1 m/s, and a contact from CONTACT on."""
+    state = np.zeros((len(T), STATE))
+    state[T >= START, 0] = MOVING
+    state[T >= END, :2] = OVER, done
+    state[T >= NOTICED, 2] = 1.0
+    if early:
+        state[(T >= 1.0) & (T < 1.2), 2] = 1.0
+    hand, twist, contact = np.zeros((len(T), 6)), np.zeros((len(T), 6)), np.zeros((len(T), 6))
+    hand[:, 1] = 2.0
+    twist[:, 1] = np.where(T < 2.0, 0.1, -0.1)
+    contact[T >= CONTACT, 2] = force
+    signals = {
+        "task_state": state,
+        "hand_wrench_E": hand,
+        "twist_master": twist,
+        "true_contact_wrench_W": contact,
+    }
+    result = SimulationResult(T, signals, [SIGNALS[name] for name in signals])
+    operator = OperatorConfig(task=task)
+    return task_measures(result, replace(Scenario(), operator=operator, simulation__settle=SETTLE))
+
+
+def test_of_a_touch():
+    found = measures(Touch(t_start=START + SETTLE))
+    assert tuple(found) == TASK_MEASURES
+    assert found["success"] == 1.0
+    assert found["task_time_s"] == pytest.approx(END - START)
+    assert found["contact_force_overshoot_N"] == pytest.approx(6.0)
+    assert found["effort_Ns"] == pytest.approx(2.0 * (END - START))
+    # Forwards and backwards both cost: the net work would be less.
+    assert found["task_work_J"] == pytest.approx(0.2 * (END - START))
+    assert found["detection_time_s"] == pytest.approx(NOTICED - CONTACT)
+    assert found["false_notices"] == 0.0
+    assert math.isnan(found["press_error_N"])
+    assert measures(Touch(t_start=START + SETTLE), early=True)["false_notices"] == 1.0
+
+
+def test_of_a_press():
+    found = measures(Press(t_start=START + SETTLE, force=5.0, tolerance=2.0, hold=1.0))
+    assert found["success"] == 1.0
+    assert found["contact_force_overshoot_N"] == pytest.approx(1.0)
+    assert found["press_error_N"] == pytest.approx(1.0)
+
+
+def test_a_task_that_failed_has_no_merits():
+    """Neither one that is given up, nor one that only the operator believes to be done."""
+    for found in (
+        measures(Press(force=5.0, tolerance=0.5)),
+        measures(Press(force=5.0, tolerance=2.0), done=-1.0),
+    ):
+        assert found["success"] == 0.0
+        missing = {name for name, value in found.items() if math.isnan(value)}
+        assert missing == set(TASK_MEASURES) - {"success", "detection_time_s", "false_notices"}
+
+
+def test_of_a_task_that_was_given_up():
+    found = measures(Touch(), done=-1.0, force=0.0)
+    assert found["success"] == 0.0
+    assert math.isnan(found["task_time_s"]) and math.isnan(found["detection_time_s"])
