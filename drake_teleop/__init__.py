@@ -8,10 +8,8 @@ costs nothing and a user with a log never waits for the simulator.
 from __future__ import annotations
 
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drake_teleop._compiled import discard_stale
 from drake_teleop._version import __version__
 from drake_teleop.errors import DrakeTeleopError
 
@@ -27,8 +25,6 @@ if TYPE_CHECKING:
     from drake_teleop.scenario import LoadScenario, Scenario, ScenarioNames
     from drake_teleop.simulation import simulate
     from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
-
-discard_stale(Path(__file__).parent, Path(__file__).parent)
 
 __all__ = [
     "DrakeTeleopError",

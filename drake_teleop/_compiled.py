@@ -1,30 +1,169 @@
-"""Compiled code that is older than what it was compiled from is thrown away.
+"""`njit` with a cache that follows calls from file to file and that processes can share.
 
-numba keeps compiled functions in `__pycache__` and compiles one again when its own file changes,
-but not when a function that it calls from another file does. In a checkout that is edited or
-updated, it would go on with the old code, and say nothing.
+numba's own cache takes a function for unchanged as long as the function's own file is, so it goes
+on with the old code of what that function calls. It numbers the types that a function was compiled
+for without a lock, so two processes that compile one function at once, for different types, can
+leave the code of one under the number of the other.
+
+Here each type of a function has a file of its own, named by a hash of all that went into it: the
+bytecode of the function and of all that it calls, and the constants that they read. What is found
+under a name is right, whoever wrote it and when; times of files do not matter. numba still chooses
+the folder: `NUMBA_CACHE_DIR` if that is set, else `__pycache__`.
 """
 
 from __future__ import annotations
 
+import os
+import pickle
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import cache
+from hashlib import sha256
 from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
+from uuid import uuid4
+
+import numba
+import numpy as np
+from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
+from numba.core.serialize import dumps
+
+_PLAIN = (int, float, complex, str, bytes, slice, type(None), type(...), np.dtype, np.generic)
 
 
-def discard_stale(package: Path, cache: Path) -> None:
-    """Removes the indices of numba's cache below `cache` that are older than a source of `package`.
+def njit(**options: Any) -> Callable[[Any], Any]:
+    """As `numba.njit`; with `cache=True` the compiled code is kept as described above."""
 
-    Args:
-        package: folder of the sources; those that compile anything count.
-        cache: folder with numba's cached code at any depth.
-    """
-    indices = list(cache.rglob("*.nbi"))
-    if not indices:
-        return
-    sources = [path for path in package.rglob("*.py") if b"njit" in path.read_bytes()]
-    newest = max(path.stat().st_mtime for path in sources)
-    for index in indices:
-        # Another process may do the same now; a folder that cannot be written was never changed.
-        with suppress(OSError):
-            if index.stat().st_mtime < newest:
-                index.unlink()
+    def compiled(function: FunctionType) -> Any:
+        dispatcher = numba.njit(**options)(function)
+        if options.get("cache") and isinstance(dispatcher, Dispatcher):
+            dispatcher._cache = _Cache(function, dispatcher)
+        return dispatcher
+
+    return compiled
+
+
+class _Cache(FunctionCache):
+    """numba's cache of one function, but for its files."""
+
+    def __init__(self, function: FunctionType, dispatcher: Dispatcher) -> None:
+        super().__init__(function)
+        self._cache_file = _Files(Path(self.cache_path), dispatcher)
+
+
+class _Files:
+    """The files of one function, one for each signature and processor that it was compiled for."""
+
+    def __init__(self, folder: Path, dispatcher: Dispatcher) -> None:
+        function = dispatcher.py_func
+        versions = f"{sys.implementation.cache_tag}.numba-{numba.__version__}"
+        self._folder = folder
+        self._dispatcher = dispatcher
+        self._name = (
+            f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}.{versions}-"
+        )
+
+    def load(self, key: Any) -> Any:
+        """The compiled code, or None if there is none yet."""
+        with suppress(OSError, EOFError, pickle.UnpicklingError):
+            stored_key, code = pickle.loads(self._path(key).read_bytes())
+            return code if stored_key == key else None
+
+    def save(self, key: Any, code: Any) -> None:
+        path = self._path(key)
+        unfinished = path.with_suffix(f".{uuid4().hex}")
+        unfinished.write_bytes(dumps((key, code)))
+        os.replace(unfinished, path)
+        self._discard(keep=self._name + fingerprint(self._dispatcher))
+
+    def flush(self) -> None:
+        self._discard()
+
+    def _path(self, key: Any) -> Path:
+        this = sha256(str(key).encode()).hexdigest()[:16]
+        return self._folder / f"{self._name}{fingerprint(self._dispatcher)}-{this}.nbc"
+
+    def _discard(self, keep: str | None = None) -> None:
+        """Removes what was compiled from other sources."""
+        for path in self._folder.glob(f"{self._name}*.nbc"):
+            if keep is None or not path.name.startswith(keep):
+                path.unlink(missing_ok=True)
+
+
+def fingerprint(dispatcher: Dispatcher) -> str:
+    """A hash of all that the function is compiled from: its own code and that of its callees."""
+    reached = {dispatcher}
+    to_do = [dispatcher]
+    while to_do:
+        called = _what_it_is(to_do.pop())[1] - reached
+        reached |= called
+        to_do.extend(called)
+    texts = sorted(_what_it_is(each)[0] for each in reached)
+    return sha256("\n".join(texts).encode()).hexdigest()[:16]
+
+
+@cache
+def _what_it_is(dispatcher: Dispatcher) -> tuple[str, frozenset[Dispatcher]]:
+    """The function's own code with the constants that it reads, and the functions that it calls."""
+    function = dispatcher.py_func
+    read = dict(_read(function))
+    text = (
+        _name(dispatcher),
+        _text(function.__code__),
+        _text(function.__defaults__),
+        sorted((name, str(option)) for name, option in dispatcher.targetoptions.items()),
+        sorted((name, _text(value)) for name, value in read.items()),
+    )
+    return repr(text), frozenset(value for value in read.values() if isinstance(value, Dispatcher))
+
+
+def _read(function: FunctionType) -> Iterator[tuple[str, Any]]:
+    """Name and value of everything outside a function that its code reads."""
+    cells = function.__closure__ or ()
+    for name, cell in zip(function.__code__.co_freevars, cells, strict=True):
+        yield name, cell.cell_contents
+    names = set(_names(function.__code__))
+    package = function.__module__.partition(".")[0]
+    scopes = [function.__globals__]
+    for scope in scopes:
+        for name in names & scope.keys():
+            value = scope[name]
+            yield f"{scope['__name__']}.{name}", value
+            # `module.function`; other packages change with their version only.
+            ours = isinstance(value, ModuleType) and value.__name__.partition(".")[0] == package
+            if ours and all(known is not vars(value) for known in scopes):
+                scopes.append(vars(value))
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)
+
+
+def _text(value: Any) -> str:
+    """Says what a constant is; the same in each process, and without line numbers."""
+    if isinstance(value, CodeType):
+        parts = [value.co_code, value.co_names, value.co_varnames, value.co_argcount]
+        # Where an exception is caught is no longer in the code itself since Python 3.11.
+        parts += [value.co_freevars, getattr(value, "co_exceptiontable", b"")]
+        return repr((parts, _text(value.co_consts)))
+    if isinstance(value, tuple):
+        return f"{type(value).__name__}{[_text(each) for each in value]}"
+    if isinstance(value, np.ndarray):
+        return repr((value.dtype, value.shape, value.tobytes()))
+    if isinstance(value, (Dispatcher, ModuleType)) or callable(value):
+        return _name(value)
+    if isinstance(value, _PLAIN):
+        return repr(value)
+    raise TypeError(f"a compiled function reads {value!r}; its cache cannot see when that changes")
+
+
+def _name(value: Any) -> str:
+    value = getattr(value, "py_func", value)
+    named = getattr(value, "__qualname__", "") or value.__name__  # a module has no qualified name
+    return f"{getattr(value, '__module__', '')}.{named}{getattr(value, '_fields', '')}"

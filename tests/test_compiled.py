@@ -1,57 +1,212 @@
-"""Compiled code follows its sources, through calls from file to file."""
+"""Compiled code follows its sources, through calls from file to file, and is shared safely."""
 
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+from importlib import import_module, invalidate_caches
+from pathlib import Path
 
+import numba
+import numpy as np
 import pytest
 
-INNER = """
-from numba import njit
+import drake_teleop
+
+# `inner` reads a constant of another file, a module's function and one that comes after it.
+FILES = {
+    "numbers": "NUMBER = 1.0\nTABLE = np.zeros(2)\nSTEP = slice(0, 2)",
+    "far": "@njit(cache=True)\ndef far(x):\n    return x",
+    "inner": """
+from .numbers import NUMBER, STEP, TABLE
+from . import far
 
 @njit(cache=True)
 def inner(x):
-    return x + {number}
-"""
-OUTER = """
-from numba import njit
-from .inner import inner
+    return far.far(x) + NUMBER + TABLE[STEP].sum() + _late(x)
 
 @njit(cache=True)
-def outer(x):
-    return inner(x)
-"""
-MAIN = """
-from pathlib import Path
-from drake_teleop._compiled import discard_stale
-
-if {discard}:
-    discard_stale(Path("package"), Path("package"))
-from package.outer import outer
-print(outer(0.0))
-"""
+def _late(x, also=0.0):
+    return 0.0 * x + also
+""",
+    "outer": "from .inner import inner\n\n@njit(cache=True)\ndef outer(x):\n    return inner(x)",
+    "other": "@njit(cache=True)\ndef other(x):\n    return 100.0",
+}
+HEAD = "import numpy as np\nfrom drake_teleop._compiled import njit\n"
 
 
-@pytest.mark.parametrize(("discard", "expected"), [(True, "2.0"), (False, "1.0")])
-def test_a_function_is_compiled_again_when_one_that_it_calls_has_changed(
-    tmp_path, discard, expected
+def _write(folder: Path, changes: dict[str, tuple[str, str]] | None = None) -> None:
+    for name, content in FILES.items():
+        old, new = (changes or {}).get(name, ("", ""))
+        assert old in content
+        (folder / f"{name}.py").write_text(HEAD + content.replace(old, new) + "\n")
+
+
+def _answers(monkeypatch) -> dict[str, tuple[float, int]]:
+    """What a new process would answer, and how often it would compile for that."""
+    for name in [name for name in sys.modules if name.split(".")[0] == "edited_package"]:
+        del sys.modules[name]
+    invalidate_caches()
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # it goes by whole seconds
+    found = {}
+    for name in ("outer", "other"):
+        function = getattr(import_module(f"edited_package.{name}"), name)
+        found[name] = (function(0.0), sum(function.stats.cache_misses.values()))
+    return found
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    folder = tmp_path / "edited_package"
+    folder.mkdir()
+    (folder / "__init__.py").touch()
+    _write(folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "expected"),
+    [
+        ("numbers", "1.0", "2.0", 2.0),
+        ("numbers", "zeros", "ones", 3.0),
+        ("numbers", "slice(0, 2)", "slice(0, 0)", 1.0),
+        ("far", "return x", "return x + 4.0", 5.0),
+        ("inner", "NUMBER +", "NUMBER -", 1.0),
+        ("inner", "also=0.0", "also=7.0", 8.0),
+        ("inner", "+ also", "+ also + np.pi", 1.0 + np.pi),
+        ("outer", "inner(x)", "inner(x + 1.0)", 2.0),
+        ("outer", "cache=True", "cache=True, error_model='numpy'", 1.0),
+    ],
+)
+def test_an_edit_compiles_what_depends_on_it_again_and_nothing_else(
+    package, monkeypatch, file, old, new, expected
 ):
-    """The second case is numba's own behaviour, for which the function is there."""
-    package = tmp_path / "package"
-    package.mkdir()
-    (package / "__init__.py").touch()
-    (package / "outer.py").write_text(OUTER)
+    _write(package, {"numbers": ("zeros(2)", "array([0.0, 0.0])")})
+    assert _answers(monkeypatch) == {"outer": (1.0, 1), "other": (100.0, 1)}
+    assert _answers(monkeypatch) == {"outer": (1.0, 0), "other": (100.0, 0)}
+    _write(package, {file: (old, new)})
+    assert _answers(monkeypatch) == {"outer": (expected, 1), "other": (100.0, 0)}
+
+
+def test_lines_that_are_not_compiled_do_not_matter(package, monkeypatch):
+    _answers(monkeypatch)
+    comment = ("@njit", "# A comment, and a function of Python.\ndef f():\n    pass\n\n@njit")
+    _write(package, {name: comment for name in ("far", "inner", "outer", "other")})
+    assert _answers(monkeypatch) == {"outer": (1.0, 0), "other": (100.0, 0)}
+
+
+@pytest.mark.parametrize("chosen", [False, True])
+def test_code_of_old_sources_is_removed(package, monkeypatch, chosen):
+    folder = package / "__pycache__"
+    if chosen:
+        folder = package.parent / "chosen"
+        monkeypatch.setattr(numba.config, "CACHE_DIR", str(folder))  # from NUMBA_CACHE_DIR
+
+    def files():
+        return {path.name for path in folder.rglob("outer.outer.*.nbc")}
+
+    _answers(monkeypatch)
+    before = files()
+    _write(package, {"numbers": ("1.0", "2.0")})
+    _answers(monkeypatch)
+    assert len(before) == len(files()) == 1
+    assert files().isdisjoint(before)
+
+
+def test_code_of_another_signature_under_the_same_name_is_not_taken(package, monkeypatch):
+    _answers(monkeypatch)
+    (found,) = package.parent.rglob("other.other.*.nbc")
+    function = import_module("edited_package.other").other
+    function(1)  # an integer: a second file
+    (second,) = set(package.parent.rglob("other.other.*.nbc")) - {found}
+    second.write_bytes(found.read_bytes())
+    del sys.modules["edited_package.other"]
+    function = import_module("edited_package.other").other
+    assert function(1) == 100.0
+    assert sum(function.stats.cache_misses.values()) == 1
+
+
+def test_what_cannot_be_followed_is_refused(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "reads_a_list.py").write_text(
+        HEAD + "LIST = [1]\n\n@njit(cache=True)\ndef f():\n    return LIST[0]\n"
+    )
+    with pytest.raises(TypeError, match=r"reads \[1\]"):
+        import_module("reads_a_list").f()
+
+
+def test_the_package_compiles_through_this_cache_only():
+    own = re.compile(r"^from drake_teleop\._compiled import njit$", re.MULTILINE)
+    for path in Path(drake_teleop.__file__).parent.rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        if path.name != "_compiled.py" and "@njit" in text:
+            assert own.search(text), path
+
+
+# Two processes: each reads what is there before the other has written, and `first` begins to
+# write before `second` and ends after it.
+SIDE_BY_SIDE = """
+import os, sys, time
+from pathlib import Path
+
+me, argument = sys.argv[1], eval(sys.argv[2])
+replace, calls = os.replace, 0
+
+def wait_for(mark):
+    end = time.monotonic() + 60.0
+    while not Path(mark).exists():
+        assert time.monotonic() < end
+        time.sleep(0.001)
+
+def in_turns(source, target, **options):
+    global calls
+    if not str(target).endswith((".nbc", ".nbi")):
+        return replace(source, target, **options)
+    calls += 1
+    Path(f"{me} has compiled").touch()
+    if calls == 1:
+        wait_for("second has compiled" if me == "first" else "first has written")
+    elif me == "first":
+        wait_for("second has ended")
+    replace(source, target, **options)
+    Path(f"{me} has written").touch()
+
+os.replace = in_turns
+os.rename = in_turns
+from shared import double
+
+print(double(argument))
+Path(f"{me} has ended").touch()
+"""
+
+
+def test_two_first_runs_side_by_side_leave_the_right_code(tmp_path):
+    """With numba's own cache, `double(1.5)` is 2 from then on."""
+    (tmp_path / "shared.py").write_text(
+        HEAD + "\n@njit(cache=True)\ndef double(x):\n    return x + x\n"
+    )
+    (tmp_path / "side_by_side.py").write_text(SIDE_BY_SIDE)
+
     environment = {key: os.environ[key] for key in os.environ if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(Path(drake_teleop.__file__).parents[1])
 
-    def answer(number: int) -> str:
-        (package / "inner.py").write_text(INNER.format(number=number))
-        program = [sys.executable, "-c", MAIN.format(discard=discard)]
-        done = subprocess.run(
-            program, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
-        )
-        return done.stdout.strip()
+    def start(*arguments: str) -> subprocess.Popen:
+        program = [sys.executable, *arguments]
+        pipe = subprocess.PIPE
+        return subprocess.Popen(program, cwd=tmp_path, env=environment, stdout=pipe, text=True)
 
-    assert answer(1) == "1.0"
-    assert answer(2) == expected
+    both = [
+        start("side_by_side.py", name, argument)
+        for name, argument in (("first", "3"), ("second", "1.5"))
+    ]
+    assert [process.communicate()[0] for process in both] == ["6\n", "3.0\n"]
+    later = start(
+        "-c",
+        "from shared import double\n"
+        "print(double(3), double(1.5), sum(double.stats.cache_misses.values()))",
+    )
+    assert later.communicate()[0] == "6 3.0 0\n"

@@ -33,10 +33,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import matrix_balance, schur
 
+from drake_teleop._compiled import njit
 from drake_teleop.analysis.one_axis import Complex, OneAxis
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.sensor.sensor_chain import butterworth_sections

@@ -10,7 +10,6 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
@@ -21,6 +20,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from drake_teleop._compiled import njit
 from drake_teleop.channel import network
 from drake_teleop.channel.network import PRESETS, NetworkConfig
 from drake_teleop.errors import DrakeTeleopError

@@ -9,10 +9,10 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_teleop._compiled import njit
 from drake_teleop.channel.channel import Channel
 from drake_teleop.comparison.one_dof import Figures, Task, figures_of
 from drake_teleop.environment.sheet_spring import SheetSpring

@@ -19,9 +19,9 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.channel import network
 from drake_teleop.channel.channel import channel_step, initial_ends
 from drake_teleop.channel.network import NetworkConfig

@@ -10,13 +10,13 @@ along the normal, regularised Coulomb friction across it); a test ties it to the
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydrake.geometry import Box, GeometryId, ProximityProperties, SceneGraphInspector, Sphere
 from pydrake.multibody.plant import CalcContactFrictionFromSurfaceProperties, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, PrismaticJoint, RigidBody
 from pydrake.systems.framework import Context
 
+from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 
 Array = NDArray[np.float64]

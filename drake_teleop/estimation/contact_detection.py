@@ -9,9 +9,9 @@ identification run that precedes the station.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.load.compensation import scaled_wrench_into
 from drake_teleop.load.contact.detection import (

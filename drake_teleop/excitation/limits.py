@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.excitation.criteria import regressor_gradient
 from drake_teleop.excitation.recursion import (
     SEED_SIZE,

@@ -14,8 +14,8 @@ with the velocities (v, w) of the links under c as two more variables.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from drake_teleop._compiled import njit
 from drake_teleop.slave.arm import MOTION_SIZE
 
 #: Of a link's seeds: s, omega, alpha, p, theta, and v, w of virtual power.

@@ -17,9 +17,9 @@ that suffix check their input and run the same kernels over any number of sample
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
+from drake_teleop._compiled import njit
 from drake_teleop.load.arrays import Array, checked, checked_rows
 
 

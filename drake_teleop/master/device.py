@@ -24,12 +24,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.quantities import quantity

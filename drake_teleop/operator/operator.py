@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import (
     BasicVector,
@@ -23,6 +22,7 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
+from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.operator import perception as feeling
 from drake_teleop.operator import task as tasks

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.noise import random_bits, random_normal
 from drake_teleop.operator.perception import NOTICED, THRESHOLD, Perception

@@ -14,9 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.passivity.memory import LEDGER, LOST, MEMORY, RECEIVED, SENT
 from drake_teleop.passivity.packet import difference_into, dot

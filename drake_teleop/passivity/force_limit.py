@@ -8,8 +8,7 @@ wrench can give. This is the ceiling that safety standards ask for, whatever the
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
-from numba import njit
-
+from drake_teleop._compiled import njit
 from drake_teleop.passivity import none
 from drake_teleop.passivity.memory import HELD, METHOD
 from drake_teleop.passivity.packet import WRENCH, limit

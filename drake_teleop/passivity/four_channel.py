@@ -15,8 +15,7 @@ to where the slave was, damps it, at the price of a drag in free motion.
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
-from numba import njit
-
+from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import COMMAND, DAMPING, HELD, LIMIT, METHOD, OWN, STIFFNESS
 from drake_teleop.passivity.packet import (
     POSE,

@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.passivity import (
     force_limit,

@@ -5,8 +5,7 @@ Energy is created in the channel as soon as there is delay or loss. It is the ba
 
 from __future__ import annotations
 
-from numba import njit
-
+from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import COMMAND, HELD, LIMIT
 from drake_teleop.passivity.packet import POSE, VELOCITY, WRENCH, arrived, fill, limit
 

@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from drake_teleop._compiled import njit
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, normalized
 
 SEQUENCE = 0  #: number of the packet, counted by its sender

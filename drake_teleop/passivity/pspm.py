@@ -24,8 +24,7 @@ damper.
 import math
 from dataclasses import dataclass
 
-from numba import njit
-
+from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import (
     COMMAND,
     DAMPING,

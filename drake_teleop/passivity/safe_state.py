@@ -37,9 +37,9 @@ hand feels meanwhile pushes it that way. A wrench that was kept goes over to the
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.passivity.packet import difference_into, length, moved_into
 
 STOP = 0.05  #: s, in which a silent end comes to rest

@@ -42,8 +42,7 @@ and credits the smaller input, so that the account holds for either.
 import math
 from dataclasses import dataclass
 
-from numba import njit
-
+from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import (
     COMMAND,
     DAMPING,

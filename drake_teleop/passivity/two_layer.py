@@ -25,8 +25,7 @@ tanks end a limit cycle soon, because it lives on what they hold.
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
-from numba import njit
-
+from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import (
     COMMAND,
     DAMPING,

@@ -30,8 +30,7 @@ push it back takes energy that nobody has paid for. Pressed anew it is as deep a
 import math
 from dataclasses import dataclass
 
-from numba import njit
-
+from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import (
     COMMAND,
     HELD,

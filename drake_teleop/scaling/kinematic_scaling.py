@@ -8,11 +8,11 @@ turned about one axis by one angle, and the slave turns about the same axis by t
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.quantities import quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, normalized, rotate

@@ -25,9 +25,9 @@ instant.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.quantities import choice, quantity
 from drake_teleop.sensor.sensor_chain import (

@@ -16,9 +16,9 @@ noise: sigma / sqrt(m), the slope -1/2; a random walk: K sqrt(tau / 3), the slop
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,

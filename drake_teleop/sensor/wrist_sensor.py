@@ -14,7 +14,6 @@ looks back: at each instant in it at which it samples, position and velocity are
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydrake.common import RandomDistribution
 from pydrake.common.value import Value
@@ -29,6 +28,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import Demultiplexer, RandomSource
 
+from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.regressor import non_contact_wrench_into

@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
@@ -29,6 +28,7 @@ from pydrake.multibody.tree import (
     WeldJoint,
 )
 
+from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 
 Array = NDArray[np.float64]

@@ -15,10 +15,10 @@ from __future__ import annotations
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 
 Array = NDArray[np.float64]

@@ -8,10 +8,10 @@ Here the velocity loop acts through the arm's computed torque, so that the joint
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.quantities import quantity
 from drake_teleop.slave.arm import ArmModel, inverse_dynamics

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop._compiled import njit
 from drake_teleop.environment.point_contact import contact_force, indentation
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.slave.arm import ArmModel, forward_kinematics, jacobian

@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array, checked, checked_rows
 from drake_teleop.load.regressor import regressor

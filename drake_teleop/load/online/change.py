@@ -43,9 +43,9 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array, checked, checked_rows
 from drake_teleop.load.identification import METHODS, Identification, positive, worth_stating

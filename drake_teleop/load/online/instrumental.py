@@ -22,8 +22,8 @@ least squares (Zellner, Theil: Econometrica 30, 1962), every sample anew, see `r
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from drake_teleop._compiled import njit
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.online.recursive_moments import (
     MomentEstimator,

@@ -15,9 +15,9 @@ import math
 from abc import ABC, abstractmethod
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array, checked_rows
 from drake_teleop.load.batch.uncertainty import prior_dominated

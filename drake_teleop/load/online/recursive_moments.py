@@ -17,9 +17,9 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.batch.moments import coefficients
 from drake_teleop.load.online.recursive import RecursiveEstimator

@@ -32,8 +32,8 @@ larger is a contact. A push of up to `LARGEST` at rest is therefore forgotten wi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from drake_teleop._compiled import njit
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.online import change
 from drake_teleop.load.online.change import (
