@@ -388,7 +388,7 @@ class TeleopChannel(LeafSystem):
                 channel.lines(), (network.FORWARD, network.BACKWARD), strict=True
             )
         ]
-        parameters = methods.parameters(passivity, list(force_scale / scales))
+        parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
         self._method, self._arm = METHODS.index(passivity.method), arm.table
         self._constants = (
             *(period, channel.timeout, np.concatenate([R_WB.ravel(), scales]), parameters),

@@ -18,7 +18,7 @@ OWN = 60  #: here begins what one method alone remembers
 MEMORY = 92
 
 # Parameters (PARAMETERS,), packed by `methods.parameters`.
-LIMIT = 0  #: (2,) what the device can display [N, N m]
+LIMIT = 0  #: (2,) what the device can display, in the master's power units [N, N m]
 STIFFNESS = 2  #: (2,) of the slave's servo, in the master's power units [N/m, N m/rad]
 DAMPING = 4  #: (2,) of the slave's servo, likewise [N s/m, N m s/rad]
 METHOD = 6  #: here begin the parameters of the method that was chosen

@@ -91,7 +91,9 @@ class PassivityConfig:
 
 
 def parameters(
-    config: PassivityConfig, power_scale: Sequence[float] = (1.0, 1.0)
+    config: PassivityConfig,
+    power_scale: Sequence[float] = (1.0, 1.0),
+    motion_scale: Sequence[float] = (1.0, 1.0),
 ) -> NDArray[np.float64]:
     """The parameters of the chosen method as one vector for the compiled steps.
 
@@ -99,12 +101,14 @@ def parameters(
         config: the method and its parameters.
         power_scale: (2,) the master's power units over the slave's, for translation and rotation:
             force scale over kinematic scale.
+        motion_scale: (2,) kinematic scale, slave over master, of translation and rotation: a wrench
+            at the hand over one in the master's power units.
 
     Returns:
         (PARAMETERS,) packed as `drake_teleop.passivity.memory` says.
     """
     p = np.zeros(PARAMETERS)
-    p[LIMIT : LIMIT + 2] = config.force_limit, config.torque_limit
+    p[LIMIT : LIMIT + 2] = np.divide([config.force_limit, config.torque_limit], motion_scale)
     p[STIFFNESS : STIFFNESS + 2] = np.multiply(config.servo_stiffness, power_scale)
     p[DAMPING : DAMPING + 2] = np.multiply(config.servo_damping, power_scale)
     own: dict[str, Any] = {
@@ -119,6 +123,8 @@ def parameters(
     if config.method in own:
         packed = own[config.method].packed()
         p[METHOD : METHOD + len(packed)] = packed
+    if config.method == "force_limit":
+        p[METHOD : METHOD + 2] /= motion_scale
     return p
 
 

@@ -1,0 +1,394 @@
+"""The assembled station where nothing is at its default: frames, scales, delays, clutch.
+
+The master's base is turned about all three axes, translation, rotation and force are scaled by
+different factors, the two directions of the network differ, and the clutch is opened and closed
+again. What the station records is held against formulas written down here and against Drake's own
+kinematics, so that an exchanged argument or a transposed frame anywhere between the two ends shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.channel.channel import Channel
+from drake_teleop.channel.network import BACKWARD, FORWARD, NetworkConfig, newest_packets
+from drake_teleop.master.device import serial_joint_angles
+from drake_teleop.operator.operator import OperatorConfig, Sine
+from drake_teleop.passivity.energy import port_work
+from drake_teleop.passivity.force_limit import ForceLimitConfig
+from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.resources import models_dir
+from drake_teleop.result import SimulationResult
+from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
+from drake_teleop.scenario import Rates, Scenario, Simulation, replace
+from drake_teleop.simulation import MakeSimulator, advance, read_log
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.station import MakeTeleopStation
+
+ALIGNMENT = [0.5, -0.4, 0.8]
+#: R_WB: roll, pitch and yaw about the fixed axes, one after the other.
+R_WB = Rotation.from_euler("xyz", ALIGNMENT).as_matrix()
+TRANSLATION, ROTATION, FORCE = 1.5, 0.5, 0.04
+SIGMA, GAMMA = 0.3, 1.3
+#: An estimate that is wrong by a tenth, so that there is a contact wrench, and offsets.
+OFFSETS, ESTIMATED = np.array([0.5, -1.0, 2.0, 0.05, -0.1, 0.08]), 0.9
+PERIOD = 1e-3  # s, of the hand, the channel and the log
+TO_SLAVE, TO_HAND = 3, 7  # steps that a packet travels
+#: When the clutch is opened and closed again [s], in rows of the log too.
+OPENED, CLOSED = 800, 1000
+END = 1500
+#: What is shown at most behind a channel [N, N m]: the peaks of the device.
+PEAKS = 37.5, 0.17
+#: Both ends of a channel have left their safe state by now, and its limits of wrench.
+SETTLED = 850
+#: What is rounding after some thousand steps.
+EXACT = 1e-12
+
+
+@dataclass
+class Recorded:
+    """One run: its log, and what Drake says of it.
+
+    R_WS (N, 3, 3) and p_WS (N, 3) are those of the joint angles in the wrist sensor's sample.
+    """
+
+    scenario: Scenario
+    log: SimulationResult
+    plant: MultibodyPlant
+    R_WS: np.ndarray
+    p_WS: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def slave():
+    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None)
+
+
+def turned(**changes: object) -> Scenario:
+    """The hand moves and turns about all axes, from 0.4 s on."""
+    sine = Sine(
+        t_start=0.4,
+        duration=10.0,
+        ramp=0.4,
+        frequency=1.6,
+        translation=[0.012, -0.015, 0.02],
+        rotation=[0.2, 0.15, 0.15],
+    )
+    other = Sine(t_start=0.4, duration=10.0, ramp=0.3, frequency=2.3, rotation=[0.1, 0.1, -0.2])
+    scenario = replace(
+        Scenario(),
+        simulation=Simulation(settle=0.0, duration=END * PERIOD),
+        rates=Rates(sensor_hz=4e3, hand_hz=1e3, joint_control_hz=2e3, estimator_hz=500, log_hz=1e3),
+        operator=OperatorConfig(grip="firm", intent=[sine, other]),
+        kinematic_scaling=KinematicScalingConfig(TRANSLATION, ROTATION, ALIGNMENT),
+        force_scaling__sigma=SIGMA,
+        force_scaling__gamma=GAMMA,
+        force_scaling__force_scale=FORCE,
+    )
+    return replace(scenario, **changes)
+
+
+def delayed(method: str, **changes: object) -> Scenario:
+    changes = {
+        "channel": Channel(
+            delay=TO_SLAVE * PERIOD, backward=NetworkConfig(delay=TO_HAND * PERIOD), timeout=0.05
+        ),
+        "passivity": PassivityConfig(method=method),
+        # Ideal, because the log shows the last sample of each block of noise differently.
+        "wrist_sensor__ideal": True,
+    } | changes
+    return turned(**changes)
+
+
+def run(scenario: Scenario, slave, offsets: np.ndarray = OFFSETS) -> Recorded:
+    """Runs it with the clutch open from row OPENED to row CLOSED."""
+    estimate = np.concatenate([offsets, ESTIMATED * slave.arm.phi_load])
+    station = MakeTeleopStation(scenario, load_estimate=estimate)
+    simulator = MakeSimulator(station, scenario.simulation)
+    clutch = station.GetInputPort("clutch")
+    end = round(scenario.simulation.duration / PERIOD)
+    for engaged, until in ((1.0, OPENED), (0.0, CLOSED), (1.0, END)):
+        clutch.FixValue(simulator.get_mutable_context(), [engaged])
+        advance(simulator, min(until, end) * PERIOD)
+    log = read_log(simulator, scenario.simulation.settle)
+    assert len(log.t) == end + 1
+    return Recorded(scenario, log, slave.plant, *poses_of_S(slave.plant, log["joint_position"]))
+
+
+def poses_of_S(plant: MultibodyPlant, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """R_WS and p_WS at joint angles (N, 6), by Drake's kinematics."""
+    context, sensor = plant.CreateDefaultContext(), plant.GetFrameByName("sensor")
+    poses = []
+    for q in angles:
+        plant.SetPositions(context, q)
+        poses.append(sensor.CalcPoseInWorld(context))
+    R_WS = np.array([pose.rotation().matrix() for pose in poses])
+    return R_WS, np.array([pose.translation() for pose in poses])
+
+
+def rotations(pose: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) of poses (N, 7)."""
+    return Rotation.from_quat(pose[..., [1, 2, 3, 0]]).as_matrix()
+
+
+def turn(R: np.ndarray) -> np.ndarray:
+    """Rotation vectors of (N, 3, 3)."""
+    return Rotation.from_matrix(R).as_rotvec()
+
+
+def steps(R: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """(N, 6) what a pose has moved since the row before, [dp; log(R_k R_(k-1)^T)]; first zero."""
+    moved = np.zeros((len(p), 6))
+    moved[1:, :3] = np.diff(p, axis=0)
+    moved[1:, 3:] = turn(R[1:] @ R[:-1].transpose(0, 2, 1))
+    return moved
+
+
+def inertial_wrench(log: SimulationResult, phi: np.ndarray) -> np.ndarray:
+    """(N, 6) Newton and Euler about So, in S: m s + alpha x mc + omega x (omega x mc), ..."""
+    s, omega, alpha = (
+        log[name] for name in ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
+    )
+    xx, xy, xz, yy, yz, zz = phi[4:]
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    f = phi[0] * s + np.cross(alpha, phi[1:4]) + np.cross(omega, np.cross(omega, phi[1:4]))
+    tau = np.cross(phi[1:4], s) + alpha @ inertia + np.cross(omega, omega @ inertia)
+    return np.hstack([f, tau])
+
+
+def wanted_at_the_hand(recorded: Recorded, slave, offsets: np.ndarray = OFFSETS) -> np.ndarray:
+    """(N, 6) -force_scale R_BW R_WS F', for each row's own sample."""
+    non_contact = inertial_wrench(recorded.log, ESTIMATED * slave.arm.phi_load)
+    contact = recorded.log["measured_wrench_S"] - offsets - non_contact
+    scaled_S = GAMMA * contact + SIGMA * non_contact
+    R_BS = R_WB.T @ recorded.R_WS
+    parts = [np.einsum("nij,nj->ni", R_BS, scaled_S[:, g : g + 3]) for g in (0, 3)]
+    return -FORCE * np.hstack(parts)
+
+
+def shortened(wrench: np.ndarray, force: float, torque: float) -> np.ndarray:
+    """Force and torque (N, 3) each, no longer than their limits."""
+    parts = []
+    for part, limit in ((wrench[:, :3], force), (wrench[:, 3:], torque)):
+        length = np.linalg.norm(part, axis=1, keepdims=True)
+        parts.append(part * np.minimum(1.0, limit / length))
+    return np.hstack(parts)
+
+
+def in_power_units(wrench_B: np.ndarray) -> np.ndarray:
+    """In W, and such that wrench times motion of the slave's command is work at the hand."""
+    return np.hstack([wrench_B[:, :3] @ R_WB.T / TRANSLATION, wrench_B[:, 3:] @ R_WB.T / ROTATION])
+
+
+@pytest.fixture(scope="module")
+def direct(slave) -> Recorded:
+    return run(turned(), slave)
+
+
+@pytest.fixture(scope="module")
+def over_a_network(slave) -> dict[str, Recorded]:
+    return {method: run(delayed(method), slave) for method in METHODS}
+
+
+def test_the_hand_feels_the_slaves_wrench_in_its_own_base(direct, slave):
+    expected = wanted_at_the_hand(direct, slave)
+    assert np.abs(np.diff(expected, axis=0)).max() > 1e-3
+    assert (np.ptp(expected, axis=0) > [0.1, 0.1, 0.1, 2e-3, 2e-3, 2e-3]).all()
+    np.testing.assert_allclose(direct.log["force_to_master"], expected, atol=EXACT)
+
+
+@pytest.fixture(params=["direct", *METHODS])
+def assembled(request, direct, over_a_network) -> Recorded:
+    return direct if request.param == "direct" else over_a_network[request.param]
+
+
+@pytest.fixture(params=METHODS)
+def assembled_over_a_network(request, over_a_network) -> Recorded:
+    return over_a_network[request.param]
+
+
+def test_the_command_is_the_scaled_turned_motion_across_the_clutch(assembled):
+    """From the start, then nothing while the clutch is open, then from where it was closed."""
+    log = assembled.log
+    command, master = log["pose_command"], log["pose_master"]
+    p, R = command[:, 4:], rotations(command)
+    p_master, R_master = master[:, 4:], rotations(master)
+    np.testing.assert_allclose(p[0], assembled.scenario.slave.position, atol=EXACT)
+    np.testing.assert_allclose(R[0], np.diag([1.0, -1.0, -1.0]), atol=EXACT)
+    for first, last in ((0, OPENED), (CLOSED, END)):
+        rows = slice(first, last + 1)
+        moved = p_master[rows] - p_master[first]
+        np.testing.assert_allclose(p[rows], p[first] + TRANSLATION * moved @ R_WB.T, atol=EXACT)
+        turned_W = turn(R_master[rows] @ R_master[first].T) @ R_WB.T
+        expected = Rotation.from_rotvec(ROTATION * turned_W).as_matrix() @ R[first]
+        np.testing.assert_allclose(R[rows], expected, atol=EXACT)
+        assert (np.ptp(moved, axis=0) > 0.01).all() and (np.ptp(turned_W, axis=0) > 0.03).all()
+    held = slice(OPENED, CLOSED + 1)
+    np.testing.assert_array_equal(command[held], np.tile(command[OPENED], (CLOSED - OPENED + 1, 1)))
+    assert np.ptp(p_master[held], axis=0).max() > 0.01
+
+
+def test_the_slave_goes_where_it_is_told(assembled):
+    """The joint command puts S onto what was received, and the arm is there a little later."""
+    log, plant = assembled.log, assembled.plant
+    received = log["pose_received" if "pose_received" in log else "pose_command"]
+    R, p = poses_of_S(plant, log["joint_command"])
+    np.testing.assert_allclose(p, received[:, 4:], atol=1e-9)
+    np.testing.assert_allclose(R, rotations(received), atol=1e-9)
+    # 12 Hz position control lags by about 13 ms.
+    now, before = slice(SETTLED, None), slice(SETTLED - 13, -13)
+    error = assembled.p_WS[now] - received[before, 4:]
+    assert np.abs(error).max() < 0.1 * np.ptp(received[now, 4:], axis=0).max()
+    error = turn(assembled.R_WS[now] @ rotations(received)[before].transpose(0, 2, 1))
+    assert np.abs(error).max() < 0.1 * np.abs(turn(rotations(received)[now] @ R[0].T)).max()
+
+
+def test_without_a_method_a_network_delays_each_direction_by_its_own(over_a_network, slave):
+    recorded = over_a_network["none"]
+    log, now = recorded.log, np.arange(SETTLED, END + 1)
+    np.testing.assert_allclose(
+        log["pose_received"][now], log["pose_command"][now - TO_SLAVE], atol=EXACT
+    )
+    expected = shortened(wanted_at_the_hand(recorded, slave)[now - TO_HAND], *PEAKS)
+    np.testing.assert_allclose(log["force_to_master"][now], expected, atol=EXACT)
+    assert np.abs(np.diff(expected, axis=0)).max() > 1e-3
+
+
+def test_each_direction_has_its_own_random_network_of_the_scenarios_seed(slave):
+    lines = (
+        NetworkConfig(delay=4e-3, jitter=0.7, loss=0.2),
+        NetworkConfig(delay=8e-3, jitter=0.5, loss=0.1, distribution="gamma"),
+    )
+    fields = {name: getattr(lines[0], name) for name in ("delay", "jitter", "loss")}
+    recorded = run(
+        delayed("none", channel=Channel(**fields, backward=lines[1]), simulation__seed=5), slave
+    )
+    log, now = recorded.log, np.arange(SETTLED, END + 1)
+    there, back = (
+        newest_packets(line, 5, direction, END + 1, PERIOD)[now]
+        for line, direction in zip(lines, (FORWARD, BACKWARD), strict=True)
+    )
+    assert len(np.unique(now - there)) > 3 and len(np.unique(now - back)) > 3
+    np.testing.assert_allclose(log["pose_received"][now], log["pose_command"][there], atol=EXACT)
+    expected = shortened(wanted_at_the_hand(recorded, slave)[back], *PEAKS)
+    np.testing.assert_allclose(log["force_to_master"][now], expected, atol=EXACT)
+
+
+def test_the_local_limit_of_force_is_the_one_at_the_hand(over_a_network, slave):
+    """Whatever the scales of motion are."""
+    recorded, limit = over_a_network["force_limit"], ForceLimitConfig()
+    now = np.arange(SETTLED, END + 1)
+    wanted = wanted_at_the_hand(recorded, slave)[now - TO_HAND]
+    expected = shortened(wanted, limit.force, limit.torque)
+    shown = recorded.log["force_to_master"][now]
+    np.testing.assert_allclose(shown, expected, atol=EXACT)
+    for part, most in ((shown[:, :3], limit.force), (shown[:, 3:], limit.torque)):
+        assert np.linalg.norm(part, axis=1).max() == pytest.approx(most)
+    assert (np.abs(wanted - expected) < EXACT).all(axis=1).any()
+
+
+def test_the_device_shows_what_it_can(slave):
+    """37.5 N, and a torque that no motor of the wrist gives more than its peak for."""
+    offsets = np.array([700.0, -500.0, 600.0, 9.0, 15.0, -27.0])
+    recorded = run(turned(simulation__duration=0.15), slave, offsets)
+    wanted, shown = wanted_at_the_hand(recorded, slave, offsets), recorded.log["force_to_master"]
+    phantom = MultibodyPlant(time_step=0.0)
+    Parser(phantom).AddModels(str(models_dir() / "phantom.sdf"))
+    phantom.WeldFrames(phantom.world_frame(), phantom.GetFrameByName("base"))
+    phantom.Finalize()
+    context, stylus = phantom.CreateDefaultContext(), phantom.GetFrameByName("stylus")
+    base = phantom.world_frame()
+    length = np.linalg.norm(wanted[:, :3], axis=1)
+    assert length.min() > 37.5
+    np.testing.assert_allclose(
+        shown[:, :3], wanted[:, :3] * (37.5 / length)[:, np.newaxis], atol=EXACT
+    )
+    for row, state in enumerate(recorded.log["master_state"]):
+        phantom.SetPositions(context, serial_joint_angles(state[:6]))
+        J = phantom.CalcJacobianAngularVelocity(context, JacobianWrtVariable.kV, stylus, base, base)
+        motors = np.abs(J[:, 3:].T @ wanted[row, 3:])
+        share = np.min([0.515, 0.515, 0.170] / motors)
+        assert share < 1.0
+        np.testing.assert_allclose(shown[row, 3:], share * wanted[row, 3:], atol=EXACT)
+
+
+def test_four_channels_add_force_to_motion_at_both_ends(over_a_network, slave):
+    """What is sent by either method's end, in W and in the master's power units."""
+    recorded, config = over_a_network["four_channel"], PassivityConfig(method="four_channel")
+    log, own = recorded.log, config.four_channel
+    p, R = log["pose_command"][:, 4:], rotations(log["pose_command"])
+    speed, slaves = steps(R, p) / PERIOD, steps(recorded.R_WS, recorded.p_WS) / PERIOD
+    # The slave's servo is told to yield to the hand's force as a spring would. Its stiffness in
+    # the slave's units becomes one in power units by the force's scale over the motion's.
+    hand = in_power_units(log["hand_wrench_E"])
+    now = np.arange(SETTLED, END + 1)
+    sent = now - TO_SLAVE
+    for g, scale in ((0, TRANSLATION), (1, ROTATION)):
+        group = slice(3 * g, 3 * g + 3)
+        K, D = (
+            servo[g] * FORCE / scale for servo in (config.servo_stiffness, config.servo_damping)
+        )
+        shift = (hand[sent, group] + D * speed[sent, group]) / K
+        received = log["pose_received"][now]
+        shifted = (
+            received[:, 4:] - p[sent],
+            turn(rotations(received) @ R[sent].transpose(0, 2, 1)),
+        )
+        np.testing.assert_allclose(shifted[g], shift, atol=EXACT)
+        assert np.abs(hand[sent, group] / K).max() > 1e-4
+    # The hand feels the slave's wrench, and a spring and damper to where the slave was.
+    heard = now - TO_HAND
+    apart = (recorded.p_WS[heard] - p[now], turn(recorded.R_WS[heard] @ R[now].transpose(0, 2, 1)))
+    wrench = in_power_units(wanted_at_the_hand(recorded, slave))[heard]
+    for g, scale in ((0, TRANSLATION), (1, ROTATION)):
+        group = slice(3 * g, 3 * g + 3)
+        wrench[:, group] += own.stiffness[g] * apart[g]
+        wrench[:, group] += own.damping[g] * (slaves[heard, group] - speed[now, group])
+        wrench[:, group] *= scale
+    expected = shortened(np.hstack([wrench[:, :3] @ R_WB, wrench[:, 3:] @ R_WB]), *PEAKS)
+    np.testing.assert_allclose(log["force_to_master"][now], expected, atol=1e-10)
+
+
+def test_the_hands_port_counts_the_work_of_the_device(assembled_over_a_network):
+    """What is displayed at row k acts until row k + 1; the log shows that work at row k + 2.
+
+    Motion is the command's, turned back into B and divided by the scales. Of translation that is
+    the device's own motion, as long as the clutch is closed. Of rotation it is not quite: a turn
+    by half the angle does not have half the angular velocity while its axis moves.
+    """
+    log = assembled_over_a_network.log
+    shown = log["force_to_master"]
+    command = steps(rotations(log["pose_command"]), log["pose_command"][:, 4:])
+    for g, scale in ((0, TRANSLATION), (1, ROTATION)):
+        group = slice(3 * g, 3 * g + 3)
+        moved = command[1:, group] @ R_WB / scale
+        put_in = -np.cumsum(np.sum(shown[:-1, group] * moved, axis=1))
+        counted = log["ports"][:, g]
+        np.testing.assert_allclose(counted[2:], put_in[:-1], atol=EXACT)
+        assert np.ptp(counted) > 2e-3
+    closed = np.ones(END, dtype=bool)
+    closed[OPENED:CLOSED] = False
+    work = np.diff(port_work(shown, log["pose_master"], "held")[:, 0])
+    np.testing.assert_allclose(log["ports"][2:, 0], -np.cumsum(work * closed)[:-1], atol=EXACT)
+    assert np.abs(work[~closed]).sum() > 1e-5
+
+
+def test_the_slaves_port_counts_the_work_of_the_scaled_wrench(assembled_over_a_network, slave):
+    """In the master's power units, at the arm's own motion."""
+    recorded = assembled_over_a_network
+    wrench = in_power_units(wanted_at_the_hand(recorded, slave))
+    moved = steps(recorded.R_WS, recorded.p_WS)
+    for g in (0, 1):
+        group = slice(3 * g, 3 * g + 3)
+        put_in = np.cumsum(np.sum(wrench[:-1, group] * moved[1:, group], axis=1))
+        counted = recorded.log["ports"][:, 2 + g]
+        np.testing.assert_allclose(counted[2:], put_in[:-1], atol=EXACT)
+        assert np.ptp(counted) > 1e-4
