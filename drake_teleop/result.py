@@ -28,6 +28,7 @@ _PART_NAMES = _PART_NAME.format(0).replace("0", "?")
 _DRAWN = 20_000
 # The canonical log (README, "Logs"): which signal fills which columns.
 _CANONICAL = {
+    "sample_time": ("t",),
     "measured_wrench_S": ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"),
     "specific_force_S": ("s_x", "s_y", "s_z"),
     "angular_velocity_S": ("omega_x", "omega_y", "omega_z"),
@@ -162,7 +163,8 @@ class SimulationResult:
         """The wrist sensor's samples as a canonical log, for `identify` and `eliminate`.
 
         Columns ``t``, ``f_x`` ... ``tau_z``, ``s_x`` ..., ``omega_x`` ..., ``alpha_x`` ... in S
-        and SI units, wrench with the sign of Eq. (1).
+        and SI units, wrench with the sign of Eq. (1). ``t`` is when the sample was taken. A sample
+        that was recorded in several rows, by a log faster than the sensor, is one row.
 
         Raises:
             DrakeTeleopError: if the sensor's signals were not recorded.
@@ -176,10 +178,10 @@ class SimulationResult:
                 where="sensor log",
                 remedy="record the wrist sensor's signals",
             )
-        columns = {"t": self._t}
+        columns: dict[str, NDArray[np.float64]] = {}
         for name, names in _CANONICAL.items():
             columns |= dict(zip(names, self[name].T, strict=True))
-        return pl.DataFrame(columns)
+        return pl.DataFrame(columns).unique("t", keep="first", maintain_order=True)
 
     def write_parquet(self, path: str | Path) -> None:
         """Writes `to_dataframe` with names, units and descriptions in the file's metadata.

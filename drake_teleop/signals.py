@@ -24,12 +24,20 @@ _JOINTS = "joint_1 joint_2 joint_3 joint_4 joint_5 joint_6"
 SIGNALS = {
     signal.name: signal
     for signal in (
-        _signal("measured_wrench_S", *_WRENCH, "what the wrist sensor reads, sign of Eq. (1)"),
-        _signal("specific_force_S", "s_x s_y s_z", "m/s^2", "a - g at So"),
-        _signal("angular_velocity_S", "omega_x omega_y omega_z", "rad/s", "from the encoders"),
-        _signal("angular_acceleration_S", "alpha_x alpha_y alpha_z", "rad/s^2", "of S"),
-        _signal("saturated", "saturated", "1", "1 while a channel of the sensor is saturated"),
-        _signal("joint_position", _JOINTS, "rad", "of the slave, the encoders' reading"),
+        _signal("measured_wrench_S", *_WRENCH, "of the sensor, sign of Eq. (1), at sample_time"),
+        _signal("specific_force_S", "s_x s_y s_z", "m/s^2", "a - g at So, at sample_time"),
+        _signal("angular_velocity_S", "omega_x omega_y omega_z", "rad/s", "of S, at sample_time"),
+        _signal(
+            "angular_acceleration_S", "alpha_x alpha_y alpha_z", "rad/s^2", "of S, at sample_time"
+        ),
+        _signal("saturated", "saturated", "1", "1 if a channel of the sensor was, at sample_time"),
+        _signal("joint_position", _JOINTS, "rad", "the slave's encoders' reading, at sample_time"),
+        _signal(
+            "sample_time",
+            "t",
+            "s",
+            "when the wrist sensor took the sample of this row; slave_state is of t",
+        ),
         _signal(
             "load_estimate",
             "fo_x fo_y fo_z tauo_x tauo_y tauo_z m mc_x mc_y mc_z I_xx I_xy I_xz I_yy I_yz I_zz",
@@ -72,7 +80,7 @@ SIGNALS = {
         ),
         _signal("joint_command", _JOINTS, "rad", "from the inverse kinematics"),
         _signal("ik_status", "status", "1", "of the inverse kinematics, 0 = fine"),
-        _signal("slave_state", _STATE, _STATE_UNITS, "true joint angles and velocities"),
+        _signal("slave_state", _STATE, _STATE_UNITS, "true joint angles and velocities, at t"),
         _signal("joint_torque", _JOINTS, "N m", "of the slave's motors"),
     )
 }

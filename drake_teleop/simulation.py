@@ -140,4 +140,6 @@ def read_log(simulator: Simulator, start: float) -> SimulationResult:
     ends = np.cumsum([port.size() for port in ports])
     columns = np.split(log.data().T[kept], ends[:-1], axis=1)
     signals = dict(zip((port.get_name() for port in ports), columns, strict=True))
+    if "sample_time" in signals:
+        signals["sample_time"] -= start
     return SimulationResult(t[kept], signals, [SIGNALS[name] for name in signals])

@@ -97,6 +97,7 @@ _SLAVE_SIGNALS = {
     "angular_acceleration_S": "sample_parts.angular_acceleration_S",
     "saturated": "sample_parts.saturated",
     "joint_position": "sample_parts.joint_position",
+    "sample_time": "wrist_sample.sample_time",
     "load_estimate": "load_estimator.load_estimate",
     "slave_state": "slave_plant.rx90_state",
     "joint_torque": "joint_control.joint_torque",
@@ -134,7 +135,7 @@ _TOGETHER = dict.fromkeys(
 #: How often the clutch and the monitor are looked at [s]; an event at 2 kHz would cost time.
 _HUMAN_PERIOD = 0.01
 #: Drake numbers these ports.
-_DIVIDED = {"sample_parts": list(sample_parts(6)), "wrist_sample": ["sample"]}
+_DIVIDED = {"sample_parts": list(sample_parts(6)), "wrist_sample": ["sample", "sample_time"]}
 _SAMPLE_SIZE = sum(sample_parts(6).values())
 
 
@@ -161,6 +162,7 @@ def MakeTeleopStation(
         - angular_acceleration_S
         - saturated
         - joint_position
+        - sample_time
         - load_estimate
         - load_state (if the load is watched)
         - slave_state

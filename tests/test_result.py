@@ -20,6 +20,7 @@ SPECS = (
     Signal("specific_force_S", XYZ, "m/s^2"),
     Signal("angular_velocity_S", XYZ, "rad/s"),
     Signal("angular_acceleration_S", XYZ, "rad/s^2"),
+    Signal("sample_time", ("t",), "s"),
     Signal("sigma", ("sigma",), "1"),
 )
 
@@ -27,14 +28,16 @@ SPECS = (
 def make_result(samples: int = 50, seed: int = 3) -> SimulationResult:
     rng = np.random.default_rng(seed)
     arrays = {s.name: rng.standard_normal((samples, len(s.components))) for s in SPECS}
-    return SimulationResult(np.arange(samples) / 8000.0, arrays, SPECS)
+    t = np.arange(samples) / 8000.0
+    arrays["sample_time"] = t - 1 / 8000.0
+    return SimulationResult(t, arrays, SPECS)
 
 
 def test_signals_are_found_by_name_and_know_their_units():
     result = make_result()
     assert result.signals == tuple(spec.name for spec in SPECS)
     assert "sigma" in result and "force" not in result
-    assert len(result) == 5 and list(result) == list(result.signals)
+    assert len(result) == 6 and list(result) == list(result.signals)
     assert result["measured_wrench_S"].shape == (50, 6)
     assert result["sigma"].shape == (50, 1)
     assert result.units["measured_wrench_S"] == {
@@ -125,6 +128,14 @@ def test_sensor_log_is_the_canonical_table():
         "omega_x", "omega_y", "omega_z", "alpha_x", "alpha_y", "alpha_z",
     ]  # fmt: skip
     np.testing.assert_array_equal(log["alpha_y"].to_numpy(), result["angular_acceleration_S"][:, 1])
+    np.testing.assert_array_equal(log["t"].to_numpy(), result["sample_time"][:, 0])
+
+
+def test_a_sample_in_several_rows_is_one_row_of_the_sensor_log():
+    result = make_result(4)
+    arrays = {name: result[name].repeat(2, axis=0) for name in result}
+    fast = SimulationResult(np.arange(8) / 16000.0, arrays, SPECS)
+    assert fast.sensor_log().equals(result.sensor_log())
 
 
 def test_sensor_log_says_what_was_not_recorded():

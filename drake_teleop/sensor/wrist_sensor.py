@@ -205,10 +205,11 @@ def sample_step(
         touching_W: (6,) what contacts exert on the tool now, as the plant says, about the world's
             origin, in W; used if `until_now`. A stiff contact multiplies the last digit of a
             position by 2e5 N/m: what has the plant's own penetration is the plant's to 1e-12 N.
-        result: filled: [last sample before now (16 + n) | memory, its queue now's end alone].
+        result: filled: [last sample before now (16 + n) | when that was taken [s] | memory, its
+            queue now's end alone].
     """
     size, width, half = _SAMPLE + tau.shape[0], state.shape[0] + 3, tau.shape[0] + 1
-    after = result[size:]
+    after = result[size + 1 :]
     after[:] = memory
     tail = after[sensor[3] :]
     count, queued = tail[0], int(tail[1])
@@ -244,6 +245,7 @@ def sample_step(
     # A step that is all rounding may have ended a little before, and have taken this sample.
     taken = (count - 1.0 + _SAME) * period > time
     result[:size] = after[size : 2 * size] if taken else after[:size]
+    result[size] = (count - (2.0 if taken else 1.0)) * period
     if until_now and (count - _SAME) * period < time:
         _take(physics, sensor, now, now_dot, now_wrench_W, noise, after)
         count += 1.0
@@ -267,7 +269,8 @@ class WristSensor(LeafSystem):
         - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, of whatever pushes it besides
           contacts [N, N m] (may be left unconnected)
         output_ports:
-        - step: [the last sample before now: the parts of `sample_parts` (16 + n) | memory]
+        - step: [the last sample before now: the parts of `sample_parts` (16 + n) | when it was
+          taken [s] | memory]
 
     Args:
         slave: the plant, for its numbers: the tool's true inertial parameters, shapes that touch.
@@ -329,7 +332,7 @@ class WristSensor(LeafSystem):
         if not config.ideal:
             self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
         self.DeclareDiscreteState(memory)
-        self._result = np.zeros(len(first) + len(memory))
+        self._result = np.zeros(len(first) + 1 + len(memory))
         self._step = self.DeclareVectorOutputPort(
             "step", len(self._result), weak_callback(self._calc_step)
         )
@@ -366,7 +369,7 @@ class WristSensor(LeafSystem):
     def take_samples(self, context: Context) -> None:
         """Takes the samples before now, for who wants to see the state that results."""
         sample_step(*self._inputs(context), False, self._nothing, self._result)
-        context.SetDiscreteState(self._result[_SAMPLE + self._n :])
+        context.SetDiscreteState(self._result[_SAMPLE + self._n + 1 :])
 
     def bring_up_to_date(self, context: Context) -> None:
         """Makes now the end of the last step, with the samples before now taken.
@@ -425,7 +428,7 @@ class WristSensor(LeafSystem):
                 state, sheet = self._state.Eval(context), self._sheet_state(context)
                 remember_step(tail, context.get_time(), state, sheet)
                 return
-        discrete_state.set_value(0, self._step.Eval(context)[_SAMPLE + self._n :])
+        discrete_state.set_value(0, self._step.Eval(context)[_SAMPLE + self._n + 1 :])
 
     def _is_due(self, time: float) -> bool:
         """Whether now the torque may change, or the noise."""
@@ -467,7 +470,7 @@ def AddWristSensor(
     q_start: Array,
 ) -> None:
     """Adds "wrist_sensor" and its noise, and what divides its port: for each part of a sample
-    "sample_parts" has a port, for all of them "wrist_sample".
+    "sample_parts" has a port, for all of them and for the sample's time "wrist_sample".
 
     What remains to be connected is the state and the torque of the arm.
 
@@ -498,7 +501,8 @@ def AddWristSensor(
         )
     sizes = list(sample_parts(slave.arm.num_joints).values())
     step = sensor.GetOutputPort("step")
-    rest = step.size() - sum(sizes)
-    for name, split in (("wrist_sample", [sum(sizes), rest]), ("sample_parts", [*sizes, rest])):
+    size, rest = sum(sizes), step.size() - sum(sizes)
+    splits = {"wrist_sample": [size, 1, rest - 1], "sample_parts": [*sizes, rest]}
+    for name, split in splits.items():
         splitter = builder.AddNamedSystem(name, Demultiplexer(split))
         builder.Connect(step, splitter.get_input_port())

@@ -6,13 +6,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import BasicVector, DiagramBuilder
 
+from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.sensor.sensor_chain import WristSensorConfig, butterworth_sections, without
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
 
 QUIET = without(
     WristSensorConfig(), "place", "noise", "random_walk", "offset", "drift", "quantisation"
@@ -107,3 +109,74 @@ def test_angular_velocity_comes_from_the_encoders_with_their_resolution():
     rough = at_rest(dataclasses.replace(QUIET, encoder_resolution=1e-3))
     assert np.abs(rough["angular_velocity_S"]).max() < 1e-9  # rounding of the low-pass
     assert np.abs(at_rest(QUIET)["angular_velocity_S"]).max() < 0.05
+
+
+def swinging(rate: float) -> SimulationResult:
+    """All joints move from a turned start under an ideal sensor; every sample is logged."""
+    scenario = replace(
+        Scenario(),
+        wrist_sensor__ideal=True,
+        rates__sensor_hz=rate,
+        rates__log_hz=rate,
+        simulation__settle=0.1,
+        simulation__duration=0.2,
+    )
+    start = [0.4, -0.3, -1.6, 0.7, -0.5, 2.0]
+    swing = np.outer([0.1, -0.1, 0.15, 0.3, -0.3, 0.5], [1.0])
+    trajectory = FourierTrajectory.at_rest(start, np.zeros((6, 1)), swing, 2.0)
+    return simulate(MakeIdentificationStation(scenario, trajectory), scenario.simulation)
+
+
+def test_the_log_says_of_which_instant_a_sample_is():
+    """The samples against what the plant says of `slave_state`.
+
+    Wrench of the weld, motion of its body and joint angles: those of the row's `sample_time` are
+    the sample, those of the row itself are not.
+    """
+    result = swinging(8000.0)
+    slave = AddSlavePlant(DiagramBuilder(), Scenario().slave.position, None)
+    plant, context = slave.plant, slave.plant.CreateDefaultContext()
+    weld = plant.GetJointByName("sensor_weld")
+    place = list(plant.GetJointIndices()).index(weld.index())
+    tool, gravity_W = plant.GetBodyByName("tool"), np.array([0.0, 0.0, -9.81])
+    torque = plant.get_actuation_input_port(slave.instance).FixValue(context, np.zeros(6))
+    truth = []
+    for state, tau in zip(result["slave_state"], result["joint_torque"], strict=True):
+        plant.SetPositionsAndVelocities(context, state)
+        torque.GetMutableData().set_value(BasicVector(tau))
+        reaction = plant.get_reaction_forces_output_port().Eval(context)[place]
+        acceleration = tool.EvalSpatialAccelerationInWorld(context)
+        R_SW = tool.EvalPoseInWorld(context).rotation().matrix().T
+        truth.append(
+            [
+                *reaction.translational(),
+                *reaction.rotational(),
+                *R_SW @ (acceleration.translational() - gravity_W),
+                *R_SW @ tool.EvalSpatialVelocityInWorld(context).rotational(),
+                *R_SW @ acceleration.rotational(),
+                *state[:6],
+            ]
+        )
+    names = (
+        "measured_wrench_S",
+        "specific_force_S",
+        "angular_velocity_S",
+        "angular_acceleration_S",
+        "joint_position",
+    )
+    samples, times = np.hstack([result[name] for name in names]), result["sample_time"][1:, 0]
+    row = np.searchsorted(result.t, times - 1e-9)
+    np.testing.assert_allclose(times, result.t[row], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(samples[1:], np.array(truth)[row], rtol=0, atol=1e-11)
+    by_row = np.abs(samples - truth).max(axis=0)
+    assert by_row[:3].max() > 0.5  # N
+    assert by_row.min() > 1e-4
+
+
+def test_an_instant_that_comes_twice_has_one_sample():
+    """At 7 kHz a row's time is later, by rounding, than the same instant of the 2 kHz events."""
+    result = swinging(7000.0)
+    np.testing.assert_allclose(result["sample_time"][1:, 0], result.t[:-1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        result["joint_position"][1:], result["slave_state"][:-1, :6], rtol=0, atol=1e-13
+    )
