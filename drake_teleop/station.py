@@ -19,6 +19,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.estimation.contact_detection import ContactDetection
 from drake_teleop.estimation.load_estimator import LoadEstimator
 from drake_teleop.load.contact.detection import NoiseFloor
+from drake_teleop.load.sample import sample_parts, sample_size
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.master import device
 from drake_teleop.master.device import MasterDevice
@@ -29,7 +30,7 @@ from drake_teleop.scaling.force_scaling import ForceScaling
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.scenario import Scenario
 from drake_teleop.sensor.motion_estimation import estimated_motion_std
-from drake_teleop.sensor.wrist_sensor import AddWristSensor, sample_parts
+from drake_teleop.sensor.wrist_sensor import AddWristSensor
 from drake_teleop.signals import LOG
 from drake_teleop.slave.inverse_kinematics import InverseKinematics
 from drake_teleop.slave.joint_control import JointControl
@@ -136,7 +137,7 @@ _TOGETHER = dict.fromkeys(
 _HUMAN_PERIOD = 0.01
 #: Drake numbers these ports.
 _DIVIDED = {"sample_parts": list(sample_parts(6)), "wrist_sample": ["sample", "sample_time"]}
-_SAMPLE_SIZE = sum(sample_parts(6).values())
+_SAMPLE_SIZE = sample_size(6)
 
 
 def MakeTeleopStation(

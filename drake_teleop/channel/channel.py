@@ -25,6 +25,7 @@ from drake_teleop.channel import network
 from drake_teleop.channel.network import PRESETS, NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT, weak_callback
+from drake_teleop.load.sample import JOINT_POSITION, SATURATED, sample_size
 from drake_teleop.passivity import methods
 from drake_teleop.passivity.memory import (
     COMMAND,
@@ -56,7 +57,6 @@ from drake_teleop.passivity.safe_state import (
 )
 from drake_teleop.quantities import choice, quantity
 from drake_teleop.quaternions import quaternion_of
-from drake_teleop.sensor.wrist_sensor import sample_parts
 from drake_teleop.slave.arm import ArmModel, forward_kinematics
 
 _NETWORKS = ("custom", *PRESETS)
@@ -344,7 +344,7 @@ class TeleopChannel(LeafSystem):
         - pose_command: (7,) X_WS, after kinematic scaling
         - wrench_B: (6,) F_E_B, what the hand should feel, from force scaling [N, N m]
         - hand_wrench_E: (6,) of the hand on the stylus at E, in B [N, N m]
-        - sample: the wrist sensor's, see `drake_teleop.sensor.wrist_sensor.sample_parts`
+        - sample: the wrist sensor's, see `drake_teleop.load.sample`
         - contact: (1,) whether the slave's detector notices a contact; unconnected 0
         output_ports:
         - pose_received: (7,) X_WS that the slave shall follow
@@ -395,12 +395,10 @@ class TeleopChannel(LeafSystem):
             *lines,
         )
         self._slave_pose = np.empty(7)
-        parts = sample_parts(arm.num_joints)
-        self._saturated = sum(list(parts.values())[: list(parts).index("saturated")])
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._wrench = self.DeclareVectorInputPort("wrench_B", 6)
         self._hand = self.DeclareVectorInputPort("hand_wrench_E", 6)
-        self._sample = self.DeclareVectorInputPort("sample", sum(parts.values()))
+        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints))
         self._contact = self.DeclareVectorInputPort("contact", 1)
         ends = initial_ends(passivity.method, parameters, start)
         state = [*(network.initial_state(p, np.zeros(PACKET_SIZE)) for p in lines), ends]
@@ -429,14 +427,14 @@ class TeleopChannel(LeafSystem):
         for part, group in zip(state, self._groups, strict=True):
             part[:] = context.get_discrete_state(group).value()
         sample = self._sample.Eval(context)
-        _slave_pose_into(self._arm, sample[self._saturated + 1 :], self._slave_pose)
+        _slave_pose_into(self._arm, sample[JOINT_POSITION], self._slave_pose)
         channel_step(
             self._method,
             self._pose.Eval(context),
             self._wrench.Eval(context),
             self._hand.Eval(context),
             self._slave_pose,
-            sample[self._saturated] > 0.5,
+            sample[SATURATED] > 0.5,
             self._contact.Eval(context)[0] if self._contact.HasValue(context) else 0.0,
             *self._constants,
             *state,

@@ -21,8 +21,16 @@ from drake_teleop.load.contact.detection import (
     NoiseFloor,
     flag_update,
 )
+from drake_teleop.load.sample import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    JOINT_POSITION,
+    SATURATED,
+    SPECIFIC_FORCE,
+    WRENCH,
+    sample_size,
+)
 from drake_teleop.quantities import choice, quantity
-from drake_teleop.sensor.wrist_sensor import sample_parts
 from drake_teleop.slave.arm import ArmModel, acceleration_into
 
 
@@ -47,11 +55,10 @@ class ContactDetectionConfig:
 def _detected(memory, sample, estimate, arm, settings):
     """Takes one sample; whether there is contact."""
     contact, acceleration = np.empty(6), np.empty(3)
-    s, omega, alpha, phi = sample[6:9], sample[9:12], sample[12:15], estimate[6:]
-    scaled_wrench_into(
-        sample[:6], estimate[:6], s, omega, alpha, phi, np.zeros(10), 0.0, 0.0, 1.0, contact
-    )
-    acceleration_into(arm, sample[16:], s, acceleration)
+    s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
+    wrench, offset, phi = sample[WRENCH], estimate[:6], estimate[6:]
+    scaled_wrench_into(wrench, offset, s, omega, alpha, phi, np.zeros(10), 0.0, 0.0, 1.0, contact)
+    acceleration_into(arm, sample[JOINT_POSITION], s, acceleration)
     return flag_update(memory, contact, s, omega, alpha, acceleration, *settings)
 
 
@@ -65,7 +72,7 @@ class ContactDetection(LeafSystem):
 
         name: ContactDetection
         input_ports:
-        - sample: the wrist sensor's, see `drake_teleop.sensor.wrist_sensor.sample_parts`
+        - sample: the wrist sensor's, see `drake_teleop.load.sample`
         - load_estimate: (16,) Eq. (7), [offsets; phi]
         output_ports:
         - contact: (1,) 1 in contact, else 0
@@ -94,9 +101,7 @@ class ContactDetection(LeafSystem):
             hold=round(config.hold / period),
             following=period / config.drift_time,
         ).settings
-        parts = sample_parts(arm.num_joints)
-        self._saturated = sum(list(parts.values())[: list(parts).index("saturated")])
-        self._sample = self.DeclareVectorInputPort("sample", sum(parts.values()))
+        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints))
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         self._flag = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(ContactDetector.initial_memory())
@@ -108,7 +113,7 @@ class ContactDetection(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
         blind = discrete_state.get_mutable_value(self._blind)
-        if sample[self._saturated] > 0.5:
+        if sample[SATURATED] > 0.5:
             blind[0] = self._recovery
             return
         if blind[0] > 0.0:

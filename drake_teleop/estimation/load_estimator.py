@@ -30,6 +30,7 @@ from drake_teleop.load.online.watched import (
     watched_state,
     watched_update,
 )
+from drake_teleop.load.sample import SATURATED
 from drake_teleop.quantities import choice, quantity
 
 # Samples between two looks at whether it has settled.
@@ -144,7 +145,7 @@ class LoadEstimator(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
-        if sample[15] > 0.0:  # saturated: the wrench is not the load's
+        if sample[SATURATED] > 0.0:  # the wrench is not the load's
             return
         estimate = discrete_state.get_mutable_value(0)
         if self._state(discrete_state) == LEARNING:

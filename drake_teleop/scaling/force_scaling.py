@@ -12,9 +12,16 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.compensation import scaled_wrench_into, scales_from_eta
 from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.load.sample import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    JOINT_POSITION,
+    SPECIFIC_FORCE,
+    WRENCH,
+    sample_size,
+)
 from drake_teleop.quantities import quantity
 from drake_teleop.scaling.wrench_mapping import wrench_to_master_into
-from drake_teleop.sensor.wrist_sensor import sample_parts
 from drake_teleop.slave.arm import ArmModel, forward_kinematics
 
 #: sigma_gripper, sigma_object, gamma that leave the contact wrench alone, Eq. (13).
@@ -77,7 +84,8 @@ def _scaled_into(sample, estimate, phi_gripper, scales, out):
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
     scaled_wrench_into(
-        sample[:6], estimate[:6], sample[6:9], sample[9:12], sample[12:15],
+        sample[WRENCH], estimate[:6],
+        sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION],
         phi_gripper, phi_object, scales[0], scales[1], scales[2], out,
     )  # fmt: skip
 
@@ -103,7 +111,7 @@ def _felt_into(sample, estimate, phi_gripper, change, time, arm, R_WB, out):
     scales, scaled_S, R_WS, p_WS = np.empty(4), np.empty(6), np.empty((3, 3)), np.empty(3)
     scales_at(change, time, scales)
     _scaled_into(sample, estimate, phi_gripper, scales, scaled_S)
-    forward_kinematics(arm, sample[16:], R_WS, p_WS)
+    forward_kinematics(arm, sample[JOINT_POSITION], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
 
 
@@ -118,7 +126,7 @@ class ForceScaling(LeafSystem):
 
         name: ForceScaling
         input_ports:
-        - sample: the wrist sensor's, see `drake_teleop.sensor.wrist_sensor.sample_parts`
+        - sample: the wrist sensor's, see `drake_teleop.load.sample`
         - load_estimate: (16,) Eq. (7), [offsets; phi]
         output_ports:
         - scaled_wrench_S: F' of Fig. 2
@@ -144,8 +152,7 @@ class ForceScaling(LeafSystem):
         # Old and new scales, start and length of the change; see `scales_at`.
         scales = [*config.scales(), config.force_scale]
         self._change = self.DeclareNumericParameter(BasicVector([*scales, *scales, 0.0, 0.0]))
-        size = sum(sample_parts(arm.num_joints).values())
-        self._sample = self.DeclareVectorInputPort("sample", size)
+        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints))
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         # Not time: a change of scales goes on with each new sample, which is soon enough.
         inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
@@ -201,7 +208,11 @@ class ForceScaling(LeafSystem):
     def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
         sample, phi = self._sample.Eval(context), self._estimate.Eval(context)[6:]
         non_contact_wrench_into(
-            sample[6:9], sample[9:12], sample[12:15], phi, output.get_mutable_value()
+            sample[SPECIFIC_FORCE],
+            sample[ANGULAR_VELOCITY],
+            sample[ANGULAR_ACCELERATION],
+            phi,
+            output.get_mutable_value(),
         )
 
     def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:

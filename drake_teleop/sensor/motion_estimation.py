@@ -29,8 +29,19 @@ from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.sample import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    JOINT_POSITION,
+    MOTION,
+    SATURATED,
+    SPECIFIC_FORCE,
+    WRENCH,
+)
 from drake_teleop.quantities import choice, quantity
 from drake_teleop.sensor.sensor_chain import (
+    READ_ANGLES,
+    READ_SATURATED,
     WristSensorConfig,
     butterworth_sections,
     low_pass,
@@ -305,14 +316,13 @@ def estimate_into(constants, memory, arm, reading, sample):
         constants, memory: of `motion_estimator`.
         arm: `ArmModel.table`.
         reading: see `drake_teleop.sensor.sensor_chain.read_into`.
-        sample: see `drake_teleop.sensor.wrist_sensor.sample_parts`.
+        sample: see `drake_teleop.load.sample`.
     """
     n = arm.shape[0] - 1
     starts = memory[0] == 0.0
     motion, joints = memory[_MOTION:_JOINTS], memory[_JOINTS:][: _PER_JOINT * n]
-    angles = sample[16:]
-    for i in range(n):
-        angles[i] = reading[13 + i]
+    angles = sample[JOINT_POSITION]
+    angles[:] = reading[READ_ANGLES]
     if starts:
         settle(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
     low_pass(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
@@ -323,7 +333,7 @@ def estimate_into(constants, memory, arm, reading, sample):
     _differentiate(constants, joints, angles)
     sensor_motion(arm, angles, joints[:n], joints[n:], motion)
     if constants[_ENCODERS] != 0.0:
-        sample[6:15] = motion[:9]
+        sample[MOTION] = motion[:9]
     else:
         _accelerate(constants, memory, arm[n, _GRAVITY:], motion, sample)
     memory[0] += 1.0
@@ -335,7 +345,7 @@ def _wait(constants, memory, n, reading, sample):
 
     The flag stays for as long as any part of the reading waits.
     """
-    angles, width = sample[16:], 12 + n
+    angles, width = sample[JOINT_POSITION], 12 + n
     line = memory[_JOINTS + _PER_JOINT * n :]
     rows = line.shape[0] // width
     shift(line, width)
@@ -348,17 +358,18 @@ def _wait(constants, memory, n, reading, sample):
             line[k * width : (k + 1) * width] = line[:width]
     wrench = int(constants[_WAITS]) * width
     acceleration = int(constants[_WAITS + 1]) * width
+    waited, read = sample[WRENCH], sample[MOTION]
     for i in range(6):
-        sample[i] = line[wrench + i]
-        sample[6 + i] = line[acceleration + 6 + i]
+        waited[i] = line[wrench + i]
+        read[i] = line[acceleration + 6 + i]
     wait = int(constants[_WAITS + 2])
     older = constants[_WAITS + 2] - wait
     encoders = wait * width + 12
     before = min(wait + 1, rows - 1) * width + 12
     for i in range(n):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
-    memory[_HELD] = float(rows) if reading[12] != 0.0 else max(memory[_HELD] - 1.0, 0.0)
-    sample[15] = 1.0 if memory[_HELD] > 0.0 else 0.0
+    memory[_HELD] = float(rows) if reading[READ_SATURATED] != 0.0 else max(memory[_HELD] - 1.0, 0.0)
+    sample[SATURATED] = 1.0 if memory[_HELD] > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -383,9 +394,10 @@ def _accelerate(constants, memory, gravity, motion, sample):
     `motion` is what the encoders say, with no acceleration.
     """
     period, fused, starts = constants[_PERIOD], constants[_FUSED] != 0.0, memory[0] == 0.0
-    s, omega, alpha, R = sample[6:9], sample[9:12], sample[12:15], motion[12:21]
-    _turn(constants[_ORIENTATION:_FILTERS], sample[9:12], alpha)
-    _turn(constants[_ORIENTATION:_FILTERS], sample[6:9], omega)
+    s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
+    R = motion[12:21]
+    _turn(constants[_ORIENTATION:_FILTERS], omega, alpha)
+    _turn(constants[_ORIENTATION:_FILTERS], s, omega)
     s[0], s[1], s[2] = omega[0], omega[1], omega[2]
     for i in range(3):
         omega[i] = motion[3 + i]

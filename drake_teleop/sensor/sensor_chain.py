@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
 from drake_teleop.quantities import choice, quantity
 
 #: Samples that share one block of random numbers: one event of a noise source, one step of a walk.
@@ -383,6 +384,11 @@ def _rotation(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
 
 #: In the constants: offset of force and torque, which may be changed while the sensor runs.
 OFFSET = slice(0, 6)
+# The truth: as a sample, see `drake_teleop.load.sample`, but for the flag.
+TRUE_ANGLES = slice(15, None)
+# A reading: wrench, accelerometer, whether a channel is saturated, angles.
+READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
+READ_SATURATED, READ_ANGLES = 12, slice(13, None)
 # Constants: 12 offsets, 12 drifts per sample, then these.
 _DRIFT, _NOISE, _WALK, _QUANTA, _LIMITS = range(12, 72, 12)
 _WRENCH = 72  # (6, 6)
@@ -461,13 +467,14 @@ def read_into(constants, memory, noise, truth, reading):
             1 if a channel is saturated, else 0 | joints' angles (n)].
     """
     if constants[_IDEAL] != 0.0:
-        reading[:9] = truth[:9]
-        reading[9:12] = truth[12:15]
-        reading[12] = 0.0
-        reading[13:] = truth[15:]
+        reading[READ_WRENCH] = truth[WRENCH]
+        reading[READ_ACCELERATION][:3] = truth[SPECIFIC_FORCE]
+        reading[READ_ACCELERATION][3:] = truth[ANGULAR_ACCELERATION]
+        reading[READ_SATURATED] = 0.0
+        reading[READ_ANGLES] = truth[TRUE_ANGLES]
         return
-    count = int(memory[0])
-    width = _ROW + truth.shape[0] - 15
+    count, angles = int(memory[0]), truth[TRUE_ANGLES]
+    width = _ROW + angles.shape[0]
     rows = (memory.shape[0] - _LINE) // width
     shift(memory[_LINE:], width)
     row = memory[_LINE:][:width]
@@ -496,7 +503,7 @@ def read_into(constants, memory, noise, truth, reading):
         low_pass(sections, filtered, channels)
     quantum = constants[_ENCODER]
     for i in range(_ROW, width):
-        angle = truth[15 + i - _ROW]
+        angle = angles[i - _ROW]
         row[i] = quantum * np.rint(angle / quantum) if quantum > 0.0 else angle
 
     if count == 0:
@@ -507,12 +514,13 @@ def read_into(constants, memory, noise, truth, reading):
     force = _LINE + int(late[0]) * width
     acceleration = _LINE + int(late[1]) * width
     encoders = _LINE + int(late[2]) * width
+    wrench, moved, turned = reading[READ_WRENCH], reading[READ_ACCELERATION], reading[READ_ANGLES]
     for i in range(6):
-        reading[i] = memory[force + i]
-        reading[6 + i] = memory[acceleration + 6 + i]
-    reading[12] = max(memory[force + _CHANNELS], memory[acceleration + _CHANNELS + 1])
+        wrench[i] = memory[force + i]
+        moved[i] = memory[acceleration + 6 + i]
+    reading[READ_SATURATED] = max(memory[force + _CHANNELS], memory[acceleration + _CHANNELS + 1])
     for i in range(_ROW, width):
-        reading[13 + i - _ROW] = memory[encoders + i]
+        turned[i - _ROW] = memory[encoders + i]
 
 
 @njit(cache=True)
@@ -528,18 +536,20 @@ def shift(line, width):
 @njit(cache=True)
 def _calibrate(constants, truth, out):
     """The 12 channels as their gains, cross-talk, axes and place make them of the truth."""
+    wrench, s = truth[WRENCH], truth[SPECIFIC_FORCE]
+    omega, alpha = truth[ANGULAR_VELOCITY], truth[ANGULAR_ACCELERATION]
     for i in range(6):
         value = 0.0
         for j in range(6):
-            value += constants[_WRENCH + 6 * i + j] * truth[j]
+            value += constants[_WRENCH + 6 * i + j] * wrench[j]
         out[i] = value
-    wx, wy, wz = truth[9], truth[10], truth[11]
-    ax, ay, az = truth[12], truth[13], truth[14]
+    wx, wy, wz = omega[0], omega[1], omega[2]
+    ax, ay, az = alpha[0], alpha[1], alpha[2]
     x, y, z = constants[_PLACE], constants[_PLACE + 1], constants[_PLACE + 2]
     ux, uy, uz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x  # omega x r
-    sx = truth[6] + ay * z - az * y + wy * uz - wz * uy
-    sy = truth[7] + az * x - ax * z + wz * ux - wx * uz
-    sz = truth[8] + ax * y - ay * x + wx * uy - wy * ux
+    sx = s[0] + ay * z - az * y + wy * uz - wz * uy
+    sy = s[1] + az * x - ax * z + wz * ux - wx * uz
+    sz = s[2] + ax * y - ay * x + wx * uy - wy * ux
     for i in range(3):
         k, m = _MOTION + 3 * i, _MOTION + 9 + 3 * i
         out[6 + i] = constants[k] * sx + constants[k + 1] * sy + constants[k + 2] * sz

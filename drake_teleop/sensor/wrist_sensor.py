@@ -32,6 +32,19 @@ from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.load.sample import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    BEFORE_JOINTS,
+    JOINT_POSITION,
+    MOTION,
+    SATURATED,
+    SPECIFIC_FORCE,
+    WRENCH,
+    WRENCH_AND_MOTION,
+    sample_parts,
+    sample_size,
+)
 from drake_teleop.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_into,
@@ -42,6 +55,7 @@ from drake_teleop.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
     OFFSET,
+    TRUE_ANGLES,
     WristSensorConfig,
     read_into,
     sensor_chain,
@@ -57,7 +71,6 @@ from drake_teleop.slave.tool_contact import add_force, environment_wrench
 
 Array = NDArray[np.float64]
 
-_SAMPLE = 16
 #: A part of a period, within which two instants are one.
 _SAME = 1e-6
 #: Steps of the plant that wait to be sampled, at most.
@@ -65,18 +78,6 @@ _LONGEST = 16
 #: How often the plant is asked whether it moves as the dynamics here say [s], and how alike they
 #: have to be: rounding is 1e-12, in a stiff contact 1e-9.
 _CHECK_PERIOD, _ALIKE = 0.05, 1e-6
-
-
-def sample_parts(num_joints: int) -> dict[str, int]:
-    """The parts of a sample, in the order of the output port `sample`, with their sizes."""
-    return {
-        "measured_wrench_S": 6,
-        "specific_force_S": 3,
-        "angular_velocity_S": 3,
-        "angular_acceleration_S": 3,
-        "saturated": 1,
-        "joint_position": num_joints,
-    }
 
 
 @njit(cache=True)
@@ -87,8 +88,10 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
     about the world's origin, in W.
     """
     sensor_motion(arm, q, v, vdot, motion)
-    out[6:15] = motion[:9]
-    non_contact_wrench_into(out[6:9], out[9:12], out[12:15], phi, out[:6])
+    out[MOTION] = motion[:9]
+    s, omega, alpha = out[SPECIFIC_FORCE], out[ANGULAR_VELOCITY], out[ANGULAR_ACCELERATION]
+    wrench = out[WRENCH]
+    non_contact_wrench_into(s, omega, alpha, phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
     f, tau, p = contact_W[:3], contact_W[3:], motion[9:12]
     tx = tau[0] - (p[1] * f[2] - p[2] * f[1])
@@ -96,8 +99,8 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
     tz = tau[2] - (p[0] * f[1] - p[1] * f[0])
     for i in range(3):  # the columns of R_WS are the axes of S
         x, y, z = motion[12 + i], motion[15 + i], motion[18 + i]
-        out[i] -= x * f[0] + y * f[1] + z * f[2]
-        out[3 + i] -= x * tx + y * ty + z * tz
+        wrench[i] -= x * f[0] + y * f[1] + z * f[2]
+        wrench[3 + i] -= x * tx + y * ty + z * tz
 
 
 @njit(cache=True)
@@ -149,13 +152,15 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
     n = half - 1
     truth = np.empty(15 + n)
     v, vdot = x[half : half + n], xdot[half : half + n]
-    true_sample(arm, phi, x[:n], v, vdot, wrench_W, np.empty(MOTION_SIZE), truth[:15])
-    truth[15:] = x[:n]
-    size = _SAMPLE + n
+    rigid = truth[WRENCH_AND_MOTION]
+    true_sample(arm, phi, x[:n], v, vdot, wrench_W, np.empty(MOTION_SIZE), rigid)
+    truth[TRUE_ANGLES] = x[:n]
+    size = BEFORE_JOINTS + n
     sample = memory[:size]
     memory[size : 2 * size] = sample
     if ideal:
-        sample[:15], sample[15], sample[16:] = truth[:15], 0.0, truth[15:]
+        sample[WRENCH_AND_MOTION], sample[SATURATED] = truth[WRENCH_AND_MOTION], 0.0
+        sample[JOINT_POSITION] = truth[TRUE_ANGLES]
         return
     reading = np.empty(13 + n)
     read_into(constants, memory[2 * size : middle], noise, truth, reading)
@@ -208,7 +213,7 @@ def sample_step(
         result: filled: [last sample before now (16 + n) | when that was taken [s] | memory, its
             queue now's end alone].
     """
-    size, width, half = _SAMPLE + tau.shape[0], state.shape[0] + 3, tau.shape[0] + 1
+    size, width, half = BEFORE_JOINTS + tau.shape[0], state.shape[0] + 3, tau.shape[0] + 1
     after = result[size + 1 :]
     after[:] = memory
     tail = after[sensor[3] :]
@@ -307,7 +312,7 @@ class WristSensor(LeafSystem):
         self._physics = (carried.table, carried.load, slave.contact_pairs, slave.leaf)
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
-            first[:6] += config.offset
+            first[WRENCH] += config.offset
         # Contact takes many steps for one torque, and to work off the queue takes longer than them.
         self._longest = _LONGEST if slave.can_touch else 1
         tail = np.zeros(2 + self._longest * (2 * n + 3))
@@ -361,15 +366,15 @@ class WristSensor(LeafSystem):
         Not counters and flags, nor random walks, nor the sample before the last one.
         """
         _, _, chain_end, end, _ = self._sensor
-        size, flag = _SAMPLE + self._n, 15
+        size = sample_size(self._n)
         before_and_walks = range(size, 2 * size + FILTERED)
-        others = [flag, *before_and_walks, chain_end, chain_end + 1]
+        others = [SATURATED, *before_and_walks, chain_end, chain_end + 1]
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
         """Takes the samples before now, for who wants to see the state that results."""
         sample_step(*self._inputs(context), False, self._nothing, self._result)
-        context.SetDiscreteState(self._result[_SAMPLE + self._n + 1 :])
+        context.SetDiscreteState(self._result[sample_size(self._n) + 1 :])
 
     def bring_up_to_date(self, context: Context) -> None:
         """Makes now the end of the last step, with the samples before now taken.
@@ -428,7 +433,7 @@ class WristSensor(LeafSystem):
                 state, sheet = self._state.Eval(context), self._sheet_state(context)
                 remember_step(tail, context.get_time(), state, sheet)
                 return
-        discrete_state.set_value(0, self._step.Eval(context)[_SAMPLE + self._n + 1 :])
+        discrete_state.set_value(0, self._step.Eval(context)[sample_size(self._n) + 1 :])
 
     def _is_due(self, time: float) -> bool:
         """Whether now the torque may change, or the noise."""
@@ -453,10 +458,10 @@ class WristSensor(LeafSystem):
 
 def sample_at_rest(arm: ArmModel, q: Array) -> Array:
     """The true sample (16 + n,) of the arm that rests at q (n,) [rad]: what stands before t = 0."""
-    sample, still = np.zeros(_SAMPLE + len(q)), np.zeros(len(q))
-    touching, motion = np.zeros(6), np.zeros(MOTION_SIZE)
-    true_sample(arm.table, arm.phi_load, q, still, still, touching, motion, sample[:15])
-    sample[16:] = q
+    sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
+    touching, motion, truth = np.zeros(6), np.zeros(MOTION_SIZE), sample[WRENCH_AND_MOTION]
+    true_sample(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
+    sample[JOINT_POSITION] = q
     return sample
 
 

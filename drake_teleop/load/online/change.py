@@ -52,6 +52,12 @@ from drake_teleop.load.identification import METHODS, Identification, positive, 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import PRIOR_STD
 from drake_teleop.load.regressor import non_contact_wrench_into, regressor_into
+from drake_teleop.load.sample import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    SPECIFIC_FORCE,
+    WRENCH_AND_MOTION,
+)
 
 STATES = ("known", "disturbed", "changed", "identified")
 """What `LoadChangeMonitor.state` may say."""
@@ -219,7 +225,7 @@ def change_update(memory, sample, block, noise, window, hold, bound):
 
     Args:
         memory: of `LoadChangeMonitor.initial_memory`, updated.
-        sample: begins with [wrench (6), s (3), omega (3), alpha (3)].
+        sample: see `drake_teleop.load.sample`, its first 15 numbers.
         block: samples of a block.
         noise: (17,) long-run variances of a sample of the wrench (6) and the motion (9), square of
             the model error, and how many blocks that lasts.
@@ -227,9 +233,11 @@ def change_update(memory, sample, block, noise, window, hold, bound):
         bound: of `LoadChangeMonitor`.
     """
     V = np.empty((6, 10))
-    regressor_into(sample[6:9], sample[9:12], sample[12:15], V)
+    s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
+    regressor_into(s, omega, alpha, V)
+    known = sample[WRENCH_AND_MOTION]
     for i in range(15):
-        memory[_WRENCH + i] += sample[i]
+        memory[_WRENCH + i] += known[i]
     for i in range(6):
         for j in range(10):
             memory[_V + 10 * i + j] += V[i, j]
@@ -429,7 +437,7 @@ class LoadChangeMonitor:
 
         Args:
             memory: as from `initial_memory`, updated in place.
-            sample: begins with [wrench (6), s (3), omega (3), alpha (3)].
+            sample: see `drake_teleop.load.sample`, its first 15 numbers.
         """
         change_update(memory, sample, *self._parameters)
 

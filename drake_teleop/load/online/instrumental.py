@@ -39,6 +39,7 @@ from drake_teleop.load.online.recursive_moments import (
     weighted_gram,
     weighted_right,
 )
+from drake_teleop.load.sample import INSTRUMENTS, MOTION, WRENCH
 
 # Share of the instruments' own information by which M is raised, against rounding.
 _RIDGE = 1e-9
@@ -103,8 +104,9 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
     for n in range(len(samples)):
         if forgetting < 1.0:
             forget(memory, theta, information, forgetting)
-        observe(samples[n], 6, z)
-        observe(samples[n], 15, y)
+        wrench = samples[n, WRENCH]
+        observe(wrench, samples[n, MOTION], z)
+        observe(wrench, samples[n, INSTRUMENTS], y)
         add_product(z, z, memory[:19])
         add_product(y, z, memory[19:38])
         add_product(y, y, memory[38:57])

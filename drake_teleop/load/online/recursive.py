@@ -28,6 +28,12 @@ from drake_teleop.load.identification import (
     worth_stating,
 )
 from drake_teleop.load.regressor import regressor_into
+from drake_teleop.load.sample import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    SPECIFIC_FORCE,
+    WRENCH,
+)
 
 PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
 """Default prior of [offsets [N, N m]; phi [kg, kg m, kg m^2]] about zero: wide for hand tools."""
@@ -52,7 +58,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
     Args:
         theta: (16,) [offsets; phi], updated.
         P: (16, 16) its covariance, exactly symmetric, updated.
-        samples: (N, at least 15) [wrench, s, omega, alpha], as for `identify`.
+        samples: (N, at least 15) rows of `drake_teleop.load.sample`.
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
         forgetting: factor per sample on the weight of the past, 1 for none.
         largest: (16,) variances up to which forgetting may raise the diagonal of P. Without this
@@ -72,7 +78,8 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
             for c in range(6):
                 squares[c] *= forgetting
 
-        regressor_into(sample[6:9], sample[9:12], sample[12:15], V)
+        wrench, s, omega = sample[WRENCH], sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY]
+        regressor_into(s, omega, sample[ANGULAR_ACCELERATION], V)
         for c in range(6):
             first, last = (0, 4) if c < 3 else (1, 10)
             for i in range(16):
@@ -81,7 +88,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
                 v = V[c, j]
                 for i in range(16):
                     gain[i] += v * P[6 + j, i]
-            innovation = sample[c] - theta[c]
+            innovation = wrench[c] - theta[c]
             predicted, uncorrelated = gain[c], P[c, c]
             for j in range(first, last):
                 v = V[c, j]

@@ -55,16 +55,17 @@ def scratch():
 
 
 @njit(cache=True)
-def observe(sample, start, z):
-    """z of a sample that begins with the wrench; its motion [s, omega, alpha] begins at start."""
+def observe(wrench, motion, z):
+    """z of a wrench (6,) and a motion (9,) [s, omega, alpha]."""
+    s, omega, alpha = motion[:3], motion[3:6], motion[6:]
     z[0] = 1.0
     for i in range(3):
-        z[1 + i] = sample[start + i]
-        z[4 + i] = sample[start + 6 + i]
+        z[1 + i] = s[i]
+        z[4 + i] = alpha[i]
         for j in range(i + 1):
-            z[_PRODUCTS[i, j]] = sample[start + 3 + i] * sample[start + 3 + j]
+            z[_PRODUCTS[i, j]] = omega[i] * omega[j]
     for c in range(6):
-        z[_WRENCH + c] = sample[c]
+        z[_WRENCH + c] = wrench[c]
 
 
 @njit(cache=True)

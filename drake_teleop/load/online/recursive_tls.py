@@ -52,6 +52,7 @@ from drake_teleop.load.online.recursive_moments import (
     weighted_gram,
     weighted_right,
 )
+from drake_teleop.load.sample import MOTION, WRENCH
 
 # Excess of information over noise, in units of sqrt(2 / samples), that compensation has to leave.
 _EXCESS = 4.0
@@ -149,7 +150,7 @@ def rtls_update(
     for n in range(len(samples)):
         if forgetting < 1.0:
             forget(memory, theta, information, forgetting)
-        observe(samples[n], 6, z)
+        observe(samples[n, WRENCH], samples[n, MOTION], z)
         add_product(z, z, Z)
         scale = rtls_normal_equations(Z, theta, *options, space, Q, G, N)
         for i in range(16):

@@ -46,6 +46,7 @@ from drake_teleop.load.online.change import (
     new_load_age,
 )
 from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
 
 LOAD_STATES = ("learning", "settled", "disturbed", "changed")
 """What the state of a load estimator means; learning is what comes before this module."""
@@ -96,10 +97,11 @@ def watched_state(memory):
 def _rests(memory, sample, period):
     """Whether S has been at rest for a while."""
     share = period / (_SMOOTH + period)
+    s, omega = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY]
     moved, turning = 0.0, 0.0
     for i in range(3):
-        memory[_S + i] += share * (sample[6 + i] - memory[_S + i])
-        memory[_OMEGA + i] += share * (sample[9 + i] - memory[_OMEGA + i])
+        memory[_S + i] += share * (s[i] - memory[_S + i])
+        memory[_OMEGA + i] += share * (omega[i] - memory[_OMEGA + i])
         moved += (memory[_S + i] - memory[_WHERE + i]) ** 2
         turning += memory[_OMEGA + i] ** 2
     if moved > _MOVED**2 or turning > _TURNING**2:
@@ -140,7 +142,7 @@ def watched_update(out, memory, sample, fallback, period, block, noise, window, 
     Args:
         out: (16,) [offsets; phi] that is handed out, updated.
         memory: of `watched_memory`, updated.
-        sample: begins with [wrench (6), s (3), omega (3), alpha (3)].
+        sample: see `drake_teleop.load.sample`, its first 15 numbers.
         fallback: (10,) phi of what is known of a load that has changed.
         period: between samples [s].
         block, noise, window, hold, bound: of `change.change_parameters`.
@@ -148,9 +150,11 @@ def watched_update(out, memory, sample, fallback, period, block, noise, window, 
     watch = memory[_CHANGE:]
     change_update(watch, sample, block, noise, window, hold, bound)
     known, residual, target = known_load(watch), np.empty(6), np.empty(16)
-    non_contact_wrench_into(sample[6:9], sample[9:12], sample[12:15], known[6:], residual)
+    s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
+    non_contact_wrench_into(s, omega, alpha, known[6:], residual)
+    wrench = sample[WRENCH]
     for i in range(6):
-        residual[i] = sample[i] - known[i] - residual[i]
+        residual[i] = wrench[i] - known[i] - residual[i]
     rests, verdict = _rests(memory, sample, period), change_state(watch)
     varies = _varies(memory, residual, new_load_age(watch), period)
     if verdict == KNOWN:
