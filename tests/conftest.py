@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import os
+
 from hypothesis import settings
+
+# One thread of BLAS in each process: the matrices are small, and threads that wait for a core which
+# another worker has take longer than the work. numpy is not imported yet, so it will see this.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Tests are never timed (the first call of a compiled function takes seconds) and the same on
 # every machine and day.
