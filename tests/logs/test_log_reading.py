@@ -360,6 +360,38 @@ def test_static_poses_from_gravity_or_orientation(tmp_path: Path) -> None:
         assert not log.angular_velocity.any() and not log.angular_acceleration.any()
 
 
+@pytest.mark.parametrize("kind", ["wrench", "static"])
+def test_axes_of_the_force_sensor_are_turned_to_S(tmp_path: Path, kind: str) -> None:
+    """The columns of `frame` are the axes of the file, seen in S."""
+    x, y, z = np.array([0.0, 0.6, -0.8]), np.array([1.0, 0.0, 0.0]), np.array([0.0, -0.8, -0.6])
+    motion = motion_at(T)
+    columns: dict[str, Any] = {"t": T, "s": motion.specific_force, "omega": motion.omega}
+    for name, vectors in zip(("f", "tau"), np.split(a_wrench(motion), 2, axis=1), strict=True):
+        columns[name] = np.column_stack([vectors @ axis for axis in (x, y, z)])
+    np.savez(tmp_path / "x.npz", **columns)
+    stream: dict[str, Any] = {
+        "file": "x.npz",
+        "force": {"columns": ["f"]},
+        "torque": {"columns": ["tau"]},
+        "frame": np.column_stack([x, y, z]).tolist(),
+    }
+    description: dict[str, Any] = {kind: stream}
+    if kind == "static":
+        stream["gravity"] = {"columns": ["s"]}
+    else:
+        time = {"column": "t"}
+        stream["time"] = time
+        description["imu"] = {
+            "file": "x.npz",
+            "time": time,
+            "specific_force": {"columns": ["s"]},
+            "angular_velocity": {"columns": ["omega"]},
+        }
+    path = tmp_path / "log.yaml"
+    path.write_text(yaml.safe_dump(description), encoding="utf-8")
+    np.testing.assert_allclose(read_log(path).wrench, a_wrench(motion), atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

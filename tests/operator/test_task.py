@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drake_teleop.channel.channel import Channel
+from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import slave_arm
 from drake_teleop.master.device import JointFriction
@@ -97,6 +99,18 @@ def test_the_picture_is_as_late_as_the_line():
         run("reach", channel__delay=delay, **task)[1]["task_time_s"] for delay in (0.05, 0.2)
     )
     assert far - near == pytest.approx(2 * 0.15, abs=0.02)
+
+
+@pytest.mark.parametrize(("there", "back"), [(0.03, 0.22), (0.22, 0.03)])
+def test_lines_that_differ_are_waited_for_each_in_its_place(there, back):
+    """The tool moves after the one delay and is seen after the other: together a round trip."""
+    task = with_task(Reach(translation=[0.0, 0.08, -0.06], width=0.04))
+    lines = Channel(delay=there, backward=NetworkConfig(delay=back))
+    differ, same = (
+        run("reach", channel=channel, **task)[1]["task_time_s"]
+        for channel in (lines, Channel(delay=0.125))
+    )
+    assert differ == pytest.approx(same, abs=0.02)
 
 
 def test_contact_is_noticed_and_the_hand_stops(touch):

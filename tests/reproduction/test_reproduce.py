@@ -61,7 +61,8 @@ def test_the_contact_is_as_in_figure_8(run):
     figures = run[0]["contact"]
     assert 0.205 <= figures["true_s"] <= 0.235
     assert 0 <= figures["detected_s"] - figures["true_s"] <= 0.010
-    assert figures["threshold_N"] > figures["free_residual_norm_max_N"]
+    free = figures["free_residual_norm_max_N"]
+    assert figures["threshold_N"] == pytest.approx(1.5 * free, rel=1e-12)
     assert figures["raw_detectable"] is False
     assert figures["false_alarm_0_6_s"] is False
     assert 10 <= figures["peak_contact_N"] <= 25

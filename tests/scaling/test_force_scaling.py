@@ -19,8 +19,13 @@ def arm():
     return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm
 
 
-def outputs(config: ForceScalingConfig, arm, contact=(0.0,) * 6) -> dict[str, np.ndarray]:
-    """The block's outputs for one sample of a load that moves and touches something."""
+def outputs(
+    config: ForceScalingConfig, arm, contact=(0.0,) * 6, scales: dict[str, float] | None = None
+) -> dict[str, np.ndarray]:
+    """The block's outputs for one sample of a load that moves and touches something.
+
+    With `scales`, after these were set while it runs.
+    """
     rng = np.random.default_rng(3)
     motion, offsets = rng.normal(size=(3, 3)) * 5, rng.normal(size=6)
     measured = non_contact_wrench(*motion, arm.phi_load) + offsets + contact
@@ -30,11 +35,14 @@ def outputs(config: ForceScalingConfig, arm, contact=(0.0,) * 6) -> dict[str, np
     sample = np.concatenate([measured, *motion, [0.0], q])
     block.GetInputPort("sample").FixValue(context, sample)
     block.GetInputPort("load_estimate").FixValue(context, np.concatenate([offsets, arm.phi_load]))
+    if scales is not None:
+        block.SetScales(context, **scales, duration=0.0)
     names = ("scaled_wrench_S", "contact_wrench_S", "non_contact_wrench_S", "wrench_B")
     found = {name: block.GetOutputPort(name).Eval(context) for name in names}
     both = block.GetOutputPort("scaled_and_contact_S").Eval(context)
     np.testing.assert_array_equal(both[:6], found["scaled_wrench_S"])
     np.testing.assert_array_equal(both[6:], found["contact_wrench_S"])
+    found["of_gripper"] = non_contact_wrench(*motion, np.array(GRIPPER))
     return found
 
 
@@ -62,6 +70,19 @@ def test_eta_keeps_that_share_of_the_object(arm):
     np.testing.assert_allclose(none["scaled_wrench_S"], 0.0, atol=1e-12)
     np.testing.assert_allclose(out["scaled_wrench_S"], 0.25 * whole["scaled_wrench_S"], atol=1e-12)
     assert np.abs(whole["scaled_wrench_S"] - total).max() > 1.0
+
+
+def test_each_scale_that_is_set_while_running_scales_its_own_part(arm):
+    contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
+    scales = dict(sigma_gripper=0.2, sigma_object=0.7, gamma=1.3, force_scale=0.05)
+    config = ForceScalingConfig(sigma=0.5, gripper_phi=GRIPPER)
+    out = outputs(config, arm, contact, scales)
+    gripper = out["of_gripper"]
+    expected = 1.3 * contact + 0.2 * gripper + 0.7 * (out["non_contact_wrench_S"] - gripper)
+    np.testing.assert_allclose(out["scaled_wrench_S"], expected, atol=1e-12)
+    length = np.linalg.norm(out["wrench_B"][:3])
+    assert length == pytest.approx(0.05 * np.linalg.norm(expected[:3]))
+    assert np.linalg.norm(gripper) > 1.0
 
 
 def test_what_the_hand_feels_is_the_scaled_reaction(arm):

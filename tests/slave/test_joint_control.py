@@ -7,7 +7,7 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.slave.arm import inverse_dynamics
-from drake_teleop.slave.joint_control import JointControlConfig, joint_control_torque
+from drake_teleop.slave.joint_control import JointControl, JointControlConfig, joint_control_torque
 from drake_teleop.slave.plant import AddSlavePlant
 
 
@@ -51,12 +51,25 @@ def test_the_joints_do_not_disturb_each_other(arm):
     np.testing.assert_allclose(torque(arm, q + error, q, np.zeros(6)), expected, rtol=1e-12)
 
 
-def test_speed_and_torque_stay_within_the_motors_limits(arm):
+def test_torque_stays_within_the_motors_limits(arm):
     q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
     far = torque(arm, q + 3.0, q, np.zeros(6))
     assert (np.abs(far) <= arm.effort_limit).all()
-    # At its speed limit a joint is not accelerated any more, however far away the setpoint is.
-    at_limit = np.zeros(6)
-    inverse_dynamics(arm.table, q, arm.velocity_limit * 0.2, np.zeros(6), at_limit)
-    slow = torque(arm, q + arm.velocity_limit * 0.2 / (2 * np.pi * 12), q, arm.velocity_limit * 0.2)
-    np.testing.assert_allclose(slow, at_limit, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+@pytest.mark.parametrize("share", [0.999, 1.0, 1.001])
+def test_at_its_speed_limit_a_joint_is_not_accelerated_any_more(arm, way, share):
+    """However far away the setpoint is; beyond the limit it is braked, by the block as by hand."""
+    q, config = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0]), JointControlConfig()
+    limit = way * arm.velocity_limit
+    braking = 2 * np.pi * config.velocity_bandwidth_hz * (1.0 - share) * limit
+    expected = np.zeros(6)
+    inverse_dynamics(arm.table, q, share * limit, braking, expected)
+    assert (np.abs(expected) < arm.effort_limit).all()
+    block = JointControl(arm, config, 1e-3, q)
+    context = block.CreateDefaultContext()
+    block.GetInputPort("joint_command").FixValue(context, q + 3.0 * way)
+    block.GetInputPort("slave_state").FixValue(context, np.concatenate([q, share * limit]))
+    updated = block.EvalUniquePeriodicDiscreteUpdate(context)
+    np.testing.assert_allclose(updated.get_value(), expected, rtol=1e-9, atol=1e-9)
