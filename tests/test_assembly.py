@@ -20,6 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import BACKWARD, FORWARD, NetworkConfig, newest_packets
+from drake_teleop.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.load.contact.detection import NoiseFloor
 from drake_teleop.master.device import serial_joint_angles
 from drake_teleop.operator.operator import OperatorConfig, Sine
 from drake_teleop.passivity.energy import port_work
@@ -36,6 +38,7 @@ from drake_teleop.station import MakeTeleopStation
 ALIGNMENT = [0.5, -0.4, 0.8]
 #: R_WB: roll, pitch and yaw about the fixed axes, one after the other.
 R_WB = Rotation.from_euler("xyz", ALIGNMENT).as_matrix()
+MASTER_START, SLAVE_START = [0.25, 0.02, 0.05], [0.52, 0.04, 0.47]
 TRANSLATION, ROTATION, FORCE = 1.5, 0.5, 0.04
 SIGMA, GAMMA = 0.3, 1.3
 #: An estimate that is wrong by a tenth, so that there is a contact wrench, and offsets.
@@ -69,7 +72,7 @@ class Recorded:
 
 @pytest.fixture(scope="module")
 def slave():
-    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None)
+    return AddSlavePlant(DiagramBuilder(), SLAVE_START, None)
 
 
 def turned(**changes: object) -> Scenario:
@@ -88,6 +91,8 @@ def turned(**changes: object) -> Scenario:
         simulation=Simulation(settle=0.0, duration=END * PERIOD),
         rates=Rates(sensor_hz=4e3, hand_hz=1e3, joint_control_hz=2e3, estimator_hz=500, log_hz=1e3),
         operator=OperatorConfig(grip="firm", intent=[sine, other]),
+        master__position=MASTER_START,
+        slave__position=SLAVE_START,
         kinematic_scaling=KinematicScalingConfig(TRANSLATION, ROTATION, ALIGNMENT),
         force_scaling__sigma=SIGMA,
         force_scaling__gamma=GAMMA,
@@ -108,18 +113,24 @@ def delayed(method: str, **changes: object) -> Scenario:
     return turned(**changes)
 
 
-def run(scenario: Scenario, slave, offsets: np.ndarray = OFFSETS) -> Recorded:
+def run(
+    scenario: Scenario,
+    slave,
+    offsets: np.ndarray = OFFSETS,
+    noise_floor: NoiseFloor | None = None,
+) -> Recorded:
     """Runs it with the clutch open from row OPENED to row CLOSED."""
     estimate = np.concatenate([offsets, ESTIMATED * slave.arm.phi_load])
-    station = MakeTeleopStation(scenario, load_estimate=estimate)
+    station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=noise_floor)
     simulator = MakeSimulator(station, scenario.simulation)
     clutch = station.GetInputPort("clutch")
     end = round(scenario.simulation.duration / PERIOD)
+    rows = round(scenario.simulation.duration * scenario.rates.log_hz)
     for engaged, until in ((1.0, OPENED), (0.0, CLOSED), (1.0, END)):
         clutch.FixValue(simulator.get_mutable_context(), [engaged])
         advance(simulator, min(until, end) * PERIOD)
     log = read_log(simulator, scenario.simulation.settle)
-    assert len(log.t) == end + 1
+    assert len(log.t) == rows + 1
     return Recorded(scenario, log, slave.plant, *poses_of_S(slave.plant, log["joint_position"]))
 
 
@@ -221,7 +232,8 @@ def test_the_command_is_the_scaled_turned_motion_across_the_clutch(assembled):
     command, master = log["pose_command"], log["pose_master"]
     p, R = command[:, 4:], rotations(command)
     p_master, R_master = master[:, 4:], rotations(master)
-    np.testing.assert_allclose(p[0], assembled.scenario.slave.position, atol=EXACT)
+    np.testing.assert_allclose(p_master[0], MASTER_START, atol=EXACT)
+    np.testing.assert_allclose(p[0], SLAVE_START, atol=EXACT)
     np.testing.assert_allclose(R[0], np.diag([1.0, -1.0, -1.0]), atol=EXACT)
     for first, last in ((0, OPENED), (CLOSED, END)):
         rows = slice(first, last + 1)
@@ -240,6 +252,8 @@ def test_the_slave_goes_where_it_is_told(assembled):
     """The joint command puts S onto what was received, and the arm is there a little later."""
     log, plant = assembled.log, assembled.plant
     received = log["pose_received" if "pose_received" in log else "pose_command"]
+    np.testing.assert_allclose(received[0, 4:], SLAVE_START, atol=EXACT)
+    np.testing.assert_allclose(assembled.p_WS[0], SLAVE_START, atol=1e-5)
     R, p = poses_of_S(plant, log["joint_command"])
     np.testing.assert_allclose(p, received[:, 4:], atol=1e-9)
     np.testing.assert_allclose(R, rotations(received), atol=1e-9)
@@ -293,6 +307,53 @@ def test_the_local_limit_of_force_is_the_one_at_the_hand(over_a_network, slave):
     for part, most in ((shown[:, :3], limit.force), (shown[:, 3:], limit.torque)):
         assert np.linalg.norm(part, axis=1).max() == pytest.approx(most)
     assert (np.abs(wanted - expected) < EXACT).all(axis=1).any()
+
+
+def test_the_flag_of_a_contact_comes_with_the_slaves_packets(slave):
+    """With a floor so low that the moving load is taken for contacts."""
+    rising, still = np.zeros((6, 2)), np.zeros(6)
+    floor = NoiseFloor(
+        0.05 * np.ones(6), np.identity(16), rising, np.identity(6), still, reached=np.ones(3)
+    )
+    log = run(
+        delayed("none", contact_detection=ContactDetectionConfig()), slave, OFFSETS, floor
+    ).log
+    noticed, at_hand = log["contact"][:, 0], log["contact_at_hand"][:, 0]
+    assert np.count_nonzero(np.diff(noticed)) >= 2
+    np.testing.assert_array_equal(at_hand[TO_HAND:], noticed[:-TO_HAND])
+    direct = run(turned(contact_detection=ContactDetectionConfig()), slave, OFFSETS, floor).log
+    np.testing.assert_array_equal(direct["contact_at_hand"], direct["contact"])
+
+
+def test_every_block_runs_at_its_own_rate(slave):
+    """What changes between rows of a log at 8 kHz changes at the block's instants, at each."""
+    rates = Rates(
+        sensor_hz=4000.0, hand_hz=1000.0, joint_control_hz=2000.0, estimator_hz=500.0, log_hz=8000.0
+    )
+    moving = Sine(
+        duration=1.0, ramp=0.02, frequency=3.0, translation=[0.01] * 3, rotation=[0.1] * 3
+    )
+    scenario = delayed(
+        "none",
+        wrist_sensor__ideal=False,
+        rates=rates,
+        simulation=Simulation(settle=0.0, duration=0.15),
+        operator=OperatorConfig(grip="firm", intent=[moving]),
+        load_estimator__enabled=True,
+    )
+    log = run(scenario, slave).log
+    for signal, rate_hz in {
+        "measured_wrench_S": rates.sensor_hz,
+        "joint_torque": rates.joint_control_hz,
+        "load_estimate": rates.estimator_hz,
+        "master_state": rates.hand_hz,
+        "pose_command": rates.hand_hz,
+        "ports": rates.hand_hz,
+    }.items():
+        rows = np.flatnonzero((log[signal][1:] != log[signal][:-1]).any(axis=1))
+        step = round(rates.log_hz / rate_hz)
+        assert len(np.unique(rows % step)) == 1, signal
+        assert len(rows) > 0.8 * len(log.t) / step, signal
 
 
 def test_the_device_shows_what_it_can(slave):
