@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import JacobianWrtVariable
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.multibody.tree import Frame, JacobianWrtVariable
+from pydrake.systems.framework import Context, DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.channel.channel import Channel
@@ -199,6 +199,16 @@ def in_power_units(wrench_B: np.ndarray) -> np.ndarray:
     return np.hstack([wrench_B[:, :3] @ R_WB.T / TRANSLATION, wrench_B[:, 3:] @ R_WB.T / ROTATION])
 
 
+def the_device() -> tuple[MultibodyPlant, Context, Frame, Frame]:
+    """The Phantom as Drake has it from its SDF, with the frames of stylus and base."""
+    phantom = MultibodyPlant(time_step=0.0)
+    Parser(phantom).AddModels(str(models_dir() / "phantom.sdf"))
+    phantom.WeldFrames(phantom.world_frame(), phantom.GetFrameByName("base"))
+    phantom.Finalize()
+    stylus = phantom.GetFrameByName("stylus")
+    return phantom, phantom.CreateDefaultContext(), stylus, phantom.world_frame()
+
+
 @pytest.fixture(scope="module")
 def direct(slave) -> Recorded:
     return run(turned(), slave)
@@ -356,17 +366,77 @@ def test_every_block_runs_at_its_own_rate(slave):
         assert len(rows) > 0.8 * len(log.t) / step, signal
 
 
+def test_the_masters_signals_are_what_their_names_say(direct):
+    """The device's by Drake's model of it, the hand's by its impedance, at a firm grip."""
+    log, rows = direct.log, np.arange(SETTLED, END)
+    phantom, context, stylus, _ = the_device()
+    for row in rows[::50]:
+        q, v = np.split(log["master_state"][row], 2)
+        serial = serial_joint_angles(np.array([q, v]))  # the same map turns speeds
+        phantom.SetPositions(context, serial[0])
+        phantom.SetVelocities(context, serial[1])
+        X_BE, V_BE = stylus.CalcPoseInWorld(context), stylus.CalcSpatialVelocityInWorld(context)
+        pose, twist = log["pose_master"][row], log["twist_master"][row]
+        np.testing.assert_allclose(pose[4:], X_BE.translation(), atol=EXACT)
+        np.testing.assert_allclose(rotations(pose), X_BE.rotation().matrix(), atol=EXACT)
+        np.testing.assert_allclose(twist[:3], V_BE.translational(), atol=EXACT)
+        np.testing.assert_allclose(twist[3:], V_BE.rotational(), atol=EXACT)
+    intent, (first, second) = log["intent"], direct.scenario.operator.intent
+    level = [np.sin(2 * np.pi * part.frequency * (log.t - 0.4)) for part in (first, second)]
+    p = MASTER_START + np.outer(level[0], first.translation)
+    turns = [
+        Rotation.from_rotvec(np.outer(sine, part.rotation))
+        for sine, part in zip(level, (first, second), strict=True)
+    ]
+    R = (turns[1] * turns[0]).as_matrix()
+    np.testing.assert_allclose(intent[rows, 4:], p[rows], atol=EXACT)
+    np.testing.assert_allclose(rotations(intent)[rows], R[rows], atol=EXACT)
+    wanted = np.gradient(p, PERIOD, axis=0), (steps(R, p)[1:, 3:] / PERIOD)
+    speed = (wanted[1][rows - 1] + wanted[1][rows]) / 2
+    apart = p - log["pose_master"][:, 4:]
+    turned_by = turn(R @ rotations(log["pose_master"]).transpose(0, 2, 1))
+    twist, hand = log["twist_master"][rows], log["hand_wrench_E"][rows]
+    force = 700.0 * apart[rows] + 20.0 * (wanted[0][rows] - twist[:, :3])
+    torque = 3.0 * turned_by[rows] + 0.06 * (speed - twist[:, 3:])
+    # What the intent's speed is wrong by, as a difference over 2 ms.
+    np.testing.assert_allclose(hand[:, :3], force, atol=1e-3 * np.ptp(force))
+    np.testing.assert_allclose(hand[:, 3:], torque, atol=1e-3 * np.ptp(torque))
+
+
+def test_the_slaves_signals_are_what_their_names_say(direct, slave):
+    """Measured, scaled and contact wrench, and the sample's angles."""
+    log = direct.log
+    non_contact = inertial_wrench(log, ESTIMATED * slave.arm.phi_load)
+    contact = log["measured_wrench_S"] - OFFSETS - non_contact
+    np.testing.assert_allclose(log["contact_wrench_S"], contact, atol=1e-11)
+    scaled = GAMMA * contact + SIGMA * non_contact
+    np.testing.assert_allclose(log["scaled_wrench_S"], scaled, atol=1e-11)
+    expected = np.tile(np.concatenate([OFFSETS, ESTIMATED * slave.arm.phi_load]), (len(log.t), 1))
+    np.testing.assert_array_equal(log["load_estimate"], expected)
+    # The sensor's own offset, and the load's weight and inertia.
+    true = inertial_wrench(log, slave.arm.phi_load) + direct.scenario.wrist_sensor.offset
+    error = log["measured_wrench_S"] - true
+    assert (
+        np.abs(error.mean(axis=0))[:3].max() < 0.1 and np.abs(error.mean(axis=0))[3:].max() < 0.01
+    )
+
+
+def test_a_sample_is_of_the_instant_that_the_log_says(over_a_network, slave):
+    """The ideal sensor's, at 4 kHz, the last one before the row's own instant."""
+    log = over_a_network["none"].log
+    age = log.t - log["sample_time"][:, 0]
+    np.testing.assert_allclose(age[1:], 1 / 4000, atol=1e-9)
+    q, v = np.split(log["slave_state"], 2, axis=1)
+    np.testing.assert_allclose(log["joint_position"][1:], (q - v / 4000)[1:], atol=1e-5)
+    assert np.abs(v / 4000).max() > 1e-4
+
+
 def test_the_device_shows_what_it_can(slave):
     """37.5 N, and a torque that no motor of the wrist gives more than its peak for."""
     offsets = np.array([700.0, -500.0, 600.0, 9.0, 15.0, -27.0])
     recorded = run(turned(simulation__duration=0.15), slave, offsets)
     wanted, shown = wanted_at_the_hand(recorded, slave, offsets), recorded.log["force_to_master"]
-    phantom = MultibodyPlant(time_step=0.0)
-    Parser(phantom).AddModels(str(models_dir() / "phantom.sdf"))
-    phantom.WeldFrames(phantom.world_frame(), phantom.GetFrameByName("base"))
-    phantom.Finalize()
-    context, stylus = phantom.CreateDefaultContext(), phantom.GetFrameByName("stylus")
-    base = phantom.world_frame()
+    phantom, context, stylus, base = the_device()
     length = np.linalg.norm(wanted[:, :3], axis=1)
     assert length.min() > 37.5
     np.testing.assert_allclose(
