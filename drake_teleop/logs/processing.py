@@ -19,7 +19,8 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.segments import Segment, segments
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
-from drake_teleop.logs.check.conventions import Finding, check_log, question_fit
+from drake_teleop.logs.check.conventions import check_log, question_fit
+from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.contact import in_contact, noise_floor
 from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log

@@ -34,7 +34,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.logs.check.conventions import Finding, check_conventions, white_noise
+from drake_teleop.logs.check.conventions import check_conventions
+from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.load_fit import white_noise
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import shortest_gap

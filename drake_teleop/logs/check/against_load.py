@@ -1,0 +1,196 @@
+"""The wrench against Eqs. (1)-(2): edits of the description with which some load explains it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from drake_teleop.load.batch.methods import identify_batch
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.identification import Identification
+from drake_teleop.logs.check.edits import edit_field, load_edits, tried
+from drake_teleop.logs.check.finding import CLOCK, Finding
+from drake_teleop.logs.check.load_fit import (
+    BELIEVABLE,
+    LoadFit,
+    decisive_factor,
+    load_fit,
+    unexplained_share,
+)
+from drake_teleop.logs.check.log_data import LogData
+from drake_teleop.logs.read.alignment import low_passed, resample, undelayed
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.delay import SEARCH_RANGE, estimate_delay
+from drake_teleop.logs.read.description import Description
+
+HARDLY = 0.9
+"""A load that leaves more than this share of the wrench's variance drowns in the rest."""
+LAG = 0.002
+"""Delays below this are not mentioned [s]."""
+
+
+def against_load(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
+    """Findings about wrench, orientation and clocks from the load, and the delay."""
+    log = data.read(description)
+    delay = None if log.static else estimate_delay(log, 30.0)
+    thin = data.thin(description)
+
+    def fitted(edited: Description) -> LoadFit:
+        # A delay that was estimated under a wrong description may be wrong too.
+        log = _rewrenched(thin, description, edited) or data.thin(edited)
+        fits = [load_fit(undelayed(log, shift)) for shift in {0.0, delay or 0.0}]
+        return min(fits, key=lambda fit: fit.unexplained)
+
+    given = fitted(description)
+    # Slow motion fits well enough with a wrong clock, but not with a delay within the range.
+    inside = delay is not None and abs(delay) < 0.9 * SEARCH_RANGE
+    edits: list[tuple[Finding | None, Description]] = []
+    if not (given.good and inside):
+        edits += _shifted(description, thin)
+    if not given.good:
+        edits = [*load_edits(description), *edits]
+    found: list[tuple[LoadFit, Finding | None, Description]] = []
+    for finding, edited in edits:
+        fit = tried(fitted, edited)
+        if fit is not None and fit.mass > 0:
+            found.append((fit, finding, edited))
+    # A negative mass is impossible: then it is enough to be as good with a positive one.
+    limit = (
+        given.unexplained * 1.01 if given.mass < 0 else given.unexplained / decisive_factor(given)
+    )
+    limit = min(limit, BELIEVABLE + given.noise)
+    found = [entry for entry in found if entry[0].unexplained < limit]
+    if not found and given.good:
+        return _lag(description, delay) if _shows(thin, delay) else [], delay
+    if not found:
+        return _without_remedy(description, log, given, delay)
+    least = 1.2 * min(fit.unexplained for fit, *_ in found) + 1e-9
+    equals = [(finding, edited) for fit, finding, edited in found if fit.unexplained <= least]
+    finding, edited = equals[0]
+    delay = None if log.static else estimate_delay(data.read(edited), 30.0)
+    if finding is None:  # The clock of the wrench, which the edit set to the nearest 20 ms.
+        assert description.wrench is not None and edited.wrench is not None
+        shift = edited.wrench.time.offset - description.wrench.time.offset + (delay or 0.0)
+        return _lag(description, shift), shift
+    others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
+    message = "; just as possible: ".join([finding.message, *others.values()])
+    return [Finding(finding.name, message), *_lag(description, delay)], delay
+
+
+def _shows(log: Log, delay: float | None) -> bool:
+    """Whether the delay is five standard errors from none: twice a log likelihood ratio of 25."""
+    if delay is None:
+        return False
+    none, aligned = load_fit(log), load_fit(undelayed(log, delay))
+    gain = none.independent * np.log(none.unexplained / (aligned.unexplained + 1e-30))
+    return bool(gain > 25.0)
+
+
+def _rewrenched(log: Log, old: Description, new: Description) -> Log | None:
+    """The log of another description of the wrench, without reading it again; None if it must."""
+    a, b = old.wrench, new.wrench
+    if a is None or b is None or "base" in (a.frame, b.frame):
+        return None
+    changes = {"sign": a.sign, "frame": a.frame, "force": a.force, "torque": a.torque}
+    if new.model_copy(update={"wrench": b.model_copy(update=changes)}) != old:
+        return None
+    R_old, R_new = (np.array(w.frame) if w.frame != "sensor" else np.eye(3) for w in (a, b))
+    parts = []
+    for x, force, again in (
+        (log.wrench[:, :3], a.force.columns, b.force.columns),
+        (log.wrench[:, 3:], a.torque.columns, b.torque.columns),
+    ):
+        if set(force) != set(again) or len(force) != 3:
+            return None
+        given = x @ R_old  # In the axes of the file.
+        parts.append(given[:, [force.index(column) for column in again]] @ R_new.T)
+    return replace(log, wrench=a.sign * b.sign * np.hstack(parts))
+
+
+def _without_remedy(
+    description: Description, log: Log, given: LoadFit, delay: float | None
+) -> tuple[list[Finding], float | None]:
+    """What is left to say of a wrench that no load explains and no edit mends."""
+    smooth = low_passed(log, 30.0)
+    fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
+    load = fit.identification
+    finding = payload_finding(load, given.unexplained - given.noise)
+    if finding:
+        return [finding], None
+    kept = ~fit.rejected
+    wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
+    residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
+    if delay is None or unexplained_share(wrench, residual) > BELIEVABLE + given.noise:
+        return [], None
+    if fit.rejected.any():
+        # A contact pulls at the delay.
+        lost = fit.rejected if log.bridged is None else fit.rejected | log.bridged
+        delay = estimate_delay(replace(log, bridged=lost), 30.0)
+    return _lag(description, delay), delay
+
+
+def payload_finding(load: Identification, unexplained: float) -> Finding | None:
+    """That a record says nothing about the mass of a load, if so.
+
+    Args:
+        load: what was fitted.
+        unexplained: share of the wrench's variance that it leaves, besides noise. With 0.9 the
+            rest (contacts, with the sensor's cross-talk and drift) is at least three times as large
+            as the load's part, and a robust fit believes the samples that suit it.
+    """
+    if load.verdicts[6] != "not" and unexplained < HARDLY:
+        return None
+    deviation = float(load.standard_deviations[6])
+    fitted = f"{load.mass:.2g} ± {deviation:.2g} kg in the fit"
+    if not np.isfinite(deviation):
+        fitted = "nothing here depends on its mass"
+    share = max(0.0, 100 * (1 - unexplained))
+    return Finding(
+        "payload",
+        f"payload not identifiable: {fitted}, which explains {share:.0f} % of the wrench's"
+        " variance; record slow turns about two horizontal axes that touch nothing",
+    )
+
+
+def _shifted(description: Description, log: Log) -> Iterator[tuple[None, Description]]:
+    """The clock of the wrench shifted within 2 s, or a quarter of the record, to the best fit."""
+    if description.wrench is None:
+        return
+    reach = min(2.0, 0.25 * float(log.t[-1] - log.t[0]))
+    smooth = low_passed(log, min(5.0, 0.2 / log.dt))
+    t = np.linspace(log.t[0] + reach, log.t[-1] - reach, 300)
+    wrench = resample(t, smooth.t, smooth.wrench)
+
+    def cost(shift: float) -> float:
+        s, omega, alpha = (resample(t + shift, smooth.t, x) for x in smooth.motion)
+        return load_fit(Log(t, wrench, s, omega, alpha)).unexplained
+
+    shifts = np.arange(-reach, reach + 1e-9, 0.02)
+    best = float(shifts[int(np.argmin([cost(x) for x in shifts]))])
+    if abs(best) < reach - 0.03:
+        offset = description.wrench.time.offset + best
+        yield None, edit_field(description, "wrench.time.offset", offset)
+
+
+def _lag(description: Description, delay: float | None) -> list[Finding]:
+    if delay is None or abs(delay) <= LAG or description.wrench is None:
+        return []
+    side = "behind" if delay > 0 else "ahead of"
+    if abs(delay) > CLOCK:
+        offset = description.wrench.time.offset + delay
+        return [
+            Finding(
+                "clock",
+                f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong;"
+                f" set wrench.time.offset: {offset:.3f} (or shift the others the other way)",
+            )
+        ]
+    return [
+        Finding(
+            "lag",
+            f"the motion is {abs(delay) * 1e3:.1f} ms {side} the wrench; identify takes this out;"
+            f" to say so in the description, add {delay:.4f} to wrench.time.offset",
+        )
+    ]

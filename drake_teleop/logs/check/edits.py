@@ -1,0 +1,183 @@
+"""Edits of a description: each would put one suspected error of convention right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.mounting import right_angled_rotations
+
+
+def _gravity_field(description: Description) -> str | None:
+    if description.imu is not None and description.imu.specific_force is not None:
+        return "imu.specific_force"
+    return "static.gravity" if description.static and description.static.gravity else None
+
+
+def unit_findings(description: Description, log: Log) -> Iterator[Finding]:
+    """That an accelerometer, or gravity at rest, is not in the unit that is given, if so."""
+    field = _gravity_field(description)
+    if field is None:
+        return
+    ratio = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
+    ratio /= float(np.linalg.norm(description.gravity))
+    unit = _field(description, field).unit
+    # 9.81 apart; a median that far from gravity is no motion.
+    if (unit == "m/s^2" and 0.07 < ratio < 0.15) or (unit == "g" and 7 < ratio < 14):
+        yield Finding(
+            "units",
+            f"the accelerometer reads {ratio:.3g} times gravity: it is not in {unit};"
+            f" set {field}.unit: {_other_unit(unit)}",
+        )
+
+
+def _other_unit(unit: str) -> str:
+    return "g" if unit == "m/s^2" else "m/s^2"
+
+
+def in_other_unit(description: Description) -> Description:
+    """The description with that unit exchanged."""
+    field = _gravity_field(description)
+    assert field is not None
+    return edit_field(description, f"{field}.unit", _other_unit(_field(description, field).unit))
+
+
+def _field(description: Description, path: str) -> Any:
+    value: Any = description
+    for name in path.split("."):
+        value = getattr(value, name)
+    return value
+
+
+def edit_field(description: Description, path: str, value: Any) -> Description:
+    """The description with one field changed."""
+    first, *rest = path.split(".", 1)
+    if rest:
+        model: Any = getattr(description, first)
+        value = edit_field(model, rest[0], value)
+    return description.model_copy(update={first: value})
+
+
+Edit = tuple[Finding, Description]
+"""What was seen, and the description without it."""
+
+
+def pose_edits(description: Description) -> Iterator[Edit]:
+    """Orientations in another form, gravity or an accelerometer that point the other way."""
+    pose, imu = description.pose, description.imu
+    if imu is not None and imu.specific_force is not None:
+        yield (
+            Finding(
+                "reversed gravity",
+                "the accelerometer reads g - a: gravity is reversed;"
+                f" set imu.sign: {-imu.sign} (or turn the vector `gravity` if z points down)",
+            ),
+            edit_field(description, "imu.sign", -imu.sign),
+        )
+    field = "static.orientation" if description.static else "pose.orientation"
+    orientation = pose.orientation if pose else getattr(description.static, "orientation", None)
+    if orientation is None:
+        return
+    if imu is None or imu.specific_force is None:
+        turned = tuple(0.0 - x for x in description.gravity)
+        yield (
+            Finding(
+                "reversed gravity",
+                f"gravity is reversed; set gravity: {list(turned)}, a vector in the world",
+            ),
+            edit_field(description, "gravity", turned),
+        )
+    inverse = orientation.inverse
+    yield (
+        Finding(
+            "inverted orientation",
+            "the orientation is that of the world in S, R_SW, not R_WS;"
+            f" set {field}.inverse: {str(not inverse).lower()}",
+        ),
+        edit_field(description, f"{field}.inverse", not inverse),
+    )
+    forms = {"quaternion_wxyz": "quaternion_xyzw", "quaternion_xyzw": "quaternion_wxyz"}
+    if orientation.form in forms:
+        other = forms[orientation.form]
+        yield (
+            Finding(
+                "quaternion order",
+                f"the quaternions are not {orientation.form}; set {field}.form: {other}",
+            ),
+            edit_field(description, f"{field}.form", other),
+        )
+    if orientation.form == "rotation_vector":
+        unit = "deg" if orientation.unit == "rad" else "rad"
+        yield (
+            Finding(
+                "degrees",
+                f"the rotation vectors are not in {orientation.unit}; set {field}.unit: {unit}",
+            ),
+            edit_field(description, f"{field}.unit", unit),
+        )
+
+
+def tried(function: Callable[[Description], Any], edited: Description) -> Any:
+    """What the function makes of an edited description; None if such a log cannot be read."""
+    try:
+        return function(edited)
+    except DrakeTeleopError:
+        return None
+
+
+def load_edits(description: Description) -> Iterator[Edit]:
+    """A wrench of the other sign or in other axes, a gyroscope in degrees, and `pose_edits`."""
+    stream = "static" if description.static else "wrench"
+    sensor: Any = getattr(description, stream)
+    yield (
+        Finding("sign", f"the sign of the wrench is inverted; set {stream}.sign: {-sensor.sign}"),
+        edit_field(description, f"{stream}.sign", -sensor.sign),
+    )
+    yield from pose_edits(description)
+    if sensor.frame == "sensor":
+        yield (
+            Finding(
+                "base axes",
+                f"the wrench is in the axes of the base; set {stream}.frame: base",
+            ),
+            edit_field(description, f"{stream}.frame", "base"),
+        )
+    elif sensor.frame == "base":
+        yield (
+            Finding("base axes", f"the wrench is not in base axes; set {stream}.frame: sensor"),
+            edit_field(description, f"{stream}.frame", "sensor"),
+        )
+    imu = description.imu
+    if imu is not None and imu.angular_velocity and imu.angular_velocity.unit == "rad/s":
+        yield (
+            Finding("degrees", "the gyroscope is in degrees; set imu.angular_velocity.unit: deg/s"),
+            edit_field(description, "imu.angular_velocity.unit", "deg/s"),
+        )
+    for order in list(permutations(range(3)))[1:]:
+        if len(sensor.force.columns) == 3 and len(sensor.torque.columns) == 3:
+            force, torque = (
+                tuple(x.columns[i] for i in order) for x in (sensor.force, sensor.torque)
+            )
+            edited = edit_field(description, f"{stream}.force.columns", force)
+            yield (
+                Finding(
+                    "swapped axes",
+                    f"axes of the wrench are exchanged; set {stream}.force.columns: {list(force)}"
+                    f" and {stream}.torque.columns: {list(torque)}",
+                ),
+                edit_field(edited, f"{stream}.torque.columns", torque),
+            )
+    old = np.array(sensor.frame) if isinstance(sensor.frame, tuple) else np.eye(3)
+    for R in right_angled_rotations()[1:] if sensor.frame != "base" else ():
+        frame = (R @ old).tolist()
+        yield (
+            Finding("swapped axes", f"the wrench is in other axes; set {stream}.frame: {frame}"),
+            edit_field(description, f"{stream}.frame", tuple(map(tuple, frame))),
+        )

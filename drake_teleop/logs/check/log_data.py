@@ -1,0 +1,100 @@
+"""A log's tables, to be read with one description after the other: whole, or thinned to 100 Hz."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.logs.read.bags import read_stream
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.description import Description, Time
+from drake_teleop.logs.read.reading import read_description
+from drake_teleop.logs.read.tables import Table
+
+_RATE = 100.0
+_STAMPS = "time stamps of a stream without"
+
+
+class LogData:
+    """The tables of a log, as they are and thinned."""
+
+    def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
+        self._source = source
+        self._tables = tables
+        self._thinned: dict[Path, Table] = {}
+        steps: dict[Path, list[int]] = {}
+        for stream in _streams(description):
+            if stream.source not in tables:
+                tables[stream.source] = read_stream(stream)
+            steps.setdefault(stream.source, []).append(self._stride(description, stream))
+        for stream in _streams(description):
+            thin = self._thinned.setdefault(
+                stream.source,
+                replace(tables[stream.source], columns=dict(tables[stream.source].columns)),
+            )
+            self._thin(stream, thin, min(steps[stream.source]))
+
+    def read(self, description: Description) -> Log:
+        """The whole log."""
+        return read_description(description, self._source, tables=self._tables)
+
+    def thin(self, description: Description) -> Log:
+        """The log with as many samples as a comparison needs."""
+        stamped = {
+            name: stream.model_copy(
+                update={"time": stream.time.model_copy(update={"column": _STAMPS, "rate": None})}
+            )
+            for name in ("wrench", "imu", "pose")
+            if (stream := getattr(description, name)) and stream.time.column is None
+        }
+        description = description.model_copy(update=stamped)
+        return read_description(description, self._source, tables=self._thinned)
+
+    def start(self, stream: Any, description: Description) -> float:
+        """When the stream's first row was taken, on the common clock [s]."""
+        if stream.time.column is None:
+            return float(stream.time.offset)
+        t = self._tables[stream.source].raw(stream.time.column, "time")
+        return float(t[0, 0]) * description.scale(stream.time.unit) + stream.time.offset
+
+    def _stride(self, description: Description, stream: Any) -> int:
+        """Rows that become one; an odd number, so that one of them is in the middle."""
+        time: Time | None = getattr(stream, "time", None)
+        if time is None:
+            return 1
+        if time.rate is not None:
+            rate = time.rate
+        else:
+            t = self._tables[stream.source].raw(str(time.column), "time")[:, 0]
+            rate = 1 / max(1e-12, float(np.median(np.diff(t))) * description.scale(time.unit))
+        return max(1, math.floor((rate / _RATE - 1) / 2) * 2 + 1)
+
+    def _thin(self, stream: Any, thin: Table, k: int) -> None:
+        """Means over k rows; of an orientation, which has no mean, the row in the middle."""
+        table = self._tables[stream.source]
+        for field in type(stream).model_fields:
+            quantity = getattr(stream, field)
+            for column in map(str, getattr(quantity, "columns", ())):
+                x = table.raw(column, field)
+                taken = x[k // 2 :: k][: len(x) // k]
+                thin.columns[column] = taken if field == "orientation" else _means(x, k)
+        time: Time | None = getattr(stream, "time", None)
+        if time is not None and time.column is not None:
+            thin.columns[str(time.column)] = _means(table.raw(time.column, "time"), k)
+        elif time is not None and time.rate is not None:
+            thin.columns[_STAMPS] = _means(np.arange(table.rows)[:, None] / time.rate, k)
+
+
+def _streams(description: Description) -> list[Any]:
+    streams = (getattr(description, name) for name in ("wrench", "imu", "pose", "static"))
+    return [stream for stream in streams if stream is not None]
+
+
+def _means(x: NDArray[np.float64], k: int) -> NDArray[np.float64]:
+    rows = len(x) // k
+    return x[: rows * k].reshape(rows, k, -1).mean(axis=1) if k > 1 else x
