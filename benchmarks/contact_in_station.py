@@ -44,7 +44,7 @@ from drake_teleop.identification import (
     slave_arm,
 )
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.contact.detection import NoiseFloor
+from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.operator.operator import OperatorConfig, Sine
 from drake_teleop.pages.progress import progress_bars
 from drake_teleop.result import SimulationResult

@@ -21,7 +21,8 @@ from drake_teleop.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.contact.detection import NoiseFloor, finite_covariance, fit_noise_floor
+from drake_teleop.load.contact.noise_floor import NoiseFloor, finite_covariance
+from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.pages.progress import Progress, Stage, silent

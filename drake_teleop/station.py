@@ -18,7 +18,7 @@ from drake_teleop.channel.network import NetworkConfig, mean_delay
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.estimation.contact_detection import ContactDetection
 from drake_teleop.estimation.load_estimator import LoadEstimator
-from drake_teleop.load.contact.detection import NoiseFloor
+from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.sample import sample_parts, sample_size
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.master import device

@@ -16,7 +16,7 @@ from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.load.compensation import scaled_wrench
-from drake_teleop.load.contact.detection import NoiseFloor
+from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.master import device
 from drake_teleop.master.device import JointFriction

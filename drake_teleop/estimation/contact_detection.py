@@ -1,6 +1,6 @@
 """Contact at the slave: noticed in the eliminated wrench, sample by sample, and told to the hand.
 
-What is noticed, and why fast motion is not contact, says `drake_teleop.load.contact.detection`. The
+What is noticed, and why fast motion is not contact, says `drake_teleop.load.contact`. The
 noise floor and the threshold come from free motion of the same load with the same sensor: the
 identification run that precedes the station.
 """
@@ -14,13 +14,8 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.load.compensation import scaled_wrench_into
-from drake_teleop.load.contact.detection import (
-    MARGIN,
-    STATISTICS,
-    ContactDetector,
-    NoiseFloor,
-    flag_update,
-)
+from drake_teleop.load.contact.detection import ContactDetector, flag_update
+from drake_teleop.load.contact.noise_floor import MARGIN, STATISTICS, NoiseFloor
 from drake_teleop.load.sample import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,

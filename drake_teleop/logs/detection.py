@@ -9,7 +9,7 @@ free                   the log of free motion that floor and threshold are of; n
                        of the log itself in which nothing stands out
                        (`drake_teleop.logs.contact.in_contact`)
 free_s                 how much free motion that was
-statistic, threshold   see `drake_teleop.load.contact.detection`
+statistic, threshold   see `drake_teleop.load.contact.statistics`
 noise                  [f; tau], standard deviation at rest
 per_acceleration       (6, 2) how it grows per m/s^2 and per rad/s^2
 above_threshold        share of the samples whose statistic reaches the threshold
@@ -35,17 +35,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.contact.detection import (
+from drake_teleop.load.contact.detection import ContactDetector
+from drake_teleop.load.contact.noise_floor import (
     MARGIN,
     STATISTICS,
-    ContactDetector,
     NoiseFloor,
     finite_covariance,
-    fit_noise_floor,
     statistic_index,
-    statistics,
-    wrench_axis,
 )
+from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
+from drake_teleop.load.contact.statistics import statistics
+from drake_teleop.load.contact.wrench_axis import wrench_axis
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.commands import common_figures, plain, print_results, write_summary
 from drake_teleop.logs.contact import contacts_of

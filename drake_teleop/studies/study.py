@@ -58,7 +58,7 @@ from drake_teleop.identification import (
     identify_load,
     slave_arm,
 )
-from drake_teleop.load.contact.detection import NoiseFloor
+from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.quantities import check_ranges, check_structure
 from drake_teleop.resources import studies_dir
 from drake_teleop.result import SimulationResult

@@ -11,7 +11,8 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.estimation.contact_detection import ContactDetection, ContactDetectionConfig
 from drake_teleop.identification import identification_scenario, identify_load
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.contact.detection import ContactDetector, NoiseFloor
+from drake_teleop.load.contact.detection import ContactDetector
+from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.run import in_contact, slave_arm
 from drake_teleop.scenario import LoadScenario, replace
