@@ -30,8 +30,8 @@ from drake_teleop.excitation.design import MARGIN, design
 from drake_teleop.excitation.excite import best_checked, criteria_of, excite, sensor_motion
 from drake_teleop.excitation.problem import Problem, Task
 from drake_teleop.excitation.robot import Robot, RobotFromScenario
-from drake_teleop.load.identification import identify
 from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
+from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.scenario import LoadScenario
 

@@ -31,12 +31,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from drake_teleop.load.batch.consistent import consistent_least_squares
-from drake_teleop.load.identification import NormalEquations, identify
 from drake_teleop.load.inertia import (
     is_physically_consistent,
     phi_from_mass_com_inertia,
     pseudo_inertia,
 )
+from drake_teleop.load.normal_equations import NormalEquations, identify
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.regressor import (

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from scipy.signal import butter, lfilter
 
 from drake_teleop.load.batch.uncertainty import intervals
-from drake_teleop.load.identification import PARAMETERS, Identification, identify
+from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 
 Array = NDArray[np.float64]

@@ -26,7 +26,7 @@ from rich.table import Table
 from scipy.interpolate import make_interp_spline
 
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.identification import identify
+from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.sensor.motion_estimation import (
     MotionEstimationConfig,

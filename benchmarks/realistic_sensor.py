@@ -35,8 +35,9 @@ from drake_teleop.identification import (
 )
 from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.identification import Identification, identify
+from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
+from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario

@@ -16,7 +16,8 @@ from drake_teleop.errors import DrakeTeleopError
 if TYPE_CHECKING:
     from drake_teleop.identification import identify_load
     from drake_teleop.load.compensation import contact_wrench, scaled_wrench
-    from drake_teleop.load.identification import Identification, identify
+    from drake_teleop.load.identification import Identification
+    from drake_teleop.load.normal_equations import identify
     from drake_teleop.load.regressor import non_contact_wrench, regressor
     from drake_teleop.logs.processing import eliminate_log, identify_log
     from drake_teleop.logs.read.reading import read_log
@@ -53,7 +54,8 @@ _HOMES = {
     "identification": ("identify_load",),
     "run": ("run_scenario",),
     "load.compensation": ("contact_wrench", "scaled_wrench"),
-    "load.identification": ("Identification", "identify"),
+    "load.identification": ("Identification",),
+    "load.normal_equations": ("identify",),
     "load.regressor": ("non_contact_wrench", "regressor"),
     "logs.processing": ("eliminate_log", "identify_log"),
     "logs.read.reading": ("read_log",),

@@ -68,3 +68,11 @@ def checked_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list
         for table in tables.values()
     ]
     return leading, rows
+
+
+def positive(name: str, value: ArrayLike, *shape: int) -> Array:
+    """`value` as a `checked` array of positive numbers."""
+    array = checked(name, value, *shape)
+    if not (array > 0.0).all():
+        raise DrakeTeleopError("is not positive throughout", where=name)
+    return array

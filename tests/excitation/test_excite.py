@@ -20,8 +20,9 @@ from drake_teleop.excitation.limits import LIMITS, empty_motions, motions_of, se
 from drake_teleop.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
 from drake_teleop.identification import identify_load
-from drake_teleop.load.identification import Identification, identify
+from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
+from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.scenario import LoadScenario, replace

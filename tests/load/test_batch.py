@@ -16,13 +16,14 @@ from drake_teleop.load.batch.consistent import Prior
 from drake_teleop.load.batch.methods import METHODS, NAMES, Options, Record, identify_batch
 from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.identification import METHODS as KNOWN_NAMES
-from drake_teleop.load.identification import Identification, identify
+from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import (
     is_physically_consistent,
     mass_com_inertia,
     phi_from_mass_com_inertia,
     transform_phi,
 )
+from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 TRUTH = np.concatenate([OFFSETS, TOOL])

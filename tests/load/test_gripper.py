@@ -9,8 +9,9 @@ import pytest
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.gripper import consistency_margin, identified_object
-from drake_teleop.load.identification import Identification, identify
+from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 
 GRIPPER = phi_from_mass_com_inertia(1.2, [0.0, 0.01, 0.05], np.diag([0.004, 0.004, 0.002]))

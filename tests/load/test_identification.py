@@ -10,7 +10,8 @@ import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.identification import PARAMETERS, Identification, NormalEquations, identify
+from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.load.normal_equations import NormalEquations, identify
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data"

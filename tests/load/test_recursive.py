@@ -7,7 +7,7 @@ import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.identification import identify
+from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 

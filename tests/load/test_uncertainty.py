@@ -21,13 +21,8 @@ from drake_teleop.load.batch.uncertainty import (
     prior_dominated,
     wrench_standard_deviations,
 )
-from drake_teleop.load.identification import (
-    PARAMETERS,
-    Identification,
-    NormalEquations,
-    identify,
-    natural_scale,
-)
+from drake_teleop.load.identification import PARAMETERS, Identification, natural_scale
+from drake_teleop.load.normal_equations import NormalEquations, identify
 from drake_teleop.load.online.recursive import RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 

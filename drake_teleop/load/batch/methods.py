@@ -64,7 +64,8 @@ from drake_teleop.load.batch.moments import (
 )
 from drake_teleop.load.batch.total_least_squares import NormalForm, total_least_squares
 from drake_teleop.load.batch.uncertainty import prior_dominated
-from drake_teleop.load.identification import Identification, NormalEquations, worth_stating
+from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 _CHUNK = 2**15

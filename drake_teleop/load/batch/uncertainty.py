@@ -19,9 +19,9 @@ from drake_teleop.load.identification import (
     PARAMETERS,
     WORTH_STATING,
     Identification,
-    NormalEquations,
     natural_scale,
 )
+from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 
 _MANY_DEGREES = 1e6  # beyond, Student's t is the normal distribution to six digits

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked
+from drake_teleop.load.arrays import Array, checked, positive
 from drake_teleop.load.contact.memory import (
     COUNT,
     FIRST_STATISTIC,
@@ -29,7 +29,6 @@ from drake_teleop.load.contact.memory import (
 )
 from drake_teleop.load.contact.noise_floor import NoiseFloor, checked_motion, statistic_index
 from drake_teleop.load.contact.statistics import LEAVE, SLACK, detection_update
-from drake_teleop.load.identification import positive
 
 
 @njit(cache=True)

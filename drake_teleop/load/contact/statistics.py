@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_teleop._compiled import njit
-from drake_teleop.load.arrays import Array
+from drake_teleop.load.arrays import Array, positive
 from drake_teleop.load.contact.memory import (
     COUNT,
     FIRST_STATISTIC,
@@ -53,7 +53,6 @@ from drake_teleop.load.contact.noise_floor import (
     hold_peaks,
     parameter_variance,
 )
-from drake_teleop.load.identification import positive
 
 SLACK = 1.0
 """Of the cumulative sum [standard deviations]. Half of the shift to be noticed is best in white

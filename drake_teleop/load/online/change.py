@@ -47,8 +47,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked, checked_rows
-from drake_teleop.load.identification import METHODS, Identification, positive, worth_stating
+from drake_teleop.load.arrays import Array, checked, checked_rows, positive
+from drake_teleop.load.identification import METHODS, Identification, worth_stating
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import PRIOR_STD
 from drake_teleop.load.regressor import non_contact_wrench_into, regressor_into

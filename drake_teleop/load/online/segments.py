@@ -31,16 +31,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.load.arrays import Array, checked_rows
+from drake_teleop.load.arrays import Array, checked_rows, positive
 from drake_teleop.load.batch.moments import Moments, normal_equations, residual_covariance
 from drake_teleop.load.gripper import SIGNIFICANT, consistency_margin, identified_object
-from drake_teleop.load.identification import (
-    WORTH_STATING,
-    Identification,
-    NormalEquations,
-    natural_scale,
-    positive,
-)
+from drake_teleop.load.identification import WORTH_STATING, Identification, natural_scale
+from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.online.change import BLOCK
 from drake_teleop.load.regressor import non_contact_wrench
 
