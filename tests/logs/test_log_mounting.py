@@ -22,7 +22,8 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.check.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.description import Description, load_description
-from drake_teleop.logs.read.mounting import Mounting, find_mounting, lever_arm_from_wrench
+from drake_teleop.logs.read.lever_arm import lever_arm_from_wrench
+from drake_teleop.logs.read.mounting import Mounting, find_mounting
 from drake_teleop.logs.read.reading import read_description, read_log
 from drake_teleop.logs.read.tables import Table
 

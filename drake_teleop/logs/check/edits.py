@@ -12,7 +12,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
-from drake_teleop.logs.read.mounting import right_angled_rotations
+from drake_teleop.logs.read.rotations import right_angled_rotations
 
 
 def _gravity_field(description: Description) -> str | None:

@@ -19,6 +19,7 @@ from drake_teleop.logs.read.alignment import (
     spacing,
     uniform_times,
 )
+from drake_teleop.logs.read.auto_mounting import describe_mounting
 from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, gaps, read_clock
@@ -32,7 +33,6 @@ from drake_teleop.logs.read.description import (
     Wrench,
     load_description,
 )
-from drake_teleop.logs.read.mounting import describe_mounting
 from drake_teleop.logs.read.rotations import (
     WIDTHS,
     nearest_rotation,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations, product
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,3 +56,13 @@ def _from_rotation_vectors(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     half = np.linalg.norm(vectors, axis=1, keepdims=True) / 2
     # np.sinc(x) is sin(pi x) / (pi x), so there is nothing to divide by at angle 0.
     return np.hstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * vectors])
+
+
+def right_angled_rotations() -> list[NDArray[np.float64]]:
+    """The 24 rotations (3, 3) that exchange and turn axes, the identity first."""
+    matrices = [
+        np.diag(signs) @ np.eye(3)[list(order)]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+    return [R for R in matrices if np.linalg.det(R) > 0]

@@ -1,0 +1,109 @@
+"""How far the clock of an IMU is behind that of the pose, whatever the axes of either."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.logs.read.alignment import resample
+from drake_teleop.logs.read.canonical import Log
+
+# A drift is believed from this likelihood ratio (twice its logarithm), and if it amounts to this.
+_LIKELIHOOD, _DRIFTED = 50.0, 0.01
+
+
+Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
+"""Of each sensor, the pose's signal and the IMU's, see `signal_pairs`."""
+
+
+def signal_pairs(t: NDArray[np.float64], imu: Log, pose: Log, gyroscope: bool) -> Pairs:
+    """Of each sensor, the signal (N, 3) of the pose at `t`, and that of the IMU on its clock."""
+    pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
+    if gyroscope:
+        pairs.append((resample(t, pose.t, pose.angular_velocity), imu.angular_velocity))
+    return pairs
+
+
+def best_shift(
+    t: NDArray[np.float64],
+    pairs: Pairs,
+    t_imu: NDArray[np.float64],
+    reach: float,
+    arm: NDArray[np.float64],
+) -> float:
+    """The shift at which free maps leave least, beyond what is linear in `arm` (N, k)."""
+    U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
+    U = U[:, singular > 1e-3 * singular[0]]
+
+    def beyond(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return x - U @ (U.T @ x)
+
+    def cost(shift: float) -> float:
+        return sum(_unmapped(beyond(y), beyond(resample(t + shift, t_imu, x))) for y, x in pairs)
+
+    step = 0.01
+    shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
+    costs = np.array([cost(shift) for shift in shifts])
+    best = int(np.argmin(costs))
+    lag = float(shifts[best])
+    if 0 < best < len(shifts) - 1:
+        below, least, above = costs[best - 1 : best + 2]
+        lag += 0.5 * step * float((below - above) / (below - 2 * least + above + 1e-300))
+    return lag
+
+
+def clock_drift(
+    t: NDArray[np.float64],
+    pairs: Pairs,
+    t_imu: NDArray[np.float64],
+    lag: float,
+    independent: float,
+) -> tuple[float, float]:
+    """Lag in the middle and its growth, by Gauss-Newton steps from a constant lag.
+
+    Args:
+        t: (N,) times on the clock of the pose.
+        pairs: of signals at `t` and signals of the IMU at `t_imu`, each mapped freely.
+        t_imu: times on the clock of the IMU.
+        lag: the best constant lag [s].
+        independent: how many samples of such signals say something new.
+
+    Returns:
+        the lag in the middle [s] and its growth [s/s]; `lag` and 0 if the likelihood of a constant
+        lag is not exceeded decisively, or the lag changes by less than 10 ms.
+    """
+    tau = t - t.mean()
+    found = np.array([lag, 0.0])
+    start = cost = np.inf
+    for step in range(10):
+        rows, left, cost = [], [], 0.0
+        for y, x in pairs:
+            at = t + found[0] + found[1] * tau
+            moved, h = resample(at, t_imu, x), 0.01
+            rate = (resample(at + h, t_imu, x) - resample(at - h, t_imu, x)) / (2 * h)
+            basis = np.column_stack([np.ones(len(t)), moved])
+            Q = np.linalg.qr(basis)[0]
+            mapped = np.linalg.lstsq(basis, y, rcond=1e-6)[0][1:]
+            # What a small shift does, beyond what another map could do as well.
+            effects = [rate @ mapped, tau[:, None] * (rate @ mapped)]
+            size = np.sqrt(y.var(axis=0).sum() + 1e-12)
+            rows.append(np.stack([(e - Q @ (Q.T @ e)).ravel() / size for e in effects], axis=1))
+            left.append(((y - y.mean(axis=0)) - (moved - moved.mean(axis=0)) @ mapped) / size)
+            cost += float(left[-1].var(axis=0).sum())
+        if step == 0:
+            start = cost
+        residual = np.concatenate([r.ravel() for r in left])
+        found = found + np.linalg.lstsq(np.vstack(rows), residual, rcond=1e-6)[0]
+    gain = independent * np.log(start / (cost + 1e-300))
+    moved_s = abs(found[1]) * float(t[-1] - t[0])
+    if gain < _LIKELIHOOD or moved_s < _DRIFTED:
+        return lag, 0.0
+    return float(found[0]), float(found[1])
+
+
+def _unmapped(y: NDArray[np.float64], x: NDArray[np.float64]) -> float:
+    """Share of the variance of y (N, 3) that no affine map of x (N, 3) explains."""
+    y, x = y - y.mean(axis=0), x - x.mean(axis=0)
+    both, total = x.T @ y, float((y * y).sum()) + 1e-12 * len(y)
+    explained = (both * (np.linalg.pinv(x.T @ x, rcond=1e-12, hermitian=True) @ both)).sum()
+    return float((y * y).sum() - explained) / total
