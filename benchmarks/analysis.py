@@ -27,18 +27,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from drake_teleop.analysis import absolute_stability, margins, transparency, two_port
+from drake_teleop.analysis.cut_loop import cut_loop, delay_margin, loop_response
 from drake_teleop.analysis.maps import StabilityMap, stability_map
 from drake_teleop.analysis.one_axis import OneAxis, device_impedance, environment_impedance
-from drake_teleop.analysis.sampled_loop import (
-    Sampling,
-    cut_loop,
-    delay_margin,
-    delay_steps,
-    growth_rate,
-    loop_response,
-    sampled_loop,
-    sampled_two_port,
-)
+from drake_teleop.analysis.period_map import Sampling, delay_steps
+from drake_teleop.analysis.sampled_loop import growth_rate, sampled_loop, sampled_two_port
 from drake_teleop.operator.operator import GRIPS
 from drake_teleop.sensor.sensor_chain import butterworth_sections
 

@@ -15,6 +15,7 @@ from drake_teleop.analysis.absolute_stability import (
     stiffness_limit,
     worst_loads,
 )
+from drake_teleop.analysis.cut_loop import cut_loop, unstable_multipliers
 from drake_teleop.analysis.linearization import AXES, hybrid_along, linearize
 from drake_teleop.analysis.margins import (
     delay_independent_mass,
@@ -22,12 +23,8 @@ from drake_teleop.analysis.margins import (
     tolerated_mass_error,
 )
 from drake_teleop.analysis.one_axis import OneAxis
-from drake_teleop.analysis.sampled_loop import (
-    Sampling,
-    cut_loop,
-    sampled_two_port,
-    unstable_multipliers,
-)
+from drake_teleop.analysis.period_map import Sampling
+from drake_teleop.analysis.sampled_loop import sampled_two_port
 from drake_teleop.analysis.task_direction import OneAxisFromScenario, task_direction
 from drake_teleop.analysis.two_port import absorb, hybrid
 from drake_teleop.identification import slave_arm

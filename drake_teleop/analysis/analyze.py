@@ -40,6 +40,13 @@ from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 
 from drake_teleop.analysis import absolute_stability, margins, sampled_wall, transparency
+from drake_teleop.analysis.cut_loop import (
+    cut_loop,
+    delay_margin,
+    dominant_multiplier,
+    loop_response,
+    unstable_multipliers,
+)
 from drake_teleop.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.analysis.linearization import (
     AXES,
@@ -51,16 +58,9 @@ from drake_teleop.analysis.linearization import (
 )
 from drake_teleop.analysis.maps import RATE, StabilityMap, stability_map
 from drake_teleop.analysis.one_axis import Complex, OneAxis
+from drake_teleop.analysis.period_map import Sampling
 from drake_teleop.analysis.report import Curves, print_tables, write_report
-from drake_teleop.analysis.sampled_loop import (
-    Sampling,
-    cut_loop,
-    delay_margin,
-    dominant_multiplier,
-    loop_response,
-    sampled_two_port,
-    unstable_multipliers,
-)
+from drake_teleop.analysis.sampled_loop import sampled_two_port
 from drake_teleop.analysis.task_direction import TIP, TaskDirection, task_direction
 from drake_teleop.analysis.two_port import (
     absorb,

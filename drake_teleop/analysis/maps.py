@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drake_teleop.analysis.cut_loop import CutLoop, cut_loop, loop_response, unstable_multipliers
 from drake_teleop.analysis.one_axis import (
     Complex,
     OneAxis,
@@ -26,13 +27,7 @@ from drake_teleop.analysis.one_axis import (
     environment_impedance,
     hand_impedance,
 )
-from drake_teleop.analysis.sampled_loop import (
-    CutLoop,
-    Sampling,
-    cut_loop,
-    loop_response,
-    unstable_multipliers,
-)
+from drake_teleop.analysis.period_map import Sampling
 from drake_teleop.analysis.transparency import ideal_impedance
 from drake_teleop.errors import DrakeTeleopError
 

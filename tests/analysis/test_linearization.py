@@ -14,7 +14,8 @@ from drake_teleop.analysis.linearization import (
     linearize_station,
 )
 from drake_teleop.analysis.one_axis import device_impedance
-from drake_teleop.analysis.sampled_loop import Sampling, sampled_two_port
+from drake_teleop.analysis.period_map import Sampling
+from drake_teleop.analysis.sampled_loop import sampled_two_port
 from drake_teleop.analysis.task_direction import TIP, task_direction
 from drake_teleop.analysis.two_port import hybrid
 from drake_teleop.channel.channel import Channel

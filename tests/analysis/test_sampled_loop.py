@@ -14,20 +14,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drake_teleop.analysis.one_axis import OneAxis
-from drake_teleop.analysis.sampled_loop import (
+from drake_teleop.analysis.cut_loop import (
     CutLoop,
-    Sampling,
     cut_loop,
     delay_margin,
     dominant_multiplier,
-    growth_rate,
     loop_response,
+    unstable_multipliers,
+)
+from drake_teleop.analysis.one_axis import OneAxis
+from drake_teleop.analysis.period_map import Sampling
+from drake_teleop.analysis.sampled_loop import (
+    growth_rate,
     multipliers,
     sampled_loop,
     sampled_response,
     sampled_two_port,
-    unstable_multipliers,
 )
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.operator.operator import GRIPS

@@ -1,8 +1,6 @@
 """Least squares whose standard deviations are those of a jackknife.
 
-It leaves out one of 20 blocks of time after the other, so that residuals may be coloured. The
-deviations contain noise, but not what interpolation between the samples of a pose does (about 0.1 %
-of a lever arm) nor the errors of scale of an accelerometer.
+It leaves out one of 20 blocks of time after the other, so that residuals may be coloured.
 """
 
 from __future__ import annotations
