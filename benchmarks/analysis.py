@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from drake_teleop.analysis import absolute_stability, margins, transparency, two_port
+from drake_teleop.analysis import absolute_stability, delayed_loop, margins, transparency, two_port
 from drake_teleop.analysis.cut_loop import cut_loop, delay_margin, loop_response
 from drake_teleop.analysis.maps import StabilityMap, stability_map
 from drake_teleop.analysis.one_axis import OneAxis, device_impedance, environment_impedance
@@ -195,7 +195,7 @@ def margin_rows() -> list[dict[str, Any]]:
     cases.append(("light", held("light", sigma=1.0, wall_stiffness=0.0), 0.13))
     rows = []
     for grip, axis, longest in cases:
-        continuous = float(margins.delay_margin(margins.station_loop(axis)))
+        continuous = float(delayed_loop.delay_margin(delayed_loop.station_loop(axis)))
         rows.append(
             {
                 "grip": grip,
@@ -297,7 +297,7 @@ def analyse(axis: OneAxis, omega: Array) -> None:
     hands, walls = absolute_stability.range_of_grips(), WALL_RANGE
     absolute_stability.can_oscillate(H, omega, hands, walls)
     absolute_stability.bounded_singular_value(H, omega, hands, walls)
-    margins.margins(margins.station_loop(axis))
+    margins.margins(delayed_loop.station_loop(axis))
     loop = cut_loop(axis, JR3)
     delay_margin(loop)
     loop_response(loop, omega, axis.delay)

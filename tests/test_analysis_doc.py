@@ -16,12 +16,9 @@ from drake_teleop.analysis.absolute_stability import (
     worst_loads,
 )
 from drake_teleop.analysis.cut_loop import cut_loop, unstable_multipliers
+from drake_teleop.analysis.delay_limits import delay_independent_mass, tolerated_mass_error
+from drake_teleop.analysis.delayed_loop import held_device
 from drake_teleop.analysis.linearization import AXES, hybrid_along, linearize
-from drake_teleop.analysis.margins import (
-    delay_independent_mass,
-    held_device,
-    tolerated_mass_error,
-)
 from drake_teleop.analysis.one_axis import OneAxis
 from drake_teleop.analysis.period_map import Sampling
 from drake_teleop.analysis.sampled_loop import sampled_two_port

@@ -10,23 +10,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from drake_teleop.analysis.margins import (
-    DelayedLoop,
+from drake_teleop.analysis.delay_limits import (
     contact_delay_margin,
     delay_independent_mass,
     delay_independent_stiffness,
-    delay_margin,
-    encirclements,
-    held_device,
-    margins,
-    margins_of_response,
-    nyquist_frequencies,
-    stable_delays,
-    station_loop,
     tolerated_mass_error,
     unstable_delays_of_mass,
+)
+from drake_teleop.analysis.delayed_loop import (
+    DelayedLoop,
+    delay_margin,
+    held_device,
+    stable_delays,
+    station_loop,
     unstable_poles,
 )
+from drake_teleop.analysis.margins import margins, margins_of_response
+from drake_teleop.analysis.nyquist import encirclements, nyquist_frequencies
 from drake_teleop.analysis.one_axis import (
     OneAxis,
     device_impedance,
