@@ -47,8 +47,9 @@ from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.contact.statistics import statistics
 from drake_teleop.load.contact.wrench_axis import wrench_axis
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.commands import common_figures, plain, print_results, write_summary
 from drake_teleop.logs.contact import contacts_of
+from drake_teleop.logs.figures import common_figures, plain, write_summary
+from drake_teleop.logs.printing import print_results
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
 from drake_teleop.logs.read.alignment import low_pass
 

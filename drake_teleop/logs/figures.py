@@ -1,0 +1,247 @@
+"""The figures of `drake-teleop identify` and `drake-teleop eliminate`.
+
+Names in the summaries (and in summary.json); forces in N, torques in N m, frame S:
+
+====================== ==========================================================================
+both
+====================== ==========================================================================
+log                    the file that was read
+samples, duration_s    samples used, and the time that they span
+rate_hz                of the log on its common clock; 0 for static poses
+cutoff_hz              zero-phase low-pass on everything; null if there was none
+delay_s                how far the motion lags behind the wrench; it was moved forward by this
+delay_source           "given", "estimated" (from this record), "load" (of the load file, because
+                       this record does not determine it), "undetermined" (0 was used), or
+                       "static" (poses at rest have none)
+notes                  what had to be assumed, and the findings, in words
+findings               list of name and message: suspected errors of the description; see
+                       `drake_teleop.logs.check.inspection`. Only looked for if the fit is poor
+====================== ==========================================================================
+
+====================== ==========================================================================
+identify
+====================== ==========================================================================
+mass, mass_std         kg; standard deviations are null for what is not determined at all
+com, com_std           m; the standard deviation is of com with the mass held
+inertia_com            kg m^2, about the centre of mass, axes of S
+offsets, offsets_std   [f; tau]
+phi, phi_std           Eq. (6), in the order of this project
+phi_interval           (10, 2) ends of the 95 % intervals
+verdicts               of each parameter: identified, weakly, not, prior; see
+                       `drake_teleop.load.identification.Identification.verdicts`
+identifiable           the names of what the record determines
+not_identifiable       the names of what it does not: do not use their values
+physically_consistent  whether phi belongs to a possible body
+determined             in words: how many independent combinations of offsets and load the record
+                       determines, which ones where single parameters are not, and what is weak
+method                 of the fit, in words
+rejected               share of the samples that a robust fit took for disturbed and left out
+condition_number       of the regression
+residual_rms           [f; tau], after the fit
+residual_rms_force     of |F|
+load_changes           list of t_s, mass_before, mass_after: where the load changes in the record,
+                       so that one load for all of it is wrong
+gripper                its file, if --gripper was given; otherwise this and the next are absent
+object                 of phi_total - phi_gr: mass, com, inertia_com, phi with their standard
+                       deviations, identifiable, not_identifiable and physically_consistent as
+                       above; consistency_margin and consistency_margin_std, see
+                       `drake_teleop.load.gripper.consistency_margin`
+====================== ==========================================================================
+
+========================= =======================================================================
+eliminate
+========================= =======================================================================
+load, gripper             the identification files; gripper is null if there is none
+sigma, sigma_object,      as given
+gamma, eta
+tare                      [f; tau], offsets of this record minus those of the load file
+tare_fraction             share of the samples that the offsets were taken from (those that agree)
+raw_rms                   rms of |F| with the offsets removed and nothing else
+gravity_only_rms          rms of |F| with offsets and m g removed; null if no orientation is known
+residual_rms              rms of |F_c|, the contact force: in free motion, what is left
+residual_peak             largest |F_c|
+raw_torque_rms ...        the same four of the torque
+raw_rms_per_channel ...   the same four of each channel [f; tau]
+noise_floor               [f; tau], standard deviation of the contact wrench where it is quiet
+contacts                  list of start_s, stop_s, peak_N, peak_Nm: from where a channel exceeds 5.5
+                          noise floors until all are below 4; null for static poses
+in_contact                share of the samples in `contacts`; null for static poses
+causal                    null, or, if --causal was given: mode, lag_s (by how much the output is
+                          late, or would be without prediction), offsets, tare_s (length of the
+                          start that they are of; null if of the load file), residual_rms,
+                          noise_floor as above, and difference_rms, of |F_causal - F_c|
+========================= =======================================================================
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.gripper import SIGNIFICANT, consistency_margin
+from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.logs.contact import contacts_of, noise_floor
+from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
+
+
+def common_figures(
+    path: Path, found: IdentifiedLog | EliminatedLog, cutoff_hz: float | None, delay_s: float
+) -> dict[str, Any]:
+    """What both summaries begin with."""
+    log = found.log
+    findings = [{"name": finding.name, "message": finding.message} for finding in found.findings]
+    return {
+        "log": str(path),
+        "samples": len(log),
+        "duration_s": 0.0 if log.static else float(log.t[-1] - log.t[0]),
+        "rate_hz": 0.0 if log.static else 1 / log.dt,
+        "cutoff_hz": None if log.static else cutoff_hz,
+        "delay_s": delay_s,
+        "delay_source": found.delay_source,
+        "notes": [*log.notes, *(f"{f['name']}: {f['message']}" for f in findings)],
+        "findings": findings,
+    }
+
+
+def load_figures(load: Identification) -> dict[str, Any]:
+    """A load: values, uncertainties, and which of them mean something."""
+    deviations = load.standard_deviations
+    ends = intervals(load)
+    return {
+        "mass": load.mass,
+        "mass_std": deviations[6],
+        "com": load.com,
+        "com_std": deviations[7:10] / load.mass,
+        "inertia_com": load.inertia_com,
+        "phi": load.phi,
+        "phi_std": deviations[6:],
+        "phi_interval": np.stack(ends, axis=1)[6:],
+        "verdicts": dict(zip(PARAMETERS, load.verdicts, strict=True)),
+        "identifiable": _named(load, True),
+        "not_identifiable": _named(load, False),
+        "physically_consistent": load.physically_consistent,
+    }
+
+
+def object_figures(alone: Identification) -> dict[str, Any]:
+    """The same of an object without its gripper."""
+    margin, deviation = consistency_margin(alone)
+    figures = load_figures(alone)
+    for name in ("identifiable", "not_identifiable"):
+        figures[name] = [entry for entry in figures[name] if entry in PARAMETERS[6:]]
+    return figures | {"consistency_margin": margin, "consistency_margin_std": deviation}
+
+
+def object_notes(alone: Identification) -> list[str]:
+    """What to know about the object; the mass is not significantly negative here."""
+    deviation = float(alone.standard_deviations[6])
+    if alone.mass < SIGNIFICANT * deviation:
+        return [
+            f"no object: the gripper's mass is exceeded by {alone.mass:.4g} ± {deviation:.2g} kg"
+        ]
+    if not alone.identifiable[6:].all() or alone.physically_consistent:
+        return []
+    margin, deviation = consistency_margin(alone)
+    if margin < -SIGNIFICANT * deviation:
+        return [
+            "no body can have the object's parameters: were gripper and total identified about the"
+            " same sensor frame, with the same gripper?"
+        ]
+    return ["the object's parameters are those of a possible body within their uncertainty only"]
+
+
+def _named(result: Identification, identifiable: bool) -> list[str]:
+    pairs = zip(PARAMETERS, result.identifiable, strict=True)
+    return [name for name, flag in pairs if bool(flag) == identifiable]
+
+
+def rms_figures(found: EliminatedLog) -> dict[str, Any]:
+    """What is left of the wrench, root mean square and peak."""
+
+    def rms(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.sqrt(np.mean(x**2, axis=0))
+
+    def peak(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.abs(x).max(axis=0)
+
+    return (
+        _reduced("raw", "rms", found.measured, rms)
+        | _reduced("gravity_only", "rms", found.gravity_only, rms)
+        | _reduced("residual", "rms", found.contact, rms)
+        | _reduced("residual", "peak", found.contact, peak)
+    )
+
+
+def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[str, Any]:
+    """Noise floor and contacts, and what `--causal` adds."""
+    figures: dict[str, Any] = {
+        "noise_floor": found.noise_floor,
+        "contacts": None,
+        "in_contact": None,
+        "causal": None,
+    }
+    if not found.log.static:
+        touches = contacts_of(found.log.t, found.contact, found.touched)
+        figures["contacts"] = [
+            {
+                "start_s": touch.start_s,
+                "stop_s": touch.stop_s,
+                "peak_N": touch.peak_force,
+                "peak_Nm": touch.peak_torque,
+            }
+            for touch in touches
+        ]
+        figures["in_contact"] = found.touched.mean()
+    if found.causal is not None:
+        late = found.causal.contact
+
+        def force_rms(wrench: NDArray[np.float64]) -> float:
+            return float(np.sqrt(np.mean(np.sum(wrench[:, :3] ** 2, axis=1))))
+
+        figures["causal"] = {
+            "mode": found.causal.mode,
+            "lag_s": found.causal.lag_s,
+            "tare_s": causal_tare_s,
+            "offsets": found.causal.offsets,
+            "residual_rms": force_rms(late),
+            "noise_floor": noise_floor(late),
+            "difference_rms": force_rms(late - found.contact),
+        }
+    return figures
+
+
+def _reduced(
+    name: str,
+    suffix: str,
+    wrench: NDArray[np.float64] | None,
+    reduce: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+) -> dict[str, Any]:
+    keys = (f"{name}_{suffix}", f"{name}_torque_{suffix}", f"{name}_{suffix}_per_channel")
+    if wrench is None:
+        return dict.fromkeys(keys)
+    norms = [reduce(np.linalg.norm(part, axis=1)) for part in (wrench[:, :3], wrench[:, 3:])]
+    return dict(zip(keys, [*norms, reduce(wrench)], strict=True))
+
+
+def plain(value: Any) -> Any:
+    """The same with lists and numbers of Python instead of numpy's, and null for infinity."""
+    if isinstance(value, dict):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(entry) for entry in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return plain(value.tolist())
+    return None if value in (float("inf"), float("-inf")) else value
+
+
+def write_summary(out: Path, summary: dict[str, Any]) -> None:
+    """Writes summary.json into the folder."""
+    (out / "summary.json").write_text(
+        json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8"
+    )
