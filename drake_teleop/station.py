@@ -21,7 +21,7 @@ from drake_teleop.estimation.load_estimator import LoadEstimator
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.sample import sample_parts, sample_size
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.master import device
+from drake_teleop.master import phantom
 from drake_teleop.master.device import MasterDevice
 from drake_teleop.master.force_display import ForceDisplay
 from drake_teleop.operator.operator import Operator
@@ -218,7 +218,7 @@ def MakeTeleopStation(
             period,
             hand_mass=hand.mass,
             hand_inertia=hand.inertia,
-            q_initial=device.inverse_kinematics(start_B),
+            q_initial=phantom.inverse_kinematics(start_B),
             friction=scenario.master.friction,
         ),
         "kinematic_scaling": KinematicScaling(scaling, _HUMAN_PERIOD, start_W),

@@ -22,7 +22,7 @@ from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import BACKWARD, FORWARD, NetworkConfig, newest_packets
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.load.contact.detection import NoiseFloor
-from drake_teleop.master.device import serial_joint_angles
+from drake_teleop.master.phantom import serial_joint_angles
 from drake_teleop.operator.operator import OperatorConfig, Sine
 from drake_teleop.passivity.energy import port_work
 from drake_teleop.passivity.force_limit import ForceLimitConfig

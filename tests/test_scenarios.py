@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.identification import slave_arm
-from drake_teleop.master import device
+from drake_teleop.master import phantom
 from drake_teleop.scenario import LoadScenario, ScenarioNames, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
@@ -58,10 +58,10 @@ def test_arm_and_sensor_stay_within_their_limits(movement):
 def test_the_master_stays_well_inside_its_workspace_and_its_force(movement):
     _, result = movement
     q = result["master_state"][:, :6]
-    assert np.all(margin(q, device.JOINT_LOWER, device.JOINT_UPPER) > np.radians(30))
-    assert np.all(margin(q[:, 1] - q[:, 2], *device.FIVE_BAR_RANGE) > np.radians(20))
+    assert np.all(margin(q, phantom.JOINT_LOWER, phantom.JOINT_UPPER) > np.radians(30))
+    assert np.all(margin(q[:, 1] - q[:, 2], *phantom.FIVE_BAR_RANGE) > np.radians(20))
     force = np.linalg.norm(result["force_to_master"][:, :3], axis=1)
-    assert np.all(force < 0.2 * device.FORCE_LIMIT)
+    assert np.all(force < 0.2 * phantom.FORCE_LIMIT)
     assert np.all(np.linalg.norm(result["hand_wrench_E"][:, :3], axis=1) < 30)
 
 

@@ -18,7 +18,7 @@ from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.load.compensation import scaled_wrench
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.master import device
+from drake_teleop.master import phantom
 from drake_teleop.master.device import JointFriction
 from drake_teleop.operator.operator import OperatorConfig, Sine
 from drake_teleop.operator.task import Touch
@@ -177,9 +177,9 @@ def test_the_operator_feels_sigma_times_the_loads_mass_on_top_of_the_device(felt
 def test_with_sigma_0_the_operator_feels_the_device_alone(felt):
     """The device's own mass, from its closed forms, and the hand's."""
     hand, acceleration, _ = felt[0.0]
-    q = device.inverse_kinematics(np.array([1.0, 0, 0, 0, 0.27, 0, 0.03]))
+    q = phantom.inverse_kinematics(np.array([1.0, 0, 0, 0, 0.27, 0, 0.03]))
     grip = OperatorConfig(grip="firm").hand
-    M, J = device.mass_matrix(q, grip.mass, grip.inertia), device.jacobian(q)
+    M, J = phantom.mass_matrix(q, grip.mass, grip.inertia), phantom.jacobian(q)
     # A vertical force meets this mass when the stylus is held upright by the wrist.
     inverse_inertia = J @ np.linalg.inv(M) @ J.T
     mass = np.linalg.inv(inverse_inertia)[2, 2]
@@ -205,7 +205,7 @@ def test_energy_of_the_ideal_loop_is_accounted_for(slave):
     steps = np.sum(held[:-1] * (twist[1:] + twist[:-1]), axis=1) / 2 / 2000
     q, v = np.split(result["master_state"], 2, axis=1)
     kinetic = [
-        0.5 * w @ device.mass_matrix(p, hand.mass, hand.inertia) @ w
+        0.5 * w @ phantom.mass_matrix(p, hand.mass, hand.inertia) @ w
         for p, w in zip(q, v, strict=True)
     ]
     work = np.concatenate([[0], np.cumsum(steps)])

@@ -42,7 +42,7 @@ from drake_teleop.analysis.two_port import two_port
 from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.point_contact import FRICTION
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master import device
+from drake_teleop.master import phantom
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.scenario import Scenario, replace
@@ -507,7 +507,7 @@ class _Period:
         start = self._pose
         pose_B = self._start_B.copy()
         pose_B[4:] += displacement
-        q = device.inverse_kinematics(pose_B)
+        q = phantom.inverse_kinematics(pose_B)
         context = self._context("master_device")
         for group, value in enumerate((np.append(q, np.zeros(6)), pose_B, np.zeros(6))):
             context.SetDiscreteState(group, value)

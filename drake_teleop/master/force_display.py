@@ -9,7 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT, weak_callback
-from drake_teleop.master.device import (
+from drake_teleop.master.phantom import (
     FORCE_LIMIT,
     WRIST_TORQUE_LIMIT,
     gravity_torque_into,

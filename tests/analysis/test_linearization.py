@@ -22,7 +22,7 @@ from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import slave_arm
-from drake_teleop.master import device
+from drake_teleop.master import phantom
 from drake_teleop.operator.operator import MinimumJerk, OperatorConfig
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.scenario import LoadScenario, Scenario, replace
@@ -283,7 +283,7 @@ def test_multipliers_predict_a_slow_decay():
     master = diagram.GetSubsystemByName("master_device")
     context = master.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     state = context.get_mutable_discrete_state(0).get_mutable_value()
-    state[6:] = np.linalg.solve(device.jacobian(state[:6]), [0, 0, 2e-3, 0, 0, 0])
+    state[6:] = np.linalg.solve(phantom.jacobian(state[:6]), [0, 0, 2e-3, 0, 0, 0])
     simulator.AdvanceTo(0.7)
     height = read_log(simulator, 0.0)["pose_master"][200:, 6]
     assert_same_rate(fitted_rate(height, predicted), predicted)

@@ -9,7 +9,7 @@ from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import slave_arm
-from drake_teleop.master import device
+from drake_teleop.master import phantom
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 
 
@@ -17,7 +17,7 @@ def test_device_whose_inner_link_alone_moves():
     """Upright force at q = 0: M22 over the link's length squared, wrist and reflected motor too."""
     scenario = replace(Scenario(), master__position=[0.215, 0.0, -0.17])
     axis = OneAxisFromScenario(scenario, (0, 0, 2.0))
-    assert axis.device_mass == pytest.approx(device.mass_matrix(np.zeros(6))[1, 1] / 0.215**2)
+    assert axis.device_mass == pytest.approx(phantom.mass_matrix(np.zeros(6))[1, 1] / 0.215**2)
     assert axis.device_damping == pytest.approx(scenario.master.friction.viscous[1] / 0.215**2)
 
 

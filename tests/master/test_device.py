@@ -10,7 +10,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master import device
+from drake_teleop.master import device, phantom
 
 NO_FRICTION = device.JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
 
@@ -18,8 +18,8 @@ NO_FRICTION = device.JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
 def random_postures(count: int, seed: int = 0) -> np.ndarray:
     """Postures inside the joint limits, the five-bar's included."""
     rng = np.random.default_rng(seed)
-    q = rng.uniform(device.JOINT_LOWER, device.JOINT_UPPER, (40 * count, 6))
-    lower, upper = device.FIVE_BAR_RANGE
+    q = rng.uniform(phantom.JOINT_LOWER, phantom.JOINT_UPPER, (40 * count, 6))
+    lower, upper = phantom.FIVE_BAR_RANGE
     allowed = (q[:, 1] - q[:, 2] > lower) & (q[:, 1] - q[:, 2] < upper)
     return q[allowed][:count]
 
@@ -30,20 +30,20 @@ def parameters(hand_mass=0.0, hand_inertia=0.0, friction=NO_FRICTION) -> np.ndar
 
 def acceleration(q, v, wrench, torque, parameters) -> np.ndarray:
     vdot = np.empty(6)
-    device.acceleration_into(q, v, wrench, torque, parameters, np.empty((2, 6, 6)), vdot)
+    phantom.acceleration_into(q, v, wrench, torque, parameters, np.empty((2, 6, 6)), vdot)
     return vdot
 
 
 def energy(state, hand_mass=0.0, hand_inertia=0.0) -> float:
     q, v = state[:6], state[6:]
-    M = device.mass_matrix(q, hand_mass, hand_inertia)
-    return 0.5 * v @ M @ v + device.potential_energy(q)
+    M = phantom.mass_matrix(q, hand_mass, hand_inertia)
+    return 0.5 * v @ M @ v + phantom.potential_energy(q)
 
 
 def advance(state, wrench, torque, parameters, period, steps) -> np.ndarray:
     state, work, stages = state.copy(), np.empty((2, 6, 6)), np.empty((3, 12))
     for _ in range(steps):
-        device.step(state, wrench, torque, parameters, period, work, stages)
+        phantom.step(state, wrench, torque, parameters, period, work, stages)
     return state
 
 
@@ -80,19 +80,19 @@ def test_main_axes_equal_the_closed_forms_of_the_literature():
             g / 2 * (2 * l1 * ma + 2 * l5 * mbe + l1 * mc) * np.cos(q2),
             g / 2 * (l2 * ma + 2 * l3 * mc - 2 * l6 * mdf) * np.sin(q3),
         ]
-        np.testing.assert_allclose(device.closed_form_mass_matrix(q), expected, atol=1e-15)
-        np.testing.assert_allclose(device.closed_form_gravity(q), gravity, atol=1e-15)
+        np.testing.assert_allclose(phantom.closed_form_mass_matrix(q), expected, atol=1e-15)
+        np.testing.assert_allclose(phantom.closed_form_gravity(q), gravity, atol=1e-15)
 
 
 def test_home_is_the_stylus_level_and_towards_the_operator():
     np.testing.assert_allclose(
-        device.forward_kinematics(device.HOME), [1, 0, 0, 0, 0.215, 0, -0.170], atol=1e-15
+        phantom.forward_kinematics(phantom.HOME), [1, 0, 0, 0, 0.215, 0, -0.170], atol=1e-15
     )
 
 
 def test_forward_kinematics_is_the_product_of_its_axes():
     for q in random_postures(100):
-        pose = device.forward_kinematics(q)
+        pose = phantom.forward_kinematics(q)
         Rx, Ry, Rz = (
             RotationMatrix.MakeXRotation,
             RotationMatrix.MakeYRotation,
@@ -109,14 +109,14 @@ def test_jacobian_is_the_derivative_of_the_pose():
     step = 1e-6
     for q in random_postures(50):
         numeric = np.empty((6, 6))
-        R = rotation(device.forward_kinematics(q))
+        R = rotation(phantom.forward_kinematics(q))
         for k in range(6):
-            ahead = device.forward_kinematics(q + step * np.eye(6)[k])
-            behind = device.forward_kinematics(q - step * np.eye(6)[k])
+            ahead = phantom.forward_kinematics(q + step * np.eye(6)[k])
+            behind = phantom.forward_kinematics(q - step * np.eye(6)[k])
             numeric[:3, k] = (ahead[4:] - behind[4:]) / (2 * step)
             cross = (rotation(ahead) - rotation(behind)) / (2 * step) @ R.T
             numeric[3:, k] = cross[2, 1], cross[0, 2], cross[1, 0]
-        np.testing.assert_allclose(device.jacobian(q), numeric, atol=1e-9)
+        np.testing.assert_allclose(phantom.jacobian(q), numeric, atol=1e-9)
 
 
 def test_inverse_kinematics_returns_the_joint_angles():
@@ -125,7 +125,7 @@ def test_inverse_kinematics_returns_the_joint_angles():
         if reach < 0.01 or abs(q[4]) > 1.56:
             continue  # the other branch of the yaw or of the wrist
         np.testing.assert_allclose(
-            device.inverse_kinematics(device.forward_kinematics(q)), q, atol=1e-9
+            phantom.inverse_kinematics(phantom.forward_kinematics(q)), q, atol=1e-9
         )
 
 
@@ -139,12 +139,12 @@ def test_inverse_kinematics_returns_the_joint_angles():
 )
 def test_a_start_pose_out_of_reach_is_refused(position, message):
     with pytest.raises(DrakeTeleopError, match=message):
-        device.inverse_kinematics(np.array([1.0, 0, 0, 0, *position]))
+        phantom.inverse_kinematics(np.array([1.0, 0, 0, 0, *position]))
 
 
 def test_mass_matrix_is_positive_definite_over_the_workspace():
     for q in random_postures(2000):
-        M = device.mass_matrix(q)
+        M = phantom.mass_matrix(q)
         np.testing.assert_array_equal(M, M.T)
         assert np.linalg.eigvalsh(M)[0] > 1e-5
 
@@ -153,8 +153,8 @@ def test_hand_adds_its_kinetic_energy_and_nothing_else():
     rng = np.random.default_rng(1)
     for q in random_postures(20):
         v = rng.normal(size=6)
-        twist = device.jacobian(q) @ v
-        added = device.mass_matrix(q, 0.3, 2e-4) - device.mass_matrix(q)
+        twist = phantom.jacobian(q) @ v
+        added = phantom.mass_matrix(q, 0.3, 2e-4) - phantom.mass_matrix(q)
         expected = 0.3 * twist[:3] @ twist[:3] + 2e-4 * twist[3:] @ twist[3:]
         assert v @ added @ v == pytest.approx(expected, rel=1e-12)
 
@@ -163,27 +163,27 @@ def test_wrist_is_a_point_mass_and_three_turning_links():
     rng = np.random.default_rng(2)
     for q in random_postures(20):
         v = rng.normal(size=6)
-        J = device.jacobian(q)
+        J = phantom.jacobian(q)
         main = np.zeros((6, 6))
-        main[:3, :3] = device.closed_form_mass_matrix(q)
+        main[:3, :3] = phantom.closed_form_mass_matrix(q)
         motors = np.array([13.3, 11.2, 11.2]) ** 2 * 1.08e-6
         expected = v @ main @ v + motors @ v[:3] ** 2 + 0.15 * np.sum((J[:3] @ v) ** 2)
         for last in (4, 5, 6):
             expected += 5e-5 * np.sum((J[3:, :last] @ v[:last]) ** 2)
-        assert v @ device.mass_matrix(q) @ v == pytest.approx(expected, rel=1e-12)
+        assert v @ phantom.mass_matrix(q) @ v == pytest.approx(expected, rel=1e-12)
 
 
 def test_gravity_is_the_gradient_of_the_potential_energy():
     step = 1e-5
     for q in random_postures(20):
         gradient = [
-            (device.potential_energy(q + step * e) - device.potential_energy(q - step * e))
+            (phantom.potential_energy(q + step * e) - phantom.potential_energy(q - step * e))
             / (2 * step)
             for e in np.eye(6)
         ]
-        np.testing.assert_allclose(device.gravity_torque(q), gradient, atol=1e-9)
-        wrist = device.gravity_torque(q)[:3] - device.closed_form_gravity(q)
-        np.testing.assert_allclose(wrist, 0.15 * 9.81 * device.jacobian(q)[2, :3], atol=1e-15)
+        np.testing.assert_allclose(phantom.gravity_torque(q), gradient, atol=1e-9)
+        wrist = phantom.gravity_torque(q)[:3] - phantom.closed_form_gravity(q)
+        np.testing.assert_allclose(wrist, 0.15 * 9.81 * phantom.jacobian(q)[2, :3], atol=1e-15)
 
 
 def test_coriolis_follows_from_the_mass_matrix():
@@ -195,7 +195,10 @@ def test_coriolis_follows_from_the_mass_matrix():
         v = rng.normal(size=6)
         dM = np.array(
             [
-                (device.mass_matrix(q + step * e, *hand) - device.mass_matrix(q - step * e, *hand))
+                (
+                    phantom.mass_matrix(q + step * e, *hand)
+                    - phantom.mass_matrix(q - step * e, *hand)
+                )
                 / (2 * step)
                 for e in np.eye(6)
             ]
@@ -204,11 +207,11 @@ def test_coriolis_follows_from_the_mass_matrix():
         wrench, torque = rng.normal(size=6), rng.normal(size=6)
         vdot = acceleration(q, v, wrench, torque, parameters(*hand))
         balance = (
-            device.mass_matrix(q, *hand) @ vdot
+            phantom.mass_matrix(q, *hand) @ vdot
             + coriolis
-            + device.gravity_torque(q)
+            + phantom.gravity_torque(q)
             - torque
-            - device.jacobian(q).T @ wrench
+            - phantom.jacobian(q).T @ wrench
         )
         np.testing.assert_allclose(balance, 0, atol=1e-9)
 
@@ -246,7 +249,7 @@ def test_work_of_held_inputs_becomes_energy():
     wrench = np.array([*rng.normal(size=3), 0, 0, 0])
     start = free_state()
     after = advance(start, wrench, torque, parameters(*hand), 5e-4, 200)
-    path = device.forward_kinematics(after[:6])[4:] - device.forward_kinematics(start[:6])[4:]
+    path = phantom.forward_kinematics(after[:6])[4:] - phantom.forward_kinematics(start[:6])[4:]
     work = wrench[:3] @ path + torque @ (after[:6] - start[:6])
     gained = energy(after, *hand) - energy(start, *hand)
     assert abs(work) > 1e-2
@@ -259,7 +262,7 @@ def test_a_hand_wrench_equals_its_joint_torque():
     for q in random_postures(20):
         v, wrench = rng.normal(size=6), rng.normal(size=6)
         by_hand = acceleration(q, v, wrench, np.zeros(6), parameters())
-        by_motor = acceleration(q, v, np.zeros(6), device.jacobian(q).T @ wrench, parameters())
+        by_motor = acceleration(q, v, np.zeros(6), phantom.jacobian(q).T @ wrench, parameters())
         np.testing.assert_allclose(by_hand, by_motor, rtol=1e-9, atol=1e-9)
 
 
@@ -269,8 +272,8 @@ def test_a_hand_wrench_equals_its_joint_torque():
     [(0, -1), (0, 1), (1, 1), (2, -1), (3, -1), (3, 1), (4, -1), (4, 1), (5, -1), (5, 1)],
 )
 def test_a_joint_stops_at_its_limit(joint, side):
-    limit = (device.JOINT_UPPER if side > 0 else device.JOINT_LOWER)[joint]
-    q = device.HOME.copy()
+    limit = (phantom.JOINT_UPPER if side > 0 else phantom.JOINT_LOWER)[joint]
+    q = phantom.HOME.copy()
     q[joint] = limit - side * 0.02
     if joint in (1, 2):
         q[3 - joint] = limit - side * 0.1  # the other link follows inside the five-bar's range
@@ -278,7 +281,7 @@ def test_a_joint_stops_at_its_limit(joint, side):
     friction = parameters(friction=device.JointFriction())
     state, farthest = np.concatenate([q, np.zeros(6)]), 0.0
     for _ in range(2000):
-        torque = push + device.gravity_torque(state[:6])
+        torque = push + phantom.gravity_torque(state[:6])
         if joint in (1, 2):
             torque[3 - joint] += 20 * (q[3 - joint] - state[3 - joint]) - 0.5 * state[9 - joint]
         state = advance(state, np.zeros(6), torque, friction, 5e-4, 1)
@@ -293,7 +296,7 @@ def test_the_five_bar_stops_at_its_limits():
     for side, limit in ((1, np.radians(65)), (-1, np.radians(-55))):
         state = np.zeros(12)
         for _ in range(3000):
-            torque = device.gravity_torque(state[:6])
+            torque = phantom.gravity_torque(state[:6])
             torque[1] += 0.5 * side
             torque[2] -= 0.5 * side
             state = advance(state, np.zeros(6), torque, friction, 5e-4, 1)
@@ -323,7 +326,7 @@ def simulate(q_initial, duration, motor_torque):
 
 def test_gravity_compensation_holds_the_device_still():
     q = np.array([0.2, 0.3, 0.1, 0.1, -0.2, 0.3])
-    result = simulate(q, 0.2, device.gravity_torque(q))
+    result = simulate(q, 0.2, phantom.gravity_torque(q))
     np.testing.assert_allclose(result["state"], [*q, *np.zeros(6)], atol=1e-12)
 
 
@@ -332,8 +335,8 @@ def test_ports_agree_with_the_state():
     result = simulate(q, 0.05, np.zeros(6))
     q, v = result["state"][:6], result["state"][6:]
     assert np.linalg.norm(v) > 0.1
-    np.testing.assert_allclose(result["pose_master"], device.forward_kinematics(q), atol=1e-15)
-    np.testing.assert_allclose(result["twist_master"], device.jacobian(q) @ v, atol=1e-14)
+    np.testing.assert_allclose(result["pose_master"], phantom.forward_kinematics(q), atol=1e-15)
+    np.testing.assert_allclose(result["twist_master"], phantom.jacobian(q) @ v, atol=1e-14)
 
 
 def test_a_slow_period_or_a_start_beyond_a_limit_is_refused():
@@ -354,4 +357,4 @@ def test_friction_that_the_step_cannot_follow_is_refused():
 def test_serial_joint_angles_turn_the_outer_link_relative_to_the_inner():
     q = np.array([[0.1, 0.2, 0.5, 0.4, 0.5, 0.6], [0.0, -0.3, 0.1, 0.0, 0.0, 0.0]])
     expected = [[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.0, -0.3, 0.4, 0.0, 0.0, 0.0]]
-    np.testing.assert_allclose(device.serial_joint_angles(q), expected, atol=1e-15)
+    np.testing.assert_allclose(phantom.serial_joint_angles(q), expected, atol=1e-15)

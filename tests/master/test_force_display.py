@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.master import device
+from drake_teleop.master import phantom
 from drake_teleop.master.force_display import ForceDisplay
 
 POSTURES = [
@@ -35,21 +35,21 @@ def test_torque_does_the_virtual_work_of_the_wrench(q):
     np.testing.assert_array_equal(displayed, wrench)
     step = 1e-6
     for k in range(6):
-        ahead = device.forward_kinematics(q + step * np.eye(6)[k])
-        behind = device.forward_kinematics(q - step * np.eye(6)[k])
+        ahead = phantom.forward_kinematics(q + step * np.eye(6)[k])
+        behind = phantom.forward_kinematics(q - step * np.eye(6)[k])
         translation = (ahead[4:] - behind[4:]) / (2 * step)
         # Small rotation in B from the quaternions: 2 dq q*.
         w, x = ahead[0], ahead[1:4]
         w0, x0 = behind[0], -behind[1:4]
         rotation = 2 * (w * x0 + w0 * x + np.cross(x, x0)) / (2 * step)
         work = wrench[:3] @ translation + wrench[3:] @ rotation
-        assert torque[k] - device.gravity_torque(q)[k] == pytest.approx(work, abs=1e-8)
+        assert torque[k] - phantom.gravity_torque(q)[k] == pytest.approx(work, abs=1e-8)
 
 
 @pytest.mark.parametrize("q", POSTURES)
 def test_no_command_leaves_the_gravity_compensation(q):
     torque, displayed = display(np.zeros(6), q)
-    np.testing.assert_allclose(torque, device.gravity_torque(q), atol=1e-15)
+    np.testing.assert_allclose(torque, phantom.gravity_torque(q), atol=1e-15)
     np.testing.assert_array_equal(displayed, 0)
 
 
@@ -65,14 +65,14 @@ def test_limits_keep_the_direction(q):
     share = np.abs(torque[3:]) / [0.515, 0.515, 0.170]
     assert share.max() == pytest.approx(1.0, rel=1e-12)
     np.testing.assert_allclose(
-        torque, device.jacobian(q).T @ displayed + device.gravity_torque(q), atol=1e-12
+        torque, phantom.jacobian(q).T @ displayed + phantom.gravity_torque(q), atol=1e-12
     )
 
 
 def test_force_and_torque_are_limited_apart():
-    _, displayed = display([0, 0, 100.0, 0.01, 0, 0], device.HOME)
+    _, displayed = display([0, 0, 100.0, 0.01, 0, 0], phantom.HOME)
     np.testing.assert_allclose(displayed, [0, 0, 37.5, 0.01, 0, 0], rtol=1e-12)
-    _, displayed = display([0, 0, 10.0, 0.34, 0.1, 0], device.HOME)
+    _, displayed = display([0, 0, 10.0, 0.34, 0.1, 0], phantom.HOME)
     np.testing.assert_allclose(displayed, [0, 0, 10.0, 0.17, 0.05, 0], rtol=1e-12)
 
 
@@ -83,11 +83,11 @@ def test_a_command_that_is_not_finite_displays_nothing(bad, index):
     wrench[index] = bad
     torque, displayed = display(wrench, POSTURES[1])
     np.testing.assert_array_equal(displayed, 0)
-    np.testing.assert_allclose(torque, device.gravity_torque(POSTURES[1]), atol=1e-15)
+    np.testing.assert_allclose(torque, phantom.gravity_torque(POSTURES[1]), atol=1e-15)
 
 
 def test_a_huge_command_is_limited_too():
-    _, displayed = display([1e308, 1e308, 0, 0, 0, 1e308], device.HOME)
+    _, displayed = display([1e308, 1e308, 0, 0, 0, 1e308], phantom.HOME)
     assert np.linalg.norm(displayed[:3]) == pytest.approx(37.5)
     assert displayed[5] == pytest.approx(0.515)
 

@@ -10,7 +10,7 @@ from pydrake.math import RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.master import device
+from drake_teleop.master import device, phantom
 from drake_teleop.master.force_display import ForceDisplay
 from drake_teleop.operator.operator import (
     GRIPS,
@@ -22,7 +22,7 @@ from drake_teleop.operator.operator import (
     intent_at,
 )
 
-START = device.forward_kinematics(device.HOME)
+START = phantom.forward_kinematics(phantom.HOME)
 SEGMENTS = [
     MinimumJerk(t_start=0.1, duration=0.5, translation=[0.01, 0.02, -0.03], rotation=[0.3, 0, 0.2]),
     Sine(
@@ -122,7 +122,7 @@ def test_hand_pulls_towards_the_intent():
 
 def test_hand_turns_about_the_axis_of_the_error():
     """An error of 0.4 rad about an axis of B gives a torque about it, whatever the posture."""
-    pose = device.forward_kinematics(np.array([0.3, 0.2, 0.4, -0.5, 0.6, 0.7]))
+    pose = phantom.forward_kinematics(np.array([0.3, 0.2, 0.4, -0.5, 0.6, 0.7]))
     axis = np.array([0.48, -0.6, 0.64])
     wanted = pose.copy()
     error = Quaternion(np.array([np.cos(0.2), *(np.sin(0.2) * axis)]))

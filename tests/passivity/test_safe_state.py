@@ -17,7 +17,7 @@ from drake_teleop.comparison.one_dof import (
     operators_intent,
     run_one_dof,
 )
-from drake_teleop.master.device import FORCE_LIMIT
+from drake_teleop.master.phantom import FORCE_LIMIT
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
