@@ -11,7 +11,7 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.operator.task import DONE
+from drake_teleop.operator.decision import DONE
 from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.scenario import Simulation
 from drake_teleop.signals import LOG, SIGNALS

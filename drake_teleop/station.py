@@ -24,8 +24,8 @@ from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.master import phantom
 from drake_teleop.master.device import MasterDevice
 from drake_teleop.master.force_display import ForceDisplay
+from drake_teleop.operator.decision import Training
 from drake_teleop.operator.operator import Operator
-from drake_teleop.operator.task import Training
 from drake_teleop.scaling.force_scaling import ForceScaling
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.scenario import Scenario

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.operator.task import DONE, FELT, PHASE, WAITING, Insert, Press, Task, Touch
+from drake_teleop.operator.decision import DONE, FELT, PHASE, WAITING
+from drake_teleop.operator.task import Insert, Press, Task, Touch
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario
 from drake_teleop.slave.arm import forward_kinematics

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from drake_teleop.operator.decision import MOVING, OVER, STATE
 from drake_teleop.operator.operator import OperatorConfig
-from drake_teleop.operator.task import MOVING, OVER, STATE, Press, Touch
+from drake_teleop.operator.task import Press, Touch
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.signals import SIGNALS

@@ -1,5 +1,6 @@
 """The haptic device as a block: the dynamics of `phantom`, one step a period."""
 
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
 import numpy as np

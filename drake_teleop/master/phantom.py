@@ -19,6 +19,8 @@ How sure each number is: P = read in a public source (Cavusoglu, Feygin, Tendick
 mahilab/Phantom), D = the manufacturer's figure, recalled, E = an engineering estimate.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -24,10 +24,12 @@ from pydrake.systems.framework import (
 
 from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT, weak_callback
+from drake_teleop.operator import decision
 from drake_teleop.operator import perception as feeling
-from drake_teleop.operator import task as tasks
+from drake_teleop.operator.decision import Training
+from drake_teleop.operator.minimum_jerk import add_plan_into
 from drake_teleop.operator.perception import Perception, perceive_into
-from drake_teleop.operator.task import Insert, Movement, Press, Reach, Touch, Training
+from drake_teleop.operator.task import Insert, Movement, Press, Reach, Task, Touch
 from drake_teleop.quantities import choice, quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, rotate
 from drake_teleop.slave.arm import ArmModel, forward_kinematics
@@ -230,7 +232,7 @@ def _wanted_into(packed, start, memory, time, pose, twist):
     """The intent's segments, and on top of them what the task asks for; no memory: no task."""
     intent_into(packed, start, time, pose, twist)
     if memory.shape[0] > 0:
-        tasks.add_plan_into(memory, time, pose, twist)
+        add_plan_into(memory, time, pose, twist)
 
 
 @njit(cache=True)
@@ -267,21 +269,21 @@ def _look_feel_decide(
         displacement[i] = p_WS[i] - tip[3 + i]
         for k in range(3):
             displacement[i] += R_WS[i, k] * tip[k]
-    tasks.look_into(person, step, displacement, sights[step % sights.shape[0]])
+    decision.look_into(person, step, displacement, sights[step % sights.shape[0]])
     # Until contact is expected the operator learns what moving alone feels like.
-    attentive = task_state[tasks.PHASE] > tasks.MOVING
+    attentive = task_state[decision.PHASE] > decision.MOVING
     felt = touches[step % touches.shape[0]]
     perceive_into(
-        feelings, senses, tasks.PERIOD, hand_mass, hand_wrench[:3], twist[:3], attentive, felt
+        feelings, senses, decision.PERIOD, hand_mass, hand_wrench[:3], twist[:3], attentive, felt
     )
     # The next to be written over is the oldest.
     seen, felt = sights[(step + 1) % sights.shape[0]], touches[(step + 1) % touches.shape[0]]
-    tasks.decide(task, person, time, seen, felt, task_state, memory)
+    decision.decide(task, person, time, seen, felt, task_state, memory)
 
 
 def _ring(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n, k) what is on its way for `delay` [s]."""
-    return np.tile(start, (round(delay / tasks.PERIOD) + 1, 1))
+    return np.tile(start, (round(delay / decision.PERIOD) + 1, 1))
 
 
 class Operator(LeafSystem):
@@ -343,7 +345,7 @@ class Operator(LeafSystem):
     def _declare_task(
         self,
         config: OperatorConfig,
-        task: tasks.Task,
+        task: Task,
         training: Training,
         arm: ArmModel,
         tip: NDArray[np.float64],
@@ -354,9 +356,9 @@ class Operator(LeafSystem):
         self._sights = _ring(senses.vision_delay + training.backward, np.zeros(3))
         self._touches = _ring(senses.reaction_time, nothing_felt)
         self._head = (
-            tasks.pack_task(task),
-            tasks.pack_person(training, senses, config.movement),
-            senses.parameters(tasks.PERIOD),
+            decision.pack_task(task),
+            decision.pack_person(training, senses, config.movement),
+            senses.parameters(decision.PERIOD),
             config.hand.mass,
             arm.table,
             np.array(tip, dtype=float),
@@ -364,15 +366,15 @@ class Operator(LeafSystem):
         self._joints = arm.num_joints
         self._slave = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         state = (
-            np.zeros(tasks.STATE),
-            tasks.initial_memory(),
+            np.zeros(decision.STATE),
+            decision.initial_memory(),
             feeling.initial_memory(),
             self._sights.ravel(),
             self._touches.ravel(),
         )
         self._groups = [self.DeclareDiscreteState(part) for part in state]
         self.DeclareStateOutputPort("task_state", self._groups[0])
-        self.DeclarePeriodicDiscreteUpdateEvent(tasks.PERIOD, 0.0, self._decide)
+        self.DeclarePeriodicDiscreteUpdateEvent(decision.PERIOD, 0.0, self._decide)
         return self.discrete_state_ticket(self._groups[1])
 
     def _decide(self, context: Context, discrete_state: DiscreteValues) -> None:

@@ -11,9 +11,11 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import slave_arm
 from drake_teleop.master.device import JointFriction
 from drake_teleop.noise import random_normal
-from drake_teleop.operator import task as tasks
+from drake_teleop.operator import decision
+from drake_teleop.operator.decision import DONE, OVER, PHASE, SEEKING
+from drake_teleop.operator.minimum_jerk import add_plan_into, plan_move
 from drake_teleop.operator.perception import NOTICED, Perception, perceive
-from drake_teleop.operator.task import DONE, OVER, PHASE, SEEKING, Insert, Press, Reach, Touch
+from drake_teleop.operator.task import Insert, Press, Reach, Touch
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
@@ -131,7 +133,7 @@ def test_weight_that_is_felt_makes_one_slow_and_blunt(touch):
     without, with_load = touch[0.0][1], touch[1.0][1]
     assert with_load["task_time_s"] > without["task_time_s"]
     assert with_load["effort_Ns"] > 2 * without["effort_Ns"]
-    limit = [result["task_state"][-1, tasks.LIMIT] for result, _ in touch.values()]
+    limit = [result["task_state"][-1, decision.LIMIT] for result, _ in touch.values()]
     assert limit[0] == pytest.approx(0.06, abs=0.005)
     assert limit[1] == pytest.approx(0.1 * 3.13 * 9.81 / 17.5, rel=0.1)
 
@@ -194,19 +196,19 @@ def test_a_human_notices_the_papers_contact_and_nothing_before():
 
 def test_every_movement_goes_on_from_the_one_before():
     """Place, velocity and acceleration have no steps, and each ends where it was to end."""
-    memory, time, rng = tasks.initial_memory(), 0.0, np.random.default_rng(3)
+    memory, time, rng = decision.initial_memory(), 0.0, np.random.default_rng(3)
     expected = np.zeros(3)
 
     def wanted(at):
         pose, twist = np.zeros(7), np.zeros(6)
-        tasks.add_plan_into(memory, at, pose, twist)
+        add_plan_into(memory, at, pose, twist)
         return pose[4:], twist[:3]
 
     for _ in range(5):
         change, length = rng.normal(size=3) * 0.1, rng.uniform(0.2, 0.5)
         now, _ = wanted(time)
         before = wanted(time - 1e-6), wanted(time)
-        tasks._plan_move(memory, time, length, change, np.zeros(3))
+        plan_move(memory, time, length, change, np.zeros(3))
         after = wanted(time), wanted(time + 1e-6)
         for place_or_speed in (0, 1):
             slope_before = (before[1][place_or_speed] - before[0][place_or_speed]) / 1e-6
