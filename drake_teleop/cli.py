@@ -2,76 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import click
 
+from drake_teleop import cli_options as option
 from drake_teleop._version import __version__
 from drake_teleop.errors import DrakeTeleopError
-
-_PATH = click.Path(path_type=Path)
-
-
-class _Number(click.FloatRange):
-    """A finite number in a range: click's own lets "nan" and "inf" through."""
-
-    name = "number"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float:
-        number = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value} is not a finite number", param, ctx)
-        return number
-
-
-class _Delay(click.ParamType):
-    """Seconds, or "auto"."""
-
-    name = "auto|SECONDS"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float | str:
-        return "auto" if value == "auto" else _Number().convert(value, param, ctx)
-
-
-def _out(command: str) -> Callable[[Any], Any]:
-    default = Path("out") / command
-    return click.option("--out", type=_PATH, default=default, show_default=True, metavar="DIR")
-
-
-_seed = click.option("--seed", type=click.IntRange(min=0), help="Instead of the scenario's seed.")
-_quiet = click.option("--quiet", is_flag=True, help="No progress bars, no tables.")
-_cutoff = click.option(
-    "--cutoff",
-    "cutoff_hz",
-    type=_Number(min=0, min_open=True),
-    default=30.0,
-    show_default=True,
-    metavar="HZ",
-    help="Zero-phase low-pass on all signals.",
-)
-_delay = click.option(
-    "--delay",
-    type=_Delay(),
-    default="auto",
-    show_default=True,
-    help="Motion behind the wrench, in seconds, or estimated.",
-)
-
-
-_gripper = click.option(
-    "--gripper",
-    type=_PATH,
-    help="The identification.json of the gripper without the object, in the same sensor frame.",
-)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -85,9 +24,9 @@ def cli() -> None:
 
 
 @cli.command()
-@_out("reproduce")
-@_seed
-@_quiet
+@option.out("reproduce")
+@option.seed
+@option.quiet
 def reproduce(out: Path, seed: int | None, quiet: bool) -> None:
     """Repeat the paper's experiments.
 
@@ -100,9 +39,9 @@ def reproduce(out: Path, seed: int | None, quiet: bool) -> None:
 
 @cli.command()
 @click.argument("scenario")
-@_out("run")
-@_seed
-@_quiet
+@option.out("run")
+@option.seed
+@option.quiet
 def run(scenario: str, out: Path, seed: int | None, quiet: bool) -> None:
     """Simulate one scenario.
 
@@ -114,8 +53,8 @@ def run(scenario: str, out: Path, seed: int | None, quiet: bool) -> None:
 
 
 @cli.command()
-@click.argument("log", type=_PATH)
-@_gripper
+@click.argument("log", type=option.PATH)
+@option.gripper
 @click.option(
     "--method",
     type=click.Choice(["ordinary", "whitened", "robust", "consistent"]),
@@ -123,10 +62,10 @@ def run(scenario: str, out: Path, seed: int | None, quiet: bool) -> None:
     show_default=True,
     help="Least squares; rows by their noise; also without knocks; also of a possible body.",
 )
-@_out("identify")
-@_cutoff
-@_delay
-@_quiet
+@option.out("identify")
+@option.cutoff
+@option.delay
+@option.quiet
 def identify(
     log: Path,
     gripper: Path | None,
@@ -155,25 +94,31 @@ def identify(
 
 
 @cli.command()
-@click.argument("log", type=_PATH)
-@click.option("--load", type=_PATH, required=True, help="The identification.json of the load.")
-@_gripper
+@click.argument("log", type=option.PATH)
+@click.option(
+    "--load", type=option.PATH, required=True, help="The identification.json of the load."
+)
+@option.gripper
 @click.option(
     "--sigma",
-    type=_Number(min=0),
+    type=option.Number(min=0),
     default=0.0,
     show_default=True,
     help="Scale of the non-contact wrench; of the gripper's, if there is one.",
 )
 @click.option(
     "--sigma-object",
-    type=_Number(min=0),
+    type=option.Number(min=0),
     help="Scale of the object's non-contact wrench, with --gripper.  [default: sigma]",
 )
 @click.option(
-    "--gamma", type=_Number(), default=1.0, show_default=True, help="Scale of the contact wrench."
+    "--gamma",
+    type=option.Number(),
+    default=1.0,
+    show_default=True,
+    help="Scale of the contact wrench.",
 )
-@click.option("--eta", type=_Number(0, 1), help="Part of a gripped object that is kept.")
+@click.option("--eta", type=option.Number(0, 1), help="Part of a gripped object that is kept.")
 @click.option(
     "--causal",
     type=click.Choice(["delayed", "predicted"]),
@@ -182,14 +127,14 @@ def identify(
 @click.option(
     "--causal-tare",
     "causal_tare_s",
-    type=_Number(min=0, min_open=True),
+    type=option.Number(min=0, min_open=True),
     metavar="SECONDS",
     help="With --causal: an untouched start that the offsets are of.  [default: the load file's]",
 )
-@_out("eliminate")
-@_cutoff
-@_delay
-@_quiet
+@option.out("eliminate")
+@option.cutoff
+@option.delay
+@option.quiet
 def eliminate(
     log: Path,
     load: Path,
@@ -230,15 +175,15 @@ def eliminate(
 
 
 @cli.command()
-@click.argument("log", type=_PATH)
+@click.argument("log", type=option.PATH)
 @click.option(
     "--load",
-    type=_PATH,
+    type=option.PATH,
     help="The identification.json of the load.  [default: identified from LOG itself]",
 )
 @click.option(
     "--free",
-    type=_PATH,
+    type=option.PATH,
     metavar="LOG",
     help="Free motion with this load, which sets the threshold.  [default: what is quiet in LOG]",
 )
@@ -249,10 +194,10 @@ def eliminate(
     show_default=True,
     help="Of the wrench over its noise floor: plain, its cumulative sum, likelihood ratio.",
 )
-@_out("detect")
-@_cutoff
-@_delay
-@_quiet
+@option.out("detect")
+@option.cutoff
+@option.delay
+@option.quiet
 def detect(
     log: Path,
     load: Path | None,
@@ -283,9 +228,9 @@ def detect(
 
 
 @cli.command()
-@click.argument("log", type=_PATH)
-@_out("inspect")
-@_quiet
+@click.argument("log", type=option.PATH)
+@option.out("inspect")
+@option.quiet
 def inspect(log: Path, out: Path, quiet: bool) -> None:
     """Say what is in a log and what is suspicious in it.
 
@@ -297,19 +242,6 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
     inspect_command(log, out, quiet=quiet)
 
 
-class _Names(click.ParamType):
-    """Names with commas between them."""
-
-    name = "NAME,..."
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
-        if isinstance(value, tuple):
-            return value
-        return tuple(name.strip() for name in value.split(","))
-
-
 @cli.command()
 @click.argument("scenario")
 @click.option(
@@ -319,8 +251,8 @@ class _Names(click.ParamType):
     show_default=True,
     help="Of the task, an axis of the world.",
 )
-@_out("analyze")
-@_quiet
+@option.out("analyze")
+@option.quiet
 def analyze(scenario: str, direction: str, out: Path, quiet: bool) -> None:
     """Analyse stability and transparency of a scenario.
 
@@ -333,14 +265,14 @@ def analyze(scenario: str, direction: str, out: Path, quiet: bool) -> None:
 
 
 @cli.command("compare-passivity")
-@click.option("--networks", type=_Names(), help="Presets.  [default: lan to lunar]")
-@click.option("--methods", type=_Names(), help="Methods.  [default: all]")
+@click.option("--networks", type=option.Names(), help="Presets.  [default: lan to lunar]")
+@click.option("--methods", type=option.Names(), help="Methods.  [default: all]")
 @click.option(
     "--jobs", type=click.IntRange(min=1), help="Processes at once.  [default: one for each core]"
 )
-@_out("compare-passivity")
+@option.out("compare-passivity")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-@_quiet
+@option.quiet
 def compare_passivity(
     networks: tuple[str, ...] | None,
     methods: tuple[str, ...] | None,
@@ -367,7 +299,7 @@ def compare_passivity(
 
 
 @cli.command()
-@click.argument("study", type=_PATH)
+@click.argument("study", type=option.PATH)
 @click.option(
     "--jobs", type=click.IntRange(min=1), help="Processes at once.  [default: one for each core]"
 )
@@ -376,8 +308,8 @@ def compare_passivity(
     metavar="ADDRESS",
     help="Of a Dask scheduler, which has the processes; or local, for one on this machine.",
 )
-@_out("study")
-@_quiet
+@option.out("study")
+@option.quiet
 def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: bool) -> None:
     """Run a scenario over a design of its fields.
 
@@ -400,8 +332,8 @@ def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: 
     help="Of a Dask scheduler, which has the processes; or local, for one on this machine.",
 )
 @click.option("--repeats", type=click.IntRange(min=1), help="Seeds of each point.  [default: 12]")
-@_out("scaling-study")
-@_quiet
+@option.out("scaling-study")
+@option.quiet
 def scaling_study(
     jobs: int | None, cluster: str | None, repeats: int | None, out: Path, quiet: bool
 ) -> None:
@@ -415,41 +347,27 @@ def scaling_study(
     scaling_study_command(out, jobs=jobs or -1, cluster=cluster, repeats=repeats, quiet=quiet)
 
 
-class _Positive(click.ParamType):
-    """Positive numbers with commas between them."""
-
-    name = "number,..."
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, ...]:
-        if isinstance(value, tuple):
-            return value
-        number = _Number(min=0, min_open=True)
-        return tuple(number.convert(part, param, ctx) for part in value.split(","))
-
-
 @cli.command()
 @click.argument("scenario", default="identification")
-@click.option("--model", type=_PATH, help="Another arm: URDF, SDF, MJCF or .dmd.yaml.")
+@click.option("--model", type=option.PATH, help="Another arm: URDF, SDF, MJCF or .dmd.yaml.")
 @click.option("--sensor-frame", metavar="NAME", help="Its frame or link with the sensor.")
 @click.option(
     "--package-path",
     "package_paths",
-    type=_PATH,
+    type=option.PATH,
     multiple=True,
     metavar="DIR",
     help="Where its package:// addresses are looked up; may be repeated.",
 )
 @click.option(
     "--acceleration",
-    type=_Positive(),
+    type=option.PositiveNumbers(),
     default=(),
     help="Limits of its joints in rad/s^2, one for all or one for each.",
 )
 @click.option(
     "--payload",
-    type=_Number(min=0, min_open=True),
+    type=option.Number(min=0, min_open=True),
     metavar="KG",
     help="Its heaviest load.  [default: what the model holds beyond the sensor, and 30 %]",
 )
@@ -460,18 +378,20 @@ class _Positive(click.ParamType):
     show_default=True,
     help="Condition numbers (whitened; plain SI; with offsets), or predicted errors.",
 )
-@click.option("--period", type=_Number(0.5, 600), default=6.0, show_default=True, metavar="SECONDS")
+@click.option(
+    "--period", type=option.Number(0.5, 600), default=6.0, show_default=True, metavar="SECONDS"
+)
 @click.option("--harmonics", type=click.IntRange(2, 20), default=5, show_default=True)
 @click.option(
     "--time",
     "seconds",
-    type=_Number(min=0, min_open=True),
+    type=option.Number(min=0, min_open=True),
     metavar="SECONDS",
     help="CPU time of the optimiser.  [default: four starts, the same on every machine]",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-@_out("excite")
-@_quiet
+@option.out("excite")
+@option.quiet
 def excite(
     scenario: str,
     model: Path | None,

@@ -13,14 +13,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import (
-    SceneGraph,
-)
+from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    Frame,
-    ModelInstanceIndex,
-)
+from pydrake.multibody.tree import Frame, ModelInstanceIndex
 from pydrake.systems.framework import Diagram
 
 from drake_teleop.errors import DrakeTeleopError

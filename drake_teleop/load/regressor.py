@@ -92,7 +92,7 @@ def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
 
     Returns:
         (..., 6, 10). For many samples this is large: `non_contact_wrench` and
-        `identification.NormalEquations` do without it.
+        `normal_equations.NormalEquations` do without it.
 
     Raises:
         DrakeTeleopError: for arrays of another shape or with numbers that are not finite.

@@ -13,8 +13,9 @@ from load_cases import OFFSETS, TOOL, rich_motion, rotations
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.batch.consistent import Prior
-from drake_teleop.load.batch.methods import METHODS, NAMES, Options, Record, identify_batch
+from drake_teleop.load.batch.methods import METHODS, NAMES, identify_batch
 from drake_teleop.load.batch.moments import Noise
+from drake_teleop.load.batch.record import Options, Record
 from drake_teleop.load.identification import METHODS as KNOWN_NAMES
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import (

@@ -29,24 +29,13 @@ with the pose and belong to no channel. With `shared_noise` the three forces hav
 noise and the three torques one; weights of their own would make mass and centre of mass worse by
 10 to 30 % (simulated gain errors of 0.3 % and tilts of 4 mrad).
 
-The covariance is that of `identification.NormalEquations` with the same weights of the rows, so
-coloured noise is accounted for; where noise of the motion couples the channels, with the
-correlation that it predicts. Offsets that wander are no stationary noise, and a record is too short
-to show how much they do: if the noise says so (`Noise.walk`, which Allan deviations of a record at
-rest give), the effects of all steps of the walk on the solution are added up. The offsets that the
-covariance is about are then those at the start of the record. A walk that goes as far as the noise
-within a record counts twice, since it is in the residuals too: that is cautious. Errors in
-variables enlarge the covariance: with G theta_LS = b and (G - lambda C) theta = b it is
-K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of `consistent` is of the same fit
-without the constraint, which is cautious. A prior adds its information to that of the record, and
-parameters that it says most about are named.
+`covariance` says how sure each of them is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,6 +43,12 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array, checked_rows
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
+from drake_teleop.load.batch.covariance import (
+    covariance_of,
+    walk_covariance,
+    white_covariance,
+    with_prior,
+)
 from drake_teleop.load.batch.moments import (
     Moments,
     Noise,
@@ -62,13 +57,11 @@ from drake_teleop.load.batch.moments import (
     normal_equations,
     residual_covariance,
 )
+from drake_teleop.load.batch.record import CHUNK, Fit, Options, Record
 from drake_teleop.load.batch.total_least_squares import NormalForm, total_least_squares
-from drake_teleop.load.batch.uncertainty import prior_dominated
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.normal_equations import NormalEquations
-from drake_teleop.load.regressor import non_contact_wrench, regressor
 
-_CHUNK = 2**15
 # Least noise of a channel, relative to the wrench: what rounding leaves of a perfect record.
 _ROUNDING = 1e-7
 # A wrench's variance is at least this share of the residual's, whatever the motion's explains.
@@ -84,65 +77,6 @@ _NOTHING_REJECTED = (
     "the residual is large where the load moves and small where it rests, so that disturbances"
     " cannot be told from errors of the motion (delay, scale, mounting): no sample was rejected"
 )
-
-
-@dataclass(frozen=True, eq=False)
-class Options:
-    """What an estimator may know beyond the record.
-
-    Attributes:
-        noise: of wrench and motion.
-        offsets: whether to estimate the sensor's; otherwise they were subtracted before.
-        shared_noise: whether the forces, and the torques, have one estimated noise each.
-        prior, ellipsoid: for `consistent`.
-    """
-
-    noise: Noise
-    offsets: bool = True
-    shared_noise: bool = False
-    prior: Prior | None = None
-    ellipsoid: Ellipsoid | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """A checked record: (N, 6), (N, 3), (N, 3), (N, 3), as for `identification.identify`."""
-
-    wrench: Array
-    s: Array
-    omega: Array
-    alpha: Array
-
-    @property
-    def arrays(self) -> tuple[Array, Array, Array, Array]:
-        return self.wrench, self.s, self.omega, self.alpha
-
-    @cached_property
-    def moments(self) -> Moments:
-        moments = Moments()
-        moments.add(*self.arrays)
-        return moments
-
-    def every(self, step: int) -> Record:
-        """Every `step`th sample of it."""
-        return Record(*(table[::step] for table in self.arrays))
-
-    def residual(self, theta: Array, part: slice) -> Array:
-        """(n, 6) F - [E V] theta of a part of the samples [N, N m]."""
-        F, s, omega, alpha = (table[part] for table in self.arrays)
-        return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """What an estimator found: the normal form, and of the wrench's noise (6,) what it used;
-    `rejected` are (N,) bools, the samples it did without; `note`, what a user has to know."""
-
-    form: NormalForm
-    wrench_noise: Array
-    moments: Moments
-    rejected: NDArray[np.bool_]
-    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,11 +246,11 @@ def identify_batch(
     plain = equations.solve(delay_s)
     theta, Z = fit.form.theta, fit.moments.mean
     steps = residual_covariance(Moments.walk_covariance(noise or Noise()), theta)
-    white = _white_covariance(plain.covariance, equations, fit)
-    covariance = _covariance(white + _walk_covariance(record, kept, fit, steps), fit.form, offsets)
+    white = white_covariance(plain.covariance, equations, fit)
+    covariance = covariance_of(white + walk_covariance(record, kept, fit, steps), fit.form, offsets)
     dominated = np.zeros(16, bool)
     if prior is not None:
-        covariance, dominated = _with_prior(covariance, prior.information(plain.samples))
+        covariance, dominated = with_prior(covariance, prior.information(plain.samples))
     deviations = np.sqrt(np.diag(covariance))
     identification = replace(
         plain,
@@ -329,31 +263,6 @@ def identify_batch(
         method=NAMES[method],
     )
     return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note, equations)
-
-
-def _with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Covariance (16, 16) of data and prior together, and which parameters are mostly the prior's.
-
-    With the information D of the data and P of the prior, (10, 10) of phi, the estimate is
-    (D + P)^-1 (D theta_data + P theta_prior): the diagonal of (D + P)^-1 D is the data's share. For
-    a single parameter it is 1 - (standard deviation over the prior's)^2.
-    """
-    known = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
-    used = known | (np.arange(16) >= 6)
-    # In units in which the entries are of one size.
-    scale = np.sqrt(np.where(known, np.diag(covariance), 1.0))
-    scale[6:] = np.diag(information) ** -0.5
-    data, total = np.zeros((2, 16, 16))
-    both, part = np.ix_(known, known), np.ix_(used, used)
-    data[both] = np.linalg.inv(covariance[both] / np.outer(scale, scale)[both])
-    total[6:, 6:] = information * np.outer(scale, scale)[6:, 6:]
-    total += data
-    posterior = np.where(np.diag(~used & np.isinf(np.diag(covariance))), np.inf, 0.0)
-    inverse = np.linalg.inv(total[part])
-    posterior[part] = inverse * np.outer(scale, scale)[part]
-    prior_share = np.zeros(16)
-    prior_share[used] = 1.0 - np.diag(inverse @ data[part])
-    return posterior, prior_dominated(np.sqrt(prior_share.clip(0.0)), np.ones(16))
 
 
 def _weighted(moments: Moments, options: Options, record: Record) -> Fit:
@@ -390,75 +299,7 @@ def _distances(record: Record, theta: Array, shared: bool) -> Array:
     scale = np.maximum(_NORMAL_MAD * median, _ROUNDING * rms)
     scale = np.where(scale > 0.0, scale, 1.0)
     out = np.empty(n)
-    for start in range(0, n, _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, n, CHUNK):
+        part = slice(start, start + CHUNK)
         out[part] = (np.abs(record.residual(theta, part)) / scale).max(axis=1)
     return out
-
-
-def _white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Array:
-    """(16, 16) of least squares with weights W that couple the channels, if they do.
-
-    Noise of the motion is in several channels of the wrench at once, which `plain`, of
-    `NormalEquations`, does not know. Their correlation is the predicted one, that of W^-1.
-    """
-    W, Z = fit.form.weights, fit.moments.mean
-    predicted = np.linalg.inv(W)
-    if np.array_equal(W, np.diag(np.diag(W))):
-        return plain
-    scale = np.sqrt(equations.long_run_variances(fit.form.theta)[0] / np.diag(predicted))
-    of_sums = W @ (predicted * np.outer(scale, scale)) @ W
-    inverse = _inverse_gram(fit)
-    covariance = inverse @ (fit.moments.samples * normal_equations(Z, of_sums)[0]) @ inverse
-    unknown = np.isinf(np.diag(plain))
-    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
-    covariance[unknown, unknown] = np.inf
-    return covariance
-
-
-def _inverse_gram(fit: Fit) -> Array:
-    """(16, 16) pseudo-inverse of the sum of [E V]^T W [E V] over the samples."""
-    Z = fit.moments.mean
-    root = inverse_root(normal_equations(Z, fit.form.weights)[0], excited_columns(Z))
-    return np.asarray(root @ root.T / fit.moments.samples)
-
-
-def _walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
-    """(16, 16) covariance of least squares from offsets that wander, about those at the start.
-
-    A step of the walk changes the wrench of all samples after it, and the solution by G^+ times
-    their share of the right-hand side. The steps are independent; `steps` (6, 6) is their
-    covariance, those of the motion's channels as changes of V phi.
-    """
-    covariance = np.zeros((16, 16))
-    if not steps.any():
-        return covariance
-    backwards, used = record.every(-1), kept[::-1]
-    after = np.zeros((6, 16))
-    for start in range(0, len(used), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        rows = np.zeros((len(used[part]), 6, 16))
-        rows[:, np.arange(6), np.arange(6)] = 1.0
-        rows[:, :, 6:] = regressor(*(table[part] for table in backwards.arrays[1:]))
-        rows = fit.form.weights @ (rows * used[part, None, None])
-        sums = after + np.cumsum(rows, axis=0)
-        after = sums[-1]
-        sums -= rows
-        covariance += np.einsum("nci,cd,ndj->ij", sums, steps, sums, optimize=True)
-    inverse = _inverse_gram(fit)
-    return inverse @ covariance @ inverse
-
-
-def _covariance(plain: Array, form: NormalForm, offsets: bool) -> Array:
-    """(16, 16) of the form's solution, from that of least squares (module docstring)."""
-    unknown = np.isinf(np.diag(plain))
-    covariance = np.where(unknown[:, None] | unknown, 0.0, plain)
-    if not offsets:  # what is left when the offsets are known
-        inner = np.linalg.pinv(covariance[:6, :6], hermitian=True)
-        covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
-        covariance[:6], covariance[:, :6] = 0.0, 0.0
-    covariance = form.transfer @ covariance @ form.transfer.T
-    unknown = unknown | form.undetermined
-    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
-    covariance[unknown, unknown] = np.inf
-    return covariance

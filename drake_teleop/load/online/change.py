@@ -50,8 +50,9 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array, checked, checked_rows, positive
 from drake_teleop.load.identification import METHODS, Identification, worth_stating
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.online.innovation import learn, whitening
 from drake_teleop.load.online.recursive import PRIOR_STD
-from drake_teleop.load.regressor import non_contact_wrench_into, regressor_into
+from drake_teleop.load.regressor import regressor_into
 from drake_teleop.load.sample import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
@@ -78,8 +79,6 @@ _SLACK, _ALARM, _BACK = 12.0, 60.0, -30.0
 # First moments may be that much less certain than the mass, relative to what is natural for a load
 # of this size, at least that large [m].
 _MOMENTS, _SMALLEST_SIZE = 10.0, 0.03
-# As in `recursive`: the least variance of a row relative to those that it is made of.
-_RESOLUTION = 1e-10
 # Standard deviations below zero from which on a new load cannot be a body.
 _IMPOSSIBLE = 4.0
 
@@ -94,74 +93,6 @@ SIZE = _KNOWN + 816
 
 
 @njit(cache=True)
-def _whitening(motion, phi, noise, model_var, n):
-    """(6, 6) inverse of the Cholesky factor of the noise of a block's mean."""
-    root, N = np.zeros((6, 6)), np.zeros((6, 6))
-    up, down, moved = np.empty(6), np.empty(6), motion.copy()
-    non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, up)
-    f, tau = up[0] ** 2 + up[1] ** 2 + up[2] ** 2, up[3] ** 2 + up[4] ** 2 + up[5] ** 2
-    arm = (phi[1] ** 2 + phi[2] ** 2 + phi[3] ** 2) / max(phi[0] ** 2, 1e-12)
-    for c in range(6):
-        N[c, c] = noise[c] + n * model_var * (f if c < 3 else tau + arm * f)
-    for k in range(9):
-        if noise[6 + k] == 0.0:
-            continue
-        # The wrench is of second order in the motion: the central difference is exact.
-        moved[k] = motion[k] + 1.0
-        non_contact_wrench_into(moved[:3], moved[3:6], moved[6:], phi, up)
-        moved[k] = motion[k] - 1.0
-        non_contact_wrench_into(moved[:3], moved[3:6], moved[6:], phi, down)
-        moved[k] = motion[k]
-        for i in range(6):
-            for j in range(i + 1):
-                N[i, j] += 0.25 * noise[6 + k] * (up[i] - down[i]) * (up[j] - down[j])
-    for i in range(6):
-        for j in range(i + 1):
-            value = N[i, j] / n
-            for k in range(j):
-                value -= N[i, k] * N[j, k]
-            N[i, j] = value / N[j, j] if j < i else math.sqrt(value)
-    for i in range(6):
-        for j in range(i + 1):
-            value = 1.0 if i == j else 0.0
-            for k in range(j, i):
-                value -= N[i, k] * root[k, j]
-            root[i, j] = value / N[i, i]
-    return root
-
-
-@njit(cache=True)
-def _learn(belief, V, wrench, root):
-    """One block into a belief (272,), Eq. (T6); returns the innovation's chi-squared."""
-    row, gain = np.empty(16), np.empty(16)
-    theta, P, chi = belief[:16], belief[16:].reshape(16, 16), 0.0
-    for c in range(6):
-        innovation = 0.0
-        row[:] = 0.0
-        for k in range(c + 1):
-            row[k] = root[c, k]
-            innovation += root[c, k] * wrench[k]
-            for j in range(10):
-                row[6 + j] += root[c, k] * V[k, j]
-        predicted, uncorrelated = 0.0, 0.0
-        for i in range(16):
-            innovation -= row[i] * theta[i]
-            value = 0.0
-            for j in range(16):
-                value += P[i, j] * row[j]
-            gain[i] = value
-            predicted += row[i] * value
-            uncorrelated += row[i] * row[i] * P[i, i]
-        total = max(1.0, _RESOLUTION * uncorrelated) + predicted
-        chi += innovation * innovation / total
-        for i in range(16):
-            theta[i] += gain[i] * innovation / total
-            for j in range(16):
-                P[i, j] -= gain[i] * gain[j] / total
-    return chi
-
-
-@njit(cache=True)
 def _explain(memory, belief, block, noise):
     """A block into a belief; returns the chi-squared of what the belief does not explain.
 
@@ -172,12 +103,12 @@ def _explain(memory, belief, block, noise):
     wrench, motion = memory[_WRENCH:_MOTION], memory[_MOTION:_V]
     V = memory[_V:_KNOWN].reshape(6, 10)
     before = memory[belief : belief + 272].copy()
-    chi = _learn(before, V, wrench, _whitening(motion, phi, noise, noise[15], block))
+    chi = learn(before, V, wrench, whitening(motion, phi, noise, noise[15], block))
     if noise[15] == 0.0:
         memory[belief : belief + 272] = before
     else:
-        lasting = _whitening(motion, phi, noise, noise[15] * noise[16], block)
-        _learn(memory[belief : belief + 272], V, wrench, lasting)
+        lasting = whitening(motion, phi, noise, noise[15] * noise[16], block)
+        learn(memory[belief : belief + 272], V, wrench, lasting)
     return chi
 
 

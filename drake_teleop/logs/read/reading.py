@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,6 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW,
     angular_motion,
-    low_pass,
     resample,
     smooth_derivatives,
     spacing,
@@ -39,26 +38,11 @@ from drake_teleop.logs.read.rotations import (
     rotation_error,
     rotation_matrices,
 )
+from drake_teleop.logs.read.streams import Stream, in_S, on_clock, turned_wrench
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 
 MINIMUM_SAMPLES = 16
 MINIMUM_POSES = 3
-
-
-@dataclass(frozen=True)
-class _Stream:
-    """Signals on one clock. Arrays (N, ...) or None; `t` is [s] on the common clock."""
-
-    name: str
-    t: NDArray[np.float64]
-    specific_force: NDArray[np.float64] | None = None
-    angular_velocity: NDArray[np.float64] | None = None
-    angular_acceleration: NDArray[np.float64] | None = None
-    R_WS: NDArray[np.float64] | None = None
-
-    @property
-    def dt(self) -> float:
-        return spacing(self.t)
 
 
 def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
@@ -187,7 +171,7 @@ class _Reader:
             both = [vectors @ R.T for vectors in both]
         return np.hstack(both)
 
-    def _pose(self, stream: Pose) -> _Stream:
+    def _pose(self, stream: Pose) -> Stream:
         table = self._table(stream)
         clock = self._clock("pose", stream, table)
         raw_t = clock.t
@@ -205,15 +189,15 @@ class _Reader:
                 stream.position.unit
             )
             acceleration = smooth_derivatives(position, dt, self._bandwidth_hz)[2]
-        return _Stream(
+        return Stream(
             "pose",
             t,
-            _in_S(R_WS, acceleration - self._description.gravity_W),
+            in_S(R_WS, acceleration - self._description.gravity_W),
             *angular_motion(R_WS, dt, self._bandwidth_hz),
             R_WS,
         )
 
-    def _imu(self, stream: Imu, pose: _Stream | None) -> _Stream:
+    def _imu(self, stream: Imu, pose: Stream | None) -> Stream:
         table = self._table(stream)
         clock = self._clock("imu", stream, table)
         raw_t = clock.t
@@ -237,7 +221,7 @@ class _Reader:
         assert stream.position != "auto"
         if s is not None and any(stream.position):
             s = self._at_S(s, np.array(stream.position), t, omega, alpha, pose)
-        return _Stream("imu", t, s, omega, alpha)
+        return Stream("imu", t, s, omega, alpha)
 
     def _at_S(
         self,
@@ -246,7 +230,7 @@ class _Reader:
         t: NDArray[np.float64],
         omega: NDArray[np.float64] | None,
         alpha: NDArray[np.float64] | None,
-        pose: _Stream | None,
+        pose: Stream | None,
     ) -> NDArray[np.float64]:
         """Specific force of So from the one measured at Io, a point of the same rigid body."""
         if omega is None or alpha is None:
@@ -262,7 +246,7 @@ class _Reader:
         frame: str | tuple,
         vectors: NDArray[np.float64],
         t: NDArray[np.float64],
-        pose: _Stream | None,
+        pose: Stream | None,
     ) -> NDArray[np.float64]:
         if isinstance(frame, tuple):
             return vectors @ np.array(frame).T
@@ -274,7 +258,7 @@ class _Reader:
                 where=f"{self._source}:{name}.frame",
                 remedy="add a pose stream",
             )
-        return _in_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
+        return in_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
 
     def _static(self, stream: Static) -> Log:
         table = self._table(stream)
@@ -297,7 +281,7 @@ class _Reader:
                     where=f"{self._source}:static.frame",
                     remedy="give static.orientation instead of static.gravity",
                 )
-            wrench = _turned(R_SW, wrench)
+            wrench = turned_wrench(R_SW, wrench)
         n = len(wrench)
         if n < MINIMUM_POSES:
             raise DrakeTeleopError(
@@ -366,7 +350,7 @@ class _Reader:
         return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def _common_time(
-        self, wrench_t: NDArray[np.float64], streams: Sequence[_Stream]
+        self, wrench_t: NDArray[np.float64], streams: Sequence[Stream]
     ) -> NDArray[np.float64]:
         """Uniform times at the wrench's rate, over the time that all streams cover."""
         start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
@@ -398,23 +382,23 @@ class _Reader:
         self,
         t: NDArray[np.float64],
         wrench: NDArray[np.float64],
-        imu: _Stream | None,
-        pose: _Stream | None,
+        imu: Stream | None,
+        pose: Stream | None,
     ) -> Log:
         def signal(field: str) -> NDArray[np.float64]:
             for stream in (imu, pose):
                 values = None if stream is None else getattr(stream, field)
                 if stream is not None and values is not None:
-                    return _on_clock(t, stream, values)
+                    return on_clock(t, stream, values)
             raise AssertionError(field)
 
         gravity = None
         if pose is not None and pose.R_WS is not None:
-            R_WS = nearest_rotation(_on_clock(t, pose, pose.R_WS))
+            R_WS = nearest_rotation(on_clock(t, pose, pose.R_WS))
             gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
             described = self._description.wrench
             if described is not None and described.frame == "base":
-                wrench = _turned(np.swapaxes(R_WS, 1, 2), wrench)
+                wrench = turned_wrench(np.swapaxes(R_WS, 1, 2), wrench)
         self._check_base_wrench(pose)
         self._note_rest(imu)
         return Log(
@@ -441,7 +425,7 @@ class _Reader:
             )
         return flags
 
-    def _check_base_wrench(self, pose: _Stream | None) -> None:
+    def _check_base_wrench(self, pose: Stream | None) -> None:
         described = self._description.wrench
         if described is not None and described.frame == "base" and pose is None:
             raise DrakeTeleopError(
@@ -450,27 +434,9 @@ class _Reader:
                 remedy="add a pose stream",
             )
 
-    def _note_rest(self, imu: _Stream | None) -> None:
+    def _note_rest(self, imu: Stream | None) -> None:
         posed = self._description.pose
         if (imu is None or imu.specific_force is None) and posed and posed.position is None:
             self._notes.append(
                 "neither accelerometer nor position: the acceleration of S is taken as zero"
             )
-
-
-def _on_clock(
-    t: NDArray[np.float64], stream: _Stream, values: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """`values` of a stream at times `t`, without what is too fast for their spacing."""
-    rate = 1 / spacing(t)
-    faster = stream.dt * rate < 0.9
-    return resample(t, stream.t, low_pass(values, stream.dt, 0.4 * rate if faster else None))
-
-
-def _in_S(R_WS: NDArray[np.float64], vectors_W: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
-
-
-def _turned(R_SW: NDArray[np.float64], wrench_W: NDArray[np.float64]) -> NDArray[np.float64]:
-    both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
-    return both.reshape(-1, 6)

@@ -1,0 +1,120 @@
+"""How sure a batch estimator's solution is.
+
+The covariance is that of `normal_equations.NormalEquations` with the same weights of the rows, so
+coloured noise is accounted for; where noise of the motion couples the channels, with the
+correlation that it predicts. Offsets that wander are no stationary noise, and a record is too short
+to show how much they do: if the noise says so (`Noise.walk`, which Allan deviations of a record at
+rest give), the effects of all steps of the walk on the solution are added up. The offsets that the
+covariance is about are then those at the start of the record. A walk that goes as far as the noise
+within a record counts twice, since it is in the residuals too: that is cautious. Errors in
+variables enlarge the covariance: with G theta_LS = b and (G - lambda C) theta = b it is
+K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of `consistent` is of the same fit
+without the constraint, which is cautious. A prior adds its information to that of the record, and
+parameters that it says most about are named.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.load.batch.moments import excited_columns, inverse_root, normal_equations
+from drake_teleop.load.batch.record import CHUNK, Fit, Record
+from drake_teleop.load.batch.total_least_squares import NormalForm
+from drake_teleop.load.batch.uncertainty import prior_dominated
+from drake_teleop.load.normal_equations import NormalEquations
+from drake_teleop.load.regressor import regressor
+
+
+def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Covariance (16, 16) of data and prior together, and which parameters are mostly the prior's.
+
+    With the information D of the data and P of the prior, (10, 10) of phi, the estimate is
+    (D + P)^-1 (D theta_data + P theta_prior): the diagonal of (D + P)^-1 D is the data's share. For
+    a single parameter it is 1 - (standard deviation over the prior's)^2.
+    """
+    known = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
+    used = known | (np.arange(16) >= 6)
+    # In units in which the entries are of one size.
+    scale = np.sqrt(np.where(known, np.diag(covariance), 1.0))
+    scale[6:] = np.diag(information) ** -0.5
+    data, total = np.zeros((2, 16, 16))
+    both, part = np.ix_(known, known), np.ix_(used, used)
+    data[both] = np.linalg.inv(covariance[both] / np.outer(scale, scale)[both])
+    total[6:, 6:] = information * np.outer(scale, scale)[6:, 6:]
+    total += data
+    posterior = np.where(np.diag(~used & np.isinf(np.diag(covariance))), np.inf, 0.0)
+    inverse = np.linalg.inv(total[part])
+    posterior[part] = inverse * np.outer(scale, scale)[part]
+    prior_share = np.zeros(16)
+    prior_share[used] = 1.0 - np.diag(inverse @ data[part])
+    return posterior, prior_dominated(np.sqrt(prior_share.clip(0.0)), np.ones(16))
+
+
+def white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Array:
+    """(16, 16) of least squares with weights W that couple the channels, if they do.
+
+    Noise of the motion is in several channels of the wrench at once, which `plain`, of
+    `NormalEquations`, does not know. Their correlation is the predicted one, that of W^-1.
+    """
+    W, Z = fit.form.weights, fit.moments.mean
+    predicted = np.linalg.inv(W)
+    if np.array_equal(W, np.diag(np.diag(W))):
+        return plain
+    scale = np.sqrt(equations.long_run_variances(fit.form.theta)[0] / np.diag(predicted))
+    of_sums = W @ (predicted * np.outer(scale, scale)) @ W
+    inverse = _inverse_gram(fit)
+    covariance = inverse @ (fit.moments.samples * normal_equations(Z, of_sums)[0]) @ inverse
+    unknown = np.isinf(np.diag(plain))
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = np.inf
+    return covariance
+
+
+def _inverse_gram(fit: Fit) -> Array:
+    """(16, 16) pseudo-inverse of the sum of [E V]^T W [E V] over the samples."""
+    Z = fit.moments.mean
+    root = inverse_root(normal_equations(Z, fit.form.weights)[0], excited_columns(Z))
+    return np.asarray(root @ root.T / fit.moments.samples)
+
+
+def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
+    """(16, 16) covariance of least squares from offsets that wander, about those at the start.
+
+    A step of the walk changes the wrench of all samples after it, and the solution by G^+ times
+    their share of the right-hand side. The steps are independent; `steps` (6, 6) is their
+    covariance, those of the motion's channels as changes of V phi.
+    """
+    covariance = np.zeros((16, 16))
+    if not steps.any():
+        return covariance
+    backwards, used = record.every(-1), kept[::-1]
+    after = np.zeros((6, 16))
+    for start in range(0, len(used), CHUNK):
+        part = slice(start, start + CHUNK)
+        rows = np.zeros((len(used[part]), 6, 16))
+        rows[:, np.arange(6), np.arange(6)] = 1.0
+        rows[:, :, 6:] = regressor(*(table[part] for table in backwards.arrays[1:]))
+        rows = fit.form.weights @ (rows * used[part, None, None])
+        sums = after + np.cumsum(rows, axis=0)
+        after = sums[-1]
+        sums -= rows
+        covariance += np.einsum("nci,cd,ndj->ij", sums, steps, sums, optimize=True)
+    inverse = _inverse_gram(fit)
+    return inverse @ covariance @ inverse
+
+
+def covariance_of(plain: Array, form: NormalForm, offsets: bool) -> Array:
+    """(16, 16) of the form's solution, from that of least squares (module docstring)."""
+    unknown = np.isinf(np.diag(plain))
+    covariance = np.where(unknown[:, None] | unknown, 0.0, plain)
+    if not offsets:  # what is left when the offsets are known
+        inner = np.linalg.pinv(covariance[:6, :6], hermitian=True)
+        covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
+        covariance[:6], covariance[:, :6] = 0.0, 0.0
+    covariance = form.transfer @ covariance @ form.transfer.T
+    unknown = unknown | form.undetermined
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = np.inf
+    return covariance

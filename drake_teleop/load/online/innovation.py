@@ -1,0 +1,81 @@
+"""What a sample block's mean says beyond a belief about the load, in units of its own noise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from drake_teleop._compiled import njit
+from drake_teleop.load.regressor import non_contact_wrench_into
+
+# As in `recursive`: the least variance of a row relative to those that it is made of.
+_RESOLUTION = 1e-10
+
+
+@njit(cache=True)
+def whitening(motion, phi, noise, model_var, n):
+    """(6, 6) inverse of the Cholesky factor of the noise of a block's mean."""
+    root, N = np.zeros((6, 6)), np.zeros((6, 6))
+    up, down, moved = np.empty(6), np.empty(6), motion.copy()
+    non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, up)
+    f, tau = up[0] ** 2 + up[1] ** 2 + up[2] ** 2, up[3] ** 2 + up[4] ** 2 + up[5] ** 2
+    arm = (phi[1] ** 2 + phi[2] ** 2 + phi[3] ** 2) / max(phi[0] ** 2, 1e-12)
+    for c in range(6):
+        N[c, c] = noise[c] + n * model_var * (f if c < 3 else tau + arm * f)
+    for k in range(9):
+        if noise[6 + k] == 0.0:
+            continue
+        # The wrench is of second order in the motion: the central difference is exact.
+        moved[k] = motion[k] + 1.0
+        non_contact_wrench_into(moved[:3], moved[3:6], moved[6:], phi, up)
+        moved[k] = motion[k] - 1.0
+        non_contact_wrench_into(moved[:3], moved[3:6], moved[6:], phi, down)
+        moved[k] = motion[k]
+        for i in range(6):
+            for j in range(i + 1):
+                N[i, j] += 0.25 * noise[6 + k] * (up[i] - down[i]) * (up[j] - down[j])
+    for i in range(6):
+        for j in range(i + 1):
+            value = N[i, j] / n
+            for k in range(j):
+                value -= N[i, k] * N[j, k]
+            N[i, j] = value / N[j, j] if j < i else math.sqrt(value)
+    for i in range(6):
+        for j in range(i + 1):
+            value = 1.0 if i == j else 0.0
+            for k in range(j, i):
+                value -= N[i, k] * root[k, j]
+            root[i, j] = value / N[i, i]
+    return root
+
+
+@njit(cache=True)
+def learn(belief, V, wrench, root):
+    """One block into a belief (272,), Eq. (T6); returns the innovation's chi-squared."""
+    row, gain = np.empty(16), np.empty(16)
+    theta, P, chi = belief[:16], belief[16:].reshape(16, 16), 0.0
+    for c in range(6):
+        innovation = 0.0
+        row[:] = 0.0
+        for k in range(c + 1):
+            row[k] = root[c, k]
+            innovation += root[c, k] * wrench[k]
+            for j in range(10):
+                row[6 + j] += root[c, k] * V[k, j]
+        predicted, uncorrelated = 0.0, 0.0
+        for i in range(16):
+            innovation -= row[i] * theta[i]
+            value = 0.0
+            for j in range(16):
+                value += P[i, j] * row[j]
+            gain[i] = value
+            predicted += row[i] * value
+            uncorrelated += row[i] * row[i] * P[i, i]
+        total = max(1.0, _RESOLUTION * uncorrelated) + predicted
+        chi += innovation * innovation / total
+        for i in range(16):
+            theta[i] += gain[i] * innovation / total
+            for j in range(16):
+                P[i, j] -= gain[i] * gain[j] / total
+    return chi

@@ -1,0 +1,46 @@
+"""Signals on a clock of their own, brought to another, and vectors turned to the axes of S."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.logs.read.alignment import low_pass, resample, spacing
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Signals on one clock. Arrays (N, ...) or None; `t` is [s] on the common clock."""
+
+    name: str
+    t: NDArray[np.float64]
+    specific_force: NDArray[np.float64] | None = None
+    angular_velocity: NDArray[np.float64] | None = None
+    angular_acceleration: NDArray[np.float64] | None = None
+    R_WS: NDArray[np.float64] | None = None
+
+    @property
+    def dt(self) -> float:
+        return spacing(self.t)
+
+
+def on_clock(
+    t: NDArray[np.float64], stream: Stream, values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """`values` of a stream at times `t`, without what is too fast for their spacing."""
+    rate = 1 / spacing(t)
+    faster = stream.dt * rate < 0.9
+    return resample(t, stream.t, low_pass(values, stream.dt, 0.4 * rate if faster else None))
+
+
+def in_S(R_WS: NDArray[np.float64], vectors_W: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3) vectors in S, of such in W."""
+    return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
+
+
+def turned_wrench(R_SW: NDArray[np.float64], wrench_W: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 6) wrenches in S, of such in W."""
+    both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
+    return both.reshape(-1, 6)
