@@ -1,4 +1,4 @@
-"""The command line. Everything heavy is imported inside the command that needs it."""
+"""The command line (long: all commands and their options). It imports heavy things when needed."""
 
 from __future__ import annotations
 

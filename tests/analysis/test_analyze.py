@@ -7,6 +7,7 @@ import json
 import pytest
 
 from drake_teleop.analysis import analyze
+from drake_teleop.analysis import figures as of_summary
 from drake_teleop.analysis.maps import stability_map
 from drake_teleop.analysis.task_direction import task_direction
 from drake_teleop.analysis.verdict import verdict
@@ -22,7 +23,7 @@ PICTURES = ("bode", "nyquist", "passive", "widths", "maps")
 def coarse_maps():
     """Maps of few pixels: they are tested by themselves."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(analyze, "_PIXELS", 12)
+        patch.setattr(of_summary, "_PIXELS", 12)
         yield
 
 
