@@ -1,4 +1,4 @@
-"""The actual Diagram, linearised at a state of rest, over one period of its mixed rates.
+"""The actual Diagram, linearised at rest over a period (long: a model, and how it comes about).
 
 Every state of the Diagram that acts on anything is displaced by a little, up and down; the Diagram
 is simulated for one period of the hand; what has become of the displacement after that is a column

@@ -1,4 +1,4 @@
-"""`drake-teleop reproduce`: the paper's experiments, from the identification to Figs. 6, 7 and 8.
+"""`drake-teleop reproduce`, Figs. 6, 7 and 8 (long: the paper's experiments in their order).
 
 1. Identification (section IV): the slave runs an excitation trajectory; load and offsets come from
    the wrist sensor's samples alone, by the recursive estimator in the loop.

@@ -1,4 +1,4 @@
-"""The motion of S that the elimination needs, of the same instant as the wrench.
+"""The motion of S at the wrench's instant (long: each path, its delay and its noise together).
 
 What is to be known is s (specific force of So), omega and alpha, all in S. What there is to know it
 from are the encoders, which see the angles but not their derivatives, and an accelerometer

@@ -1,4 +1,4 @@
-"""The wrist sensor as a chain of small parts, from what is true to what can be read.
+"""The wrist sensor as a chain of small parts (long: their parameters beside what they do).
 
 The truth is rigid-body mechanics: the wrench that the sensor exerts on the tool, the motion of the
 sensor frame S, and the joints' angles. A reading is what the electronics put out. Between them:

@@ -1,4 +1,4 @@
-"""The wrist sensor in the station: when it samples, what is true then, and what it makes of it.
+"""The wrist sensor in the station: when it samples, and what (long: the step and its block).
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 

@@ -1,4 +1,4 @@
-"""Kinematics and inverse dynamics of any serial arm of revolute joints, compiled.
+"""Kinematics and inverse dynamics of any serial arm, compiled (long: recursions over one table).
 
 `ArmModelFromPlant` reads the arm out of a finalized MultibodyPlant into one table of numbers; the
 kernels below run on that table. They repeat what the plant can do because an 8 kHz sample has
