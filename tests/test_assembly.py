@@ -319,6 +319,15 @@ def test_the_local_limit_of_force_is_the_one_at_the_hand(over_a_network, slave):
     assert (np.abs(wanted - expected) < EXACT).all(axis=1).any()
 
 
+def test_the_drag_that_charges_a_channel_is_the_one_at_the_hand(slave):
+    """All that is felt of a load that is not displayed at all."""
+    nothing = {"force_scaling__sigma": 0.0, "force_scaling__gamma": 0.0}
+    log = run(delayed("charged_tdpa", **nothing), slave).log
+    for g, drag in enumerate(PassivityConfig().charged_tdpa.drag):
+        felt = np.linalg.norm(log["force_to_master"][:, 3 * g : 3 * g + 3], axis=1)
+        assert felt.max() == pytest.approx(drag, rel=1e-9)
+
+
 def test_the_flag_of_a_contact_comes_with_the_slaves_packets(slave):
     """With a floor so low that the moving load is taken for contacts."""
     rising, still = np.zeros((6, 2)), np.zeros(6)

@@ -13,7 +13,7 @@ channel, the environment f . dx; what comes out of a passive channel never excee
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -107,8 +107,9 @@ def parameters(
     Returns:
         (PARAMETERS,) packed as `drake_teleop.passivity.memory` says.
     """
+    config = _in_power_units(config, motion_scale)
     p = np.zeros(PARAMETERS)
-    p[LIMIT : LIMIT + 2] = np.divide([config.force_limit, config.torque_limit], motion_scale)
+    p[LIMIT : LIMIT + 2] = config.force_limit, config.torque_limit
     p[STIFFNESS : STIFFNESS + 2] = np.multiply(config.servo_stiffness, power_scale)
     p[DAMPING : DAMPING + 2] = np.multiply(config.servo_damping, power_scale)
     own: dict[str, Any] = {
@@ -123,9 +124,31 @@ def parameters(
     if config.method in own:
         packed = own[config.method].packed()
         p[METHOD : METHOD + len(packed)] = packed
-    if config.method == "force_limit":
-        p[METHOD : METHOD + 2] /= motion_scale
     return p
+
+
+def _in_power_units(config: PassivityConfig, motion_scale: Sequence[float]) -> PassivityConfig:
+    """What is said of the hand, in the master's power units."""
+    translation, rotation = motion_scale
+
+    def of_hand(tdpa: TdpaConfig) -> TdpaConfig:
+        return replace(
+            tdpa,
+            drag=list(np.divide(tdpa.drag, motion_scale)),
+            hand_stiffness=list(np.divide(tdpa.hand_stiffness, np.square(motion_scale))),
+        )
+
+    return replace(
+        config,
+        force_limit=config.force_limit / translation,
+        torque_limit=config.torque_limit / rotation,
+        tdpa=of_hand(config.tdpa),
+        charged_tdpa=of_hand(config.charged_tdpa),
+        local_force_limit=ForceLimitConfig(
+            config.local_force_limit.force / translation,
+            config.local_force_limit.torque / rotation,
+        ),
+    )
 
 
 def initial_memory(
