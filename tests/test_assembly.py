@@ -9,6 +9,7 @@ kinematics, so that an exchanged argument or a transposed frame anywhere between
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import BACKWARD, FORWARD, NetworkConfig, newest_packets
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.load.contact.detection import NoiseFloor
+from drake_teleop.load.online.watched import OTHER_LOAD
 from drake_teleop.master.phantom import serial_joint_angles
 from drake_teleop.operator.operator import OperatorConfig, Sine
 from drake_teleop.passivity.energy import port_work
@@ -29,6 +31,7 @@ from drake_teleop.passivity.force_limit import ForceLimitConfig
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.resources import models_dir
 from drake_teleop.result import SimulationResult
+from drake_teleop.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.scenario import Rates, Scenario, Simulation, replace
 from drake_teleop.simulation import MakeSimulator, advance, read_log
@@ -117,11 +120,11 @@ def run(
     scenario: Scenario,
     slave,
     offsets: np.ndarray = OFFSETS,
-    noise_floor: NoiseFloor | None = None,
+    **known: Any,
 ) -> Recorded:
-    """Runs it with the clutch open from row OPENED to row CLOSED."""
+    """Runs it with the clutch open from row OPENED to row CLOSED; `known` of MakeTeleopStation."""
     estimate = np.concatenate([offsets, ESTIMATED * slave.arm.phi_load])
-    station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=noise_floor)
+    station = MakeTeleopStation(scenario, load_estimate=estimate, **known)
     simulator = MakeSimulator(station, scenario.simulation)
     clutch = station.GetInputPort("clutch")
     end = round(scenario.simulation.duration / PERIOD)
@@ -164,14 +167,16 @@ def steps(R: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def inertial_wrench(log: SimulationResult, phi: np.ndarray) -> np.ndarray:
-    """(N, 6) Newton and Euler about So, in S: m s + alpha x mc + omega x (omega x mc), ..."""
+    """(N, 6) Newton and Euler about So, in S, of phi (10,) or, for each row, (N, 10)."""
     s, omega, alpha = (
         log[name] for name in ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
     )
-    xx, xy, xz, yy, yz, zz = phi[4:]
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    f = phi[0] * s + np.cross(alpha, phi[1:4]) + np.cross(omega, np.cross(omega, phi[1:4]))
-    tau = np.cross(phi[1:4], s) + alpha @ inertia + np.cross(omega, omega @ inertia)
+    phi = np.broadcast_to(phi, (len(s), 10))
+    m, mc = phi[:, :1], phi[:, 1:4]
+    inertia = phi[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(-1, 3, 3)
+    turning, accelerating = (np.einsum("nij,nj->ni", inertia, w) for w in (omega, alpha))
+    f = m * s + np.cross(alpha, mc) + np.cross(omega, np.cross(omega, mc))
+    tau = np.cross(mc, s) + accelerating + np.cross(omega, turning)
     return np.hstack([f, tau])
 
 
@@ -334,13 +339,12 @@ def test_the_flag_of_a_contact_comes_with_the_slaves_packets(slave):
     floor = NoiseFloor(
         0.05 * np.ones(6), np.identity(16), rising, np.identity(6), still, reached=np.ones(3)
     )
-    log = run(
-        delayed("none", contact_detection=ContactDetectionConfig()), slave, OFFSETS, floor
-    ).log
+    scenario = delayed("none", contact_detection=ContactDetectionConfig())
+    log = run(scenario, slave, noise_floor=floor).log
     noticed, at_hand = log["contact"][:, 0], log["contact_at_hand"][:, 0]
     assert np.count_nonzero(np.diff(noticed)) >= 2
     np.testing.assert_array_equal(at_hand[TO_HAND:], noticed[:-TO_HAND])
-    direct = run(turned(contact_detection=ContactDetectionConfig()), slave, OFFSETS, floor).log
+    direct = run(turned(contact_detection=ContactDetectionConfig()), slave, noise_floor=floor).log
     np.testing.assert_array_equal(direct["contact_at_hand"], direct["contact"])
 
 
@@ -428,6 +432,28 @@ def test_the_slaves_signals_are_what_their_names_say(direct, slave):
     assert (
         np.abs(error.mean(axis=0))[:3].max() < 0.1 and np.abs(error.mean(axis=0))[3:].max() < 0.01
     )
+
+
+def test_what_is_gripper_and_what_is_object_are_told_apart(slave):
+    """eta keeps a share of the object; if another load hangs there, the gripper is what is known.
+
+    The load is a tenth heavier than the estimate, which is said to be exact.
+    """
+    gripper, eta = 0.5 * slave.arm.phi_load, 0.3
+    scenario = turned(
+        load_estimator__watch=True,
+        force_scaling=ForceScalingConfig(0.0, 1.0, eta, gripper.tolist(), FORCE),
+    )
+    offsets = np.array(scenario.wrist_sensor.offset)
+    log = run(scenario, slave, offsets, load_covariance=1e-6 * np.identity(16)).log
+    known = log["load_estimate"]
+    np.testing.assert_allclose(known[0], np.concatenate([offsets, 0.9 * slave.arm.phi_load]))
+    np.testing.assert_allclose(known[-1, 6:], gripper, rtol=1e-3)
+    assert log["load_state"][-1, 0] == OTHER_LOAD
+    contact = log["measured_wrench_S"] - known[:, :6] - inertial_wrench(log, known[:, 6:])
+    of_object = inertial_wrench(log, known[:, 6:] - gripper)
+    np.testing.assert_allclose(log["scaled_wrench_S"], contact + eta * of_object, atol=1e-11)
+    assert np.ptp(of_object, axis=0).max() > 1.0
 
 
 def test_a_sample_is_of_the_instant_that_the_log_says(over_a_network, slave):
