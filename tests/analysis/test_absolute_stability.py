@@ -426,6 +426,16 @@ def test_positive_real_does_not_miss_a_narrow_notch(depth, passive):
         assert ab.positive_real(control.ss(1 + 1e-3 * lag - depth * notch)) is passive
 
 
+@pytest.mark.parametrize(("depth", "passive"), [(0.999, True), (1.001, False)])
+def test_a_gyrator_hides_no_notch(depth, passive):
+    """A lossless gyrator takes no power: its feed-through leaves the edges of a notch in place."""
+    notch = control.ss(1 - depth * control.tf([17.0, 0], [1, 17.0, 17.0**2]))
+    pair = control.append(notch, control.ss([], [], [], [[1.0]]))
+    for ratio in (0.0, 0.5, 5.0):
+        D = pair.D + ratio * np.array([[0.0, 1.0], [-1.0, 0.0]])
+        assert ab.positive_real(control.ss(pair.A, pair.B, pair.C, D)) is passive
+
+
 def test_positive_real_of_stations():
     """A passive servo coupling is passive, with more tool felt than there is it is not."""
     for damping, passive in ((200.0, True), (-0.1, False)):

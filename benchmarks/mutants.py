@@ -1,0 +1,505 @@
+"""Which mistakes in the numeric code would no test notice?
+
+Makes seeded mistakes, one at a time (`mutations.py`), in the files of the numeric rooms, a share of
+each that goes with the root of the number of places where one can be made. For each it runs the
+tests that are related to the file, the most direct and quickest first, until one fails. A mutant
+that all of them pass has survived: it wants a test, or a reason in `mutants_equivalent.yaml` why
+nothing that matters changes.
+
+    python benchmarks/mutants.py [--number 220] [--seed 0] [--only FILE] [--jobs 2] [--json FILE]
+
+All happens in copies in a folder for temporary files. What is found is written there at once, so
+that the same command goes on after an interruption; `--again` runs the survivors again. Each mutant
+runs in a fork of this process, which has imported the libraries already.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import math
+import multiprocessing
+import os
+import random
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterable
+from contextlib import suppress
+from importlib import import_module
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mutations import Mutation, mutations
+
+PACKAGE = "drake_teleop"
+ROOMS = ("analysis", "channel", "environment", "estimation", "excitation", "load", "logs")
+ROOMS += ("master", "operator", "passivity", "scaling", "sensor", "slave")
+#: Tests of texts, and of what runs for minutes; none is about one number of one room.
+LEFT_OUT = {"test_benchmarks", "test_house", "test_notebooks", "test_packaging", "test_quality"}
+LEFT_OUT |= {"test_readme"}
+#: Seconds of processor that one test may take before it counts as endless; compiling takes most.
+ENDLESS = 120
+_LIBRARIES = """pytest hypothesis.strategies numba scipy.linalg scipy.optimize scipy.stats
+scipy.signal matplotlib.pyplot control pydantic yaml pydrake.geometry pydrake.multibody.plant
+pydrake.multibody.parsing pydrake.systems.analysis pydrake.systems.primitives"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--number", type=int, default=220, help="of mutants")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="files with this in their path")
+    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
+    parser.add_argument("--budget", type=float, default=60.0, help="s of tests for one mutant")
+    parser.add_argument("--again", action="store_true", help="run what survived once more")
+    parser.add_argument("--root", type=Path, default=Path(__file__).parents[1])
+    parser.add_argument("--folder", type=Path, help="of copies and records; default: temporary")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    arguments = parser.parse_args()
+    root = arguments.root.resolve()
+    folder = arguments.folder or Path(tempfile.gettempdir()) / f"{PACKAGE}_mutants"
+    folder.mkdir(parents=True, exist_ok=True)
+    made = sample(root, arguments.number, arguments.seed, arguments.only)
+    records = tested(root, folder.resolve(), made, arguments)
+    figures = summary(records)
+    report(records, figures)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def numeric_files(root: Path, only: str = "") -> list[str]:
+    """Files that compute and neither draw nor print: those of the rooms, and compiled ones."""
+    files = []
+    for path in sorted((root / PACKAGE).rglob("*.py")):
+        file, text = path.relative_to(root).as_posix(), path.read_text(encoding="utf-8")
+        room = path.relative_to(root).parts[1]
+        shows = re.search(rf"^\s*(from|import) (matplotlib|rich|{PACKAGE}\.pages)\b", text, re.M)
+        if (
+            only in file
+            and not shows
+            and (room in ROOMS or (room == path.name and "@njit" in text))
+        ):
+            files.append(file)
+    return files
+
+
+def sample(root: Path, number: int, seed: int, only: str = "") -> list[Mutation]:
+    """Mutants of all numeric files; those of a file depend on the seed and on that file alone."""
+    sites = {
+        file: mutations(file, (root / file).read_bytes()) for file in numeric_files(root, only)
+    }
+    sites = {file: found for file, found in sites.items() if found}
+    weights = {file: math.sqrt(len(found)) for file, found in sites.items()}
+    chosen, before = [], 0.0
+    for file, found in sites.items():
+        after = before + number * weights[file] / sum(weights.values())
+        draws = random.Random(f"{seed} {file}")
+        chosen += _some(found, round(after) - round(before), draws, (root / file).read_bytes())
+        before = after
+    return chosen
+
+
+def _some(
+    found: list[Mutation], number: int, draws: random.Random, source: bytes
+) -> list[Mutation]:
+    """Of each kind as likely as of any other, and no two in one line if there are others."""
+    left, chosen = list(found), []
+    while left and len(chosen) < number:
+        lines = {mutant.line for mutant in chosen}
+        free = [mutant for mutant in left if mutant.line not in lines] or left
+        kind = draws.choice(sorted({mutant.kind for mutant in free}))
+        mutant = draws.choice([mutant for mutant in free if mutant.kind == kind])
+        left.remove(mutant)
+        if mutant.valid(source):
+            chosen.append(mutant)
+    return sorted(chosen, key=lambda mutant: mutant.start)
+
+
+# Which tests are related to a file.
+
+
+def imports(root: Path) -> dict[str, set[str]]:
+    """Of each file of the package and the tests: the files that it imports, lazily or not."""
+    paths = [*(root / PACKAGE).rglob("*.py"), *(root / "tests").rglob("*.py")]
+    files = {path.relative_to(root).as_posix(): path for path in paths}
+    modules = {file.removesuffix(".py").replace("/", "."): file for file in files}
+    modules |= {name.removesuffix(".__init__"): file for name, file in modules.items()}
+    trees = {file: ast.parse(path.read_bytes()) for file, path in files.items()}
+    # The package's names are those of the modules that it takes them from.
+    homes = {
+        alias.name: modules[node.module]
+        for node in ast.walk(trees[f"{PACKAGE}/__init__.py"])
+        if isinstance(node, ast.ImportFrom) and node.module in modules
+        for alias in node.names
+    }
+    found: dict[str, set[str]] = {}
+    for file, tree in trees.items():
+        neighbours = ".".join(file.split("/")[:-1])
+        names = found.setdefault(file, set())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                wholes = [f"{node.module}.{alias.name}" for alias in node.names]
+                wholes += [node.module, f"{neighbours}.{node.module}"]
+            elif isinstance(node, ast.Import):
+                wholes = [n for a in node.names for n in (a.name, f"{neighbours}.{a.name}")]
+            else:
+                continue
+            names |= {modules[whole] for whole in wholes if whole in modules}
+        if f"{PACKAGE}/__init__.py" in names and file.startswith("tests"):
+            words = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+            words |= {
+                a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names
+            }
+            names |= {home for name, home in homes.items() if name in words}
+        names.discard(f"{PACKAGE}/__init__.py")
+    return found
+
+
+def distances(graph: dict[str, set[str]], start: str) -> dict[str, int]:
+    """How many imports it takes from `start` to each file that it can reach."""
+    reached, layer = {start: 0}, {start}
+    while layer:
+        # The command line can reach everything; a test of one command sees what that one uses.
+        layer = {f for file in layer - {f"{PACKAGE}/cli.py"} for f in graph[file]} - reached.keys()
+        reached |= dict.fromkeys(layer, max(reached.values()) + 1)
+    return reached
+
+
+def related(
+    file: str, reach: dict[str, dict[str, int]], seconds: dict[str, float], budget: float
+) -> list[str]:
+    """Test files that can see `file`, the nearest and quickest first, of `budget` seconds.
+
+    First those that import it or are of its room; then those of the whole; then the rest.
+    """
+    room = file.split("/")[1]
+
+    def key(test: str) -> tuple[int, float]:
+        direct, near = reach[test][file] == 1, test.split("/")[1] == room
+        whole = test.count("/") == 1
+        return 0 if direct and near else 1 if direct or near else 2 if whole else 3, seconds[test]
+
+    tests = sorted((test for test in seconds if file in reach[test]), key=key)
+    sums = [sum(seconds[test] for test in tests[:count]) for count in range(len(tests))]
+    return [
+        test
+        for test, before in zip(tests, sums, strict=True)
+        if before < budget or key(test)[0] == 0
+    ]
+
+
+# Running them.
+
+
+def tested(
+    root: Path, folder: Path, made: list[Mutation], arguments: argparse.Namespace
+) -> list[dict[str, Any]]:
+    """The record of each mutant, from the file of records or new."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends the forks too, see below
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    for library in _LIBRARIES.split():
+        import_module(library)
+    tree, path = folder / "tree", folder / "records.jsonl"
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    known = {record["mutant"]: record for record in map(json.loads, lines)}
+    names = {mutant: _name(mutant, (root / mutant.file).read_bytes()) for mutant in made}
+    wanted = [
+        mutant
+        for mutant in made
+        if names[mutant] not in known
+        or (arguments.again and known[names[mutant]]["outcome"] == "survived")
+    ]
+    if wanted:
+        reach, seconds = warmed(root, tree, folder, {mutant.file for mutant in wanted})
+    wanted.reverse()
+    running: dict[Any, tuple[Mutation, Fork]] = {}
+    try:
+        while wanted or running:
+            while wanted and len(running) < arguments.jobs:
+                mutant = wanted.pop()
+                tests = related(mutant.file, reach, seconds, arguments.budget)
+                fork = Fork(_copy(tree, folder, mutant), tests)
+                running[fork.process.sentinel] = mutant, fork
+            for sentinel in _over(running):
+                mutant, fork = running.pop(sentinel)
+                _keep_compiled(fork.tree, tree)
+                record = _record(mutant, (root / mutant.file).read_bytes()) | fork.result()
+                for test, duration in record.pop("durations").items():
+                    seconds[test] = min(seconds.get(test, math.inf), duration)
+                known[record["mutant"]] = record
+                with path.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(record) + "\n")
+                done = f"{sum(name in known for name in names.values())}/{len(made)}"
+                place = f"{mutant.file}:{mutant.line}"
+                print(done, record["outcome"], place, record["new"], flush=True)
+    finally:
+        for _, fork in running.values():
+            fork.result()
+    return [known[name] for name in names.values()]
+
+
+def _over(running: dict[Any, tuple[Mutation, Fork]]) -> list[Any]:
+    """Those that have ended, or wait for what never comes."""
+    over = wait(list(running), timeout=5.0)
+    return over or [each for each, (_, fork) in running.items() if fork.waits_too_long()]
+
+
+def _record(mutant: Mutation, source: bytes) -> dict[str, Any]:
+    old, new = mutant.lines(source)
+    place = {"file": mutant.file, "line": mutant.line, "kind": mutant.kind}
+    return {"mutant": _name(mutant, source)} | place | {"old": old, "new": new}
+
+
+def _name(mutant: Mutation, source: bytes) -> str:
+    """What it is known by in the records: its text and place."""
+    return " ".join([mutant.file, str(mutant.start), *mutant.lines(source)])
+
+
+def warmed(
+    root: Path, tree: Path, folder: Path, files: Iterable[str]
+) -> tuple[dict[str, dict[str, int]], dict[str, float]]:
+    """Makes `tree` a copy of `root` in which all that the tests need is compiled already.
+
+    Returns:
+        What each test file reaches, and the seconds of each that passed and reaches any of `files`.
+    """
+    changed = _renewed(root, tree)
+    graph = imports(tree)
+    tests = [
+        file
+        for file in graph
+        if Path(file).name.startswith("test_") and Path(file).stem not in LEFT_OUT
+    ]
+    reach = {test: distances(graph, test) for test in tests}
+    known = folder / "seconds.json"
+    seconds = json.loads(known.read_text()) if known.exists() else {}
+    seconds = {
+        test: duration
+        for test, duration in seconds.items()
+        if test in reach and not changed & reach[test].keys()
+    }
+    new = [t for t in tests if t not in seconds and any(file in reach[t] for file in files)]
+    print(f"{len(new)} test files without any mutant", flush=True)
+    for test in sorted(new):  # one by one: what fails without a mutant tells nothing with one
+        fork = Fork(tree, [test])
+        while fork.process.is_alive() and not fork.waits_too_long():
+            fork.process.join(5.0)
+        result = fork.result()
+        if result["outcome"] == "survived":
+            seconds[test] = sum(result["durations"].values())
+        else:
+            print(f"{test} fails without any mutant: {result['killer']}", flush=True)
+        known.write_text(json.dumps(seconds))
+    return reach, {test: duration for test, duration in seconds.items() if test in reach}
+
+
+def _renewed(root: Path, tree: Path) -> set[str]:
+    """Copies to `tree` what has changed in `root`; returns those files."""
+
+    def files(folder: Path) -> set[str]:
+        kept = set()
+        for path, folders, names in os.walk(folder):
+            hidden = {".", "__pycache__", "out"}
+            folders[:] = [f for f in folders if f not in hidden and not f.startswith(".")]
+            kept |= {(Path(path) / n).relative_to(folder).as_posix() for n in names if n[0] != "."}
+        return kept
+
+    new, old = files(root), files(tree) if tree.exists() else set()
+    changed = {f for f in new & old if (root / f).read_bytes() != (tree / f).read_bytes()}
+    changed |= new ^ old
+    for file in changed:
+        (tree / file).unlink(missing_ok=True)
+        if file in new:
+            (tree / file).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(root / file, tree / file)
+    return changed
+
+
+def _copy(tree: Path, folder: Path, mutant: Mutation) -> Path:
+    """A copy of the tree, of links to its files but for the mutant's."""
+    copy = Path(tempfile.mkdtemp(dir=folder, prefix="mutant_")) / "tree"
+    shutil.copytree(tree, copy, copy_function=os.link)
+    source = (copy / mutant.file).read_bytes()
+    (copy / mutant.file).unlink()
+    (copy / mutant.file).write_bytes(mutant.applied(source))
+    return copy
+
+
+def _keep_compiled(copy: Path, tree: Path) -> None:
+    """Links what a mutant's tests have compiled; its name says of what, so it is right for all."""
+    for code in copy.rglob("*.nbc"):
+        kept = tree / code.relative_to(copy)
+        kept.parent.mkdir(exist_ok=True)
+        with suppress(FileExistsError):
+            os.link(code, kept)
+
+
+class Fork:
+    """Tests in a process of their own, until one fails."""
+
+    def __init__(self, tree: Path, tests: list[str]) -> None:
+        self.tree, self.tests = tree, tests
+        self.found = tree.parent / "found.json"
+        self.found.unlink(missing_ok=True)
+        self._start = time.monotonic()
+        context = multiprocessing.get_context("fork")
+        self.process = context.Process(target=_run, args=(tree, tests, self.found))
+        self.process.start()
+
+    def waits_too_long(self) -> bool:
+        """Whether it stands still: time by the clock, of which a busy machine takes a lot."""
+        return time.monotonic() - self._start > 20 * ENDLESS
+
+    def result(self) -> dict[str, Any]:
+        """What came of it; removes the tree unless it is the one without a mutant."""
+        if self.process.is_alive():
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.join()
+        found = json.loads(self.found.read_text()) if self.found.exists() else {"durations": {}}
+        code = self.process.exitcode
+        outcome = "survived" if code == 0 else "killed"
+        if code in (-signal.SIGVTALRM, -signal.SIGKILL):
+            outcome = "timed out"
+        if self.tree.name == "tree" and self.tree.parent.name.startswith("mutant_"):
+            shutil.rmtree(self.tree.parent, ignore_errors=True)
+        return {
+            "outcome": outcome,
+            "killer": found.get("killer", f"exit code {code}" if code else ""),
+            "message": found.get("message", ""),
+            "seconds": round(time.monotonic() - self._start, 1),
+            "tests": len(self.tests),
+            "durations": found["durations"],
+        }
+
+
+def _run(tree: Path, tests: list[str], found: Path) -> None:
+    """The body of a fork; its exit code is pytest's."""
+    import pytest
+
+    os.setsid()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    os.nice(10)
+    with (tree.parent / "output.txt").open("w") as output:
+        os.dup2(output.fileno(), 1)
+        os.dup2(output.fileno(), 2)
+    os.chdir(tree)
+    sys.path[:1] = [str(tree)]
+    os.environ["PYTHONPATH"] = str(tree)
+    options = [
+        "-x",
+        "-q",
+        "--tb=short",
+        "--no-header",
+        "-p",
+        "no:cacheprovider",
+        f"--rootdir={tree}",
+    ]
+    options.append(f"--basetemp={tree.parent / 'temporary'}")
+    code = 0
+    # In two parts: to collect the far tests imports and compiles more than the near ones need.
+    for part in (tests[:3], tests[3:]):
+        if part and code == 0:
+            code = int(pytest.main([*options, *part], plugins=[_Watch(found)]))
+    sys.stdout.flush()
+    os._exit(code)
+
+
+class _Watch:
+    """A plugin of pytest that notes times and the first failure, and ends endless tests."""
+
+    def __init__(self, found: Path) -> None:
+        self._found = found
+        self._notes = json.loads(found.read_text()) if found.exists() else {"durations": {}}
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        self._spent = sum(os.times()[:4])  # of its children too; others do not lengthen it
+        # Not by a handler: compiled code would never come to it. What is written is the suspect.
+        self._write(killer=nodeid, message="endless or crashed")
+        signal.setitimer(signal.ITIMER_VIRTUAL, ENDLESS)
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        file = report.nodeid.partition("::")[0]
+        durations = self._notes["durations"]
+        durations[file] = durations.get(file, 0.0) + sum(os.times()[:4]) - self._spent
+        self._spent = sum(os.times()[:4])
+        if report.failed:
+            self._fail(report)
+
+    def pytest_collectreport(self, report: Any) -> None:
+        if report.failed:
+            self._fail(report)
+
+    def pytest_sessionfinish(self) -> None:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        if not self._notes.get("failed"):
+            self._notes.pop("killer", None)
+            self._notes.pop("message", None)
+        self._write()
+
+    def _fail(self, report: Any) -> None:
+        self._notes["failed"] = True
+        crash = getattr(report.longrepr, "reprcrash", None)
+        message = crash.message if crash else str(report.longrepr)
+        self._write(killer=report.nodeid, message=message[-200:] if not crash else message[:200])
+
+    def _write(self, **notes: str) -> None:
+        if notes and not (self._notes.get("failed") and "endless" in notes["message"]):
+            self._notes |= notes
+        self._found.write_text(json.dumps(self._notes))
+
+
+# What came out.
+
+
+def explanations() -> dict[tuple[str, str, str], str]:
+    """Why survivors change nothing that matters, by file, old lines and new lines."""
+    path = Path(__file__).with_name("mutants_equivalent.yaml")
+    entries = yaml.safe_load(path.read_text(encoding="utf-8")) or []
+    return {(entry["file"], entry["old"], entry["new"]): entry["why"] for entry in entries}
+
+
+def summary(records: list[dict[str, Any]]) -> dict[str, float]:
+    """Figures by name: of all, and of each room."""
+    known, counts = explanations(), Counter()
+    for record in records:
+        parts = record["file"].split("/")
+        for group in ("all", parts[1].removesuffix(".py")):
+            counts[f"{group}.made"] += 1
+            counts[f"{group}.{record['outcome'].replace(' ', '_')}"] += 1
+            if record["outcome"] == "survived":
+                explained = (record["file"], record["old"], record["new"]) in known
+                counts[f"{group}.explained"] += explained
+    figures = {name: float(count) for name, count in sorted(counts.items())}
+    noticed = counts["all.killed"] + counts["all.timed_out"]
+    figures["all.killed_percent"] = 100.0 * noticed / max(counts["all.made"], 1)
+    return figures
+
+
+def report(records: list[dict[str, Any]], figures: dict[str, float]) -> None:
+    known = explanations()
+    for record in records:
+        if record["outcome"] == "survived":
+            print(f"\n{record['file']}:{record['line']} ({record['kind']})")
+            print("\n".join(f"  - {line}" for line in record["old"].splitlines()))
+            print("\n".join(f"  + {line}" for line in record["new"].splitlines()))
+            why = known.get((record["file"], record["old"], record["new"]), "NO TEST NOTICES")
+            print(f"  {why}")
+    print()
+    names = ("made", "killed", "timed_out", "survived", "explained")
+    print(f"{'':20s}" + "".join(f"{name:>11s}" for name in names))
+    for room in sorted({name.partition(".")[0] for name in figures}):
+        cells = [figures.get(f"{room}.{name}", 0.0) for name in names]
+        print(f"{room:20s}" + "".join(f"{cell:11.0f}" for cell in cells))
+    print(f"noticed: {figures['all.killed_percent']:.1f} %")
+
+
+if __name__ == "__main__":
+    main()
