@@ -5,7 +5,8 @@
 2. Figs. 6 and 7: one free movement each with that estimate, sigma = 0 in the loop ("the forces in
    the bottom plots serve as inputs for the haptic device"). The curves for sigma = 1, 0.5 and 0 are
    computed from the recorded samples of that run with the kernel of the loop; sigma = 1 is F - F_o.
-3. The same movements with an ideal sensor and the true load: what is left is rounding.
+3. The same movements with an ideal sensor and the true load, eliminated from the reaction force
+   that the plant itself has in the wrist (`reaction.py`): what is left is rounding.
 4. Fig. 8: the contact, and the same movement without the sheet spring, for the threshold.
 
 What is measured, all of it at the rate at which the hand is served:
@@ -44,6 +45,7 @@ from drake_teleop.load.compensation import scaled_wrench
 from drake_teleop.pages.progress import Progress, Stage, progress_bars
 from drake_teleop.replay import write_replay
 from drake_teleop.reproduction.figures import contact_figure, scaling_figure
+from drake_teleop.reproduction.reaction import eliminated_reaction
 from drake_teleop.reproduction.report import (
     Comparison,
     ReportFigure,
@@ -131,7 +133,7 @@ def reproduce_command(out: Path, *, seed: int | None = None, quiet: bool = False
         force_run = free_motion(force, load.estimate, stage("Fig. 6: vertical free motion"))
         torque_run = free_motion(torque, load.estimate, stage("Fig. 7: horizontal free motion"))
         ideal = [
-            _ideal(scenario, stage(f"Fig. {number}: the same, ideal sensor"))
+            eliminated_reaction(scenario, stage(f"Fig. {number}: the same, ideal sensor"))
             for number, scenario in ((6, force), (7, torque))
         ]
         contact_run = contact_motion(contact, load.estimate, stage)
@@ -187,8 +189,11 @@ def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> Contact
     )
 
 
-def free_figures(run: FreeMotion, ideal: SimulationResult, component: int, unit: str) -> Figures:
-    """The figures of Figs. 6 and 7; `component` of the wrench, names end in `unit`."""
+def free_figures(run: FreeMotion, ideal: Array, component: int, unit: str) -> Figures:
+    """The figures of Figs. 6 and 7; `component` of the wrench, names end in `unit`.
+
+    `ideal` (N, 6) is what `eliminated_reaction` left.
+    """
     raw, half, rest = (run.scaled[sigma][:, component] for sigma in SIGMAS)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
     scale = run.scenario.force_scaling.force_scale
@@ -200,7 +205,7 @@ def free_figures(run: FreeMotion, ideal: SimulationResult, component: int, unit:
         f"residual_max_{unit}": float(np.abs(rest).max()),
         f"residual_rms_{unit}": _rms(rest),
         f"residual_norm_max_{unit}": _largest(run.scaled[0.0][:, vector]),
-        f"residual_ideal_max_{unit}": _largest(ideal["contact_wrench_S"][:, vector]),
+        f"residual_ideal_max_{unit}": _largest(ideal[:, vector]),
     }
 
 
@@ -300,11 +305,6 @@ def _at_the_hands_rate(scenario: Scenario, seed: int) -> Scenario:
 def _simulate(scenario: Scenario, estimate: Array, progress: Progress) -> SimulationResult:
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     return simulate(station, scenario.simulation, progress=progress)
-
-
-def _ideal(scenario: Scenario, progress: Progress) -> SimulationResult:
-    truth = np.concatenate([np.zeros(6), _truth(scenario)[6:]])
-    return _simulate(replace(scenario, wrist_sensor__ideal=True), truth, progress)
 
 
 def _truth(scenario: Scenario) -> Array:
