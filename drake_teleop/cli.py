@@ -27,14 +27,19 @@ def cli() -> None:
 @option.out("reproduce")
 @option.seed
 @option.quiet
-def reproduce(out: Path, seed: int | None, quiet: bool) -> None:
+def reproduce(out: Path, seed: int | None, quiet: bool) -> int:
     """Repeat the paper's experiments.
 
-    Writes the paper's figures and numbers next to ours, a replay and report.html.
+    Writes the paper's figures and numbers next to ours, a replay and report.html. The exit status
+    is 1 if a number is not as accepted.
     """
+    from drake_teleop.reproduction.report import unaccepted
     from drake_teleop.reproduction.reproduce import reproduce_command
 
-    reproduce_command(out, seed=seed, quiet=quiet)
+    lines = unaccepted(reproduce_command(out, seed=seed, quiet=quiet))
+    for line in lines:
+        click.echo(line, err=True)
+    return 1 if lines else 0
 
 
 @cli.command()
@@ -432,7 +437,10 @@ def excite(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs the command line and exits: 0, 2 for unusable input, 130 for Ctrl-C or `kill`."""
+    """Runs the command line and exits: 0, 2 for unusable input, 130 for Ctrl-C or `kill`.
+
+    Also 1, if `reproduce` finds a number that is not as accepted.
+    """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         status = cli.main(arguments, prog_name="drake-teleop", standalone_mode=False)

@@ -128,6 +128,13 @@ def test_programming_mistakes_keep_their_traceback(install):
         cli.main(["run", "x"])
 
 
+@pytest.mark.parametrize(("lines", "status"), [([], 0), (["Mass: beyond our bound"], 1)])
+def test_a_number_that_is_not_as_accepted_is_status_1(capsys, install, lines, status):
+    install("drake_teleop.reproduction.reproduce", "reproduce_command", lambda *_, **__: "figures")
+    install("drake_teleop.reproduction.report", "unaccepted", {"figures": lines}.get)
+    assert run_main(capsys, "reproduce") == (status, "", "".join(f"{x}\n" for x in lines))
+
+
 def test_options_reach_the_commands(capsys, install):
     calls = []
 
@@ -136,6 +143,7 @@ def test_options_reach_the_commands(capsys, install):
 
     install("drake_teleop.run", "run_command", note)
     install("drake_teleop.reproduction.reproduce", "reproduce_command", note)
+    install("drake_teleop.reproduction.report", "unaccepted", lambda summary: [])
     install("drake_teleop.logs.commands", "identify_command", note)
     status, out, err = run_main(capsys, "run", "contact_transition", "--seed", "7", "--quiet")
     assert (status, out, err) == (0, "", "")

@@ -51,6 +51,7 @@ from drake_teleop.reproduction.report import (
     ReportFigure,
     captions,
     compare_with_paper,
+    flat,
     parameter_rows,
     write_report,
 )
@@ -151,15 +152,6 @@ def reproduce_command(out: Path, *, seed: int | None = None, quiet: bool = False
     if not quiet:
         _print(compare_with_paper(flat(summary)), out)
     return summary
-
-
-def flat(summary: Figures) -> Figures:
-    """The figures by full name: ``{"contact.true_s": 0.22, ...}``; null becomes NaN."""
-    return {
-        f"{part}.{name}": math.nan if value is None else value
-        for part, figures in summary.items()
-        for name, value in figures.items()
-    }
 
 
 def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
@@ -430,7 +422,10 @@ def _setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str,
             f"wrist sensor {rates.sensor_hz:g} Hz, hand and channel {rates.hand_hz:g} Hz, joint "
             f"control {rates.joint_control_hz:g} Hz, load estimator {rates.estimator_hz:g} Hz"
         ),
-        "Plant": f"continuous, {scenario.simulation.integrator}, a step for every sensor sample",
+        "Plant": (
+            f"continuous, {scenario.simulation.integrator}, no step longer than a period of the joint "
+            "control; the sensor samples inside the steps"
+        ),
         "Excitation": (
             f"one period of {load.trajectory.period:g} s, {load.trajectory.rho.shape[1]} "
             f"harmonics, condition number {load.kappa_w10:.1f}"
@@ -440,10 +435,10 @@ def _setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str,
 
 
 def _markdown(rows: list[Comparison]) -> str:
-    lines = ["| What | Paper | This run | Accepted | Verdict |", "|---|---|---|---|---|"]
+    lines = ["| What | Paper | This run | | Accepted | Verdict |", "|---|---|---|---|---|---|"]
     lines += [
-        f"| {row.what.replace('|', '&#124;')} | {row.paper} | {row.ours} | {row.accepted or '–'} "
-        f"| {row.verdict} |"
+        f"| {row.what.replace('|', '&#124;')} | {row.paper} | {row.ours} | {row.origin} "
+        f"| {row.accepted or '–'} | {row.verdict} |"
         for row in rows
     ]
     return "\n".join(lines) + "\n"
@@ -458,11 +453,12 @@ def _print(rows: list[Comparison], out: Path) -> None:
     table.add_column("What")
     table.add_column("Paper")
     table.add_column("This run", justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
     table.add_column("Verdict", no_wrap=True)
-    colours = {"agrees": "green", "differs": "bold red", "for the record": "dim"}
+    colours = {"agrees": "green", "differs": "bold red", "": "dim"}
     for row in rows:
-        verdict = f"[{colours[row.verdict]}]{row.verdict}[/]"
-        table.add_row(row.what, row.paper, row.ours, verdict)
+        verdict = f"[{colours[row.pill]}]{row.verdict}[/]"
+        table.add_row(row.what, row.paper, row.ours, row.origin, verdict)
     console = Console()
     console.print(table)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)
