@@ -423,8 +423,8 @@ def _setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str,
             f"control {rates.joint_control_hz:g} Hz, load estimator {rates.estimator_hz:g} Hz"
         ),
         "Plant": (
-            f"continuous, {scenario.simulation.integrator}, no step longer than a period of the joint "
-            "control; the sensor samples inside the steps"
+            f"continuous, {scenario.simulation.integrator}, no step longer than a period of the "
+            "joint control; the sensor samples inside the steps"
         ),
         "Excitation": (
             f"one period of {load.trajectory.period:g} s, {load.trajectory.rho.shape[1]} "

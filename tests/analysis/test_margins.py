@@ -1,6 +1,5 @@
 """Margins of loops with delay, against closed forms, time, roots and the control library."""
 
-import time
 from dataclasses import replace
 
 import control
@@ -339,10 +338,8 @@ def test_loops_of_control():
 
 def test_a_grid_of_parameters():
     delay, wall = np.linspace(0, 0.2, 100)[:, None], np.geomspace(100, 1e5, 100)
-    started = time.thread_time()
     loop = station_loop(held("medium", ideal_servo=False, delay=delay, wall_stiffness=wall))
     count, margin = unstable_poles(loop), delay_margin(loop)
-    assert time.thread_time() - started < 2.0
     assert count.shape == margin.shape == (100, 100)
     for i, j in ((0, 0), (50, 60), (10, 99), (99, 40)):
         single = station_loop(

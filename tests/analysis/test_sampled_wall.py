@@ -1,7 +1,5 @@
 """The Z-width of a sampled device: in frequency, in time, and against the loop's own poles."""
 
-import time
-
 import control
 import numpy as np
 import pytest
@@ -223,10 +221,8 @@ def test_sampled_poles_in_time():
 
 def test_a_grid_of_parameters():
     b, B = np.linspace(0.1, 5, 100)[:, None], np.linspace(0, 2, 100)
-    started = time.thread_time()
     K = passive_stiffness(b, B, PERIOD, 1)
     stable = stable_stiffness(0.15, b, B, PERIOD, 1)
-    assert time.thread_time() - started < 5.0
     assert K.shape == stable.shape == (100, 100)
     for i, j in ((0, 0), (50, 20), (99, 99)):
         assert passive_stiffness(b[i, 0], B[j], PERIOD, 1) == pytest.approx(K[i, j], rel=1e-12)

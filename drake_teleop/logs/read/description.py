@@ -2,7 +2,9 @@
 
 Every field is documented in docs/logs.md. A number x of a file becomes a quantity in S by
 
-    x_S = sign * R_S,stream * (x * unit - bias)
+    x_S = sign * R_S,stream * (x - bias) * unit
+
+so a bias is in the unit and the axes of the file.
 """
 
 from __future__ import annotations

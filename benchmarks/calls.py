@@ -1,0 +1,181 @@
+"""Is each call as fast as the station, or who waits for it, needs it to be?
+
+    python benchmarks/calls.py [--json FILE]
+
+The status is 1 if a call takes longer than it may. Baselines: the same function interpreted, for
+what runs at every sample; one cell at a time, for grids; a second of simulation, for the
+linearisation. Times are thread CPU time, the shortest of some rounds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from drake_teleop.analysis.delayed_loop import delay_margin, station_loop, unstable_poles
+from drake_teleop.analysis.linearization import linearize
+from drake_teleop.analysis.one_axis import OneAxis
+from drake_teleop.analysis.sampled_wall import passive_stiffness, stable_stiffness
+from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.identification import slave_arm
+from drake_teleop.load.contact.memory import SIZE
+from drake_teleop.load.contact.noise_floor import NoiseFloor
+from drake_teleop.load.contact.statistics import detection_update
+from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.sensor.sensor_chain import (
+    NOISE_SIZE,
+    PRESETS,
+    WristSensorConfig,
+    read_into,
+    sensor_chain,
+)
+from drake_teleop.simulation import MakeSimulator, advance
+from drake_teleop.station import MakeTeleopStation
+
+PERIOD = 1 / 8000  # [s] of the sensor
+N = 100  # cells of a grid in each direction
+SAMPLE = 40  # cells of a grid that the baseline does
+#: What each call may take [s].
+MAY_TAKE = {
+    **{f"reading of {name}": 2.5e-6 for name in PRESETS},
+    "detection of contact, a sample": 5e-6,
+    f"delay margins, {N} x {N}": 2.0,
+    f"limits of a sampled wall, {N} x {N}": 5.0,
+    "linearisation of a station that presses on a leaf": 10.0,
+}
+
+
+def seconds(call: Callable[[], Any], rounds: int) -> float:
+    """Of the thread, the shortest of some rounds, after one that compiles."""
+    times = []
+    for _ in range(rounds + 1):
+        began = time.thread_time()
+        call()
+        times.append(time.thread_time() - began)
+    return min(times[1:])
+
+
+@njit
+def _read_often(constants, memory, noise, truth, reading, count):  # type: ignore[no-untyped-def]
+    for _ in range(count):
+        read_into(constants, memory, noise, truth, reading)
+
+
+def reading(config: WristSensorConfig) -> tuple[float, float]:
+    """One sample of six joints through the chain, and the same interpreted [s]."""
+    rng = np.random.default_rng(0)
+    constants, memory = sensor_chain(config, 6, PERIOD)
+    noise = rng.standard_normal(NOISE_SIZE)
+    rest = constants, memory, noise, rng.normal(size=21), np.empty(19)
+    ours = seconds(lambda: _read_often(*rest, 2000), 5) / 2000
+    return ours, seconds(lambda: read_into.py_func(*rest), 20)
+
+
+@njit
+def _detect_often(memory, wrenches, motion, parameters):  # type: ignore[no-untyped-def]
+    for i in range(len(wrenches)):
+        detection_update(memory, wrenches[i], *motion, *parameters, 1.0, 0.0, 0.0)
+
+
+def detection() -> tuple[float, float]:
+    """All statistics of one sample at rest, and the same interpreted [s]."""
+    noise = np.repeat([0.05, 0.002], 3)
+    still = np.zeros(3)
+    floor = NoiseFloor(noise, np.zeros((16, 16)), np.zeros((6, 2)), np.eye(6), np.full(6, 0.5))
+    wrenches = np.random.default_rng(0).normal(size=(20_000, 6)) * noise
+    motion = (np.array([0.0, 0.0, 9.81]), still, still, still)
+    memory, parameters = np.zeros(SIZE), tuple(floor.parameters)
+    ours = seconds(lambda: _detect_often(memory, wrenches, motion, parameters), 3) / len(wrenches)
+    update = detection_update.py_func
+    slow = seconds(lambda: update(memory, wrenches[0], *motion, *parameters, 1.0, 0.0, 0.0), 20)
+    return ours, slow
+
+
+def margin_grid() -> tuple[float, float]:
+    """Margins and unstable poles over delay and stiffness, and cell by cell [s]."""
+
+    def margins(delay: Any, stiffness: Any) -> None:
+        loop = station_loop(OneAxis(delay=delay, wall_stiffness=stiffness))
+        unstable_poles(loop)
+        delay_margin(loop)
+
+    return grid(margins, np.linspace(0, 0.2, N), np.geomspace(100, 1e5, N))
+
+
+def wall_grid() -> tuple[float, float]:
+    """Passive and stable stiffness over the device's and the wall's damping, cell by cell [s]."""
+
+    def limits(b: Any, B: Any) -> None:
+        passive_stiffness(b, B, 1e-3, 1)
+        stable_stiffness(0.15, b, B, 1e-3, 1)
+
+    return grid(limits, np.linspace(0.1, 5, N), np.linspace(0, 2, N))
+
+
+def grid(call: Callable[[Any, Any], None], a: Any, b: Any) -> tuple[float, float]:
+    """The call on the whole grid, and on each of its cells as by a sample of them [s]."""
+    cells = np.random.default_rng(1).integers(N, size=(SAMPLE, 2))
+
+    def some() -> None:
+        for i, j in cells:
+            call(float(a[i]), float(b[j]))
+
+    return seconds(lambda: call(a[:, None], b), 1), seconds(some, 1) / SAMPLE * N * N
+
+
+def linearisation() -> tuple[float, float]:
+    """Of the station with 40 mm of a leaf pressed in, and a second of its simulation [s]."""
+    leaf = SheetSpring(
+        position=[0.55, 0.0, 0.45 - 0.2 - 0.03], length=0.12, width=0.05, thickness=0.0015
+    )
+    scenario = replace(LoadScenario("free_motion_force"), sheet_spring=leaf)
+    estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+    pressing = (0.0, 0.0, -0.04)
+    ours = seconds(lambda: linearize(scenario, load_estimate=estimate, displacement=pressing), 1)
+    station = MakeTeleopStation(scenario, load_estimate=estimate)
+    return ours, seconds(lambda: advance(MakeSimulator(station, scenario.simulation), 1.0), 1)
+
+
+def measure() -> dict[str, dict[str, float]]:
+    """Per call, what it takes, what it may take, and what the baseline takes [s]."""
+    calls: list[Callable[[], tuple[float, float]]] = [
+        *(lambda name=name: reading(PRESETS[name]) for name in PRESETS),  # type: ignore[misc]
+        detection,
+        margin_grid,
+        wall_grid,
+        linearisation,
+    ]
+    rows = {}
+    for (name, may_take), call in zip(MAY_TAKE.items(), calls, strict=True):
+        ours, baseline = call()
+        rows[name] = {"seconds": ours, "may_take": may_take, "baseline": baseline}
+    return rows
+
+
+def main() -> int:
+    """Measures, prints; returns 0 if no call takes longer than it may."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    arguments = parser.parse_args()
+    rows = measure()
+    print(f"{'':52}{'takes':>10}{'may take':>10}{'baseline':>12}")
+    for name, row in rows.items():
+        print(
+            f"{name:52}{row['seconds']:9.2g}s{row['may_take']:9.2g}s"
+            f"{row['baseline'] / row['seconds']:10.1f} x"
+        )
+    if arguments.json:
+        arguments.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    return 1 if any(row["seconds"] > row["may_take"] for row in rows.values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
