@@ -95,8 +95,8 @@ class _Files:
 
 def fingerprint(dispatcher: Dispatcher) -> str:
     """A hash of all that the function is compiled from: its own code and that of its callees."""
-    reached = {dispatcher}
-    to_do = [dispatcher]
+    reached: set[Any] = {dispatcher}
+    to_do: list[Any] = [dispatcher]
     while to_do:
         called = _what_it_is(to_do.pop())[1] - reached
         reached |= called
@@ -106,18 +106,26 @@ def fingerprint(dispatcher: Dispatcher) -> str:
 
 
 @cache
-def _what_it_is(dispatcher: Dispatcher) -> tuple[str, frozenset[Dispatcher]]:
+def _what_it_is(compiled: Any) -> tuple[str, frozenset[Any]]:
     """The function's own code with the constants that it reads, and the functions that it calls."""
-    function = dispatcher.py_func
+    function = getattr(compiled, "py_func", compiled)
     read = dict(_read(function))
+    options = getattr(compiled, "targetoptions", {})
     text = (
-        _name(dispatcher),
+        _name(compiled),
         _text(function.__code__),
         _text(function.__defaults__),
-        sorted((name, str(option)) for name, option in dispatcher.targetoptions.items()),
+        sorted((name, str(option)) for name, option in options.items()),
         sorted((name, _text(value)) for name, value in read.items()),
     )
-    return repr(text), frozenset(value for value in read.values() if isinstance(value, Dispatcher))
+    package = function.__module__.partition(".")[0]
+    return repr(text), frozenset(value for value in read.values() if _is_compiled(value, package))
+
+
+def _is_compiled(value: Any, package: str) -> bool:
+    """Whether it becomes part of what calls it: that of `register_jitable` is a plain function."""
+    plain = isinstance(value, FunctionType) and value.__module__.partition(".")[0] == package
+    return plain or isinstance(value, Dispatcher)
 
 
 def _read(function: FunctionType) -> Iterator[tuple[str, Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from drake_teleop._compiled import njit
+from drake_teleop.vectors import cross, plus, plus_cross, three, times
 
 
 @njit(cache=True)
@@ -27,14 +28,9 @@ def conjugate(a):
 @njit(cache=True)
 def rotate(a, v):
     """R(a) v, for a vector v of three numbers."""
-    tx = 2.0 * (a[2] * v[2] - a[3] * v[1])
-    ty = 2.0 * (a[3] * v[0] - a[1] * v[2])
-    tz = 2.0 * (a[1] * v[1] - a[2] * v[0])
-    return (
-        v[0] + a[0] * tx + a[2] * tz - a[3] * ty,
-        v[1] + a[0] * ty + a[3] * tx - a[1] * tz,
-        v[2] + a[0] * tz + a[1] * ty - a[2] * tx,
-    )
+    axis = three(a, 1)
+    t = times(2.0, cross(axis, v))
+    return plus_cross(plus(v, times(a[0], t)), axis, t)
 
 
 @njit(cache=True)

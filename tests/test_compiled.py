@@ -15,10 +15,12 @@ import pytest
 
 import drake_teleop
 
-# `inner` reads a constant of another file, a module's function and one that comes after it.
+# `inner` reads a constant of another file, a module's function, one that comes after it, and
+# one that becomes part of its caller.
 FILES = {
     "numbers": "NUMBER = 1.0\nTABLE = np.zeros(2)\nSTEP = slice(0, 2)",
-    "far": "@njit(cache=True)\ndef far(x):\n    return x",
+    "far": "from .parts import part\n\n@njit(cache=True)\ndef far(x):\n    return part(x)",
+    "parts": "@register_jitable\ndef part(x):\n    return x",
     "inner": """
 from .numbers import NUMBER, STEP, TABLE
 from . import far
@@ -34,7 +36,10 @@ def _late(x, also=0.0):
     "outer": "from .inner import inner\n\n@njit(cache=True)\ndef outer(x):\n    return inner(x)",
     "other": "@njit(cache=True)\ndef other(x):\n    return 100.0",
 }
-HEAD = "import numpy as np\nfrom drake_teleop._compiled import njit\n"
+HEAD = """import numpy as np
+from numba.extending import register_jitable
+from drake_teleop._compiled import njit
+"""
 
 
 def _write(folder: Path, changes: dict[str, tuple[str, str]] | None = None) -> None:
@@ -74,7 +79,8 @@ def package(tmp_path, monkeypatch):
         ("numbers", "1.0", "2.0", 2.0),
         ("numbers", "zeros", "ones", 3.0),
         ("numbers", "slice(0, 2)", "slice(0, 0)", 1.0),
-        ("far", "return x", "return x + 4.0", 5.0),
+        ("far", "part(x)", "part(x) + 4.0", 5.0),
+        ("parts", "return x", "return x + 6.0", 7.0),
         ("inner", "NUMBER +", "NUMBER -", 1.0),
         ("inner", "also=0.0", "also=7.0", 8.0),
         ("inner", "+ also", "+ also + np.pi", 1.0 + np.pi),

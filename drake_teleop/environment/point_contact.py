@@ -18,6 +18,7 @@ from pydrake.systems.framework import Context
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.vectors import apply, dot, nine, three, transposed
 
 Array = NDArray[np.float64]
 
@@ -139,11 +140,8 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
     w0 -= pair[13] + deflection * pair[19]
     w1 -= pair[14] + deflection * pair[20]
     w2 -= pair[15] + deflection * pair[21]
-    d = (
-        pair[4] * w0 + pair[7] * w1 + pair[10] * w2,
-        pair[5] * w0 + pair[8] * w1 + pair[11] * w2,
-        pair[6] * w0 + pair[9] * w1 + pair[12] * w2,
-    )
+    R_WBox, w = nine(pair, 4), (w0, w1, w2)
+    d = apply(transposed(R_WBox), w)
     outside, deepest, face = 0.0, -np.inf, 0
     for i in range(3):
         beyond = abs(d[i]) - pair[16 + i]
@@ -162,12 +160,11 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
         beyond = abs(d[i]) - pair[16 + i]
         if (outside > 0.0 and beyond > 0.0) or (outside == 0.0 and i == face):
             normal[3 + i] = np.copysign(beyond / distance if outside > 0.0 else 1.0, d[i])
-    n0, n1, n2 = normal[3], normal[4], normal[5]
+    n_W = apply(R_WBox, three(normal, 3))
     # Halfway between the sphere's deepest point and the box's surface.
     inwards = (radius + distance) / 2
-    w = (w0, w1, w2)
     for i in range(3):
-        normal[i] = pair[4 + 3 * i] * n0 + pair[5 + 3 * i] * n1 + pair[6 + 3 * i] * n2
+        normal[i] = n_W[i]
         origin = pair[13 + i] + deflection * pair[19 + i] + w[i]
         normal[3 + i] = origin - inwards * normal[i]
     return radius - distance
@@ -195,7 +192,7 @@ def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: 
         velocity: (3,) of the sphere at the point of contact, relative to the box [m/s].
         force: (3,) filled [N].
     """
-    out = velocity[0] * normal[0] + velocity[1] * normal[1] + velocity[2] * normal[2]
+    out = dot(velocity, normal)
     f_n = max(pair[22] * x * (1.0 - pair[23] * out), 0.0)
     speed = 0.0
     for i in range(3):

@@ -28,6 +28,7 @@ from drake_teleop.sensor.motion_estimation import (
     motion_gains,
 )
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
+from drake_teleop.vectors import cross_matrix
 
 Array = NDArray[np.float64]
 
@@ -98,7 +99,7 @@ def predicted_deviations(
         of_motion = -_spatial_inertia(phi) @ influence[:, :6]
         through_s = _backwards(of_s, of_motion[:, :3], step)
         # s of So is s of Ao plus p_SoAo x alpha.
-        through_alpha = of_motion[:, 3:] + _cross(noise.place).T @ through_s
+        through_alpha = of_motion[:, 3:] + cross_matrix(noise.place).T @ through_s
         influence[:, 6:9] = through_s
         influence[:, 9:] = _backwards(of_alpha, through_alpha, step)
     # An increment of a walk is in all that comes after it.
@@ -123,9 +124,5 @@ def _backwards(polynomials: tuple[Array, Array], signals: Array, step: float) ->
 
 def _spatial_inertia(phi: Array) -> Array:
     """(6, 6) from [s, alpha] of S to the wrench of phi."""
-    moment = _cross(phi[1:4])
+    moment = cross_matrix(phi[1:4])
     return np.block([[phi[0] * np.eye(3), -moment], [moment, inertia_about_origin(phi)]])
-
-
-def _cross(p: Array) -> Array:
-    return np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from drake_teleop._compiled import njit
 from drake_teleop.load.arrays import Array, checked, checked_rows
+from drake_teleop.vectors import apply, cross, plus, symmetric, three, times
 
 
 @njit(cache=True)
@@ -49,25 +50,13 @@ def regressor_into(s, omega, alpha, V):
 @njit(cache=True)
 def non_contact_wrench_into(s, omega, alpha, phi, out):
     """Writes V phi, Eqs. (1)-(2), into out (6,) without building V. phi may be a tuple."""
-    sx, sy, sz = s[0], s[1], s[2]
-    wx, wy, wz = omega[0], omega[1], omega[2]
-    ax, ay, az = alpha[0], alpha[1], alpha[2]
-    m, hx, hy, hz = phi[0], phi[1], phi[2], phi[3]
-    ixx, ixy, ixz, iyy, iyz, izz = phi[4], phi[5], phi[6], phi[7], phi[8], phi[9]
-
-    # f = m s + alpha x h + omega x (omega x h), h = m c
-    ux, uy, uz = wy * hz - wz * hy, wz * hx - wx * hz, wx * hy - wy * hx
-    out[0] = m * sx + (ay * hz - az * hy) + (wy * uz - wz * uy)
-    out[1] = m * sy + (az * hx - ax * hz) + (wz * ux - wx * uz)
-    out[2] = m * sz + (ax * hy - ay * hx) + (wx * uy - wy * ux)
-
-    # tau = I alpha + omega x (I omega) + h x s
-    lx = ixx * wx + ixy * wy + ixz * wz
-    ly = ixy * wx + iyy * wy + iyz * wz
-    lz = ixz * wx + iyz * wy + izz * wz
-    out[3] = ixx * ax + ixy * ay + ixz * az + (wy * lz - wz * ly) + (hy * sz - hz * sy)
-    out[4] = ixy * ax + iyy * ay + iyz * az + (wz * lx - wx * lz) + (hz * sx - hx * sz)
-    out[5] = ixz * ax + iyz * ay + izz * az + (wx * ly - wy * lx) + (hx * sy - hy * sx)
+    s, omega, alpha = three(s, 0), three(omega, 0), three(alpha, 0)
+    m, h, inertia = phi[0], three(phi, 1), symmetric(phi, 4)  # h = m c
+    force = plus(plus(times(m, s), cross(alpha, h)), cross(omega, cross(omega, h)))
+    torque = plus(apply(inertia, alpha), cross(omega, apply(inertia, omega)))
+    torque = plus(torque, cross(h, s))
+    out[0], out[1], out[2] = force
+    out[3], out[4], out[5] = torque
 
 
 @njit(cache=True)

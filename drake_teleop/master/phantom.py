@@ -30,6 +30,8 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.quaternions import multiply
+from drake_teleop.vectors import cross, dot, plus, solve, times
 
 GRAVITY = 9.81  # m/s^2, along -z_B
 
@@ -167,12 +169,12 @@ def gravity_torque_into(q, out):
 def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
     """Subtracts C(q, v) v of the whole device from `torque` (6,)."""
     # Main axes: Christoffel symbols of their closed-form M.
-    cross = _COUPLING * math.cos(q[1] - q[2])
+    coupling = _COUPLING * math.cos(q[1] - q[2])
     yaw_2 = -2.0 * (_YAW_2 * math.sin(2.0 * q[1]) + _COUPLING * math.sin(q[1]) * math.sin(q[2]))
     yaw_3 = -2.0 * (_YAW_3 * math.sin(2.0 * q[2]) - _COUPLING * math.cos(q[1]) * math.cos(q[2]))
     torque[0] -= (yaw_2 * v[1] + yaw_3 * v[2]) * v[0]
-    torque[1] -= cross * v[2] * v[2] - 0.5 * yaw_2 * v[0] * v[0]
-    torque[2] -= -cross * v[1] * v[1] - 0.5 * yaw_3 * v[0] * v[0]
+    torque[1] -= coupling * v[2] * v[2] - 0.5 * yaw_2 * v[0] * v[0]
+    torque[2] -= -coupling * v[1] * v[1] - 0.5 * yaw_3 * v[0] * v[0]
 
     # Point mass at E: J_v^T m (dJ_v/dt) v.
     s1, c1 = math.sin(q[0]), math.cos(q[0])
@@ -189,20 +191,15 @@ def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
 
     # Wrist links: angular velocity and velocity-product acceleration from link to link. Their
     # inertia is the same about every axis, so there is no gyroscopic moment.
-    wx, wy, wz = 0.0, 0.0, v[0]
-    bx, by, bz = 0.0, 0.0, 0.0
+    omega, alpha = (0.0, 0.0, v[0]), (0.0, 0.0, 0.0)
     for k in range(2, 6):
-        ax, ay, az = v[k] * J[3, k], v[k] * J[4, k], v[k] * J[5, k]
-        bx += wy * az - wz * ay
-        by += wz * ax - wx * az
-        bz += wx * ay - wy * ax
-        wx += ax
-        wy += ay
-        wz += az
+        turn = times(v[k], (J[3, k], J[4, k], J[5, k]))
+        alpha = plus(alpha, cross(omega, turn))
+        omega = plus(omega, turn)
         if k >= 3:
             inertia = WRIST_INERTIA + (hand_inertia if k == 5 else 0.0)
             for i in range(k + 1):
-                torque[i] -= inertia * (J[3, i] * bx + J[4, i] * by + J[5, i] * bz)
+                torque[i] -= inertia * dot((J[3, i], J[4, i], J[5, i]), alpha)
 
 
 @njit(cache=True)
@@ -234,25 +231,6 @@ def _add_friction_and_stops(q, v, coulomb, viscous, torque):
 
 
 @njit(cache=True)
-def _solve_in_place(M, b):
-    """b <- M^-1 b by Cholesky; M (6, 6), symmetric positive definite, is overwritten."""
-    for i in range(6):
-        for j in range(i + 1):
-            value = M[i, j]
-            for k in range(j):
-                value -= M[i, k] * M[j, k]
-            M[i, j] = math.sqrt(value) if i == j else value / M[j, j]
-    for i in range(6):
-        for k in range(i):
-            b[i] -= M[i, k] * b[k]
-        b[i] /= M[i, i]
-    for i in range(5, -1, -1):
-        for k in range(i + 1, 6):
-            b[i] -= M[k, i] * b[k]
-        b[i] /= M[i, i]
-
-
-@njit(cache=True)
 def acceleration_into(q, v, hand_wrench, motor_torque, parameters, work, vdot):
     """Forward dynamics of device and hand; writes the joint accelerations (6,) into `vdot`.
 
@@ -274,7 +252,7 @@ def acceleration_into(q, v, hand_wrench, motor_torque, parameters, work, vdot):
             vdot[i] += J[k, i] * hand_wrench[k]
     _subtract_coriolis(q, v, J, parameters[0], parameters[1], vdot)
     _add_friction_and_stops(q, v, parameters[2:8], parameters[8:14], vdot)
-    _solve_in_place(M, vdot)
+    solve(M, vdot, 6)
 
 
 @njit(cache=True)
@@ -309,12 +287,9 @@ def pose_into(q, pose):
     s5, c5 = math.sin(0.5 * q[4]), math.cos(0.5 * q[4])
     s6, c6 = math.sin(0.5 * q[5]), math.cos(0.5 * q[5])
     # Rz(q1) Ry(-q3), then Rz(q4) Ry(q5), their product, then Rx(q6).
-    aw, ax, ay, az = c1 * c3, -s1 * s3, c1 * s3, s1 * c3
-    bw, bx, by, bz = c4 * c5, -s4 * s5, c4 * s5, s4 * c5
-    w = aw * bw - ax * bx - ay * by - az * bz
-    x = aw * bx + ax * bw + ay * bz - az * by
-    y = aw * by - ax * bz + ay * bw + az * bx
-    z = aw * bz + ax * by - ay * bx + az * bw
+    a = c1 * c3, -s1 * s3, c1 * s3, s1 * c3
+    b = c4 * c5, -s4 * s5, c4 * s5, s4 * c5
+    w, x, y, z = multiply(a, b)
     pose[0] = w * c6 - x * s6
     pose[1] = x * c6 + w * s6
     pose[2] = y * c6 + z * s6

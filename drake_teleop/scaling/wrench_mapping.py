@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
+from drake_teleop.vectors import apply, rows, three, times, transposed
 
 
 @njit(cache=True)
@@ -14,12 +15,9 @@ def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
     for part in range(2):
         scale = torque_scale if part == 1 else force_scale
         base = 3 * part
-        x, y, z = wrench_S[base], wrench_S[base + 1], wrench_S[base + 2]
-        wx = R_WS[0, 0] * x + R_WS[0, 1] * y + R_WS[0, 2] * z
-        wy = R_WS[1, 0] * x + R_WS[1, 1] * y + R_WS[1, 2] * z
-        wz = R_WS[2, 0] * x + R_WS[2, 1] * y + R_WS[2, 2] * z
-        for k in range(3):
-            out[base + k] = -scale * (R_WB[0, k] * wx + R_WB[1, k] * wy + R_WB[2, k] * wz)
+        in_W = apply(rows(R_WS), three(wrench_S, base))
+        in_B = times(-scale, apply(transposed(rows(R_WB)), in_W))
+        out[base], out[base + 1], out[base + 2] = in_B
 
 
 def wrench_to_master(

@@ -49,6 +49,7 @@ from drake_teleop.sensor.sensor_chain import (
     shift,
 )
 from drake_teleop.slave.arm import MOTION_SIZE, sensor_motion
+from drake_teleop.vectors import apply, cross, minus, nine, plus, plus_cross, three, transposed
 
 _SOURCES = ("encoders", "accelerometer", "fused")
 #: How far an encoder's error moves So, root mean square over joints and directions [m/rad]: that of
@@ -395,10 +396,9 @@ def _accelerate(constants, memory, gravity, motion, sample):
     """
     period, fused, starts = constants[_PERIOD], constants[_FUSED] != 0.0, memory[0] == 0.0
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
-    R = motion[12:21]
-    _turn(constants[_ORIENTATION:_FILTERS], omega, alpha)
-    _turn(constants[_ORIENTATION:_FILTERS], s, omega)
-    s[0], s[1], s[2] = omega[0], omega[1], omega[2]
+    R_SA, R = nine(constants, _ORIENTATION), motion[12:21]
+    alpha[0], alpha[1], alpha[2] = apply(R_SA, three(omega, 0))
+    s[0], s[1], s[2] = apply(R_SA, three(s, 0))
     for i in range(3):
         omega[i] = motion[3 + i]
 
@@ -417,7 +417,9 @@ def _accelerate(constants, memory, gravity, motion, sample):
             angular[6 + i] = alpha[i]
             omega[i] = angular[3 + i] + 0.5 * period * alpha[i]
 
-    _move(constants[_PLACE:], omega, alpha, s)
+    # From Ao to So: what the rotation adds over r = p_SoAo_S goes.
+    r, w = three(constants, _PLACE), three(omega, 0)
+    s[0], s[1], s[2] = minus(s, plus_cross(cross(alpha, r), w, cross(w, r)))
     if fused:
         if starts:
             linear[15:18] = motion[9:12]
@@ -426,14 +428,12 @@ def _accelerate(constants, memory, gravity, motion, sample):
             linear[15 + i] = motion[9 + i]
             s[i] -= linear[12 + i]
         a_W = motion[3:6]  # what the encoders said of omega is used up
-        _turn(R, s, a_W)
-        for i in range(3):
-            a_W[i] += gravity[i]
+        a_W[0], a_W[1], a_W[2] = plus(apply(R, s), gravity)
         _track(constants[_LINEAR_GAINS:], period, motion, a_W, linear)
+        correction = apply(transposed(R), motion)
         for i in range(3):
-            correction = R[i] * motion[0] + R[3 + i] * motion[1] + R[6 + i] * motion[2]
-            linear[12 + i] -= correction
-            s[i] += correction
+            linear[12 + i] -= correction[i]
+            s[i] += correction[i]
             linear[6 + i] = a_W[i] + motion[i]
 
 
@@ -446,25 +446,6 @@ def _turned(before, R, angle):
         for row in range(0, 9, 3):
             value += before[row + k] * R[row + j] - before[row + j] * R[row + k]
         angle[i] = 0.5 * value
-
-
-@njit(cache=True)
-def _turn(R, vector, out):
-    """R (by rows) times a vector."""
-    x, y, z = vector[0], vector[1], vector[2]
-    for i in range(3):
-        out[i] = R[3 * i] * x + R[3 * i + 1] * y + R[3 * i + 2] * z
-
-
-@njit(cache=True)
-def _move(r, omega, alpha, s):
-    """Moves a specific force from Ao to So: what the rotation adds over r = p_SoAo_S goes."""
-    x, y, z = r[0], r[1], r[2]
-    wx, wy, wz = omega[0], omega[1], omega[2]
-    ux, uy, uz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
-    s[0] -= alpha[1] * z - alpha[2] * y + wy * uz - wz * uy
-    s[1] -= alpha[2] * x - alpha[0] * z + wz * ux - wx * uz
-    s[2] -= alpha[0] * y - alpha[1] * x + wx * uy - wy * ux
 
 
 @njit(cache=True)

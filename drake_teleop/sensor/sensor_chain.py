@@ -37,6 +37,7 @@ from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
 from drake_teleop.quantities import choice, quantity
+from drake_teleop.vectors import apply, cross, cross_matrix, nine, plus_cross, three
 
 #: Samples that share one block of random numbers: one event of a noise source, one step of a walk.
 NOISE_BLOCK = 128
@@ -377,9 +378,8 @@ def calibration_matrices(
 
 def _rotation(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
     """Rodrigues' formula; `axis` of any length."""
-    x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    K = cross_matrix(axis / np.linalg.norm(axis))
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
 
 #: In the constants: offset of force and torque, which may be changed while the sensor runs.
@@ -543,17 +543,10 @@ def _calibrate(constants, truth, out):
         for j in range(6):
             value += constants[_WRENCH + 6 * i + j] * wrench[j]
         out[i] = value
-    wx, wy, wz = omega[0], omega[1], omega[2]
-    ax, ay, az = alpha[0], alpha[1], alpha[2]
-    x, y, z = constants[_PLACE], constants[_PLACE + 1], constants[_PLACE + 2]
-    ux, uy, uz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x  # omega x r
-    sx = s[0] + ay * z - az * y + wy * uz - wz * uy
-    sy = s[1] + az * x - ax * z + wz * ux - wx * uz
-    sz = s[2] + ax * y - ay * x + wx * uy - wy * ux
-    for i in range(3):
-        k, m = _MOTION + 3 * i, _MOTION + 9 + 3 * i
-        out[6 + i] = constants[k] * sx + constants[k + 1] * sy + constants[k + 2] * sz
-        out[9 + i] = constants[m] * ax + constants[m + 1] * ay + constants[m + 2] * az
+    r = three(constants, _PLACE)
+    at_Ao = plus_cross(plus_cross(s, alpha, r), omega, cross(omega, r))
+    out[6], out[7], out[8] = apply(nine(constants, _MOTION), at_Ao)
+    out[9], out[10], out[11] = apply(nine(constants, _MOTION + 9), alpha)
 
 
 @njit(cache=True)

@@ -68,6 +68,7 @@ from drake_teleop.slave.arm import (
 )
 from drake_teleop.slave.plant import SlavePlant
 from drake_teleop.slave.tool_contact import add_force, environment_wrench
+from drake_teleop.vectors import apply, cross, minus, nine, three, transposed
 
 Array = NDArray[np.float64]
 
@@ -93,14 +94,10 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
     wrench = out[WRENCH]
     non_contact_wrench_into(s, omega, alpha, phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
-    f, tau, p = contact_W[:3], contact_W[3:], motion[9:12]
-    tx = tau[0] - (p[1] * f[2] - p[2] * f[1])
-    ty = tau[1] - (p[2] * f[0] - p[0] * f[2])
-    tz = tau[2] - (p[0] * f[1] - p[1] * f[0])
-    for i in range(3):  # the columns of R_WS are the axes of S
-        x, y, z = motion[12 + i], motion[15 + i], motion[18 + i]
-        wrench[i] -= x * f[0] + y * f[1] + z * f[2]
-        wrench[3 + i] -= x * tx + y * ty + z * tz
+    f, p_WS, R_SW = three(contact_W, 0), three(motion, 9), transposed(nine(motion, 12))
+    tau = minus(three(contact_W, 3), cross(p_WS, f))
+    wrench[0], wrench[1], wrench[2] = minus(three(wrench, 0), apply(R_SW, f))
+    wrench[3], wrench[4], wrench[5] = minus(three(wrench, 3), apply(R_SW, tau))
 
 
 @njit(cache=True)

@@ -30,6 +30,20 @@ from pydrake.multibody.tree import (
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.vectors import (
+    add_into,
+    apply,
+    cross,
+    dot,
+    minus,
+    nine,
+    plus,
+    plus_cross,
+    symmetric,
+    three,
+    times,
+    transposed,
+)
 
 Array = NDArray[np.float64]
 
@@ -250,46 +264,26 @@ def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
 @njit(cache=True, inline="always")
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
     """Moves the pose in x from the previous link to this one; returns p_PL_W."""
-    r0 = r1 = r2 = 0.0
-    for k in range(3):
-        p = table[row, 9 + k]
-        r0 += x[12 + k] * p
-        r1 += x[15 + k] * p
-        r2 += x[18 + k] * p
-    x[9] += r0
-    x[10] += r1
-    x[11] += r2
+    joint = table[row]
+    p_PL_W = apply(nine(x, 12), three(joint, _TRANSLATION))
+    add_into(x, 9, p_PL_W)
     c = np.cos(q)
     s = np.sin(q)
+    R_JP = transposed(nine(joint, _ROTATION))
     for i in range(12, 21, 3):
-        a, b, d = x[i], x[i + 1], x[i + 2]
-        u = a * table[row, 0] + b * table[row, 3] + d * table[row, 6]
-        v = a * table[row, 1] + b * table[row, 4] + d * table[row, 7]
-        x[i] = c * u + s * v
-        x[i + 1] = c * v - s * u
-        x[i + 2] = a * table[row, 2] + b * table[row, 5] + d * table[row, 8]
-    return r0, r1, r2
+        u, v, w = apply(R_JP, three(x, i))
+        x[i], x[i + 1], x[i + 2] = c * u + s * v, c * v - s * u, w
+    return p_PL_W
 
 
 @njit(cache=True, inline="always")
 def _advance(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
     """Moves the state x from the previous link to this one."""
-    r0, r1, r2 = _advance_pose(table, row, q, x)
-    w0, w1, w2, a0, a1, a2 = x[3], x[4], x[5], x[6], x[7], x[8]
-    # omega x r, then alpha x r + omega x (omega x r)
-    u0 = w1 * r2 - w2 * r1
-    u1 = w2 * r0 - w0 * r2
-    u2 = w0 * r1 - w1 * r0
-    x[0] += a1 * r2 - a2 * r1 + w1 * u2 - w2 * u1
-    x[1] += a2 * r0 - a0 * r2 + w2 * u0 - w0 * u2
-    x[2] += a0 * r1 - a1 * r0 + w0 * u1 - w1 * u0
-    z0, z1, z2 = x[14], x[17], x[20]
-    x[3] += z0 * qd
-    x[4] += z1 * qd
-    x[5] += z2 * qd
-    x[6] += z0 * qdd + (w1 * z2 - w2 * z1) * qd
-    x[7] += z1 * qdd + (w2 * z0 - w0 * z2) * qd
-    x[8] += z2 * qdd + (w0 * z1 - w1 * z0) * qd
+    r = _advance_pose(table, row, q, x)
+    omega, alpha, z = three(x, 3), three(x, 6), (x[14], x[17], x[20])
+    add_into(x, 0, plus_cross(cross(alpha, r), omega, cross(omega, r)))
+    add_into(x, 3, times(qd, z))
+    add_into(x, 6, plus(times(qdd, z), times(qd, cross(omega, z))))
 
 
 def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
@@ -359,13 +353,11 @@ def jacobian(table: Array, q: Array, J_out: Array) -> None:
             J_out[i, row] = x[9 + i]
             J_out[3 + i, row] = x[14 + 3 * i]
     _advance_pose(table, n, 0.0, x)
+    p_WS = three(x, 9)
     for row in range(n):
-        r0 = x[9] - J_out[0, row]
-        r1 = x[10] - J_out[1, row]
-        r2 = x[11] - J_out[2, row]
-        J_out[0, row] = J_out[4, row] * r2 - J_out[5, row] * r1
-        J_out[1, row] = J_out[5, row] * r0 - J_out[3, row] * r2
-        J_out[2, row] = J_out[3, row] * r1 - J_out[4, row] * r0
+        column = J_out[:, row]
+        lever = minus(p_WS, column)
+        column[0], column[1], column[2] = cross(three(column, 3), lever)
 
 
 @njit(cache=True)
@@ -386,10 +378,9 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
     for row in range(n):
         _advance(table, row, q[row], v[row], vdot[row], out)
     _advance(table, n, 0.0, 0.0, 0.0, out)
+    R_SW = transposed(nine(out, 12))
     for i in range(0, 9, 3):
-        a, b, c = out[i], out[i + 1], out[i + 2]
-        for k in range(3):
-            out[i + k] = out[12 + k] * a + out[15 + k] * b + out[18 + k] * c
+        out[i], out[i + 1], out[i + 2] = apply(R_SW, three(out, i))
 
 
 @njit(cache=True)
@@ -419,39 +410,19 @@ def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
 
     All in W. The wrench is Newton and Euler about the origin of L, Eqs. (1)-(2), taken in L.
     """
-    m, h0, h1, h2 = table[row, 12], table[row, 13], table[row, 14], table[row, 15]
-    xx, xy, xz = table[row, 16], table[row, 17], table[row, 18]
-    yy, yz, zz = table[row, 19], table[row, 20], table[row, 21]
-    s0 = x[12] * x[0] + x[15] * x[1] + x[18] * x[2]
-    s1 = x[13] * x[0] + x[16] * x[1] + x[19] * x[2]
-    s2 = x[14] * x[0] + x[17] * x[1] + x[20] * x[2]
-    w0 = x[12] * x[3] + x[15] * x[4] + x[18] * x[5]
-    w1 = x[13] * x[3] + x[16] * x[4] + x[19] * x[5]
-    w2 = x[14] * x[3] + x[17] * x[4] + x[20] * x[5]
-    a0 = x[12] * x[6] + x[15] * x[7] + x[18] * x[8]
-    a1 = x[13] * x[6] + x[16] * x[7] + x[19] * x[8]
-    a2 = x[14] * x[6] + x[17] * x[7] + x[20] * x[8]
-    u0, u1, u2 = w1 * h2 - w2 * h1, w2 * h0 - w0 * h2, w0 * h1 - w1 * h0
-    f0 = m * s0 + a1 * h2 - a2 * h1 + w1 * u2 - w2 * u1
-    f1 = m * s1 + a2 * h0 - a0 * h2 + w2 * u0 - w0 * u2
-    f2 = m * s2 + a0 * h1 - a1 * h0 + w0 * u1 - w1 * u0
-    l0 = xx * w0 + xy * w1 + xz * w2
-    l1 = xy * w0 + yy * w1 + yz * w2
-    l2 = xz * w0 + yz * w1 + zz * w2
-    t0 = xx * a0 + xy * a1 + xz * a2 + w1 * l2 - w2 * l1 + h1 * s2 - h2 * s1
-    t1 = xy * a0 + yy * a1 + yz * a2 + w2 * l0 - w0 * l2 + h2 * s0 - h0 * s2
-    t2 = xz * a0 + yz * a1 + zz * a2 + w0 * l1 - w1 * l0 + h0 * s1 - h1 * s0
+    phi, wrench, R_WL, p_WL = table[row, _PHI:], link[row], nine(x, 12), three(x, 9)
+    R_LW, m, h, inertia = transposed(R_WL), phi[0], three(phi, 1), symmetric(phi, 4)
+    s, omega, alpha = apply(R_LW, three(x, 0)), apply(R_LW, three(x, 3)), apply(R_LW, three(x, 6))
+    f = plus_cross(plus_cross(times(m, s), alpha, h), omega, cross(omega, h))
+    tau = plus_cross(apply(inertia, alpha), omega, apply(inertia, omega))
+    tau = plus_cross(tau, h, s)
+    f_W = apply(R_WL, f)
+    tau_W = plus(apply(R_WL, tau), cross(p_WL, f_W))
     for i in range(3):
-        j = 12 + 3 * i
-        link[row, i] = x[j + 2]
-        link[row, 3 + i] = x[9 + i]
-        link[row, 6 + i] = x[j] * f0 + x[j + 1] * f1 + x[j + 2] * f2
-        link[row, 9 + i] = x[j] * t0 + x[j + 1] * t1 + x[j + 2] * t2
-    p0, p1, p2 = link[row, 3], link[row, 4], link[row, 5]
-    g0, g1, g2 = link[row, 6], link[row, 7], link[row, 8]
-    link[row, 9] += p1 * g2 - p2 * g1
-    link[row, 10] += p2 * g0 - p0 * g2
-    link[row, 11] += p0 * g1 - p1 * g0
+        wrench[i] = x[14 + 3 * i]
+        wrench[3 + i] = p_WL[i]
+        wrench[6 + i] = f_W[i]
+        wrench[9 + i] = tau_W[i]
 
 
 @njit(cache=True)
@@ -462,14 +433,10 @@ def _to_the_joints(link: Array, tau: Array) -> None:
         for k in range(6, 12):
             link[row - 1, k] += link[row, k]
     for row in range(n):
-        z0, z1, z2 = link[row, 0], link[row, 1], link[row, 2]
-        p0, p1, p2 = link[row, 3], link[row, 4], link[row, 5]
-        f0, f1, f2 = link[row, 6], link[row, 7], link[row, 8]
-        tau[row] = (
-            z0 * (link[row, 9] - p1 * f2 + p2 * f1)
-            + z1 * (link[row, 10] - p2 * f0 + p0 * f2)
-            + z2 * (link[row, 11] - p0 * f1 + p1 * f0)
-        )
+        x = link[row]
+        # About the joint's own origin.
+        moment = plus_cross(three(x, 9), times(-1.0, three(x, 3)), three(x, 6))
+        tau[row] = dot(three(x, 0), moment)
 
 
 @njit(cache=True)
@@ -505,28 +472,18 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
 @njit(cache=True, inline="always")
 def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
     """Adds a link's inertia about Wo in W: m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
-    m, h0, h1, h2 = table[row, 12], table[row, 13], table[row, 14], table[row, 15]
-    p0, p1, p2 = x[9], x[10], x[11]
-    u0 = x[12] * h0 + x[13] * h1 + x[14] * h2
-    u1 = x[15] * h0 + x[16] * h1 + x[17] * h2
-    u2 = x[18] * h0 + x[19] * h1 + x[20] * h2
+    phi, p = table[row, _PHI:], three(x, 9)
+    m, h, about_Lo = phi[0], apply(nine(x, 12), three(phi, 1)), symmetric(phi, 4)
     inertia[0] += m
-    inertia[1] += u0 + m * p0
-    inertia[2] += u1 + m * p1
-    inertia[3] += u2 + m * p2
+    add_into(inertia, 1, plus(h, times(m, p)))
     # From Lo to Wo: 2 p.h 1 - p h' - h p' + m (p.p 1 - p p')
-    across = 2.0 * (p0 * u0 + p1 * u1 + p2 * u2) + m * (p0 * p0 + p1 * p1 + p2 * p2)
+    across = 2.0 * dot(p, h) + m * dot(p, p)
     k = 4
     for i in range(3):
-        a, b, c = x[12 + 3 * i], x[13 + 3 * i], x[14 + 3 * i]
-        r0 = a * table[row, 16] + b * table[row, 17] + c * table[row, 18]
-        r1 = a * table[row, 17] + b * table[row, 19] + c * table[row, 20]
-        r2 = a * table[row, 18] + b * table[row, 20] + c * table[row, 21]
-        u_i = u0 if i == 0 else (u1 if i == 1 else u2)
+        turned = apply(about_Lo, three(x, 12 + 3 * i))
         for j in range(i, 3):
-            u_j = u0 if j == 0 else (u1 if j == 1 else u2)
-            value = r0 * x[12 + 3 * j] + r1 * x[13 + 3 * j] + r2 * x[14 + 3 * j]
-            value -= x[9 + i] * u_j + u_i * x[9 + j] + m * x[9 + i] * x[9 + j]
+            value = dot(turned, three(x, 12 + 3 * j))
+            value -= p[i] * h[j] + h[i] * p[j] + m * p[i] * p[j]
             if i == j:
                 value += across
             inertia[k] += value
@@ -544,31 +501,25 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
         for k in range(10):
             inertia[row, k] += inertia[row + 1, k]
         c = inertia[row]
-        z0, z1, z2 = link[row, 0], link[row, 1], link[row, 2]
-        p0, p1, p2 = link[row, 3], link[row, 4], link[row, 5]
-        v0, v1, v2 = p1 * z2 - p2 * z1, p2 * z0 - p0 * z2, p0 * z1 - p1 * z0
+        z, h = three(link[row], 0), three(c, 1)
+        v = cross(three(link[row], 3), z)
         # Momentum about Wo of all that is outboard, for a unit of this joint's speed.
-        l0 = c[0] * v0 + z1 * c[3] - z2 * c[2]
-        l1 = c[0] * v1 + z2 * c[1] - z0 * c[3]
-        l2 = c[0] * v2 + z0 * c[2] - z1 * c[1]
-        a0 = c[4] * z0 + c[5] * z1 + c[6] * z2 + c[2] * v2 - c[3] * v1
-        a1 = c[5] * z0 + c[7] * z1 + c[8] * z2 + c[3] * v0 - c[1] * v2
-        a2 = c[6] * z0 + c[8] * z1 + c[9] * z2 + c[1] * v1 - c[2] * v0
-        M[row, row] = z0 * a0 + z1 * a1 + z2 * a2 + v0 * l0 + v1 * l1 + v2 * l2
-        M[row, row] += table[row, _ROTOR]
+        linear = plus_cross(times(c[0], v), z, h)
+        angular = plus_cross(apply(symmetric(c, 4), z), h, v)
         # Only the lower half is needed; the axis of joint i moves along z_i through p_i.
-        for i in range(row):
-            z0, z1, z2 = link[i, 0], link[i, 1], link[i, 2]
-            p0, p1, p2 = link[i, 3], link[i, 4], link[i, 5]
-            M[row, i] = (
-                z0 * a0 + z1 * a1 + z2 * a2
-                + (p1 * z2 - p2 * z1) * l0 + (p2 * z0 - p0 * z2) * l1 + (p0 * z1 - p1 * z0) * l2
-            )  # fmt: skip
+        for i in range(row + 1):
+            z = three(link[i], 0)
+            v = cross(three(link[i], 3), z)
+            M[row, i] = dot(z, angular) + v[0] * linear[0] + v[1] * linear[1] + v[2] * linear[2]
+        M[row, row] += table[row, _ROTOR]
 
 
 @njit(cache=True)
 def _solve_spd(M: Array, x: Array) -> None:
-    """x := M^-1 x by Cholesky in M's lower half: so small that LAPACK's calls would cost more."""
+    """x := M^-1 x by Cholesky in M's lower half.
+
+    As `vectors.solve`, by columns, and with the last digit of its own: m / sqrt(m) on the diagonal.
+    """
     n = x.shape[0]
     for j in range(n):
         for k in range(j):

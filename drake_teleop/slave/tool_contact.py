@@ -10,6 +10,7 @@ from drake_teleop._compiled import njit
 from drake_teleop.environment.point_contact import contact_force, indentation
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.slave.arm import ArmModel, forward_kinematics, jacobian
+from drake_teleop.vectors import add_into, cross, minus, plus, three
 
 
 @njit(cache=True)
@@ -30,7 +31,7 @@ def environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W):
     R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
     twist, velocity, has_twist = np.empty(6), np.empty(3), False
     forward_kinematics(arm, q, R_WS, p_WS)
-    _add_moment(wrench_W[3:], p_WS, applied_W[:3])
+    add_into(wrench_W, 3, cross(p_WS, applied_W))
     for pair in pairs:
         depth = indentation(pair, p_WS, R_WS, sheet[0], normal)
         if depth <= 0.0:
@@ -39,10 +40,10 @@ def environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W):
             J = np.empty((6, q.shape[0]))
             jacobian(arm, q, J)
             twist[:], has_twist = J @ v, True
-        velocity[:] = twist[:3]
-        _add_moment(velocity, twist[3:], normal[3:] - p_WS)
+        lever = minus(three(normal, 3), p_WS)
+        moving = plus(three(twist, 0), cross(three(twist, 3), lever))
         for i in range(3):
-            velocity[i] -= pair[19 + i] * sheet[1]
+            velocity[i] = moving[i] - pair[19 + i] * sheet[1]
         contact_force(pair, depth, normal[:3], velocity, force)
         add_force(wrench_W, normal[3:], force)
 
@@ -50,17 +51,8 @@ def environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W):
 @njit(cache=True)
 def add_force(wrench_W, p_WC, force_W):
     """Adds a force (3,) at C [N] to a wrench (6,) about the world's origin, all in W."""
-    for i in range(3):
-        wrench_W[i] += force_W[i]
-    _add_moment(wrench_W[3:], p_WC, force_W)
-
-
-@njit(cache=True)
-def _add_moment(out, p, f):
-    """out += p x f."""
-    out[0] += p[1] * f[2] - p[2] * f[1]
-    out[1] += p[2] * f[0] - p[0] * f[2]
-    out[2] += p[0] * f[1] - p[1] * f[0]
+    add_into(wrench_W, 0, force_W)
+    add_into(wrench_W, 3, cross(p_WC, force_W))
 
 
 class ToolContact(LeafSystem):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from drake_teleop._compiled import njit
 from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.vectors import cholesky
 
 # As in `recursive`: the least variance of a row relative to those that it is made of.
 _RESOLUTION = 1e-10
@@ -35,12 +34,8 @@ def whitening(motion, phi, noise, model_var, n):
         for i in range(6):
             for j in range(i + 1):
                 N[i, j] += 0.25 * noise[6 + k] * (up[i] - down[i]) * (up[j] - down[j])
-    for i in range(6):
-        for j in range(i + 1):
-            value = N[i, j] / n
-            for k in range(j):
-                value -= N[i, k] * N[j, k]
-            N[i, j] = value / N[j, j] if j < i else math.sqrt(value)
+    N /= n
+    cholesky(N, 6)
     for i in range(6):
         for j in range(i + 1):
             value = 1.0 if i == j else 0.0

@@ -23,6 +23,7 @@ from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, res
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.jackknife import RANK, solve
+from drake_teleop.vectors import cross_matrix
 
 LEVER_KNOWN = 0.005
 """A coordinate of the accelerometer is determined if its standard deviation is below this [m]."""
@@ -109,15 +110,8 @@ def common_times(
 
 def lever_matrix(omega: NDArray[np.float64], alpha: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 3, 3) K = [alpha x] + [omega x]^2: K p is what p adds to the specific force."""
-    W = _cross(omega)
-    return _cross(alpha) + W @ W
-
-
-def _cross(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    matrix = np.zeros((len(v), 3, 3))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        matrix[:, k, j], matrix[:, j, k] = v[:, i], -v[:, i]
-    return matrix
+    W = cross_matrix(omega)
+    return cross_matrix(alpha) + W @ W
 
 
 def shown_axes(K: NDArray[np.float64], log: Log, cutoff: float) -> NDArray[np.bool_]:

@@ -1,0 +1,82 @@
+"""The vectors' functions against numpy's, in Python, compiled, and with Drake's other scalars."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numba import njit
+from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
+from pydrake.symbolic import MakeVectorVariable
+
+from drake_teleop import vectors
+from drake_teleop.load.regressor import non_contact_wrench, non_contact_wrench_into, regressor
+
+a, b, c = np.array([[0.3, -1.2, 2.5], [-0.7, 0.4, 1.1], [5.0, -6.0, 7.0]])
+R = np.linalg.qr(np.array([[1.0, 2.0, 0.5], [-0.3, 1.0, 4.0], [2.0, 0.1, 1.0]]))[0]
+phi = np.array([2.0, 0.1, -0.2, 0.3, 0.05, 0.01, -0.02, 0.06, 0.003, 0.07])
+INERTIA = np.array([[0.05, 0.01, -0.02], [0.01, 0.06, 0.003], [-0.02, 0.003, 0.07]])
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize(
+    ("function", "arguments", "expected"),
+    [
+        (vectors.three, (phi, 1), phi[1:4]),
+        (vectors.nine, (phi, 1), phi[1:]),
+        (vectors.rows, (R,), R.ravel()),
+        (vectors.transposed, (R.ravel(),), R.T.ravel()),
+        (vectors.plus, (a, b), a + b),
+        (vectors.minus, (a, b), a - b),
+        (vectors.times, (3.0, b), 3 * b),
+        (vectors.dot, (a, b), a @ b),
+        (vectors.cross, (a, b), np.cross(a, b)),
+        (vectors.plus_cross, (c, a, b), c + np.cross(a, b)),
+        (vectors.apply, (R.ravel(), a), R @ a),
+        (vectors.symmetric, (phi, 4), INERTIA.ravel()),
+    ],
+)
+def test_it_is_what_numpy_says(function, arguments, expected, compiled):
+    if compiled:
+        function = njit(function)
+    np.testing.assert_allclose(function(*arguments), expected, rtol=1e-15, atol=1e-15)
+
+
+def test_adding_is_to_the_place_that_is_named():
+    x = np.zeros(6)
+    vectors.add_into(x, 2, a)
+    vectors.add_into(x, 2, b)
+    np.testing.assert_array_equal(x, [0, 0, *(a + b), 0])
+
+
+@pytest.mark.parametrize("n", [1, 3, 6])
+def test_cholesky_and_solve_are_those_of_numpy_and_read_the_lower_half_only(n):
+    random = np.random.default_rng(n)
+    root, right = random.normal(size=(n, n)), random.normal(size=n)
+    M = root @ root.T + np.eye(n)
+    lower, x = np.where(np.tri(n) > 0, M, np.nan), right.copy()
+    njit(lambda M, b: vectors.solve(M, b, n))(lower, x)
+    np.testing.assert_allclose(x, np.linalg.solve(M, right), rtol=1e-10)
+    np.testing.assert_allclose(np.tril(lower), np.linalg.cholesky(M), rtol=1e-10)
+    vectors.solve(M, right, n)
+    np.testing.assert_allclose(right, x, rtol=1e-14)
+
+
+def test_the_matrix_of_a_cross_product_is_made_of_one_vector_and_of_many():
+    np.testing.assert_allclose(vectors.cross_matrix(a) @ b, np.cross(a, b), rtol=1e-15)
+    many = np.array([[a, c], [c, a]])
+    np.testing.assert_allclose(vectors.cross_matrix(many) @ b, np.cross(many, b), atol=1e-14)
+
+
+def test_the_wrench_takes_automatic_derivatives_and_expressions():
+    s, omega, alpha = a, b, c
+    derived, wrench = InitializeAutoDiff(phi).ravel(), np.empty(6, dtype=object)
+    non_contact_wrench_into.py_func(s, omega, alpha, derived, wrench)
+    np.testing.assert_allclose(ExtractGradient(wrench), regressor(s, omega, alpha), atol=1e-14)
+    symbols = MakeVectorVariable(10, "phi")
+    non_contact_wrench_into.py_func(s, omega, alpha, symbols, wrench)
+    values = dict(zip(symbols, phi, strict=True))
+    np.testing.assert_allclose(
+        [entry.Evaluate(values) for entry in wrench],
+        non_contact_wrench(s, omega, alpha, phi),
+        rtol=1e-13,
+    )
