@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import bilinear, lfilter
 
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.load.regressor import regressor
@@ -118,6 +117,9 @@ def _correction(filter_: SteadyState, period: float) -> tuple[Array, Array]:
 
 def _backwards(polynomials: tuple[Array, Array], signals: Array, step: float) -> Array:
     """The filter in reversed time, along the first axis."""
+    # Takes longer to import than the station.
+    from scipy.signal import bilinear, lfilter
+
     b, a = bilinear(*polynomials, fs=1 / step)
     return np.asarray(lfilter(b, a, signals[::-1], axis=0)[::-1])
 

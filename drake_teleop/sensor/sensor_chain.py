@@ -329,6 +329,9 @@ def preset_of(block: Mapping[str, Any] | None) -> WristSensorConfig:
 def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
     """Fourth-order Butterworth low-pass as two second-order sections, bilinear, prewarped.
 
+    The poles of `scipy.signal.butter`, whose import would double that of a scenario, and whose
+    sections have the gain of all in the first: `settle` takes each for one of unit gain.
+
     Args:
         cutoff_hz: -3 dB frequency [Hz], below half the rate.
         rate_hz: sampling rate [Hz].

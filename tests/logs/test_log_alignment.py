@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from known_motion import motion_at
+from scipy.signal import savgol_filter
 
 from drake_teleop.logs.read.alignment import (
     angular_motion,
@@ -51,6 +52,21 @@ def test_smoother_is_exact_on_quintics_even_at_the_ends(bandwidth: float | None)
     np.testing.assert_allclose(smooth, x, atol=1e-11)
     np.testing.assert_allclose(first[:, 0], 1 - 4 * t + 9 * t**2 - 5 * t**4, atol=1e-8)
     np.testing.assert_allclose(second[:, 0], -4 + 18 * t - 20 * t**3, atol=1e-5)
+
+
+def test_smoother_is_that_of_savitzky_and_golay() -> None:
+    x = np.random.default_rng(2).normal(size=(200, 2))
+    for order, ours in enumerate(smooth_derivatives(x, 0.01, 10.0)):  # a window of 19 samples
+        scipys = savgol_filter(x, 19, 5, deriv=order, delta=0.01, axis=0)
+        np.testing.assert_allclose(ours, scipys, atol=1e-10 * np.abs(scipys).max())
+
+
+def test_smoother_keeps_its_digits_in_long_windows() -> None:
+    t = np.arange(4000) / 8e3
+    x = t**5 - t**3 + 1.0
+    _, first, second = smooth_derivatives(x, t[1], 10.0)  # a window of 1441 samples
+    np.testing.assert_allclose(first, 5 * t**4 - 3 * t**2, atol=1e-9)
+    np.testing.assert_allclose(second, 20 * t**3 - 6 * t, atol=1e-6)
 
 
 def test_noise_gain_is_what_noise_does() -> None:

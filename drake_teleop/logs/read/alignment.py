@@ -54,7 +54,8 @@ def low_pass(x: NDArray[np.float64], dt: float, cutoff_hz: float | None) -> NDAr
 
     The gain is 1 / (1 + (f / cutoff)^4): a second-order Butterworth filter run forward and
     backward, half the amplitude at `cutoff_hz`. The ends are continued by point reflection
-    (2 x_0 - x_k), which keeps value and slope.
+    (2 x_0 - x_k), which keeps value and slope. Filters in time (`scipy.signal.sosfiltfilt`) have
+    this gain only far below the Nyquist rate, where the bilinear transform does not bend it.
 
     Args:
         x: (N, ...) samples.
@@ -90,6 +91,10 @@ def smooth_derivatives(
     fitted to a window of 1.8 / `bandwidth_hz`, at least 9 samples; at the ends the outermost
     polynomials are continued. White noise of standard deviation sigma comes out, away from the
     ends, as sigma * `noise_gain`.
+
+    `scipy.signal.savgol_filter` fits the same polynomials, but in powers of the sample's number:
+    within 2e-13 of these for a window of 19 samples, 3e-7 for 721, and wrong by more than the
+    signal for 1441 (8 kHz, 10 Hz), where it takes powers for rounding. It is also half as fast.
 
     Args:
         x: (N, ...) equidistant samples, N >= 9.
