@@ -15,14 +15,16 @@ import numpy as np
 import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame, JacobianWrtVariable
+from pydrake.multibody.tree import Frame, JacobianWrtVariable, MultibodyForces
 from pydrake.systems.framework import Context, DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import BACKWARD, FORWARD, NetworkConfig, newest_packets
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.load.contact.detection import NoiseFloor
+from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.online.watched import OTHER_LOAD
 from drake_teleop.master.phantom import serial_joint_angles
 from drake_teleop.operator.operator import OperatorConfig, Sine
@@ -34,7 +36,10 @@ from drake_teleop.result import SimulationResult
 from drake_teleop.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.scenario import Rates, Scenario, Simulation, replace
+from drake_teleop.sensor.motion_estimation import estimated_motion_std
+from drake_teleop.sensor.sensor_chain import NOISE_BLOCK
 from drake_teleop.simulation import MakeSimulator, advance, read_log
+from drake_teleop.slave.joint_control import JointControlConfig
 from drake_teleop.slave.plant import AddSlavePlant
 from drake_teleop.station import MakeTeleopStation
 
@@ -124,7 +129,7 @@ def run(
 ) -> Recorded:
     """Runs it with the clutch open from row OPENED to row CLOSED; `known` of MakeTeleopStation."""
     estimate = np.concatenate([offsets, ESTIMATED * slave.arm.phi_load])
-    station = MakeTeleopStation(scenario, load_estimate=estimate, **known)
+    station = MakeTeleopStation(scenario, **({"load_estimate": estimate} | known))
     simulator = MakeSimulator(station, scenario.simulation)
     clutch = station.GetInputPort("clutch")
     end = round(scenario.simulation.duration / PERIOD)
@@ -348,23 +353,36 @@ def test_the_flag_of_a_contact_comes_with_the_slaves_packets(slave):
     np.testing.assert_array_equal(direct["contact_at_hand"], direct["contact"])
 
 
-def test_every_block_runs_at_its_own_rate(slave):
-    """What changes between rows of a log at 8 kHz changes at the block's instants, at each."""
-    rates = Rates(
-        sensor_hz=4000.0, hand_hz=1000.0, joint_control_hz=2000.0, estimator_hz=500.0, log_hz=8000.0
-    )
+@pytest.fixture(scope="module")
+def finely_logged(slave) -> Recorded:
+    """Faster logged than anything runs; the load estimator learns, from encoders."""
     moving = Sine(
         duration=1.0, ramp=0.02, frequency=3.0, translation=[0.01] * 3, rotation=[0.1] * 3
     )
     scenario = delayed(
         "none",
         wrist_sensor__ideal=False,
-        rates=rates,
+        motion_estimation__source="encoders",
+        rates=Rates(
+            sensor_hz=4e3, hand_hz=1e3, joint_control_hz=2e3, estimator_hz=500.0, log_hz=8e3
+        ),
         simulation=Simulation(settle=0.0, duration=0.15),
         operator=OperatorConfig(grip="firm", intent=[moving]),
-        load_estimator__enabled=True,
+        joint_control=JointControlConfig(8.0, 60.0),
+        load_estimator=LoadEstimatorConfig(enabled=True, method="rtls", forgetting=0.98),
     )
-    log = run(scenario, slave).log
+    return run(scenario, slave, load_estimate=None)
+
+
+def instants(recorded: Recorded, rate_hz: float) -> np.ndarray:
+    """Rows of the log at which something of this rate happens; the log shows it one row later."""
+    step = round(recorded.scenario.rates.log_hz / rate_hz)
+    return np.arange(0, len(recorded.log.t) - 1, step)
+
+
+def test_every_block_runs_at_its_own_rate(finely_logged):
+    """What changes between rows changes at the block's instants, at nearly each."""
+    log, rates = finely_logged.log, finely_logged.scenario.rates
     for signal, rate_hz in {
         "measured_wrench_S": rates.sensor_hz,
         "joint_torque": rates.joint_control_hz,
@@ -373,10 +391,42 @@ def test_every_block_runs_at_its_own_rate(slave):
         "pose_command": rates.hand_hz,
         "ports": rates.hand_hz,
     }.items():
-        rows = np.flatnonzero((log[signal][1:] != log[signal][:-1]).any(axis=1))
-        step = round(rates.log_hz / rate_hz)
-        assert len(np.unique(rows % step)) == 1, signal
-        assert len(rows) > 0.8 * len(log.t) / step, signal
+        changed = np.flatnonzero((log[signal][1:] != log[signal][:-1]).any(axis=1))
+        at = instants(finely_logged, rate_hz)
+        assert np.isin(changed, at).all(), signal
+        assert len(changed) > 0.8 * len(at), signal
+
+
+def test_the_motors_do_what_the_scenarios_controllers_ask_for(finely_logged, slave):
+    """Speed asked for by the position loop, acceleration by the velocity loop, Drake's torque."""
+    log, plant = finely_logged.log, slave.plant
+    context = plant.CreateDefaultContext()
+    for row in instants(finely_logged, 2e3)[::10]:
+        q, v = np.split(log["slave_state"][row], 2)
+        speed = 2 * np.pi * 8.0 * (log["joint_command"][row] - q)
+        assert (np.abs(speed) < slave.arm.velocity_limit).all()
+        plant.SetPositions(context, q)
+        plant.SetVelocities(context, v)
+        gravity = MultibodyForces(plant)
+        plant.CalcForceElementsContribution(context, gravity)
+        torque = plant.CalcInverseDynamics(context, 2 * np.pi * 60.0 * (speed - v), gravity)
+        np.testing.assert_allclose(log["joint_torque"][row + 1], torque, atol=1e-9)
+
+
+def test_the_load_estimator_learns_by_the_scenarios_method_and_sensor(finely_logged):
+    """As the estimator of logs does from the samples at its own instants."""
+    log, scenario = finely_logged.log, finely_logged.scenario
+    sensor, period = scenario.wrist_sensor, 1 / scenario.rates.sensor_hz
+    motion = estimated_motion_std(scenario.motion_estimation, sensor, 6, period)
+    estimator = RecursiveTotalLeastSquares(sensor.wrench_std(), motion, forgetting=0.98)
+    # The log shows the last sample of each block of noise differently.
+    rows = instants(finely_logged, 500.0)
+    rows = rows[log.t[rows] < 0.99 * NOISE_BLOCK * period]
+    names = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
+    estimator.learn(log["measured_wrench_S"][rows], *(log[name][rows] for name in names))
+    expected = np.concatenate([estimator.offsets, estimator.phi])
+    np.testing.assert_allclose(log["load_estimate"][rows[-1] + 1], expected, rtol=1e-9, atol=1e-12)
+    assert np.abs(expected).min() > 0.0 and len(rows) > 10
 
 
 def test_the_masters_signals_are_what_their_names_say(direct):
