@@ -64,6 +64,7 @@ def test_the_functions_work_as_shown():
     assert names["closed"].isdtime(strict=True)
 
 
+@pytest.mark.slow
 def test_the_diagram_works_as_shown():
     # The estimate that the script takes some seconds to identify.
     shown = 'dt.identify_load(dt.LoadScenario("identification")).estimate'
@@ -98,6 +99,7 @@ def diagrams():
     return found
 
 
+@pytest.mark.slow
 def test_how_far_the_models_are_from_the_diagram(diagrams):
     for model, sensor, *said in rows("model | sensor"):
         omega, H, axis, sampling = diagrams[sensor]

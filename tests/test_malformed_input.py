@@ -91,6 +91,7 @@ def error_line(arguments, capsys) -> str:
     return lines[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_a_malformed_scenario(name, tmp_path, capsys):
     text, expected = SCENARIOS[name]

@@ -88,6 +88,7 @@ def test_every_notebook_is_checked():
     assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == CHECKS.keys()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHECKS)
 def test_it_runs_and_shows_what_it_promises(name):
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)

@@ -71,6 +71,7 @@ def relative(folder: Path) -> set[str]:
     }
 
 
+@pytest.mark.slow
 def test_the_wheel_works_from_an_empty_folder(wheel, tmp_path):
     home = tmp_path / "environment"
     venv.create(home)

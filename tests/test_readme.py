@@ -7,11 +7,13 @@ import subprocess
 from pathlib import Path
 
 import polars as pl
+import pytest
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_python_example_runs(tmp_path, monkeypatch):
     (example,) = re.findall("```python\n(.*?)```", README, re.S)
     monkeypatch.chdir(tmp_path)

@@ -92,6 +92,7 @@ def test_the_film_is_one_page_that_needs_nothing_else(tmp_path, scenario, result
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=.?(http|//|/)", page)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("slow_motion", "frames"), [(1.0, 3), (10.0, 21)])
 def test_the_film_has_fifty_frames_a_second(
     tmp_path, monkeypatch, scenario, result, slow_motion, frames

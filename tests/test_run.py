@@ -53,6 +53,7 @@ def quick(tmp_path):
     return run
 
 
+@pytest.mark.slow
 def test_the_contact_is_run_with_an_identified_load(contact):
     summary, out = contact
     assert summary["warnings"] == []
@@ -69,6 +70,7 @@ def test_the_contact_is_run_with_an_identified_load(contact):
     assert load.method == "recursive total least squares"
 
 
+@pytest.mark.slow
 def test_everything_is_written(contact):
     summary, out = contact
     assert json.loads((out / "summary.json").read_text()) == summary
@@ -80,6 +82,7 @@ def test_everything_is_written(contact):
     assert (out / "overview.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_the_shipped_identification_is_the_identification(identification):
     """Its sensor log gives the same load to the tools for recorded logs."""
     summary, out = identification
@@ -93,6 +96,7 @@ def test_the_shipped_identification_is_the_identification(identification):
     assert np.all(np.abs(found - from_log) < 5 * again.standard_deviations)
 
 
+@pytest.mark.slow
 def test_the_load_is_known_as_well_as_it_says(identification):
     _, out = identification
     load = Identification.load(out / "identification.json")
@@ -111,6 +115,7 @@ def test_the_load_is_known_as_well_as_it_says(identification):
     assert np.sum((low <= truth) & (truth <= high)) >= 13
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(quick):
     _, first = quick("first")
     _, again = quick("again")
@@ -131,6 +136,7 @@ def test_a_scenario_that_learns_needs_no_identification_before(quick):
     assert summary["true_contact_s"] == []
 
 
+@pytest.mark.slow
 def test_a_saturated_sensor_is_reported_with_its_time(quick):
     summary, _ = quick("saturated", "wrist_sensor: {force_range: [100, 100, 31]}")
     (warning,) = summary["warnings"]
@@ -172,6 +178,7 @@ def test_bounces_belong_to_one_contact():
     np.testing.assert_array_equal(np.flatnonzero(contact), [*range(10, 22), 60])
 
 
+@pytest.mark.slow
 def test_a_touch_is_noticed_by_the_detector_and_then_by_the_operator(tmp_path, capsys):
     text = (scenarios_dir() / "touch.yaml").read_text()
     path = tmp_path / "touch.yaml"

@@ -45,6 +45,7 @@ def movement(request):
     return run(request.param)
 
 
+@pytest.mark.slow
 def test_arm_and_sensor_stay_within_their_limits(movement):
     scenario, result = movement
     arm, state = slave_arm(scenario), result["slave_state"]
@@ -55,6 +56,7 @@ def test_arm_and_sensor_stay_within_their_limits(movement):
     assert not result["ik_status"].any()
 
 
+@pytest.mark.slow
 def test_the_master_stays_well_inside_its_workspace_and_its_force(movement):
     _, result = movement
     q = result["master_state"][:, :6]

@@ -104,6 +104,7 @@ def test_the_wrist_wrench_is_the_reaction_force_of_the_sensors_joint(slave, touc
     assert error < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "most"), [("free_motion_force", 1e-6), ("contact_transition", 0.15)]
 )
@@ -164,6 +165,7 @@ def felt(slave):
     return responses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 1.5])
 def test_the_operator_feels_sigma_times_the_loads_mass_on_top_of_the_device(felt, sigma):
     """Apparent mass m_a = sigma m (section V), here / 17.5 and times the slave's tracking."""
@@ -174,6 +176,7 @@ def test_the_operator_feels_sigma_times_the_loads_mass_on_top_of_the_device(felt
     assert added_mass.real == pytest.approx(sigma * MASS * FORCE_SCALE, rel=0.02)
 
 
+@pytest.mark.slow
 def test_with_sigma_0_the_operator_feels_the_device_alone(felt):
     """The device's own mass, from its closed forms, and the hand's."""
     hand, acceleration, _ = felt[0.0]
@@ -413,6 +416,7 @@ def test_identification_leaves_the_teleoperation_station_alone(slave):
     assert "pose_master" in simulate(MakeTeleopStation(Scenario()), short)
 
 
+@pytest.mark.slow
 def test_a_station_that_nobody_holds_is_no_more(slave):
     """Thousands of stations in one process, one after the other, need the memory of one."""
     short = Simulation(duration=0.02)

@@ -37,6 +37,7 @@ def run(tmp_path_factory):
     return json.loads((out / "summary.json").read_text()), out
 
 
+@pytest.mark.slow
 def test_it_writes_a_page_with_all_of_its_pictures(run):
     summary, out = run
     page = (out / "report.html").read_text(encoding="utf-8")
@@ -47,11 +48,13 @@ def test_it_writes_a_page_with_all_of_its_pictures(run):
         assert sentence.split("'")[0][:30] in page
 
 
+@pytest.mark.slow
 def test_the_diagram_is_the_sampled_model_of_one_axis(run):
     """The hand holds all other directions; what couples with them is left in h11."""
     assert max(run[0]["two_port"]["sampled"].values()) < 1e-4
 
 
+@pytest.mark.slow
 def test_what_dies_last_dies_as_on_one_axis(run):
     """Of this scenario it is the vertical motion, which the wrist's coupling changes by 1 %."""
     for point in run[0]["diagram"]:
@@ -59,6 +62,7 @@ def test_what_dies_last_dies_as_on_one_axis(run):
             assert point[name] == pytest.approx(point["one_axis"][name], rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_nonlinear_simulation_feels_as_the_linearised_diagram(run):
     measured = run[0]["measured"]
     assert max(measured["frequency_Hz"]) > 29.9
@@ -66,6 +70,7 @@ def test_the_nonlinear_simulation_feels_as_the_linearised_diagram(run):
     assert min(measured["coherence"]) > 0.95
 
 
+@pytest.mark.slow
 def test_what_is_said_of_stability_is_one_story(run):
     """The linearised Diagram, the margins, the stiffest walls and the maps agree."""
     summary, _ = run
@@ -82,6 +87,7 @@ def test_what_is_said_of_stability_is_one_story(run):
         assert without_delay == pytest.approx([limit], rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_verdict_follows_the_figures(run):
     summary, _ = run
     assert summary["verdict"] == verdict(summary)
@@ -93,6 +99,7 @@ def figures(scenario: Scenario, direction: str = "z"):
     return analyze.analyze(scenario, direction, silent)[0]
 
 
+@pytest.mark.slow
 def test_delay_and_a_light_grip_make_it_unstable_and_that_is_said():
     """sigma = 1 is unstable in free motion at round trips between 190 and 339 ms."""
     scenario = replace(
@@ -111,6 +118,7 @@ def test_delay_and_a_light_grip_make_it_unstable_and_that_is_said():
     assert min(sigma for _, sigma in sigmas["boundary"]["light"]) > 0.3
 
 
+@pytest.mark.slow
 def test_another_direction_and_a_method_that_is_not_linear():
     scenario = replace(
         LoadScenario("free_motion_force"), passivity__method="tdpa", channel__delay=0.01
@@ -134,6 +142,7 @@ def test_eta_has_no_single_sigma():
         figures(scenario)
 
 
+@pytest.mark.slow
 def test_maps_are_of_the_scenario(run):
     """A map's share of stable cells is what a map made anew says."""
     scenario = LoadScenario("contact_transition")

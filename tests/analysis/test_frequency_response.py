@@ -52,6 +52,7 @@ def assert_agrees(
     assert response.coherence(output, input_).min() > 0.95
 
 
+@pytest.mark.slow
 def test_station_with_the_tool_felt():
     response, predicted = measured(station(sigma=1.0, coulomb=0.0))
     assert response.omega[-1] >= 2 * np.pi * 29.99
@@ -64,6 +65,7 @@ def test_station_with_the_tool_felt():
     assert frd(1j * response.omega[3]) == pytest.approx(felt[3])
 
 
+@pytest.mark.slow
 def test_station_without_the_tool_and_with_friction():
     """What is felt is next to nothing; friction, which is not linear, changes only the device."""
     response, predicted = measured(station(sigma=0.0, coulomb=1.0))

@@ -135,6 +135,7 @@ def difference(H, other):
     return np.abs(H / other - 1).max(axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 @pytest.mark.parametrize("servo", [{}, DEADBEAT], ids=["servo", "ideal servo"])
 def test_one_direction_equals_the_model_on_paper(servo, sigma):
@@ -150,6 +151,7 @@ def test_one_direction_equals_the_model_on_paper(servo, sigma):
     assert (difference(H, exact_two_port(scenario, OMEGA)) < 1e-6).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 def test_real_station_within_one_percent_to_30_hz(sigma):
     scenario = replace(LoadScenario("free_motion_force"), force_scaling__sigma=sigma)
@@ -161,6 +163,7 @@ def test_real_station_within_one_percent_to_30_hz(sigma):
     assert (difference(H, sampled_two_port(axis, sampling, OMEGA)) < 0.01).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 def test_continuous_closed_form_with_the_delays_of_holds_and_filter(sigma):
     """Half a period in the servo's loop; a period and the low-pass's delay on the force's way.
@@ -229,6 +232,7 @@ def leaf(scenario: Scenario) -> Scenario:
     return replace(scenario, sheet_spring=sheet)
 
 
+@pytest.mark.slow
 def test_stiffness_felt_through_the_station():
     scenario = leaf(LoadScenario("free_motion_force"))
     task = task_direction(scenario, UP, displacement=(0.0, 0.0, -0.04))
@@ -286,6 +290,7 @@ def test_multipliers_predict_a_slow_decay():
     assert_same_rate(fitted_rate(height, predicted), predicted)
 
 
+@pytest.mark.slow
 def test_multipliers_predict_growth_over_a_network():
     """Pressing on the leaf 20 ms away swings itself up."""
     scenario = replace(

@@ -68,6 +68,7 @@ def grows(axis: OneAxis, sampling: Sampling, **values: float) -> bool:
     return growth_rate(sampled_loop(replace(axis, **values), faster)) > 1e-6
 
 
+@pytest.mark.slow
 def test_cells_are_what_eigenvalues_say(drawn) -> None:
     axis, sampling, found = drawn
     assert 0 < found.stable.sum() < found.stable.size
@@ -77,6 +78,7 @@ def test_cells_are_what_eigenvalues_say(drawn) -> None:
         assert grows(axis, sampling, **cell) == (found.unstable[i, j] > 0), cell
 
 
+@pytest.mark.slow
 def test_one_percent_beside_the_boundary_it_is_stable_and_unstable(drawn) -> None:
     """Along the parameter that is not the delay, where the delay is a whole number of periods."""
     axis, sampling, found = drawn

@@ -216,6 +216,7 @@ def random_loops(count: int, order: int, neutral: bool, seed: int):
         yield DelayedLoop(N, D, random.uniform(0.05, 3.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order, neutral", [(1, False), (2, False), (3, False), (2, True)])
 def test_counts_by_crossing_encirclement_and_roots_agree(order, neutral):
     seen = set()
@@ -336,6 +337,7 @@ def test_loops_of_control():
         DelayedLoop.from_control(control.tf([1.0], [1.0, 0.5], 0.001))
 
 
+@pytest.mark.slow
 def test_a_grid_of_parameters():
     delay, wall = np.linspace(0, 0.2, 100)[:, None], np.geomspace(100, 1e5, 100)
     loop = station_loop(held("medium", ideal_servo=False, delay=delay, wall_stiffness=wall))

@@ -219,6 +219,7 @@ def test_sampled_poles_in_time():
         assert rate == pytest.approx(np.log(np.abs(poles).max()), rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_grid_of_parameters():
     b, B = np.linspace(0.1, 5, 100)[:, None], np.linspace(0, 2, 100)
     K = passive_stiffness(b, B, PERIOD, 1)

@@ -49,6 +49,7 @@ def run(scenario: Scenario, load_estimate: np.ndarray):
     return simulate(MakeTeleopStation(scenario, load_estimate=load_estimate), scenario.simulation)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [1, 7, 40])
 def test_without_a_method_it_is_a_delay_in_both_directions(steps, load_estimate):
     """At 2 kHz and logged at 2 kHz: what comes out went in so many samples ago, to rounding."""
@@ -102,6 +103,7 @@ def test_a_channel_that_cannot_be_is_refused(changes, message, load_estimate):
         MakeTeleopStation(replace(Scenario(), **changes), load_estimate=load_estimate)
 
 
+@pytest.mark.slow
 def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
     monkeypatch, load_estimate
 ):

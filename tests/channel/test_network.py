@@ -108,6 +108,7 @@ def oracle(config: NetworkConfig, seed: int) -> np.ndarray:
 # Which packet is the newest.
 
 
+@pytest.mark.slow
 @given(networks(), seeds)
 @example(ROUGH, 0)
 @example(replace(ROUGH, playout=0.05), 1)

@@ -33,6 +33,7 @@ def work_of_the_hand(model: OneDof, round_trip: float, frequency: float, damping
     return float(-np.sum(run.felt[last][:-1] * moved) + damping * np.sum(moved**2) / PERIOD)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wall", [0.0, 5100.0])
 @pytest.mark.parametrize("round_trip", [0.02, 0.1])
 def test_it_covers_what_delay_puts_in_and_little_more(wall, round_trip):

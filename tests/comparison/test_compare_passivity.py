@@ -13,6 +13,7 @@ from drake_teleop.comparison.one_dof import OneDof
 from drake_teleop.errors import DrakeTeleopError
 
 
+@pytest.mark.slow
 def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "WALLS", (5100.0,))
     monkeypatch.setattr(study, "IMPAIRMENTS", ((0.0, 0.0),))

@@ -46,6 +46,7 @@ def test_it_rings_at_the_frequency_of_its_stiffness_and_mass_and_decays():
     assert plant.GetPositions(context)[0] == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_contact_at_the_scenarios_step_agrees_with_a_tight_run():
     """RK2 at the sensor's 125 us against error-controlled RK3 at half of that, which is as good as
     at an eighth: both are 8e-7 m away.

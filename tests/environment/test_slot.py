@@ -82,6 +82,7 @@ def distance_to(corners: np.ndarray, point: np.ndarray) -> float:
     return float(np.linalg.norm(point - nearest, axis=1).min())
 
 
+@pytest.mark.slow
 @given(
     yaw=st.floats(-3.1, 3.1),
     chamfer=st.floats(5e-4, 0.015),
@@ -181,6 +182,7 @@ def test_the_peg_finds_in_is_slid_down_and_stands_quietly_on_the_floor(inserted)
     assert "sheet_state" not in result
 
 
+@pytest.mark.slow
 def test_contact_only_takes_energy_from_the_tool(inserted):
     """Springs of the contact give back at most what was put in; friction takes."""
     scenario, result = inserted

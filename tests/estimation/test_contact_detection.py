@@ -95,6 +95,7 @@ def identified():
     return scenario, found.estimate, found.noise_floor(slave_arm(scenario))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 0.015, 0.05])
 def test_the_papers_contact_is_noticed_and_the_hand_knows_after_the_delay(identified, delay):
     scenario, estimate, noise_floor = identified
@@ -110,6 +111,7 @@ def test_the_papers_contact_is_noticed_and_the_hand_knows_after_the_delay(identi
     np.testing.assert_array_equal(hand[late:], slave[: len(slave) - late])
 
 
+@pytest.mark.slow
 def test_a_station_without_a_detector_has_none_of_it(identified):
     scenario, estimate, _ = identified
     plain = replace(scenario, contact_detection=None)

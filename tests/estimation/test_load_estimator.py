@@ -69,6 +69,7 @@ def MakeEstimator(initial=None, **config):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["rls", "rtls"])
 def test_in_the_loop_it_is_the_estimator_of_logs(method):
     rows = samples(0, duration=0.3)

@@ -103,6 +103,7 @@ def first(result, state, after=0.0):
     return result.t[np.argmax((result["load_state"][:, 0] == state) & (result.t >= after))]
 
 
+@pytest.mark.slow
 def test_it_settles_and_freezes(grasped, tool):
     settled = first(grasped, SETTLED)
     assert 0.1 < settled < 1.5
@@ -118,6 +119,7 @@ def test_it_settles_and_freezes(grasped, tool):
     np.testing.assert_allclose(com, tool[1:4] / tool[0], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_grasp_is_noticed_and_the_object_is_found(grasped):
     """It is known half a second later that it is another load, and soon which one."""
     assert first(grasped, DISTURBED) - GRASP < 0.05
@@ -132,6 +134,7 @@ def test_a_grasp_is_noticed_and_the_object_is_found(grasped):
     assert grasped["load_state"][-1] == SETTLED
 
 
+@pytest.mark.slow
 def test_what_is_handed_out_fades_without_a_step(grasped):
     """Between two known loads nothing is eliminated; each sample goes a hundredth of the way."""
     phi = grasped["load_estimate"][:, 6:]
@@ -142,6 +145,7 @@ def test_what_is_handed_out_fades_without_a_step(grasped):
     assert (steps <= 1e-3 / FADE * np.ptp(phi[watched], axis=0) * 1.02).all()
 
 
+@pytest.mark.slow
 def test_contacts_are_no_change(known):
     """Fig. 8, and pressing down on the leaf for good, still and sliding: nothing fades."""
     touch = replace(LoadScenario("contact_transition"), load_estimator__watch=True)
@@ -214,6 +218,7 @@ def test_a_push_at_rest_is_neither_an_offset_nor_a_load(known):
     np.testing.assert_allclose(handed[-1, 6:], known[0][6:], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_gripper_that_is_known_otherwise_stays_eliminated(known, grasped):
     names = ("measured_wrench_S", "specific_force_S", "angular_velocity_S")
     rows = np.hstack([grasped[name] for name in (*names, "angular_acceleration_S")])[2500:]

@@ -63,6 +63,7 @@ def urdf(tmp_path):
     return write_urdf(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_slaves_motion_is_good_at_rest_and_uses_no_limit_up(slave, designed):
     assert designed.values["kappa_w10"] < 4.3
     assert designed.history[-1, 1] == pytest.approx(designed.values["kappa_w10"], rel=0.01)
@@ -78,6 +79,7 @@ def test_the_slaves_motion_is_good_at_rest_and_uses_no_limit_up(slave, designed)
     assert slave.limits.phi[0] == pytest.approx(1.3 * 3.13)
 
 
+@pytest.mark.slow
 def test_same_seed_same_trajectory_other_seed_another(slave, short):
     again, other = (
         excite(slave, starts=1, period=2.4, harmonics=2, seed=seed).trajectory for seed in (0, 1)
@@ -86,6 +88,7 @@ def test_same_seed_same_trajectory_other_seed_another(slave, short):
     assert not np.allclose(other.rho, again.rho, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_executed_motion_keeps_the_limits(slave):
     """The shipped trajectory in the whole simulation, with the station's joint control."""
     found = identify_load(LoadScenario("identification"))
@@ -115,6 +118,7 @@ def record(constants, memory, estimator, remembered, table, truth, noise, sample
         estimate_into(estimator, remembered, table, reading, samples[k])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["accelerometer", "fused", "encoders"])
 def test_predicted_and_observed_scatter_agree(slave, short, source):
     """200 records of one motion: noise, walks, quantisation, filter, estimated motion.
@@ -146,6 +150,7 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
     np.testing.assert_allclose(np.std(found, axis=0, ddof=1), predicted, rtol=0.2)
 
 
+@pytest.mark.slow
 def test_what_is_predicted_is_of_the_heaviest_load_and_of_the_sensor(slave, designed):
     motion = sensor_motion(slave, designed.trajectory)
     predicted = predicted_deviations(*motion, 1e-3, slave.noise, slave.limits.phi)
@@ -164,6 +169,7 @@ def test_what_is_predicted_is_of_the_heaviest_load_and_of_the_sensor(slave, desi
     assert np.all(fused < accelerometer)
 
 
+@pytest.mark.slow
 def test_the_check_finds_every_kind_of_violation(slave, short):
     """The same motion in a world where each limit in turn is a little less than what it uses."""
     uses = {use.limit: use.share for use in short.uses}
@@ -188,6 +194,7 @@ def test_the_check_finds_every_kind_of_violation(slave, short):
         assert (worst.limit, worst.share > 1, worst.share < 1.03) == (name, True, True)
 
 
+@pytest.mark.slow
 def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
     t = np.zeros((6, 2))
     for q, bodies in (
@@ -200,6 +207,7 @@ def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
         assert bodies & set(clearance.what.split(" and "))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["contact_transition", "peg_in_slot"])
 def test_what_a_scenario_has_to_touch_is_not_touched(name):
     """The sheet spring, or the slot, stands in the room in which the tool moves."""
@@ -217,6 +225,7 @@ def test_what_a_scenario_has_to_touch_is_not_touched(name):
         assert not port.Eval(of_scene).HasCollisions()
 
 
+@pytest.mark.slow
 def test_an_infeasible_design_is_never_returned_nor_written(slave, tmp_path, capsys):
     box = slave.limits._replace(box_half=np.full(3, 0.01))
     with pytest.raises(DrakeTeleopError, match="no trajectory was found that respects all limits"):
@@ -230,6 +239,7 @@ def test_an_infeasible_design_is_never_returned_nor_written(slave, tmp_path, cap
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_trajectory_that_does_not_fit_the_run_is_refused(short):
     scenario = LoadScenario("identification")
     with pytest.raises(DrakeTeleopError, match=r"period is 2\.4 s, the simulation lasts 6 s"):
@@ -361,6 +371,7 @@ def foreign(request, tmp_path_factory):
     return out, joints, execute(path, frame, pl.read_csv(out / "trajectory.csv"), load)
 
 
+@pytest.mark.slow
 def test_what_is_written_for_any_arm(foreign):
     out, joints, recording = foreign
     summary = json.loads((out / "summary.json").read_text())
@@ -414,6 +425,7 @@ def write_described(folder, t, readings, recording):
     return folder / "log.yaml"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write_log", [write_canonical, write_described])
 def test_identify_closes_the_loop_on_any_arm(foreign, write_log, tmp_path):
     """Excited, executed, measured with a noisy sensor, written as a log, identified."""

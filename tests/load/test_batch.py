@@ -221,6 +221,7 @@ def test_stated_deviations_hold_with_errors_in_variables():
     assert 0.4 < errors.mean() < 1.3
 
 
+@pytest.mark.slow
 def test_stated_deviations_are_not_too_large_where_noise_couples_the_channels():
     """Of angular accelerations for the most part: in force and torque at once."""
     motion, errors = rich_motion(1000), []
@@ -304,6 +305,7 @@ def static_poses():
     return 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @settings(max_examples=10, deadline=None)
 @given(rotation=rotations(), seed=st.integers(0, 1000), force=st.floats(0.1, 10.0))
@@ -375,6 +377,7 @@ def test_every_tool_without_noise(utias, method):
         assert max(mass, com, inertia) < 1e-6, file.stem
 
 
+@pytest.mark.slow
 def test_utias_protocol(utias):
     for level, methods in utias.run(TOOLS, seeds=5).items():
         *errors, consistent = methods["consistent"]

@@ -50,6 +50,7 @@ def test_the_motion_of_the_benchmark_is_that_of_a_body(bench):
     assert np.linalg.norm(s - 9.81 * up, axis=1).max() < 10.0
 
 
+@pytest.mark.slow
 def test_a_free_motion_is_no_change(bench, tool):
     for seed in SEEDS:
         states = bench.monitor("JR3", tool).watch(*bench.record("JR3", seed))
@@ -180,6 +181,7 @@ def test_inertias_that_noise_has_shrunk_are_doubted(bench, tool):
     assert error[4] < -0.005 and not monitor.load.identifiable[10]
 
 
+@pytest.mark.slow
 def test_coloured_noise_of_the_stated_long_run_variance_is_no_change(bench, tool):
     """AR(1) noise with a memory of 2 ms, much louder in the long run than from sample to sample."""
     pole = 0.6

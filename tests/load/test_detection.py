@@ -82,6 +82,7 @@ def test_a_held_acceleration_fades():
     np.testing.assert_allclose(sigma**2, NOISE**2 + held[:, None], rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_planted_floor_is_found(seed):
     rng, samples = np.random.default_rng(seed), 40_000
@@ -208,6 +209,7 @@ def test_sums_notice_a_weak_contact_sooner_at_equal_false_alarms():
 # The detector
 
 
+@pytest.mark.slow
 @given(st.sampled_from(STATISTICS), st.integers(0, 100))
 @settings(max_examples=20)
 def test_sample_by_sample_is_as_in_one_go(statistic, seed):

@@ -128,6 +128,7 @@ def test_unweighted_deviations_know_newtons_from_newton_metres():
     assert 0.7 < squares.mean() / 40 < 1.3
 
 
+@pytest.mark.slow
 def test_static_poses_determine_all_but_the_inertia():
     s = static_poses()
     rng = np.random.default_rng(4)

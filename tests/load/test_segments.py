@@ -26,6 +26,7 @@ def bench():
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["JR3", "ideal"])
 def test_the_instant_and_both_loads(bench, sensor):
     full = bench.TOOL + bench.OBJECT
@@ -55,6 +56,7 @@ def test_grasped_and_released(bench):
     assert masses == pytest.approx([3.13, 3.93, 3.13], rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["JR3", "ideal"])
 @pytest.mark.parametrize("kind", ["free", "knock", "push", "hand", "along g"])
 def test_nothing_else_is_a_change(bench, sensor, kind):

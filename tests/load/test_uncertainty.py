@@ -62,6 +62,7 @@ def turntable(samples=400):
 # ---- coverage
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("colour", study.COLOURS)
 def test_intervals_hold_in_noise_of_any_colour(colour):
     # A share of 60 at 95 % has a standard deviation of 2.8 %: fewer than 50 of 60 has a chance of

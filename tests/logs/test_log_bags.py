@@ -135,6 +135,7 @@ def parquet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("storage", "lone"), [("sqlite3", False), ("mcap", False), ("mcap", True)])
 def test_the_same_load_by_bag_and_by_parquet(
     tmp_path: Path, parquet: Path, storage: str, lone: bool

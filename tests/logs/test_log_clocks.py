@@ -159,6 +159,7 @@ def frame(t: np.ndarray, names: tuple[str, ...], values: np.ndarray) -> pl.DataF
     return pl.DataFrame({"t": t} | dict(zip(names, values.T, strict=True)))
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(
     offset=st.floats(-50, 50),

@@ -62,6 +62,7 @@ def test_identify_recovers_a_noise_free_load(tmp_path: Path) -> None:
     assert found.delay_source == "given"
 
 
+@pytest.mark.slow
 def test_identify_finds_delay_and_load_in_a_noisy_log(tmp_path: Path) -> None:
     log = simulated(tmp_path / "log.parquet", noise=0.3, delay_s=0.0062)
     summary = identify_command(log, tmp_path / "out", quiet=True)
@@ -73,6 +74,7 @@ def test_identify_finds_delay_and_load_in_a_noisy_log(tmp_path: Path) -> None:
     assert summary["not_identifiable"] == []
 
 
+@pytest.mark.slow
 def test_identify_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = simulated(tmp_path / "log.csv", noise=0.1)
     summary = identify_command(log, tmp_path / "a" / "b")
@@ -87,6 +89,7 @@ def test_identify_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.slow
 def test_inverted_sign_is_an_error_that_says_so(tmp_path: Path) -> None:
     log = simulated(tmp_path / "log.parquet", sign=-1.0)
     with pytest.raises(DrakeTeleopError, match=r"mass is -3\.13 kg.*sign: -1") as error:
@@ -94,6 +97,7 @@ def test_inverted_sign_is_an_error_that_says_so(tmp_path: Path) -> None:
     assert str(log) in str(error.value)
 
 
+@pytest.mark.slow
 def test_rotation_about_one_axis_does_not_determine_the_inertias(tmp_path: Path) -> None:
     t = np.arange(0, 6, 2e-3)
     angle = 0.5 * np.pi * (1 - np.cos(np.pi * t / 6))
@@ -110,6 +114,7 @@ def test_rotation_about_one_axis_does_not_determine_the_inertias(tmp_path: Path)
     assert found["phi_std"][4] is None
 
 
+@pytest.mark.slow
 def test_eliminate_leaves_the_contact(tmp_path: Path, load: Path) -> None:
     t = np.arange(0, 4, 1e-3)
     log = simulated(tmp_path / "log.parquet", contact=push(t), noise=0.1)
@@ -126,6 +131,7 @@ def test_eliminate_leaves_the_contact(tmp_path: Path, load: Path) -> None:
     assert np.sqrt(np.mean(np.sum(contact[free, :3] ** 2, axis=1))) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tare", [None, 0.5])
 def test_the_causal_wrench_knows_nothing_of_what_comes(
     tmp_path: Path, load: Path, tare: float | None
@@ -153,6 +159,7 @@ def test_the_causal_wrench_knows_nothing_of_what_comes(
     np.testing.assert_allclose(after.contact[3200:3400], push(t - after.lag_s)[3200:3400], atol=0.3)
 
 
+@pytest.mark.slow
 def test_a_start_to_tare_with_has_samples(tmp_path: Path, load: Path) -> None:
     log = simulated(tmp_path / "log.parquet")
     for seconds in (1e-3, 9.0):
@@ -162,6 +169,7 @@ def test_a_start_to_tare_with_has_samples(tmp_path: Path, load: Path) -> None:
         eliminate_log(log, load, delay=0.0, causal_tare_s=0.5)
 
 
+@pytest.mark.slow
 def test_eliminate_writes_its_files(
     tmp_path: Path, load: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,6 +180,7 @@ def test_eliminate_writes_its_files(
     assert "less the non-contact wrench" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sigma", "gamma"), [(0.0, 1.0), (1.0, 1.0), (0.5, 2.0), (1.5, 0.0)])
 def test_scaling_law_on_a_log(tmp_path: Path, load: Path, sigma: float, gamma: float) -> None:
     log = simulated(tmp_path / "log.parquet", contact=push(np.arange(0, 4, 1e-3)))
@@ -181,6 +190,7 @@ def test_scaling_law_on_a_log(tmp_path: Path, load: Path, sigma: float, gamma: f
     np.testing.assert_allclose(found.contact + found.non_contact, found.measured, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_eta_keeps_a_share_of_the_object(tmp_path: Path, load: Path) -> None:
     log = simulated(tmp_path / "log.parquet")
     kept = eliminate_log(log, load, eta=0.25).scaled
@@ -191,6 +201,7 @@ def test_eta_keeps_a_share_of_the_object(tmp_path: Path, load: Path) -> None:
         eliminate_log(log, load, sigma=-1.0)
 
 
+@pytest.mark.slow
 def test_offsets_are_those_of_the_record(tmp_path: Path, load: Path) -> None:
     drift = np.array([0.3, -0.2, 0.5, 0.01, 0.02, -0.01])
     log = simulated(tmp_path / "log.parquet", contact=np.tile(drift, (4000, 1)), noise=0.1)
@@ -200,6 +211,7 @@ def test_offsets_are_those_of_the_record(tmp_path: Path, load: Path) -> None:
     np.testing.assert_allclose(kept.contact.mean(axis=0), drift, atol=0.02)
 
 
+@pytest.mark.slow
 def test_delay_of_the_load_file_where_the_record_has_none(tmp_path: Path, load: Path) -> None:
     t = np.arange(0, 2, 1e-3)
     rest = np.zeros((len(t), 3))
@@ -308,6 +320,7 @@ ROTATION = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pose", [GRAVITY, ROTATION])
 def test_ntnu_poses_give_mass_centre_and_offsets(
     ntnu: Path, tmp_path: Path, pose: dict[str, Any]
@@ -326,6 +339,7 @@ def test_ntnu_poses_give_mass_centre_and_offsets(
         identify_log(describe_poses(tmp_path, ntnu, pose, sign=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("record", "residual", "gravity_only"),
     [("1-baseline", 0.30, 0.58), ("2-vibrations", 0.32, 0.78)],

@@ -120,6 +120,7 @@ REAL: list[tuple[Callable[[Data, Tables], None], str, str]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "name", "says", "record"),
     [(*p, ("1-baseline", "2-vibrations")[i % 2]) for i, p in enumerate(REAL)],
@@ -149,6 +150,7 @@ def test_an_error_in_a_real_record_is_named(
         assert summary["delay_s"] == pytest.approx(-0.494, abs=3e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_loads_and_streams_of_any_kind_raise_no_alarm(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -177,6 +179,7 @@ def test_the_rate_of_a_held_sensor_is_told(tmp_path: Path) -> None:
     assert "4.0 ms ahead" in found["lag"]
 
 
+@pytest.mark.slow
 def test_a_coarse_sensor_at_rest_repeats_rows_by_itself(tmp_path: Path) -> None:
     columns = good()
     for key in ("force", "torque"):
@@ -203,6 +206,7 @@ def test_the_remedy_for_a_drifting_clock_is_right(tmp_path: Path) -> None:
     assert inspect_command(path, tmp_path / "again", quiet=True)["findings"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "says"),
     [
@@ -222,6 +226,7 @@ def test_identify_refuses_a_worthless_result_and_says_why(
         identify_command(written(tmp_path, columns), tmp_path / "out", quiet=True)
 
 
+@pytest.mark.slow
 def test_identify_and_eliminate_pass_findings_on(tmp_path: Path) -> None:
     path = written(tmp_path, good())
     found = identify_log(path)
@@ -239,6 +244,7 @@ def test_identify_and_eliminate_pass_findings_on(tmp_path: Path) -> None:
     assert [finding.name for finding in suspected] == ["sign"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("move", "force", "lag_s"),
     [

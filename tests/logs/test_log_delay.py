@@ -28,6 +28,7 @@ def delayed(delay_s: float, noise: float, seed: int = 1, duration: float = 4.0) 
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_s", [-0.0371, 0.0, 0.0004, 0.0061, 0.18])
 @pytest.mark.parametrize("cutoff", [15.0, None])
 @pytest.mark.parametrize("phi", [PHI, None])

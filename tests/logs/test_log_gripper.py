@@ -52,6 +52,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_identify_writes_the_object(files: Path) -> None:
     summary = json.loads((files / "total" / "summary.json").read_text())
     total, alone, found = (
@@ -73,6 +74,7 @@ def test_identify_writes_the_object(files: Path) -> None:
     assert not [note for note in summary["notes"] if "object" in note]
 
 
+@pytest.mark.slow
 def test_the_table_has_the_object_only_with_a_gripper(
     files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -85,6 +87,7 @@ def test_the_table_has_the_object_only_with_a_gripper(
     assert not (tmp_path / "single" / "object.json").exists()
 
 
+@pytest.mark.slow
 def test_nothing_gripped_is_said(files: Path, tmp_path: Path) -> None:
     gripper = files / "gripper" / "identification.json"
     log = simulated(tmp_path / "empty.parquet", GRIPPER, 8)
@@ -93,6 +96,7 @@ def test_nothing_gripped_is_said(files: Path, tmp_path: Path) -> None:
     assert summary["object"]["identifiable"] == []
 
 
+@pytest.mark.slow
 def test_eta_splits_gripper_and_object(files: Path) -> None:
     load, gripper = (files / name / "identification.json" for name in ("total", "gripper"))
     log = files / "total.parquet"
@@ -111,6 +115,7 @@ def test_eta_splits_gripper_and_object(files: Path) -> None:
     np.testing.assert_allclose(whole.scaled, whole.measured, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_scales_that_do_not_go_together(files: Path) -> None:
     load, gripper = (files / name / "identification.json" for name in ("total", "gripper"))
     log = files / "total.parquet"
@@ -122,6 +127,7 @@ def test_scales_that_do_not_go_together(files: Path) -> None:
         eliminate_log(log, load, gripper=gripper, sigma_object=-1.0)
 
 
+@pytest.mark.slow
 def test_exchanged_files_are_an_error_in_both_commands(files: Path, tmp_path: Path) -> None:
     load, gripper = (files / name / "identification.json" for name in ("total", "gripper"))
     with pytest.raises(DrakeTeleopError, match="kg for the object"):
@@ -131,6 +137,7 @@ def test_exchanged_files_are_an_error_in_both_commands(files: Path, tmp_path: Pa
     assert not (tmp_path / "a").exists() and not (tmp_path / "b").exists()
 
 
+@pytest.mark.slow
 def test_contacts_and_the_causal_wrench_come_with_eliminate(files: Path, tmp_path: Path) -> None:
     t = np.arange(0, 4, 2e-3)
     force = np.where((t > 2.0) & (t < 2.5), 12 * np.sin(2 * np.pi * (t - 2.0)) ** 2, 0.0)
@@ -160,6 +167,7 @@ def test_contacts_and_the_causal_wrench_come_with_eliminate(files: Path, tmp_pat
     assert np.abs(ahead.contact[:, 2] - contact[:, 2]).max() < 0.4
 
 
+@pytest.mark.slow
 def test_a_free_record_has_no_contact(files: Path, tmp_path: Path) -> None:
     load = files / "total" / "identification.json"
     summary = eliminate_command(files / "total.parquet", load, tmp_path, delay=0.0, quiet=True)

@@ -53,6 +53,7 @@ def test_nothing_is_suspected_in_a_good_log(tmp_path: Path, streams: dict[str, b
     assert findings(tmp_path, good(), **streams) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "name", "says", "streams"),
     PLANTED,

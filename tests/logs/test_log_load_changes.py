@@ -39,6 +39,7 @@ def simulated(path: Path, grasped_at: float, clock: float = 0.0) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_identify_says_when_the_load_changes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -53,6 +54,7 @@ def test_identify_says_when_the_load_changes(
     assert "the load changes at t = 104.0" in capsys.readouterr().out.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_identify_says_nothing_if_it_does_not(tmp_path: Path) -> None:
     summary = identify_command(simulated(tmp_path / "log.parquet", 20.0), tmp_path, quiet=True)
     assert summary["load_changes"] == []
@@ -121,6 +123,7 @@ def test_ur5_pushes_are_no_load(ur5: Path, tmp_path: Path) -> None:
     assert segments(log.wrench, *log.motion, log.dt) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 def test_utias_records_have_one_load(level: str, utias: Path) -> None:
     """Ten tools from 9 g to 1 kg, stop and go."""

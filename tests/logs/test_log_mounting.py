@@ -126,6 +126,7 @@ rotations = st.integers(0, 10**6).map(a_rotation)
 places = st.tuples(*[st.floats(-0.1, 0.1)] * 3).map(np.array)
 
 
+@pytest.mark.slow
 @settings(max_examples=6, deadline=None)
 @given(rotations, places, st.integers(0, 10**6), st.booleans())
 def test_any_mounting_is_found_within_what_is_stated(
@@ -142,6 +143,7 @@ def test_any_mounting_is_found_within_what_is_stated(
     assert found.lag_s == pytest.approx(LAG, abs=3e-4)
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_repeated_records() -> None:
     truth = [(a_rotation(seed), np.array([0.05, -0.03, 0.08])) for seed in range(16)]
     ratios = []
@@ -156,6 +158,7 @@ def test_deviations_are_those_of_repeated_records() -> None:
     assert 0.7 < np.sqrt((ratios**2).mean()) < 1.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_the_wrench_tells_the_lever_arm_without_a_pose(seed: int) -> None:
     p = np.random.default_rng(seed).uniform(-0.1, 0.1, 3)
@@ -184,6 +187,7 @@ def test_a_load_that_touches_something_tells_nothing() -> None:
         read_description(described(pose=False, position="auto"), "log.yaml", tables=tables)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["pose", "wrench"])
 def test_rotation_about_one_axis_tells_two_coordinates(source: str) -> None:
     recorder = Recorder(np.eye(3), np.array([0.03, 0.04, -0.05]), motion=turning_about_y)
@@ -227,6 +231,7 @@ def written(folder: Path, recorder: Recorder, **imu: Any) -> Path:
     return folder / "log.yaml"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("oblique", [False, True])
 def test_what_was_found_can_be_written_down(tmp_path: Path, oblique: bool) -> None:
     R_SI = Rotation.from_rotvec([0.1, -0.4, 0.2]).as_matrix() @ RIGHT_ANGLED
@@ -249,6 +254,7 @@ def test_what_was_found_can_be_written_down(tmp_path: Path, oblique: bool) -> No
     assert inspect_command(path, tmp_path / "out", quiet=True)["mounting"]["angle_deg"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_position_that_is_given_is_that_of_the_found_frame(tmp_path: Path) -> None:
     p = np.array([0.04, -0.06, 0.02])
     recorder = Recorder(a_rotation(5), p, noise=0.1)
@@ -262,6 +268,7 @@ def test_a_position_that_is_given_is_that_of_the_found_frame(tmp_path: Path) -> 
     assert np.abs(log.specific_force - given_place.specific_force).max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -322,6 +329,7 @@ def test_gaps_are_not_taken_for_motion() -> None:
 # Real records
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("record", "residual", "delay_s"),
     [("1-baseline", 0.296, 0.00612), ("2-vibrations", 0.316, 0.00588)],

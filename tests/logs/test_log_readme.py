@@ -31,6 +31,7 @@ def motion() -> Motion:
     return motion_at(np.arange(0.0, 8.0, 2e-3))
 
 
+@pytest.mark.slow
 def test_a_robots_log_as_in_the_readme(tmp_path, monkeypatch, capsys, motion):
     monkeypatch.chdir(tmp_path)
     wrench = OFFSETS + non_contact_wrench(motion.specific_force, motion.omega, motion.alpha, PHI)

@@ -117,6 +117,7 @@ def test_the_spectrum_has_the_power_of_the_signal() -> None:
     assert rate[np.argmax(density)] == pytest.approx(50, abs=0.3)
 
 
+@pytest.mark.slow
 def test_a_robust_fit_says_what_it_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -63,6 +63,7 @@ def test_reaching_ends_in_the_target(reach):
     assert np.isnan(measures["detection_time_s"]) and measures["contact_force_overshoot_N"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_smaller_target_takes_longer():
     """Fitts: noise in the movements makes corrections necessary."""
     mean = {}
@@ -115,6 +116,7 @@ def test_lines_that_differ_are_waited_for_each_in_its_place(there, back):
     assert differ == pytest.approx(same, abs=0.02)
 
 
+@pytest.mark.slow
 def test_contact_is_noticed_and_the_hand_stops(touch):
     for result, measures in touch.values():
         assert measures["success"] == 1.0
@@ -128,6 +130,7 @@ def test_contact_is_noticed_and_the_hand_stops(touch):
         assert 0.0 <= result.t[-1] - measures["task_time_s"] < 0.03
 
 
+@pytest.mark.slow
 def test_weight_that_is_felt_makes_one_slow_and_blunt(touch):
     """sigma = 1: the threshold follows the load's displayed weight, and with it trust."""
     without, with_load = touch[0.0][1], touch[1.0][1]
@@ -138,12 +141,14 @@ def test_weight_that_is_felt_makes_one_slow_and_blunt(touch):
     assert limit[1] == pytest.approx(0.1 * 3.13 * 9.81 / 17.5, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_peg_is_felt_into_the_slot():
     _, measures = run("insert")
     assert measures["success"] == 1.0
     assert measures["false_notices"] == 0
 
 
+@pytest.mark.slow
 def test_who_misses_the_mouth_looks_around():
     """The chamfers reach 4 mm to each side; who sees the mouth farther off lands beside them."""
     task = Insert(translation=[0.0, 0.0085, -0.02], depth=0.04)
@@ -154,6 +159,7 @@ def test_who_misses_the_mouth_looks_around():
     assert measures["detection_time_s"] < 0.5
 
 
+@pytest.mark.slow
 def test_who_feels_nothing_gives_up():
     result, measures = run("touch", force_scaling__gamma=0.0, sheet_spring=None)
     assert measures["success"] == 0.0 and np.isnan(measures["task_time_s"])
@@ -161,6 +167,7 @@ def test_who_feels_nothing_gives_up():
     assert result["task_state"][-1, DONE] <= 0.0
 
 
+@pytest.mark.slow
 def test_a_set_force_is_held():
     """Without friction in the device, which hides 1 N at the tool: as exactly as one can judge."""
     smooth = {"master__friction": JointFriction([0.0] * 6, [5e-4] * 3 + [5e-5] * 3)}

@@ -31,6 +31,7 @@ def least(bench: ModuleType) -> dict[str, dict[str, float]]:
     return bench.study(networks=24, seconds=4.0, processes=1)
 
 
+@pytest.mark.slow
 def test_tdpa_never_gives_out_more_than_was_put_in(least):
     assert least["tdpa"]["energy"] >= -1e-9
     assert least["tdpa"]["stronger"] <= 1e-12, "the wrench became stronger"

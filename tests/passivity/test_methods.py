@@ -188,6 +188,7 @@ def test_a_method_that_does_not_exist_is_refused():
     assert initial_memory("none", np.zeros(1), START).shape == (MEMORY,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wall", "round_trip"), [(5100.0, 1.0), (20000.0, 0.3), (20000.0, 0.02)])
 def test_charged_tdpa_holds_a_wall_over_a_long_delay_with_the_right_force(wall, round_trip):
     model, task = OneDof(wall_stiffness=wall), Task(release=15.5, released=16.5, end=21.0)

@@ -72,6 +72,7 @@ def test_silence_while_pressing_fades_and_comes_back_without_a_step(tmp_path, me
     assert np.isfinite(felt).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "tdpa"])
 def test_pressing_anew_after_a_silence_is_as_without_it(tmp_path, method):
     """The wall is pressed twice; the first time there is silence in the middle.
@@ -144,6 +145,7 @@ def rough_networks(tmp_path_factory) -> list[tuple[NetworkConfig, NetworkConfig]
     return list(zip(lines[::2], lines[1::2], strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_every_rough_network_is_recovered_from(rough_networks, method):
     """Whatever the network did until 9 s, in contact: it comes to rest, and the slave is there."""
@@ -159,6 +161,7 @@ def test_every_rough_network_is_recovered_from(rough_networks, method):
         assert np.abs(result.felt[-1000:]).max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_nothing_steps_up_while_it_resumes_in_rough_networks(rough_networks, method):
     """Before the paper's wall, where several methods chatter: not in the 0.5 s after a silence."""

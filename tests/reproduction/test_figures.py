@@ -92,6 +92,7 @@ def test_no_contact_at_all_is_drawn_without_its_mark():
     assert [text.get_text() for text in lower.texts] == ["detected"]
 
 
+@pytest.mark.slow
 def test_the_same_data_draw_the_same_picture():
     assert render(scaling()) == render(scaling())
     assert render(contact()) != render(contact(detected_s=0.3))

@@ -40,6 +40,7 @@ def log(out, name: str) -> SimulationResult:
     return SimulationResult.read_parquet(out / "logs" / f"{name}.parquet")
 
 
+@pytest.mark.slow
 def test_free_motion_is_as_in_figure_6(run):
     figures = run[0]["free_force"]
     assert 90 <= figures["peak_raw_N"] <= 115
@@ -49,6 +50,7 @@ def test_free_motion_is_as_in_figure_6(run):
     assert 0 < figures["residual_ideal_max_N"] <= 1e-10
 
 
+@pytest.mark.slow
 def test_free_motion_is_as_in_figure_7(run):
     figures = run[0]["free_torque"]
     assert 3 <= figures["peak_raw_Nm"] <= 12
@@ -58,6 +60,7 @@ def test_free_motion_is_as_in_figure_7(run):
     assert 0 < figures["residual_ideal_max_Nm"] <= 1e-11
 
 
+@pytest.mark.slow
 def test_the_contact_is_as_in_figure_8(run):
     figures = run[0]["contact"]
     assert 0.205 <= figures["true_s"] <= 0.235
@@ -70,6 +73,7 @@ def test_the_contact_is_as_in_figure_8(run):
     assert figures["peak_contact_N"] < 0.5 * figures["peak_inertial_N"]
 
 
+@pytest.mark.slow
 def test_the_load_is_found_from_the_sensors_samples(run):
     figures = run[0]["identification"]
     assert figures["mass_error_percent"] <= 0.2
@@ -78,6 +82,7 @@ def test_the_load_is_found_from_the_sensors_samples(run):
     assert figures["recursive_against_batch_std"] < 1
 
 
+@pytest.mark.slow
 def test_the_speed_was_measured(run):
     """No bound: a test is never timed."""
     speed = run[0]["speed"]
@@ -85,10 +90,12 @@ def test_the_speed_was_measured(run):
     assert speed["cost_over_bare_plant"] > 1
 
 
+@pytest.mark.slow
 def test_everything_is_as_accepted(run):
     assert unaccepted(run[0]) == []
 
 
+@pytest.mark.slow
 def test_everything_is_written(run):
     summary, out = run
     assert json.loads((out / "summary.json").read_text(encoding="utf-8")) == summary
@@ -107,6 +114,7 @@ def test_everything_is_written(run):
     assert load.method == "recursive total least squares"
 
 
+@pytest.mark.slow
 def test_the_bottom_plots_are_what_the_hand_gets(run):
     """Computed afterwards from the samples, they are the loop's own output, scaled."""
     _, out = run
@@ -128,6 +136,7 @@ def test_the_bottom_plots_are_what_the_hand_gets(run):
             np.testing.assert_allclose(felt, FORCE_SCALE * left, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_estimators_in_loop_and_on_the_log_had_only_the_sensor(run):
     """The identification's log, without the states of the plant, gives the same load."""
     _, out = run

@@ -192,6 +192,7 @@ def test_arms_with_other_numbers_of_joints(source, joints):
 # Delays
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("preset", ["jr3_85m35a3", "ati_gamma_imu"])
 @pytest.mark.parametrize("frequency", [5.0, 20.0])

@@ -318,6 +318,7 @@ def records():
     return {name: rest_record(config, LONG, PERIOD, 3) for name, config in AT_REST.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in AT_REST if name != "walk"])
 def test_the_spectrum_at_rest_is_the_one_that_was_predicted(records, name):
     """Averaged over bands, to five standard deviations of the estimate."""
@@ -334,6 +335,7 @@ def test_the_spectrum_at_rest_is_the_one_that_was_predicted(records, name):
         assert noisy.any() and np.abs(ratio - 1).max() <= 5 * deviation, (low, ratio)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AT_REST)
 def test_the_allan_deviation_at_rest_is_the_one_that_was_predicted(records, name):
     lengths = 2 ** np.arange(0 if name != "walk" else 5, 14)

@@ -59,6 +59,7 @@ def test_lengths_are_those_of_the_model(plant):
     np.testing.assert_allclose(np.diff(heights), lengths, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_random_poses_come_back_and_all_eight_branches_meet_them(arm):
     rng = np.random.default_rng(0)
     for _ in range(10_000):

@@ -58,6 +58,7 @@ def test_the_sensor_feels_it_as_its_joint_does():
     assert sizes[0] == pytest.approx(5.13 * 9.81, rel=0.01)  # not yet
 
 
+@pytest.mark.slow
 def test_the_identification_finds_it():
     scenario = identification_scenario(replace(Scenario(), slave__payload=HELD), 1)
     mass, com, _ = mass_com_inertia(identify_load(scenario).estimate[6:])

@@ -94,6 +94,7 @@ def test_they_are_a_thousand_runs_over_the_same_scales():
     assert scales[3] == scales[0][:1]
 
 
+@pytest.mark.slow
 def test_the_answer_of_a_folder(tmp_path, monkeypatch):
     """The studies are not run here; their rows are made up."""
 

@@ -108,6 +108,7 @@ def parts(out: Path) -> dict[str, bytes]:
     return {part.name: part.read_bytes() for part in (out / "runs.parquet").iterdir()}
 
 
+@pytest.mark.slow
 def test_a_row_for_each_run(serial):
     summary, out = serial
     rows = pl.read_parquet(out / "runs.parquet").sort("run")
@@ -129,6 +130,7 @@ def test_a_row_for_each_run(serial):
     assert np.all(np.diff(mean.sort("force_scaling.sigma")["rms_force_to_master_N"]) > 0.1)
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_bytes(serial, files):
     out = files / "parallel"
     summary = study_command(files / "study.yaml", out, jobs=2, quiet=True)
@@ -136,6 +138,7 @@ def test_processes_give_the_same_bytes(serial, files):
     assert parts(out) == parts(serial[1])
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_gives_the_same_bytes(serial, files):
     out = files / "dask"
     summary = study_command(files / "study.yaml", out, jobs=2, cluster="local", quiet=True)
@@ -149,6 +152,7 @@ def test_without_dask_the_extra_is_named(files, monkeypatch):
         study_command(files / "study.yaml", files / "none", cluster="local", quiet=True)
 
 
+@pytest.mark.slow
 def test_a_killed_study_of_stations_goes_on(serial, files):
     out = files / "killed"
     command = "from drake_teleop.cli import main; main()"
@@ -160,6 +164,7 @@ def test_a_killed_study_of_stations_goes_on(serial, files):
     assert parts(out) == parts(serial[1])
 
 
+@pytest.mark.slow
 def test_kills_lose_and_double_no_row(tmp_path):
     names = ("fake.py", "killed", "whole", "kept.json")
     script, killed, whole, report = (tmp_path / name for name in names)
@@ -213,6 +218,7 @@ def test_a_run_that_fails_is_a_row(files):
     assert summary["measures"]["hand_work_J"] == {"mean": None, "least": None, "largest": None}
 
 
+@pytest.mark.slow
 def test_another_study_does_not_mix_with_the_rows(serial, files):
     before = parts(serial[1])
     (files / "other.yaml").write_text(STUDY + "seed: 1\n")
@@ -260,6 +266,7 @@ def dying(own: int, at: float):
     return work
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cluster", [None, "local"])
 def test_a_run_that_ends_its_process_is_a_row(tmp_path, cluster):
     factor = Factor("a.b", low=0.0, high=9.0, levels=10)
@@ -302,6 +309,7 @@ run_study(Study(factors=[Factor("a.b", values=[1.0, 2.0])]), out / "out", work, 
 """
 
 
+@pytest.mark.slow
 def test_processes_end_with_a_study_that_is_killed(tmp_path):
     script = tmp_path / "orphans.py"
     script.write_text(ORPHANS)
@@ -329,6 +337,7 @@ def wait_for(condition, seconds=60.0):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_factors_over_flags_and_vectors(files, tmp_path):
     """They reach the scenario, and the table has a column of their kind."""
     path = files / "kinds.yaml"
@@ -371,6 +380,7 @@ BOWL = Study(
 )
 
 
+@pytest.mark.slow
 def test_an_adaptive_design_finds_the_best_point(tmp_path):
     rows = run_study(BOWL, tmp_path, bowl, {}, jobs=1)
     assert rows["point"].max() == 39 and rows.height == 80
@@ -385,6 +395,7 @@ def test_an_adaptive_design_finds_the_best_point(tmp_path):
     assert len(rows.select("a.x", "a.w").unique()) == 40
 
 
+@pytest.mark.slow
 def test_an_adaptive_design_goes_on_after_any_stop(tmp_path):
     run_study(BOWL, tmp_path / "whole", bowl, {}, jobs=1)
     calls = []
