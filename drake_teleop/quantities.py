@@ -17,9 +17,7 @@ from typing import Any
 from drake_teleop.errors import DrakeTeleopError
 
 
-def quantity(
-    default: Any, unit: str, low: float, high: float, doc: str, *, nonzero: bool = False
-) -> Any:
+def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
     """A dataclass field holding a number or a list of numbers.
 
     Args:
@@ -27,9 +25,8 @@ def quantity(
         unit: SI unit, "1" if it has none.
         low, high: the closed range in which a value is plausible.
         doc: what it is, with frame and source.
-        nonzero: zero is refused although it is inside the range.
     """
-    metadata = {"unit": unit, "low": low, "high": high, "doc": doc, "nonzero": nonzero}
+    metadata = {"unit": unit, "low": low, "high": high, "doc": doc}
     if isinstance(default, list):
         metadata["length"] = len(default)
         return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)
@@ -108,8 +105,6 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
                 where=place,
                 remedy=f"check the value and its unit ({metadata['doc']})",
             )
-        if metadata["nonzero"] and number == 0:
-            raise DrakeTeleopError("must not be zero", where=place, remedy=metadata["doc"])
 
 
 def _fields(config: Any) -> Iterator[tuple[dataclasses.Field[Any], Any]]:

@@ -184,24 +184,24 @@ def _square(z: Complex) -> Real:
     return z.real**2 + z.imag**2
 
 
-def scanned_resistance(H: Complex, loads: int = 17, rounds: int = 8) -> Real:
+def scanned_resistance(H: Complex) -> Real:
     """Least Re Z felt by the hand over all lossless environments, found by trying them [N s/m].
 
     A second opinion of Llewellyn's criterion: where h11 and h22 have positive real parts the two
-    have the same sign. Each round tries `loads` susceptances around the best of the one before.
+    have the same sign. Each of 8 rounds tries 17 susceptances around the best of the one before.
     """
     h11, h12, h21, h22 = (entry[..., None] for entry in entries(H))
     scale = np.where(h22.real != 0, np.abs(h22.real), 1.0)
-    step = 2 * np.pi / (loads - 1)
-    angles = np.linspace(-np.pi, np.pi, loads)
+    step = np.pi / 8
+    angles = np.linspace(-np.pi, np.pi, 17)
     centre = np.zeros_like(scale)
-    for _ in range(rounds):
+    for _ in range(8):
         tried = centre + angles
         susceptance = scale * np.tan(tried / 2) - h22.imag
         resistance = (h11 - h12 * h21 / (h22 + 1j * susceptance)).real
         best = np.argmin(resistance, axis=-1, keepdims=True)
         centre = np.take_along_axis(tried, best, axis=-1)
-        angles, step = np.linspace(-step, step, loads), 2 * step / (loads - 1)
+        angles, step = np.linspace(-step, step, 17), step / 8
     return np.take_along_axis(resistance, best, axis=-1)[..., 0]
 
 

@@ -35,10 +35,10 @@ def render(package: str, template: str, **values: Any) -> str:
     return environment.get_template(template).render(**values)
 
 
-def embedded(figure: Figure, dpi: int = 160) -> str:
+def embedded(figure: Figure) -> str:
     """The figure as a PNG in a data: URL."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
+    figure.savefig(buffer, format="png", dpi=160)
     return _data(buffer.getvalue())
 
 

@@ -98,10 +98,6 @@ class BatchResult:
     note: str
     equations: NormalEquations
 
-    @property
-    def rejected_fraction(self) -> float:
-        return float(self.rejected.mean())
-
 
 def _ordinary(record: Record, options: Options) -> Fit:
     form = total_least_squares(record.moments, Noise(), np.ones(6), offsets=options.offsets)

@@ -86,20 +86,18 @@ def read_description(
     source: str,
     *,
     tables: dict[Path, Table] | None = None,
-    bandwidth_hz: float | None = 30.0,
 ) -> Log:
-    """The log of a description in memory; arguments as those of `read_log`.
+    """The log of a description in memory, as of `read_log`.
 
     Args:
         description: with absolute paths.
         source: the file, for messages.
         tables: files that are read already.
-        bandwidth_hz: of the smoother that differentiates.
 
     Raises:
         DrakeTeleopError: if the log cannot be used.
     """
-    return _Reader(description, source, bandwidth_hz, tables).log()
+    return _Reader(description, source, 30.0, tables).log()
 
 
 class _Reader:

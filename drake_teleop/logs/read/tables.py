@@ -212,6 +212,6 @@ def _unreadable(path: Path, error: Exception) -> DrakeTeleopError:
     )
 
 
-def _listed(names: Sequence[str], most: int = 12) -> str:
-    shown = ", ".join(names[:most])
-    return f"{shown}, ..." if len(names) > most else shown
+def _listed(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:12])
+    return f"{shown}, ..." if len(names) > 12 else shown
