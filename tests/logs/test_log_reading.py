@@ -341,12 +341,20 @@ def test_static_poses_from_gravity_or_orientation(tmp_path: Path) -> None:
     motion = motion_at(np.linspace(0, 5, 12))
     gravity = np.einsum("nji,j->ni", motion.R_WS, GRAVITY_W)
     wrench_W = np.einsum("nij,nj->ni", motion.R_WS, -2 * gravity)
+    bias = [0.1, -0.2, 0.3]  # in g, as the column that has it
     np.savez(
-        tmp_path / "x.npz", f=-2 * gravity, f_W=wrench_W, tau=0 * gravity, g=gravity, R=motion.R_WS
+        tmp_path / "x.npz",
+        f=-2 * gravity,
+        f_W=wrench_W,
+        tau=0 * gravity,
+        g=gravity,
+        in_g=gravity / np.linalg.norm(GRAVITY_W) + bias,
+        R=motion.R_WS,
     )
     orientation = {"columns": ["R"], "form": "matrix"}
     for force, extra in (
         ("f", {"gravity": {"columns": ["g"]}}),
+        ("f", {"gravity": {"columns": ["in_g"], "unit": "g", "bias": bias}}),
         ("f", {"orientation": orientation}),
         ("f_W", {"orientation": orientation, "frame": "base"}),
     ):
