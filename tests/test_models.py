@@ -10,7 +10,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.resources import models_dir
-from drake_teleop.slave.arm import ArmModelFromPlant
+from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 
 
 def parse(name: str):

@@ -48,7 +48,8 @@ from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.sensor.sensor_chain import without
 from drake_teleop.simulation import MakeSimulator
-from drake_teleop.slave.arm import ArmModelFromPlant, jacobian
+from drake_teleop.slave.arm import jacobian
+from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station import MakeTeleopStation
 
 Array = NDArray[np.float64]

@@ -29,7 +29,8 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.scenario import Scenario
 from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.slave.arm import ArmModel, ArmModelFromPlant
+from drake_teleop.slave.arm import ArmModel
+from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.payload import AddPayload
 from drake_teleop.slave.plant import AddEnvironment, ParseSlave, finalize, home_position
 

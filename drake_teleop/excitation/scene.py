@@ -32,7 +32,7 @@ from drake_teleop.excitation.capsules import Capsule, bounding_capsule
 from drake_teleop.excitation.limits import capsule_distances, empty_motions, motions_of
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.inertia import inertia_about_origin
-from drake_teleop.slave.arm import ArmModelFromPlant
+from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.plant import finalize
 
 #: What the arm keeps between its links, and from everything else [m]. The flange of the RX90 passes

@@ -60,12 +60,7 @@ from drake_teleop.sensor.sensor_chain import (
     read_into,
     sensor_chain,
 )
-from drake_teleop.slave.arm import (
-    MOTION_SIZE,
-    ArmModel,
-    forward_dynamics,
-    sensor_motion,
-)
+from drake_teleop.slave.arm import MOTION_SIZE, ArmModel, forward_dynamics, sensor_motion
 from drake_teleop.slave.plant import SlavePlant
 from drake_teleop.slave.tool_contact import add_force, environment_wrench
 from drake_teleop.vectors import apply, cross, minus, nine, three, transposed

@@ -1,6 +1,6 @@
-"""Kinematics and inverse dynamics of any serial arm, compiled (long: recursions over one table).
+"""Kinematics and inverse dynamics of any serial arm of revolute joints, compiled.
 
-`ArmModelFromPlant` reads the arm out of a finalized MultibodyPlant into one table of numbers; the
+`ArmModel` is the arm as one table of numbers (`arm_from_plant` reads it out of a plant); the
 kernels below run on that table. They repeat what the plant can do because an 8 kHz sample has
 125 us in all and the plant's output ports take 5-20 us each; a test ties each kernel to the plant.
 
@@ -15,21 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    BodyIndex,
-    Joint,
-    JointActuator,
-    ModelInstanceIndex,
-    RevoluteJoint,
-    RigidBody,
-    SpatialInertia,
-    WeldJoint,
-)
 
 from drake_teleop._compiled import njit
-from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.vectors import (
     add_into,
     apply,
@@ -48,9 +35,9 @@ from drake_teleop.vectors import (
 Array = NDArray[np.float64]
 
 # Columns of ArmModel.table.
-_ROTATION, _TRANSLATION, _PHI, _ROTOR, _DAMPING, _WIDTH = 0, 9, 12, 22, 23, 25
+ROTATION, TRANSLATION, PHI, ROTOR, DAMPING, WIDTH = 0, 9, 12, 22, 23, 25
 # In the last row, which has no joint, gravity stands from here on.
-_GRAVITY = 22
+GRAVITY = 22
 
 MOTION_SIZE = 21
 """Length of the vector that `sensor_motion` fills."""
@@ -104,172 +91,24 @@ class ArmModel:
     @property
     def load(self) -> Array:
         """The same, a view into the table."""
-        return self.table[-1, _PHI:_ROTOR]
+        return self.table[-1, PHI:ROTOR]
 
     def with_load(self, phi: Array) -> ArmModel:
         """The same arm carrying ``phi`` (10,) beyond S instead; zeros for the bare arm."""
         table = self.table.copy()
-        table[-1, _PHI:_ROTOR] = phi
+        table[-1, PHI:ROTOR] = phi
         return replace(self, table=table)
-
-
-def ArmModelFromPlant(
-    plant: MultibodyPlant,
-    model_instance: ModelInstanceIndex,
-    sensor_frame_name: str = "sensor",
-) -> ArmModel:
-    """Reads the chain from the world to a sensor frame out of a finalized plant.
-
-    Joints beyond the sensor frame (a gripper's fingers) count as held at their default positions.
-
-    Args:
-        plant: a finalized plant; other models in it do not matter, whatever is attached to the arm
-            counts, whichever model instance it belongs to.
-        model_instance: the arm's.
-        sensor_frame_name: a frame of that model instance, on the last link or welded to it.
-
-    Raises:
-        DrakeTeleopError: there is no such frame, or what leads to it from the world is not a chain
-            of welds and revolute joints, or a link carries a further moving joint.
-    """
-    if not plant.HasFrameNamed(sensor_frame_name, model_instance):
-        raise DrakeTeleopError(
-            f"the arm has no frame named {sensor_frame_name!r}",
-            where=plant.GetModelInstanceName(model_instance),
-            remedy="name the frame or link at which the sensor measures",
-        )
-    frame_S = plant.GetFrameByName(sensor_frame_name, model_instance)
-    inboard = {
-        joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
-    }
-    joints = _chain(inboard, frame_S.body())
-    n = len(joints)
-    table = np.zeros((n + 1, _WIDTH))
-    for row, joint in enumerate(joints):
-        table[row, _ROTOR] = _reflected_inertia(plant, joint)
-        table[row, _DAMPING] = joint.default_damping()
-    gravity = plant.gravity_field()
-    table[n, _GRAVITY:] = gravity.gravity_vector() * gravity.is_enabled(model_instance)
-
-    context = plant.CreateDefaultContext()
-    # C turns the joint's axis into z.
-    C = [RigidTransform(RotationMatrix.MakeFromOneVector(j.revolute_axis(), 2)) for j in joints]
-    X_WS = frame_S.CalcPoseInWorld(context)
-    X_WJ = [
-        j.frame_on_parent().CalcPoseInWorld(context) @ X for j, X in zip(joints, C, strict=True)
-    ]
-    X_WL = [j.frame_on_child().CalcPoseInWorld(context) @ X for j, X in zip(joints, C, strict=True)]
-    X_WJ.append(X_WS)
-    X_WL.append(X_WS)
-    for row, X_WP in enumerate([RigidTransform(), *X_WL[:-1]]):
-        X_PJ = X_WP.InvertAndCompose(X_WJ[row])
-        table[row, _ROTATION:_TRANSLATION] = X_PJ.rotation().matrix().ravel()
-        table[row, _TRANSLATION:_PHI] = X_PJ.translation()
-    rows = {joint.child_body().index(): row for row, joint in enumerate(joints)}
-    for index in inboard:
-        body = plant.get_body(index)
-        found = _row_of(body, inboard, rows, frame_S.body())
-        if found is not None:
-            X_LB = X_WL[found].InvertAndCompose(body.EvalPoseInWorld(context))
-            M_B = body.CalcSpatialInertiaInBodyFrame(context)
-            table[found, _PHI:_ROTOR] += _phi(M_B, X_LB)
-    return ArmModel(
-        joint_names=tuple(joint.name() for joint in joints),
-        table=table,
-        lower=_per_joint([j.position_lower_limits()[0] for j in joints]),
-        upper=_per_joint([j.position_upper_limits()[0] for j in joints]),
-        velocity_limit=_per_joint([j.velocity_upper_limits()[0] for j in joints]),
-        acceleration_limit=_per_joint([j.acceleration_upper_limits()[0] for j in joints]),
-        effort_limit=_per_joint([_effort_limit(plant, j) for j in joints]),
-        position_index=np.array([j.position_start() for j in joints], dtype=np.intp),
-        velocity_index=np.array([j.velocity_start() for j in joints], dtype=np.intp),
-    )
-
-
-def _per_joint(values: list[float]) -> Array:
-    return np.array(values, dtype=np.float64)
-
-
-def _chain(inboard: dict[BodyIndex, Joint], body: RigidBody) -> list[RevoluteJoint]:
-    """The revolute joints from the world to ``body``, from the base outwards."""
-    joints: list[RevoluteJoint] = []
-    while body.index() in inboard:
-        joint = inboard[body.index()]
-        if isinstance(joint, RevoluteJoint):
-            joints.append(joint)
-        elif not isinstance(joint, WeldJoint):
-            raise DrakeTeleopError(
-                f"the arm hangs on a {joint.type_name()} joint",
-                where=joint.name(),
-                remedy="weld the arm's base to the world and use revolute joints up to the sensor",
-            )
-        body = joint.parent_body()
-    if not joints:
-        raise DrakeTeleopError(
-            "no revolute joint between the world and the sensor frame", where=body.name()
-        )
-    return joints[::-1]
-
-
-def _row_of(
-    body: RigidBody,
-    inboard: dict[BodyIndex, Joint],
-    rows: dict[BodyIndex, int],
-    sensor_body: RigidBody,
-) -> int | None:
-    """The row of the table that carries the body's inertia; None if the arm does not carry it."""
-    moving = None
-    outermost = body
-    while True:
-        if body.index() == sensor_body.index() and outermost.index() != body.index():
-            return len(rows)
-        if body.index() in rows:
-            break
-        if body.index() not in inboard:
-            return None
-        joint = inboard[body.index()]
-        if not isinstance(joint, WeldJoint):
-            moving = joint
-        body = joint.parent_body()
-    if moving is not None:
-        raise DrakeTeleopError(
-            f"link {body.name()} carries a moving part beside the chain to the sensor",
-            where=moving.name(),
-            remedy="weld that joint",
-        )
-    return rows[body.index()]
-
-
-def _phi(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
-    """(10,) phi of a body about the origin of L, in L."""
-    M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
-    M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
-    I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()
-    return np.array([M_BLo_L.get_mass(), *M_BLo_L.CalcComMoment(), *I_BLo_L[np.triu_indices(3)]])
-
-
-def _actuators(plant: MultibodyPlant, joint: Joint) -> list[JointActuator]:
-    actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
-    return [a for a in actuators if a.joint().index() == joint.index()]
-
-
-def _reflected_inertia(plant: MultibodyPlant, joint: Joint) -> float:
-    return sum(a.default_reflected_inertia() for a in _actuators(plant, joint))
-
-
-def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
-    return min((a.effort_limit() for a in _actuators(plant, joint)), default=np.inf)
 
 
 @njit(cache=True, inline="always")
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
     """Moves the pose in x from the previous link to this one; returns p_PL_W."""
     joint = table[row]
-    p_PL_W = apply(nine(x, 12), three(joint, _TRANSLATION))
+    p_PL_W = apply(nine(x, 12), three(joint, TRANSLATION))
     add_into(x, 9, p_PL_W)
     c = np.cos(q)
     s = np.sin(q)
-    R_JP = transposed(nine(joint, _ROTATION))
+    R_JP = transposed(nine(joint, ROTATION))
     for i in range(12, 21, 3):
         u, v, w = apply(R_JP, three(x, i))
         x[i], x[i + 1], x[i + 2] = c * u + s * v, c * v - s * u, w
@@ -299,7 +138,7 @@ def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
     """Writes a = s + g of So, in S, of the specific force s (3,) at q (n,) into out (3,)."""
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(table, q, R_WS, p_WS)
-    g = table[table.shape[0] - 1, _GRAVITY : _GRAVITY + 3]
+    g = table[table.shape[0] - 1, GRAVITY : GRAVITY + 3]
     for i in range(3):
         out[i] = s[i] + R_WS[0, i] * g[0] + R_WS[1, i] * g[1] + R_WS[2, i] * g[2]
 
@@ -309,7 +148,7 @@ def _start(table: Array, x: Array) -> None:
     """The state of the world's frame at rest: s = -g, identity pose."""
     x[:] = 0.0
     for k in range(3):
-        x[k] = -table[table.shape[0] - 1, _GRAVITY + k]
+        x[k] = -table[table.shape[0] - 1, GRAVITY + k]
         x[12 + 4 * k] = 1.0
 
 
@@ -410,7 +249,7 @@ def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
 
     All in W. The wrench is Newton and Euler about the origin of L, Eqs. (1)-(2), taken in L.
     """
-    phi, wrench, R_WL, p_WL = table[row, _PHI:], link[row], nine(x, 12), three(x, 9)
+    phi, wrench, R_WL, p_WL = table[row, PHI:], link[row], nine(x, 12), three(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], three(phi, 1), symmetric(phi, 4)
     s, omega, alpha = apply(R_LW, three(x, 0)), apply(R_LW, three(x, 3)), apply(R_LW, three(x, 6))
     f = plus_cross(plus_cross(times(m, s), alpha, h), omega, cross(omega, h))
@@ -466,13 +305,13 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
         _link_wrench(table, row, x, link)
     _to_the_joints(link, tau_out)
     for row in range(n):
-        tau_out[row] += table[row, _ROTOR] * vdot[row] + table[row, _DAMPING] * v[row]
+        tau_out[row] += table[row, ROTOR] * vdot[row] + table[row, DAMPING] * v[row]
 
 
 @njit(cache=True, inline="always")
 def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
     """Adds a link's inertia about Wo in W: m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
-    phi, p = table[row, _PHI:], three(x, 9)
+    phi, p = table[row, PHI:], three(x, 9)
     m, h, about_Lo = phi[0], apply(nine(x, 12), three(phi, 1)), symmetric(phi, 4)
     inertia[0] += m
     add_into(inertia, 1, plus(h, times(m, p)))
@@ -511,7 +350,7 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
             z = three(link[i], 0)
             v = cross(three(link[i], 3), z)
             M[row, i] = dot(z, angular) + v[0] * linear[0] + v[1] * linear[1] + v[2] * linear[2]
-        M[row, row] += table[row, _ROTOR]
+        M[row, row] += table[row, ROTOR]
 
 
 @njit(cache=True)
@@ -571,6 +410,6 @@ def forward_dynamics(
         link[n, 6 + k] -= wrench_W[k]
     _to_the_joints(link, vdot_out)
     for row in range(n):
-        vdot_out[row] = tau[row] - vdot_out[row] - table[row, _DAMPING] * v[row]
+        vdot_out[row] = tau[row] - vdot_out[row] - table[row, DAMPING] * v[row]
     _mass_matrix(table, link, inertia, M)
     _solve_spd(M, vdot_out)

@@ -18,7 +18,8 @@ from drake_teleop.environment.sheet_spring import AddSheetSpring, SheetSpring
 from drake_teleop.environment.slot import AddSlot, Slot, TouchAsSlot
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.resources import models_dir
-from drake_teleop.slave.arm import ArmModel, ArmModelFromPlant
+from drake_teleop.slave.arm import ArmModel
+from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
 from drake_teleop.slave.payload import AddPayload, Payload
 

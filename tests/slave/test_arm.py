@@ -13,13 +13,13 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.resources import models_dir
 from drake_teleop.slave.arm import (
     MOTION_SIZE,
-    ArmModelFromPlant,
     forward_dynamics,
     forward_kinematics,
     inverse_dynamics,
     jacobian,
     sensor_motion,
 )
+from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 
 SEVEN_AXES = [
     (0, 0, 1),

@@ -11,7 +11,8 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.resources import models_dir
 from drake_teleop.slave import inverse_kinematics as ik
-from drake_teleop.slave.arm import ArmModelFromPlant, forward_kinematics
+from drake_teleop.slave.arm import forward_kinematics
+from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.inverse_kinematics import (
     IkStatus,
     InverseKinematics,
