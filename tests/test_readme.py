@@ -58,5 +58,5 @@ def test_ci_runs_the_readmes_test_command(tmp_path):
         f"+ {command}",
         "python3 -m venv .venv-test",
         "pip install -q -e .[test]",
-        "pytest -n 2",
+        "pytest -n 2 --dist worksteal",
     ]
