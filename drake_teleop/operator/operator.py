@@ -4,7 +4,7 @@ The hand is a two-port: it pulls the stylus towards where the operator wants it,
 the force that it feels. Its passive mass moves with the stylus and is part of the device.
 
 With a task the operator is closed-loop: it sees the tool and feels the stylus, both late, and plans
-its movements from them (`task.py`, `perception.py`); the intent's segments are added to these.
+its movements from them (`decision.py`, `perception.py`); the intent's segments are added to these.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
