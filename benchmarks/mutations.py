@@ -239,7 +239,7 @@ class _Sites(ast.NodeVisitor):
                 # Another one of the same three.
                 other = index.value + (1 if index.value % 3 < 2 else -1)
                 self._replace("index", index, b"%d" % other)
-        elif isinstance(index, ast.Tuple) and len(index.elts) == 2:
+        elif isinstance(index, ast.Tuple) and len(index.elts) == 2 and not _has_text(index):
             first, second = index.elts
             slices = [isinstance(element, ast.Slice) for element in index.elts]
             if ast.dump(first) != ast.dump(second) and not any(slices):

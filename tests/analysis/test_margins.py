@@ -313,6 +313,14 @@ def test_at_its_margins_the_loop_meets_minus_one(grip, wall, sigma, delay):
         assert np.min(np.abs(1 + away)) < 1e-6
 
 
+def test_gain_margins_past_every_frequency_and_below_one():
+    """L goes to 0.4 e^-jwT, which 2.5 puts on -1; K (p + 1)^2 / p^3 must not have less gain."""
+    tail = margins(DelayedLoop([0.4, 0.4], [1.0, 2.0], 0.1))
+    assert (tail.gain, tail.gain_frequency) == (pytest.approx(2.5), np.inf)
+    conditional = margins(DelayedLoop(20.0 * np.array([1, 20, 100]), [1.0, 0, 0, 0], 0.0))
+    assert (conditional.unstable_poles, conditional.gain) == (0, np.inf)
+
+
 def test_margins_of_a_frequency_response():
     axis = held("medium", ideal_servo=False, delay=np.array([0.0, 0.004, 0.01]), sigma=0.5)
     omega = np.geomspace(0.1, 1000, 3000)

@@ -23,7 +23,7 @@ from drake_teleop.analysis.cut_loop import (
     unstable_multipliers,
 )
 from drake_teleop.analysis.one_axis import OneAxis
-from drake_teleop.analysis.period_map import Sampling
+from drake_teleop.analysis.period_map import Sampling, _held_response
 from drake_teleop.analysis.sampled_loop import (
     growth_rate,
     multipliers,
@@ -326,3 +326,16 @@ def test_arrays_of_parameters_give_what_each_gives() -> None:
 def test_what_has_no_such_form_is_said(call, words: str) -> None:
     with pytest.raises(DrakeTeleopError, match=words):
         call()
+
+
+@pytest.mark.parametrize("turns", [0.01, 1.0, 50.0])
+def test_what_is_held_on_a_stiff_wall_swings_as_on_paper(turns):
+    """x'' = u - w^2 x from x, v and u: cosines and sines, however many periods one step holds."""
+    w, t = 300.0, turns * 2 * np.pi / 300.0 + 1e-3
+    c, s = np.cos(w * t), np.sin(w * t)
+    for found, exact in zip(
+        _held_response(w**2, 0.0, np.array([t])),
+        ([c, -w * s], [s / w, c], [(1 - c) / w**2, s / w]),
+        strict=True,
+    ):
+        np.testing.assert_allclose(found[0], exact, atol=1e-9 * w)

@@ -113,6 +113,12 @@ def test_no_motion_takes_energy_from_a_passive_wall(K, B, delay, seed):
     assert np.all(wall_work(x, K, B, delay) + lost >= -1e-12 * lost[-1])
 
 
+def test_steps_of_a_negative_damping_are_as_large_as_of_a_positive_one():
+    """Delta / 2 of error in each of two samples, times |B| / Ts each: whichever the sign."""
+    for B in (0.5, -0.5):
+        assert passive_friction(0.0, B, PERIOD, 2e-5) == pytest.approx(2e-5 * 0.5 / PERIOD)
+
+
 @given(stiffnesses, st.floats(-1.0, 1.0), delays, st.integers(0, 10**6))
 def test_friction_covers_the_steps_of_the_encoder(K, B, delay, seed):
     """Slow motion about an edge of the encoder, where rounding does its worst."""
