@@ -143,7 +143,7 @@ class Linearization:
             raise DrakeTeleopError(
                 f"{size} states, most of them of the delay, are too many",
                 where="channel.delay",
-                remedy="count unstable multipliers of one axis instead (sampled_loop)",
+                remedy="count unstable multipliers of one axis instead (cut_loop)",
             )
         else:
             values = _near_the_circle(self._with_lines(size), 2 * np.pi * _HIGHEST * self.dt)

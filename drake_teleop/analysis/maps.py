@@ -1,6 +1,6 @@
 """Maps: where over two parameters the sampled loop is stable, and how true the hand feels.
 
-Stability is counted by the argument principle, see `sampled_loop`; where it changes between two
+Stability is counted by the argument principle, see `cut_loop`; where it changes between two
 neighbours of the grid, bisection finds the place. The delay is taken as it is instead of rounded to
 whole hand periods, so that its boundaries are curves instead of steps.
 
