@@ -347,7 +347,9 @@ def test_the_flag_of_a_contact_comes_with_the_slaves_packets(slave):
     scenario = delayed("none", contact_detection=ContactDetectionConfig())
     log = run(scenario, slave, noise_floor=floor).log
     noticed, at_hand = log["contact"][:, 0], log["contact_at_hand"][:, 0]
-    assert np.count_nonzero(np.diff(noticed)) >= 2
+    changed = np.flatnonzero(np.diff(noticed))
+    # The detector runs at 500 Hz, the log at 1 kHz.
+    assert len(changed) > 20 and (changed % 2 == 0).all()
     np.testing.assert_array_equal(at_hand[TO_HAND:], noticed[:-TO_HAND])
     direct = run(turned(contact_detection=ContactDetectionConfig()), slave, noise_floor=floor).log
     np.testing.assert_array_equal(direct["contact_at_hand"], direct["contact"])
