@@ -26,20 +26,26 @@ from numba import njit
 from numpy.typing import NDArray
 
 from drake_teleop.channel.network import NetworkConfig, newest_packets
-from drake_teleop.passivity import methods, two_layer
+from drake_teleop.passivity import methods, two_layer, wave
 from drake_teleop.passivity.memory import (
     COMMAND,
+    COMMAND_POSE,
     DAMPING,
     LEDGER,
     LIMIT,
     LOST,
-    METHOD,
-    OWN,
     RECEIVED,
     SENT,
     STIFFNESS,
+    own_memory,
 )
-from drake_teleop.passivity.methods import METHODS, PassivityConfig, initial_memory, parameters
+from drake_teleop.passivity.methods import (
+    AT_THE_MOTOR,
+    METHODS,
+    PassivityConfig,
+    initial_memory,
+    parameters,
+)
 from drake_teleop.passivity.packet import (
     INTEGRAL,
     PACKET_SIZE,
@@ -61,7 +67,7 @@ POSE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 # felt it, least energy in the tank of an end.
 BACKWARD, TRUE, STRONGER, TANK, FIGURES = range(5)
 WAVE_HOLD = -1
-AT_MOTOR = ("two_layer", "pspm")
+_STEP = own_memory().vector(6)
 # These run over every network, the rest over every tenth: what has no bound is found out sooner,
 # and `charged_tdpa` has the ledger of `tdpa`.
 EVERY = ("wave", "tdpa", "two_layer", "pspm")
@@ -134,7 +140,7 @@ def _run(method, at_motor, p, memories, newest, motion, poses, wrenches, T, sent
     wrench, before, motor, pull = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
     command, old, moved, nothing = np.zeros(13), np.zeros(7), np.zeros(6), np.zeros(PACKET_SIZE)
     twists, energy, work = np.zeros((2, 6)), np.zeros((2, 2)), np.zeros((2, 2))
-    start = memories[:, LEDGER : LEDGER + 2].copy()
+    start = memories[:, LEDGER].copy()
     old[0], rate, slots = 1.0, 1.0 / T, sent.shape[1]
     figures[:] = 0.0
     for k in range(newest.shape[1]):
@@ -147,9 +153,9 @@ def _run(method, at_motor, p, memories, newest, motion, poses, wrenches, T, sent
             received = nothing if now < 0 else sent[1 - end, now % slots]
             fresh = now >= 0 and (k == 0 or now != newest[1 - end, k - 1])
             if end == 0:
-                _master(method, received, fresh, poses[0, k], twists[0], motion[0, k], hand, T, p,
-                        memories[0], wrench, sent[0, k % slots])  # fmt: skip
-                felt[:] = received[WRENCH : WRENCH + 6]
+                _master(method, received, fresh, poses[0, k], twists[0], motion[0, k], hand,
+                        p[LIMIT], T, p, memories[0], wrench, sent[0, k % slots])  # fmt: skip
+                felt[:] = received[WRENCH]
             else:
                 _slave(method, received, fresh, poses[1, k], twists[1], motion[1, k], f_e, T, p,
                        memories[1], command, sent[1, k % slots])  # fmt: skip
@@ -161,7 +167,7 @@ def _run(method, at_motor, p, memories, newest, motion, poses, wrenches, T, sent
             # The pull of the slave's servo from now until the next step.
             difference_into(command, poses[1, k], pull)
             for i in range(6):
-                motor[i] = p[STIFFNESS + i // 3] * pull[i] - p[DAMPING + i // 3] * twists[1, i]
+                motor[i] = p[STIFFNESS][i // 3] * pull[i] - p[DAMPING][i // 3] * twists[1, i]
         else:
             difference_into(command, old, moved)
             old[:] = command[:7]
@@ -172,8 +178,8 @@ def _run(method, at_motor, p, memories, newest, motion, poses, wrenches, T, sent
         for g in range(2):
             energy[1, g] = -work[0, g] - work[1, g]
             for end in range(2):
-                books = memories[end, RECEIVED + g] - memories[end, SENT + g]
-                tank = start[end, g] + books - memories[end, LOST + g] - work[end, g]
+                books = memories[end, RECEIVED][g] - memories[end, SENT][g]
+                tank = start[end, g] + books - memories[end, LOST][g] - work[end, g]
                 figures[g, TANK] = min(figures[g, TANK], tank)
             figures[g, BACKWARD] = min(figures[g, BACKWARD], energy[0, g])
             figures[g, TRUE] = min(figures[g, TRUE], energy[1, g])
@@ -182,20 +188,20 @@ def _run(method, at_motor, p, memories, newest, motion, poses, wrenches, T, sent
 
 
 @njit
-def _master(method, received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+def _master(method, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     if method != WAVE_HOLD:
         methods.master_step(
-            method, received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet
+            method, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         return
     for i in range(6):
-        b = p[METHOD + i // 3]  # the line's impedance
-        wrench[i] = math.sqrt(2.0 * b) * received[INTEGRAL + i] - b * dx[i] / T
+        b = p[wave.IMPEDANCE][i // 3]  # the line's impedance
+        wrench[i] = math.sqrt(2.0 * b) * received[INTEGRAL][i] - b * dx[i] / T
     for g in range(2):
-        limit(wrench, g, p[LIMIT + g])
+        limit(wrench, g, limits[g])
     for i in range(6):
-        b = p[METHOD + i // 3]
-        packet[INTEGRAL + i] = (b * dx[i] / T - wrench[i]) / math.sqrt(2.0 * b)
+        b = p[wave.IMPEDANCE][i // 3]
+        packet[INTEGRAL][i] = (b * dx[i] / T - wrench[i]) / math.sqrt(2.0 * b)
 
 
 @njit
@@ -205,13 +211,13 @@ def _slave(method, received, fresh, pose, twist, dx, wrench, T, p, memory, comma
             method, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
         return
-    step = memory[OWN : OWN + 6]
+    step = memory[_STEP]
     for i in range(6):
-        b, u = p[METHOD + i // 3], received[INTEGRAL + i]
+        b, u = p[wave.IMPEDANCE][i // 3], received[INTEGRAL][i]
         step[i] = T * (math.sqrt(2.0 * b) * u + wrench[i]) / b
-        packet[INTEGRAL + i] = u + math.sqrt(2.0 / b) * wrench[i]
-    moved_into(memory[COMMAND : COMMAND + 7], step, memory[COMMAND : COMMAND + 7])
-    command[:] = memory[COMMAND : COMMAND + 13]
+        packet[INTEGRAL][i] = u + math.sqrt(2.0 / b) * wrench[i]
+    moved_into(memory[COMMAND_POSE], step, memory[COMMAND_POSE])
+    command[:] = memory[COMMAND]
 
 
 def cases() -> dict[str, tuple[int, Array]]:
@@ -227,7 +233,7 @@ def cases() -> dict[str, tuple[int, Array]]:
         found[name] = METHODS.index(name), parameters(PassivityConfig(method=name, **soft))
     tank = PassivityConfig(method="two_layer", **soft)
     found["two_layer_no_margin"] = METHODS.index("two_layer"), parameters(tank)
-    found["two_layer_no_margin"][1][two_layer.ACCELERATION : two_layer.ACCELERATION + 2] = 0.0
+    found["two_layer_no_margin"][1][two_layer.ACCELERATION] = 0.0
     found["wave_hold"] = WAVE_HOLD, parameters(PassivityConfig(method="wave"))
     return found
 
@@ -277,10 +283,10 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
                 continue
             p = p.copy()
             if saturates:
-                p[LIMIT : LIMIT + 2] = 0.5, 0.01
-            at_motor = METHODS[method] in AT_MOTOR and method != WAVE_HOLD
+                p[LIMIT] = 0.5, 0.01
+            at_motor = METHODS[method] in AT_THE_MOTOR and method != WAVE_HOLD
             start = initial_memory("none" if method == WAVE_HOLD else METHODS[method], p, POSE)
-            initial = start[LEDGER : LEDGER + 2]
+            initial = start[LEDGER]
             memories = np.stack([start, start])
             began = time.thread_time()
             _run(

@@ -27,15 +27,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.sample import JOINT_POSITION, SATURATED, sample_size
 from drake_teleop.passivity import methods
-from drake_teleop.passivity.memory import (
-    COMMAND,
-    DAMPING,
-    HELD,
-    LEDGER,
-    LIMIT,
-    MEMORY,
-    STIFFNESS,
-)
+from drake_teleop.passivity.memory import LIMIT, MEMORY, Slots
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.passivity.packet import (
     CONTACT,
@@ -45,9 +37,9 @@ from drake_teleop.passivity.packet import (
     dot,
     finite,
 )
-from drake_teleop.passivity.pspm import OFFSET
 from drake_teleop.passivity.safe_state import (
     MASTER_WATCH,
+    SILENT,
     SLAVE_WATCH,
     STOP,
     initial_master_watch,
@@ -92,18 +84,27 @@ class Channel(NetworkConfig):
         return PRESETS[self.network], PRESETS[self.network]
 
 
-# The state of both ends, one array: the step's number, then these.
-_STEP = 0
-_POSE_M = 1  # (8,) command at the master, a step ago; 1 if it was unknown, then the one before
-_POSE_S = _POSE_M + 8  # (8,) slave, likewise
-_WRENCH_M = _POSE_S + 8  # (6,) what the hand feels since then
-_WRENCH_S = _WRENCH_M + 6  # (6,) the slave's wrench then
-_TRUSTED = _WRENCH_S + 6  # for how long the wrench was good without a break [s]
-_WATCH_M = _TRUSTED + 1
-_WATCH_S = _WATCH_M + MASTER_WATCH
-_MEMORY_M = _WATCH_S + SLAVE_WATCH
-_MEMORY_S = _MEMORY_M + MEMORY
-_SIZE = _MEMORY_S + MEMORY
+# The state of both ends, one array.
+_SIZE = 2 + 2 * (8 + 6 + MEMORY) + MASTER_WATCH + SLAVE_WATCH
+_places = Slots(_SIZE)
+_STEP = _places.number()  # the step's number
+_POSE_M = _places.vector(8)  # command at the master, a step ago; 1 if unknown, then the one before
+_POSE_S = _places.vector(8)  # slave, likewise
+_WRENCH_M = _places.vector(6)  # what the hand feels since then
+_WRENCH_S = _places.vector(6)  # the slave's wrench then
+_TRUSTED = _places.number()  # for how long the wrench was good without a break [s]
+_WATCH_M, _WATCH_S = _places.vector(MASTER_WATCH), _places.vector(SLAVE_WATCH)
+MEMORY_M, MEMORY_S = _places.vector(MEMORY), _places.vector(MEMORY)
+# What turns a wrench at the hand into one in the world, one array.
+_places = Slots(11)
+_ROTATION = _places.vector(9)  # R_WB by rows
+_SCALES = _places.vector(2)  # of translation and rotation
+# What the station records of the channel, one array: see `channel_step`.
+_places = Slots(6)
+_WORK_M, _WORK_S, _SILENCE = _places.vector(2), _places.vector(2), _places.vector(2)
+# What the hand's end makes of the newest packet.
+_places = Slots(7)
+_FELT, _TOLD = _places.vector(6), _places.number()
 
 # Steps that a packet is on its way at least. Forward: the slave sees the command a step later.
 # Backward: the master has taken its step when the slave takes its own.
@@ -121,12 +122,12 @@ def initial_ends(
         start: (7,) X_WS of command and slave.
     """
     ends = np.zeros(_SIZE)
-    ends[_POSE_M : _POSE_M + 7] = ends[_POSE_S : _POSE_S + 7] = start
+    ends[_POSE_M][:7] = ends[_POSE_S][:7] = start
     ends[_TRUSTED] = STOP
-    ends[_WATCH_M : _WATCH_M + MASTER_WATCH] = initial_master_watch()
-    ends[_WATCH_S : _WATCH_S + SLAVE_WATCH] = initial_slave_watch(start)
+    ends[_WATCH_M] = initial_master_watch()
+    ends[_WATCH_S] = initial_slave_watch(start)
     memory = methods.initial_memory(method, parameters, start)
-    ends[_MEMORY_M : _MEMORY_M + MEMORY] = ends[_MEMORY_S:] = memory
+    ends[MEMORY_M] = ends[MEMORY_S] = memory
     return ends
 
 
@@ -176,12 +177,11 @@ def channel_step(
     """
     k = int(ends[_STEP])
     ends[_STEP] += 1.0
-    before_M, before_S = ends[_POSE_M : _POSE_M + 8], ends[_POSE_S : _POSE_S + 8]
-    held_M, held_S = ends[_WRENCH_M : _WRENCH_M + 6], ends[_WRENCH_S : _WRENCH_S + 6]
-    watch_M = ends[_WATCH_M : _WATCH_M + MASTER_WATCH]
-    watch_S = ends[_WATCH_S : _WATCH_S + SLAVE_WATCH]
-    memory_M = ends[_MEMORY_M : _MEMORY_M + MEMORY]
-    memory_S = ends[_MEMORY_S : _MEMORY_S + MEMORY]
+    before_M, before_S = ends[_POSE_M], ends[_POSE_S]
+    held_M, held_S = ends[_WRENCH_M], ends[_WRENCH_S]
+    watch_M, watch_S = ends[_WATCH_M], ends[_WATCH_S]
+    memory_M, memory_S = ends[MEMORY_M], ends[MEMORY_S]
+    work_M, work_S = ports[_WORK_M], ports[_WORK_S]
     dx, twist, hand, wrench = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
     limits, command = np.empty(2), np.empty(13)
     received, packet = np.empty(PACKET_SIZE), np.empty(PACKET_SIZE)
@@ -191,7 +191,7 @@ def channel_step(
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
-        ports[g] -= dot(held_M, dx, g)
+        work_M[g] -= dot(held_M, dx, g)
     hand[:] = 0.0
     if finite(hand_B):
         _to_world(hand_B, frame, hand)
@@ -199,28 +199,24 @@ def channel_step(
         good = False
     _, fresh = network.receive(backward_parameters, backward, k, received)
     alive = fresh and received[HEALTHY] > 0.5
-    full = parameters[LIMIT : LIMIT + 2].copy()
-    master_limits_into(
-        alive, (fresh and not alive) or not good, T, timeout, full, held_M, watch_M, limits
-    )
-    parameters[LIMIT : LIMIT + 2] = limits
+    fault = (fresh and not alive) or not good
+    master_limits_into(alive, fault, T, timeout, parameters[LIMIT], held_M, watch_M, limits)
     methods.master_step(
-        method, received, fresh, before_M[:7], twist, dx, hand, T, parameters, memory_M, held_M,
-        packet,
+        method, received, fresh, before_M[:7], twist, dx, hand, limits, T, parameters, memory_M,
+        held_M, packet,
     )  # fmt: skip
-    parameters[LIMIT : LIMIT + 2] = full
     if not good:
         packet[HEALTHY] = 0.0
     network.send(forward_parameters, forward, k, packet)
-    _to_master(held_M, frame, wrench_received)
-    wrench_received[6] = received[CONTACT]
+    _to_master(held_M, frame, wrench_received[_FELT])
+    wrench_received[_TOLD] = received[CONTACT]
 
     # The slave's end.
     good = _moved(slave_pose, before_S, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
-        ports[2 + g] += dot(held_S, dx, g)
+        work_S[g] += dot(held_S, dx, g)
     if not finite(wrench_B):
         good = False
         ends[_TRUSTED] = 0.0
@@ -244,30 +240,10 @@ def channel_step(
         packet[HEALTHY] = 0.0
     packet[CONTACT] = contact
     network.send(backward_parameters, backward, k, packet)
-    slave_command_into(
-        alive, (fresh and not alive) or not good, T, timeout, command[:7], watch_S, pose_received
-    )
-    if method == methods.TWO_LAYER or method == methods.PSPM:
-        _pull_into(method, command[:7], pose_received, before_S[:7], twist, parameters, memory_S)
-    ports[4], ports[5] = watch_M[0], watch_S[0]
-
-
-@njit(cache=True)
-def _pull_into(method, wanted, command, pose, twist, p, memory):
-    """Tells a method at the motor's port how the servo pulls at the command that really left.
-
-    PSPM counts the spring's energy, and pays for what there is more of it than it had wanted.
-    """
-    offset, other = memory[OFFSET : OFFSET + 6], np.empty(6)
-    difference_into(command, pose, offset)
-    difference_into(wanted, pose, other)
-    for i in range(6):
-        memory[HELD + i] = p[STIFFNESS + i // 3] * offset[i] - p[DAMPING + i // 3] * twist[i]
-    if method == methods.PSPM:
-        memory[COMMAND : COMMAND + 7] = command
-        for g in range(2):
-            more = dot(offset, offset, g) - dot(other, other, g)
-            memory[LEDGER + g] -= 0.5 * p[STIFFNESS + g] * more
+    fault, wanted = (fresh and not alive) or not good, command[:7]
+    slave_command_into(alive, fault, T, timeout, wanted, watch_S, pose_received)
+    methods.command_left(method, wanted, pose_received, before_S[:7], twist, parameters, memory_S)
+    ports[_SILENCE][0], ports[_SILENCE][1] = watch_M[SILENT], watch_S[SILENT]
 
 
 @njit(cache=True)
@@ -295,23 +271,25 @@ def _moved(pose, before, dx):
 @njit(cache=True)
 def _to_world(wrench_B, frame, out):
     """The wrench in W and in the master's power units."""
+    R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
             total = 0.0
             for j in range(3):
-                total += frame[3 * i + j] * wrench_B[3 * g + j]
-            out[3 * g + i] = total / frame[9 + g]
+                total += R[3 * i + j] * wrench_B[3 * g + j]
+            out[3 * g + i] = total / scales[g]
 
 
 @njit(cache=True)
 def _to_master(wrench, frame, out):
     """The inverse of `_to_world`."""
+    R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
             total = 0.0
             for j in range(3):
-                total += frame[3 * j + i] * wrench[3 * g + j]
-            out[3 * g + i] = total * frame[9 + g]
+                total += R[3 * j + i] * wrench[3 * g + j]
+            out[3 * g + i] = total * scales[g]
 
 
 @njit(cache=True)
@@ -446,10 +424,10 @@ class TeleopChannel(LeafSystem):
         return self.get_cache_entry(self._step).Eval(context)
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._taken(context)[-1][:6])
+        output.SetFromVector(self._taken(context)[-1][_FELT])
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._taken(context)[-1][6]
+        output[0] = self._taken(context)[-1][_TOLD]
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         for part, group in zip(self._taken(context), self._groups, strict=False):

@@ -302,10 +302,10 @@ def receive(p, state, k, packet):
 @njit(cache=True)
 def _fill_silence(policy, silent, packet):
     """What to read `silent` seconds after the newest packet came; see `NetworkConfig.silence`."""
-    velocity, pose = packet[VELOCITY : VELOCITY + 6], packet[POSE : POSE + 7]
+    velocity, pose = packet[VELOCITY], packet[POSE]
     if policy == _ZERO:
         velocity[:] = 0.0
-        packet[WRENCH : WRENCH + 6] = 0.0
+        packet[WRENCH] = 0.0
     elif policy == _EXTRAPOLATE and arrived(packet):
         moved_into(pose, velocity * min(silent, LONGEST_EXTRAPOLATION), pose)
         if silent > LONGEST_EXTRAPOLATION:

@@ -26,15 +26,12 @@ from drake_teleop.channel import network
 from drake_teleop.channel.channel import channel_step, initial_ends
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.passivity import methods
-from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.passivity.methods import AT_THE_MOTOR, METHODS, PassivityConfig
 from drake_teleop.passivity.packet import PACKET_SIZE
 
 PERIOD = 1e-3  #: s, of the channel
 _SUBSTEPS = 20
 _FRICTION_SPEED = 5e-3  # m/s, below it Coulomb friction fades
-# These methods know the force of the slave's motor, which is therefore held over a period; for the
-# others the command is interpolated over it.
-AT_THE_MOTOR = ("two_layer", "pspm")
 
 _QUIET, _TIP = 0.5e-3, 0.2  # m, peak to peak at rest; from the wrist to the tool's tip
 _FREE, _DEPTH = -0.04, 0.02  # m, from the wall: where the operator rests, and how deep he presses
@@ -176,6 +173,8 @@ def run_one_dof(
     states = [network.initial_state(line, np.zeros(PACKET_SIZE)) for line in lines]
     ends = initial_ends(passivity.method, p, start)
     numbers = np.array([float(getattr(model, entry.name)) for entry in dataclasses.fields(model)])
+    # These methods know the force of the slave's motor, which is therefore held over a period; for
+    # the others the command is interpolated over it.
     held = passivity.method in AT_THE_MOTOR and not model.ideal_servo
     rows = _simulate(
         METHODS.index(passivity.method), numbers, held, p, *lines, *states, ends, start, timeout,

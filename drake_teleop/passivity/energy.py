@@ -104,7 +104,7 @@ def ledger(memory: Array) -> Ledger:
             f"memory {memory.shape} is not one", where="memory", remedy=f"give (..., {MEMORY})"
         )
     stored, received, sent, lost = (
-        memory[..., slot : slot + 2].copy() for slot in (LEDGER, RECEIVED, SENT, LOST)
+        memory[..., places].copy() for places in (LEDGER, RECEIVED, SENT, LOST)
     )
     return Ledger(stored, received, sent, lost)
 

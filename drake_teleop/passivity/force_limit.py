@@ -8,11 +8,16 @@ wrench can give. This is the ceiling that safety standards ask for, whatever the
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drake_teleop._compiled import njit
 from drake_teleop.passivity import none
-from drake_teleop.passivity.memory import HELD, METHOD
+from drake_teleop.passivity.memory import HELD, MOTION_SCALE, own_parameters
 from drake_teleop.passivity.packet import WRENCH, limit
 from drake_teleop.quantities import quantity
+
+_OWN_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
 
 
 @dataclass
@@ -22,19 +27,19 @@ class ForceLimitConfig:
     force: float = quantity(1.0, "N", 0.0, 1e4, "largest force at the hand")
     torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")
 
-    def packed(self) -> list[float]:
-        """The values in the order in which the steps read them."""
-        return [self.force, self.torque]
+    def pack_into(self, p: NDArray[np.float64]) -> None:
+        """Writes the values to where the steps read them."""
+        p[_OWN_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
 
 
 @njit(cache=True)
-def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """One step of the master's end; see `methods.master_step`."""
-    none.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
+    none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
-        limit(wrench, g, p[METHOD + g])
-    memory[HELD : HELD + 6] = wrench
-    packet[WRENCH : WRENCH + 6] = wrench
+        limit(wrench, g, p[_OWN_LIMIT][g])
+    memory[HELD] = wrench
+    packet[WRENCH] = wrench
 
 
 @njit(cache=True)

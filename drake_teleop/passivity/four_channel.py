@@ -15,8 +15,20 @@ to where the slave was, damps it, at the price of a drag in free motion.
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drake_teleop._compiled import njit
-from drake_teleop.passivity.memory import COMMAND, DAMPING, HELD, LIMIT, METHOD, OWN, STIFFNESS
+from drake_teleop.passivity.memory import (
+    COMMAND,
+    COMMAND_POSE,
+    COMMAND_TWIST,
+    DAMPING,
+    HELD,
+    STIFFNESS,
+    own_memory,
+    own_parameters,
+)
 from drake_teleop.passivity.packet import (
     POSE,
     VELOCITY,
@@ -29,9 +41,12 @@ from drake_teleop.passivity.packet import (
 )
 from drake_teleop.quantities import quantity
 
-# Parameters; of two numbers for translation and rotation but the last two.
-_SPRING, _DAMPER, _SLAVE, _HAND = METHOD, METHOD + 2, METHOD + 4, METHOD + 5
-_DIFFERENCE = OWN
+# Parameters; those of two numbers are for translation and rotation.
+_places = own_parameters()
+_SPRING, _DAMPER = _places.vector(2), _places.vector(2)
+_SLAVE, _HAND = _places.number(), _places.number()
+# Memory.
+_DIFFERENCE = own_memory().vector(6)
 
 
 @dataclass
@@ -49,28 +64,29 @@ class FourChannelConfig:
         0.0, "1", -1.0, 10.0, "C6: the hand's own force; 1 + C6 is C2, the contact force"
     )
 
-    def packed(self) -> list[float]:
-        """The values in the order in which the steps read them."""
-        return [*self.stiffness, *self.damping, self.slave_feedback, self.hand_feedback]
+    def pack_into(self, p: NDArray[np.float64]) -> None:
+        """Writes the values to where the steps read them."""
+        p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
+        p[_SLAVE], p[_HAND] = self.slave_feedback, self.hand_feedback
 
 
 @njit(cache=True)
-def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """One step of the master's end; see `methods.master_step`. It sends the hand's wrench."""
-    difference = memory[_DIFFERENCE : _DIFFERENCE + 6]
+    difference = memory[_DIFFERENCE]
     difference[:] = 0.0
     behind = arrived(received)
     if behind:
-        difference_into(received[POSE : POSE + 7], pose, difference)
+        difference_into(received[POSE], pose, difference)
     for i in range(6):
         g = i // 3
-        wrench[i] = (1.0 + p[_HAND]) * received[WRENCH + i] + p[_HAND] * hand[i]
+        wrench[i] = (1.0 + p[_HAND]) * received[WRENCH][i] + p[_HAND] * hand[i]
         if behind:
-            wrench[i] += p[_SPRING + g] * difference[i]
-            wrench[i] += p[_DAMPER + g] * (received[VELOCITY + i] - twist[i])
+            wrench[i] += p[_SPRING][g] * difference[i]
+            wrench[i] += p[_DAMPER][g] * (received[VELOCITY][i] - twist[i])
     for g in range(2):
-        limit(wrench, g, p[LIMIT + g])
-    memory[HELD : HELD + 6] = wrench
+        limit(wrench, g, limits[g])
+    memory[HELD] = wrench
     fill(pose, twist, hand, packet)
 
 
@@ -78,13 +94,13 @@ def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, pa
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """One step of the slave's end; see `methods.slave_step`."""
     if arrived(received):
-        shift = memory[_DIFFERENCE : _DIFFERENCE + 6]
+        shift = memory[_DIFFERENCE]
         for i in range(6):
             g = i // 3
-            force = (1.0 + p[_SLAVE]) * received[WRENCH + i] + p[_SLAVE] * wrench[i]
-            shift[i] = (force + p[DAMPING + g] * received[VELOCITY + i]) / p[STIFFNESS + g]
-        moved_into(received[POSE : POSE + 7], shift, memory[COMMAND : COMMAND + 7])
-        memory[COMMAND + 7 : COMMAND + 13] = received[VELOCITY : VELOCITY + 6]
-    command[:] = memory[COMMAND : COMMAND + 13]
-    memory[HELD : HELD + 6] = wrench
+            force = (1.0 + p[_SLAVE]) * received[WRENCH][i] + p[_SLAVE] * wrench[i]
+            shift[i] = (force + p[DAMPING][g] * received[VELOCITY][i]) / p[STIFFNESS][g]
+        moved_into(received[POSE], shift, memory[COMMAND_POSE])
+        memory[COMMAND_TWIST] = received[VELOCITY]
+    command[:] = memory[COMMAND]
+    memory[HELD] = wrench
     fill(pose, twist, wrench, packet)

@@ -1,25 +1,76 @@
-"""What every method remembers at one end of the channel, and where its parameters lie.
+"""The places of what every method remembers at one end of the channel, and of its parameters.
 
-Both are plain float64 vectors, so that they fit a Drake discrete state and a compiled loop.
+Both are plain float64 vectors, so that they fit a Drake discrete state and a compiled loop. What a
+method alone needs it names at the head of its file, with `own_memory` and `own_parameters`.
 """
 
 from __future__ import annotations
 
-# Memory (MEMORY,) of one end.
-STEPS = 0  #: steps so far: the number of the next packet
-LEDGER = 1  #: (2,) energy that this end may still give out, for each group [J]
-RECEIVED = 3  #: (2,) the other end's counter of energy, as accounted so far [J]
-SENT = 5  #: (2,) this end's counter of energy, as sent [J]
-LOST = 7  #: (2,) energy that the method took out of the loop here [J]
-HELD = 9  #: (6,) the wrench at this port since the last step
-COMMAND = 15  #: (13,) the slave's command [pose 7; twist 6] since the last step
-PACKET = 28  #: (32,) the last packet that was sent
-OWN = 60  #: here begins what one method alone remembers
-MEMORY = 92
+MEMORY = 92  #: length of the memory of one end
+PARAMETERS = 24  #: length of the parameters, packed by `methods.parameters`
 
-# Parameters (PARAMETERS,), packed by `methods.parameters`.
-LIMIT = 0  #: (2,) what the device can display, in the master's power units [N, N m]
-STIFFNESS = 2  #: (2,) of the slave's servo, in the master's power units [N/m, N m/rad]
-DAMPING = 4  #: (2,) of the slave's servo, likewise [N s/m, N m s/rad]
-METHOD = 6  #: here begin the parameters of the method that was chosen
-PARAMETERS = 22
+
+class Slots:
+    """Gives out the places of a vector one after the other: each gets a name, none a number.
+
+    Args:
+        size: of the vector.
+        first: place that is given out first.
+    """
+
+    def __init__(self, size: int, first: int = 0) -> None:
+        self._size, self._next = size, first
+
+    def number(self) -> int:
+        """The place of a number."""
+        return self.vector(1).start
+
+    def vector(self, length: int) -> slice:
+        """The place of a vector, of which ``array[place]`` is a view.
+
+        Raises:
+            IndexError: if that is more than is left.
+        """
+        first, self._next = self._next, self._next + length
+        if self._next > self._size:
+            raise IndexError(f"{self._next} numbers do not fit into {self._size}")
+        return slice(first, self._next)
+
+    def rest(self) -> slice:
+        """All that is left."""
+        return self.vector(self._size - self._next)
+
+
+_memory = Slots(MEMORY)
+STEPS = _memory.number()  #: steps so far: the number of the next packet
+LEDGER = _memory.vector(2)  #: energy that this end may still give out, for each group [J]
+RECEIVED = _memory.vector(2)  #: the other end's counter of energy, as accounted so far [J]
+SENT = _memory.vector(2)  #: this end's counter of energy, as sent [J]
+LOST = _memory.vector(2)  #: energy that the method took out of the loop here [J]
+HELD = _memory.vector(6)  #: the wrench at this port since the last step
+COMMAND = _memory.vector(13)  #: the slave's command since the last step, X_WS and its twist
+PACKET = _memory.vector(32)  #: the last packet that was sent, see `packet`
+_OWN = _memory.rest()
+_command = Slots(COMMAND.stop, COMMAND.start)
+COMMAND_POSE, COMMAND_TWIST = _command.vector(7), _command.rest()
+
+_parameters = Slots(PARAMETERS)
+#: What the device can display, in the master's power units [N, N m].
+LIMIT = _parameters.vector(2)
+#: Of the slave's servo, in the master's power units [N/m, N m/rad].
+STIFFNESS = _parameters.vector(2)
+#: Of the slave's servo, likewise [N s/m, N m s/rad].
+DAMPING = _parameters.vector(2)
+#: A wrench at the hand over one in the master's power units, of force and torque.
+MOTION_SCALE = _parameters.vector(2)
+_METHOD = _parameters.rest()
+
+
+def own_memory() -> Slots:
+    """Of the memory of an end, what is left for a method of its own. All zeros at the start."""
+    return Slots(MEMORY, _OWN.start)
+
+
+def own_parameters() -> Slots:
+    """Of the parameters, what is left for those of a method."""
+    return Slots(PARAMETERS, _METHOD.start)

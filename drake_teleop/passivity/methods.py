@@ -13,7 +13,9 @@ channel, the environment f . dx; what comes out of a passive channel never excee
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields
+from importlib import import_module
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -21,57 +23,64 @@ from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.passivity import (
-    force_limit,
-    four_channel,
-    none,
-    pspm,
-    tdpa,
-    two_layer,
-    wave,
-)
+from drake_teleop.passivity import none
 from drake_teleop.passivity.force_limit import ForceLimitConfig
 from drake_teleop.passivity.four_channel import FourChannelConfig
 from drake_teleop.passivity.memory import (
     COMMAND,
+    COMMAND_POSE,
+    COMMAND_TWIST,
     DAMPING,
     LIMIT,
     MEMORY,
-    METHOD,
+    MOTION_SCALE,
     PACKET,
     PARAMETERS,
     STEPS,
     STIFFNESS,
 )
-from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, POSE, SEQUENCE, finite
+from drake_teleop.passivity.packet import HEALTHY, POSE, SEQUENCE, finite
 from drake_teleop.passivity.pspm import PspmConfig
 from drake_teleop.passivity.tdpa import TdpaConfig, charged
 from drake_teleop.passivity.two_layer import TwoLayerConfig
 from drake_teleop.passivity.wave import WaveConfig
 from drake_teleop.quantities import choice, quantity
 
-METHODS = (
-    "none",
-    "wave",
-    "tdpa",
-    "charged_tdpa",
-    "two_layer",
-    "pspm",
-    "four_channel",
-    "force_limit",
-)
 
-NONE, WAVE, TDPA, CHARGED_TDPA, TWO_LAYER, PSPM, FOUR_CHANNEL, FORCE_LIMIT = range(len(METHODS))
+@dataclass
+class Methods:
+    """The methods and the parameters of each: a line here enters one, by its field's name.
+
+    The file of a method is that of its parameters' class, which has `pack_into(p)`. It holds the
+    compiled `master_step` and `slave_step`, called with the arguments of those below but for the
+    first. It may hold `initialize(p, memory)`, which changes the memory of an end before its first
+    step; and the compiled `command_left(wanted, command, pose, twist, p, memory)`, which tells a
+    method that acts at the motor's port how the safe state has changed what it `wanted` (7,).
+    """
+
+    wave: WaveConfig = field(default_factory=WaveConfig)
+    tdpa: TdpaConfig = field(default_factory=TdpaConfig)
+    charged_tdpa: TdpaConfig = field(default_factory=charged)
+    two_layer: TwoLayerConfig = field(default_factory=TwoLayerConfig)
+    pspm: PspmConfig = field(default_factory=PspmConfig)
+    four_channel: FourChannelConfig = field(default_factory=FourChannelConfig)
+    local_force_limit: ForceLimitConfig = field(
+        default_factory=ForceLimitConfig, metadata={"method": "force_limit"}
+    )
+
+
+_FIELDS = {entry.metadata.get("method", entry.name): entry for entry in fields(Methods)}
+_FILES: dict[str, Any] = {"none": none} | {
+    name: import_module(entry.type.__module__) for name, entry in _FIELDS.items()
+}
+METHODS = tuple(_FILES)
+"""The names of all methods."""
+AT_THE_MOTOR = tuple(name for name, file in _FILES.items() if hasattr(file, "command_left"))
+"""Those that act at the port of the slave's motors."""
 
 
 @dataclass
-class PassivityConfig:
-    """Which method keeps the station passive, and the parameters of each.
-
-    The servo is what the methods that act at the slave's motor port (`two_layer`, `pspm`) and
-    `four_channel` believe of it: it pulls the slave with K (x_command - x) - D v.
-    """
-
+class _Common:
     method: str = choice("none", METHODS, "what keeps the channel passive")
     force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest force that the hand shall feel")
     torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest torque that the hand shall feel")
@@ -81,13 +90,15 @@ class PassivityConfig:
     servo_damping: list[float] = quantity(
         [3.5e3, 117.0], "N s/m, N m s/rad", 0.0, 1e8, "D of the slave's servo, likewise (E)"
     )
-    wave: WaveConfig = field(default_factory=WaveConfig)
-    tdpa: TdpaConfig = field(default_factory=TdpaConfig)
-    charged_tdpa: TdpaConfig = field(default_factory=charged)
-    two_layer: TwoLayerConfig = field(default_factory=TwoLayerConfig)
-    pspm: PspmConfig = field(default_factory=PspmConfig)
-    four_channel: FourChannelConfig = field(default_factory=FourChannelConfig)
-    local_force_limit: ForceLimitConfig = field(default_factory=ForceLimitConfig)
+
+
+@dataclass
+class PassivityConfig(Methods, _Common):
+    """Which method keeps the station passive, and the parameters of each.
+
+    The servo is what the methods that act at the slave's motor port (`two_layer`, `pspm`) and
+    `four_channel` believe of it: it pulls the slave with K (x_command - x) - D v.
+    """
 
 
 def parameters(
@@ -107,48 +118,14 @@ def parameters(
     Returns:
         (PARAMETERS,) packed as `drake_teleop.passivity.memory` says.
     """
-    config = _in_power_units(config, motion_scale)
     p = np.zeros(PARAMETERS)
-    p[LIMIT : LIMIT + 2] = config.force_limit, config.torque_limit
-    p[STIFFNESS : STIFFNESS + 2] = np.multiply(config.servo_stiffness, power_scale)
-    p[DAMPING : DAMPING + 2] = np.multiply(config.servo_damping, power_scale)
-    own: dict[str, Any] = {
-        "wave": config.wave,
-        "tdpa": config.tdpa,
-        "charged_tdpa": config.charged_tdpa,
-        "two_layer": config.two_layer,
-        "pspm": config.pspm,
-        "four_channel": config.four_channel,
-        "force_limit": config.local_force_limit,
-    }
-    if config.method in own:
-        packed = own[config.method].packed()
-        p[METHOD : METHOD + len(packed)] = packed
+    p[LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
+    p[STIFFNESS] = np.multiply(config.servo_stiffness, power_scale)
+    p[DAMPING] = np.multiply(config.servo_damping, power_scale)
+    p[MOTION_SCALE] = motion_scale
+    if config.method in _FIELDS:
+        getattr(config, _FIELDS[config.method].name).pack_into(p)
     return p
-
-
-def _in_power_units(config: PassivityConfig, motion_scale: Sequence[float]) -> PassivityConfig:
-    """What is said of the hand, in the master's power units."""
-    translation, rotation = motion_scale
-
-    def of_hand(tdpa: TdpaConfig) -> TdpaConfig:
-        return replace(
-            tdpa,
-            drag=list(np.divide(tdpa.drag, motion_scale)),
-            hand_stiffness=list(np.divide(tdpa.hand_stiffness, np.square(motion_scale))),
-        )
-
-    return replace(
-        config,
-        force_limit=config.force_limit / translation,
-        torque_limit=config.torque_limit / rotation,
-        tdpa=of_hand(config.tdpa),
-        charged_tdpa=of_hand(config.charged_tdpa),
-        local_force_limit=ForceLimitConfig(
-            config.local_force_limit.force / translation,
-            config.local_force_limit.torque / rotation,
-        ),
-    )
 
 
 def initial_memory(
@@ -171,13 +148,37 @@ def initial_memory(
             remedy=f"choose one of {', '.join(METHODS)}",
         )
     memory = np.zeros(MEMORY)
-    memory[COMMAND : COMMAND + 7] = pose
-    memory[PACKET + POSE : PACKET + POSE + 7] = pose
-    if method == "two_layer":
-        two_layer.initialize(parameters, memory)
-    elif method == "pspm":
-        pspm.initialize(parameters, memory)
+    memory[COMMAND_POSE] = pose
+    memory[PACKET][POSE] = pose
+    if hasattr(_FILES[method], "initialize"):
+        _FILES[method].initialize(parameters, memory)
     return memory
+
+
+def _one_of(steps: Sequence[Any]) -> Any:
+    """A compiled function that takes one of several steps: `take(which, ...)`.
+
+    It is written here as by hand, one `if` for each: numba has no table of functions, and to put
+    one function around the other doubles the time to compile a channel.
+    """
+    names = ", ".join(signature(steps[0].py_func).parameters)
+    cases = "\n    el".join(
+        f"if which == {n}:\n        step_{n}({names})" for n in range(len(steps))
+    )
+    scope = {"__name__": __name__} | {f"step_{n}": step for n, step in enumerate(steps)}
+    exec(f"def take(which, {names}):\n    {cases}", scope)
+    return njit()(scope["take"])
+
+
+@njit(cache=True)
+def _as_wanted(wanted, command, pose, twist, p, memory):
+    """What a method does that need not know which command has left."""
+
+
+_master_step = _one_of([file.master_step for file in _FILES.values()])
+_slave_step = _one_of([file.slave_step for file in _FILES.values()])
+#: Tells a method which command has left: `command_left(method, wanted, ...)`, see `Methods`.
+command_left = _one_of([getattr(file, "command_left", _as_wanted) for file in _FILES.values()])
 
 
 @njit(cache=True)
@@ -185,16 +186,18 @@ def _finish(healthy, memory, packet):
     """Numbers the packet; one of an end whose inputs are not finite repeats the last good one."""
     if healthy:
         packet[HEALTHY] = 1.0
-        memory[PACKET : PACKET + PACKET_SIZE] = packet
+        memory[PACKET] = packet
     else:
-        packet[:] = memory[PACKET : PACKET + PACKET_SIZE]
+        packet[:] = memory[PACKET]
         packet[HEALTHY] = 0.0
     packet[SEQUENCE] = memory[STEPS]
     memory[STEPS] += 1.0
 
 
 @njit(cache=True)
-def master_step(method, received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+def master_step(
+    method, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
+):  # fmt: skip
     """One step of the master's end, allocation-free: what the hand feels, and what is sent.
 
     Args:
@@ -206,6 +209,7 @@ def master_step(method, received, fresh, pose, twist, dx, hand, T, p, memory, wr
         dx: (6,) its increment since the last step [dp; log(R_k R_(k-1)^T)], in W.
         hand: (6,) wrench of the hand on the device, in W and master power units (0 if it is not
             measured; `four_channel` alone uses it).
+        limits: (2,) that force and torque keep, in the master's power units [N, N m].
         T: time between steps [s].
         p: (PARAMETERS,) of `parameters`.
         memory: (MEMORY,) of `initial_memory`, changed.
@@ -217,24 +221,10 @@ def master_step(method, received, fresh, pose, twist, dx, hand, T, p, memory, wr
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(hand)
     if not healthy:
         wrench[:] = 0.0
-    elif method == WAVE:
-        wave.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
-    elif method in (TDPA, CHARGED_TDPA):
-        tdpa.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
-    elif method == TWO_LAYER:
-        two_layer.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
-    elif method == PSPM:
-        pspm.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
-    elif method == FOUR_CHANNEL:
-        four_channel.master_step(
-            received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet
-        )
-    elif method == FORCE_LIMIT:
-        force_limit.master_step(
-            received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet
-        )
     else:
-        none.master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet)
+        _master_step(
+            method, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
+        )
     _finish(healthy, memory, packet)
 
 
@@ -255,26 +245,8 @@ def slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, c
     packet[:] = 0.0  # a method writes only what it uses
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(wrench)
     if not healthy:
-        memory[COMMAND + 7 : COMMAND + 13] = 0.0
-        command[:] = memory[COMMAND : COMMAND + 13]
-    elif method == WAVE:
-        wave.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
-    elif method in (TDPA, CHARGED_TDPA):
-        tdpa.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
-    elif method == TWO_LAYER:
-        two_layer.slave_step(
-            received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
-        )
-    elif method == PSPM:
-        pspm.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
-    elif method == FOUR_CHANNEL:
-        four_channel.slave_step(
-            received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
-        )
-    elif method == FORCE_LIMIT:
-        force_limit.slave_step(
-            received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
-        )
+        memory[COMMAND_TWIST] = 0.0
+        command[:] = memory[COMMAND]
     else:
-        none.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
+        _slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
     _finish(healthy, memory, packet)

@@ -6,18 +6,19 @@ Energy is created in the channel as soon as there is delay or loss. It is the ba
 from __future__ import annotations
 
 from drake_teleop._compiled import njit
-from drake_teleop.passivity.memory import COMMAND, HELD, LIMIT
+from drake_teleop.passivity.memory import COMMAND, COMMAND_POSE, COMMAND_TWIST, HELD
 from drake_teleop.passivity.packet import POSE, VELOCITY, WRENCH, arrived, fill, limit
 
 
 @njit(cache=True)
-def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """One step of the master's end; see `methods.master_step`."""
+    wanted = received[WRENCH]
     for i in range(6):
-        wrench[i] = received[WRENCH + i]
+        wrench[i] = wanted[i]
     for g in range(2):
-        limit(wrench, g, p[LIMIT + g])
-    memory[HELD : HELD + 6] = wrench
+        limit(wrench, g, limits[g])
+    memory[HELD] = wrench
     fill(pose, twist, wrench, packet)
 
 
@@ -25,8 +26,8 @@ def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, pa
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """One step of the slave's end; see `methods.slave_step`."""
     if arrived(received):
-        memory[COMMAND : COMMAND + 7] = received[POSE : POSE + 7]
-        memory[COMMAND + 7 : COMMAND + 13] = received[VELOCITY : VELOCITY + 6]
-    command[:] = memory[COMMAND : COMMAND + 13]
-    memory[HELD : HELD + 6] = wrench
+        memory[COMMAND_POSE] = received[POSE]
+        memory[COMMAND_TWIST] = received[VELOCITY]
+    command[:] = memory[COMMAND]
+    memory[HELD] = wrench
     fill(pose, twist, wrench, packet)

@@ -13,39 +13,46 @@ from __future__ import annotations
 import math
 
 from drake_teleop._compiled import njit
+from drake_teleop.passivity.memory import Slots
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, normalized
 
-SEQUENCE = 0  #: number of the packet, counted by its sender
-HEALTHY = 1  #: 1 if the sender's inputs were finite, else 0 (all else is then its last good packet)
-POSE = 2  #: (7,) X_WS [qw qx qy qz px py pz] of the sender
-VELOCITY = 9  #: (6,) its twist [v; omega], in W
-WRENCH = 15  #: (6,) its wrench [f; tau], in W, in the master's power units
-INTEGRAL = 21  #: (6,) cumulative integral, of the method's choice
-ENERGY = 27  #: (2,) cumulative energy that the receiver may use, for each group [J]
-OTHER_ENERGY = 29  #: (2,) a second counter of energy, for each group [J]
-CONTACT = 31  #: 1 while the slave's detector says that something is touched
 PACKET_SIZE = 32
+_places = Slots(PACKET_SIZE)
+#: Number of the packet, counted by its sender.
+SEQUENCE = _places.number()
+#: 1 if the sender's inputs were finite, else 0 (all else is then its last good packet).
+HEALTHY = _places.number()
+#: X_WS [qw qx qy qz px py pz] of the sender.
+POSE = _places.vector(7)
+#: Its twist [v; omega], in W.
+VELOCITY = _places.vector(6)
+#: Its wrench [f; tau], in W, in the master's power units.
+WRENCH = _places.vector(6)
+#: Cumulative integral, of the method's choice.
+INTEGRAL = _places.vector(6)
+#: Cumulative energy that the receiver may use, for each group [J].
+ENERGY = _places.vector(2)
+#: A second counter of energy, for each group [J].
+OTHER_ENERGY = _places.vector(2)
+#: 1 while the slave's detector says that something is touched.
+CONTACT = _places.number()
 
 
 @njit(cache=True)
 def arrived(received):
     """Whether anything was received yet: before that a receiver has zeros."""
-    return (
-        received[POSE] != 0.0
-        or received[POSE + 1] != 0.0
-        or received[POSE + 2] != 0.0
-        or received[POSE + 3] != 0.0
-    )
+    pose = received[POSE]
+    return pose[0] != 0.0 or pose[1] != 0.0 or pose[2] != 0.0 or pose[3] != 0.0
 
 
 @njit(cache=True)
 def fill(pose, twist, wrench, packet):
     """Writes pose, twist and wrench of the sender into its packet."""
+    now, velocity, force = packet[POSE], packet[VELOCITY], packet[WRENCH]
     for i in range(7):
-        packet[POSE + i] = pose[i]
+        now[i] = pose[i]
     for i in range(6):
-        packet[VELOCITY + i] = twist[i]
-        packet[WRENCH + i] = wrench[i]
+        velocity[i], force[i] = twist[i], wrench[i]
 
 
 @njit(cache=True)

@@ -24,19 +24,23 @@ damper.
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import (
     COMMAND,
+    COMMAND_POSE,
+    COMMAND_TWIST,
     DAMPING,
     HELD,
     LEDGER,
-    LIMIT,
     LOST,
-    METHOD,
-    OWN,
     RECEIVED,
     SENT,
     STIFFNESS,
+    own_memory,
+    own_parameters,
 )
 from drake_teleop.passivity.packet import (
     ENERGY,
@@ -53,9 +57,12 @@ from drake_teleop.passivity.packet import (
 from drake_teleop.quantities import quantity
 
 # Parameters, for translation and rotation.
-_INITIAL, _CEILING, _SPRING, _DAMPER = METHOD, METHOD + 2, METHOD + 4, METHOD + 6
+_places = own_parameters()
+_INITIAL, _CEILING = _places.vector(2), _places.vector(2)
+_SPRING, _DAMPER = _places.vector(2), _places.vector(2)
 # Memory: the set position less the position, and what is wanted of it.
-OFFSET, _WANTED = OWN, OWN + 6
+_places = own_memory()
+_OFFSET, _WANTED = _places.vector(6), _places.vector(6)
 
 
 @dataclass
@@ -73,16 +80,16 @@ class PspmConfig:
         [0.5, 0.005], "N s/m, N m s/rad", 0.0, 1e6, "B, shown to the hand"
     )
 
-    def packed(self) -> list[float]:
-        """The values in the order in which the steps read them."""
-        return [*self.initial, *self.ceiling, *self.stiffness, *self.damping]
+    def pack_into(self, p: NDArray[np.float64]) -> None:
+        """Writes the values to where the steps read them."""
+        p[_INITIAL], p[_CEILING] = self.initial, self.ceiling
+        p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
 
 
 @njit(cache=True)
 def initialize(p, memory):
     """Stores the energy of the start."""
-    for g in range(2):
-        memory[LEDGER + g] = p[_INITIAL + g]
+    memory[LEDGER] = p[_INITIAL]
 
 
 @njit(cache=True)
@@ -93,60 +100,83 @@ def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
     `before` is the square of the latter at the last step. What is above the ceiling is sent, or
     (not `shuffle`) lost.
     """
-    offset, wanted = memory[OFFSET : OFFSET + 6], memory[_WANTED : _WANTED + 6]
+    offset, wanted = memory[_OFFSET], memory[_WANTED]
     stored, needed = dot(offset, offset, g), dot(wanted, wanted, g)
-    damped = -dot(memory[HELD : HELD + 6], dx, g) - 0.5 * stiffness * (stored - before)
-    energy = memory[LEDGER + g] + damped
-    more = received[ENERGY + g] - memory[RECEIVED + g]
+    damped = -dot(memory[HELD], dx, g) - 0.5 * stiffness * (stored - before)
+    ledger, accounted = memory[LEDGER], memory[RECEIVED]
+    energy = ledger[g] + damped
+    more = received[ENERGY][g] - accounted[g]
     if more > 0.0:
         energy += more
-        memory[RECEIVED + g] += more
+        accounted[g] += more
     most = stored + 2.0 * energy / stiffness
     share = 1.0 if needed <= max(most, 0.0) else math.sqrt(max(most, 0.0) / needed)
     for i in range(3 * g, 3 * g + 3):
         offset[i] = share * wanted[i]
     energy -= 0.5 * stiffness * (dot(offset, offset, g) - stored)
-    surplus = max(energy - p[_CEILING + g], 0.0)
-    memory[SENT + g if shuffle else LOST + g] += surplus
-    memory[LEDGER + g] = energy - surplus
-    packet[ENERGY + g] = memory[SENT + g]
+    surplus = max(energy - p[_CEILING][g], 0.0)
+    if shuffle:
+        memory[SENT][g] += surplus
+    else:
+        memory[LOST][g] += surplus
+    ledger[g] = energy - surplus
+    packet[ENERGY][g] = memory[SENT][g]
 
 
 @njit(cache=True)
-def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """One step of the master's end; see `methods.master_step`."""
-    offset, wanted = memory[OFFSET : OFFSET + 6], memory[_WANTED : _WANTED + 6]
+    offset, wanted, shown = memory[_OFFSET], memory[_WANTED], received[WRENCH]
+    K, B = p[_SPRING], p[_DAMPER]
     for g in range(2):
         before = dot(offset, offset, g)
         for i in range(3 * g, 3 * g + 3):
             offset[i] -= dx[i]
-            wrench[i] = received[WRENCH + i]
-        limit(wrench, g, p[LIMIT + g])
+            wrench[i] = shown[i]
+        limit(wrench, g, limits[g])
         for i in range(3 * g, 3 * g + 3):
-            wanted[i] = wrench[i] / p[_SPRING + g]
-        _modulate(received, g, p[_SPRING + g], dx, before, True, p, memory, packet)
+            wanted[i] = wrench[i] / K[g]
+        _modulate(received, g, K[g], dx, before, True, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
-            wrench[i] = p[_SPRING + g] * offset[i] - p[_DAMPER + g] * twist[i]
-        limit(wrench, g, p[LIMIT + g])
-    memory[HELD : HELD + 6] = wrench
+            wrench[i] = K[g] * offset[i] - B[g] * twist[i]
+        limit(wrench, g, limits[g])
+    memory[HELD] = wrench
     fill(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """One step of the slave's end; see `methods.slave_step`."""
-    offset, wanted = memory[OFFSET : OFFSET + 6], memory[_WANTED : _WANTED + 6]
-    now = memory[COMMAND : COMMAND + 7]
+    offset, wanted = memory[_OFFSET], memory[_WANTED]
+    now, held, K, D = memory[COMMAND_POSE], memory[HELD], p[STIFFNESS], p[DAMPING]
     before = dot(offset, offset, 0), dot(offset, offset, 1)
     difference_into(now, pose, offset)
     wanted[:] = offset
     if arrived(received):
-        difference_into(received[POSE : POSE + 7], pose, wanted)
-        memory[COMMAND + 7 : COMMAND + 13] = received[VELOCITY : VELOCITY + 6]
+        difference_into(received[POSE], pose, wanted)
+        memory[COMMAND_TWIST] = received[VELOCITY]
     for g in range(2):
-        _modulate(received, g, p[STIFFNESS + g], dx, before[g], False, p, memory, packet)
+        _modulate(received, g, K[g], dx, before[g], False, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
-            memory[HELD + i] = p[STIFFNESS + g] * offset[i] - p[DAMPING + g] * twist[i]
+            held[i] = K[g] * offset[i] - D[g] * twist[i]
     moved_into(pose, offset, now)
-    command[:] = memory[COMMAND : COMMAND + 13]
+    command[:] = memory[COMMAND]
     fill(pose, twist, wrench, packet)
+
+
+@njit(cache=True)
+def command_left(wanted, command, pose, twist, p, memory):
+    """Notes how the servo pulls at the command that has left; see `methods.Methods`.
+
+    What the spring has more of than was wanted is paid for.
+    """
+    offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD]
+    K, D = p[STIFFNESS], p[DAMPING]
+    difference_into(command, pose, offset)
+    difference_into(wanted, pose, other)
+    for i in range(6):
+        held[i] = K[i // 3] * offset[i] - D[i // 3] * twist[i]
+    memory[COMMAND_POSE] = command
+    for g in range(2):
+        more = dot(offset, offset, g) - dot(other, other, g)
+        memory[LEDGER][g] -= 0.5 * K[g] * more

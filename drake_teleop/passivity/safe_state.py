@@ -40,34 +40,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
+from drake_teleop.passivity.memory import Slots
 from drake_teleop.passivity.packet import difference_into, length, moved_into
 
 STOP = 0.05  #: s, in which a silent end comes to rest
 RESUME = 0.5  #: s, in which it goes over to normal again
 
-# Watch of the master: time without packets, present limits (2,), what they fall by per second (2,),
-# time since the last silence.
-_SILENT, _LIMIT, _FALL, _HEARD = 0, 1, 3, 5
-MASTER_WATCH = 6
-# Watch of the slave: likewise; time since it began to stop, and to resume; command (7,) when it
-# began to stop; velocity (6,) there; the last command (7,), the one before (7,).
-_STOPPING, _RESUMING, _FROM, _VELOCITY, _LAST, _BEFORE = 1, 2, 3, 10, 16, 23
-SLAVE_WATCH = 30
+MASTER_WATCH, SLAVE_WATCH = 6, 30  #: their lengths
+# Watch of the master.
+_places = Slots(MASTER_WATCH)
+SILENT = _places.number()  #: time without packets [s], of the slave's watch too
+_LIMIT = _places.vector(2)  # present limits
+_FALL = _places.vector(2)  # what they fall by per second
+_HEARD = _places.number()  # time since the last silence
+# Watch of the slave.
+_places = Slots(SLAVE_WATCH, SILENT + 1)
+_STOPPING = _places.number()  # time since it began to stop
+_RESUMING = _places.number()  # time since it began to resume
+_FROM = _places.vector(7)  # command when it began to stop
+_VELOCITY = _places.vector(6)  # velocity there
+_LAST, _BEFORE = _places.vector(7), _places.vector(7)  # the last command, the one before
 
 
 def initial_master_watch() -> NDArray[np.float64]:
     """(MASTER_WATCH,) before the first packet."""
     watch = np.zeros(MASTER_WATCH)
-    watch[_SILENT] = np.inf
+    watch[SILENT] = np.inf
     return watch
 
 
 def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """(SLAVE_WATCH,) before the first packet: the command rests at `pose` (7,), X_WS."""
     watch = np.zeros(SLAVE_WATCH)
-    watch[_SILENT] = np.inf
+    watch[SILENT] = np.inf
     for part in (_FROM, _LAST, _BEFORE):
-        watch[part : part + 7] = pose
+        watch[part] = pose
     return watch
 
 
@@ -75,9 +82,9 @@ def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 def _listen(alive, fault, T, watch):
     """Counts for how long nothing was heard."""
     if fault:
-        watch[_SILENT] = np.inf
+        watch[SILENT] = np.inf
     else:
-        watch[_SILENT] = 0.0 if alive else watch[_SILENT] + T
+        watch[SILENT] = 0.0 if alive else watch[SILENT] + T
 
 
 @njit(cache=True)
@@ -95,20 +102,21 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
         limits: (2,) written [N, N m].
     """
     _listen(alive, fault, T, watch)
-    heard = watch[_SILENT] <= timeout
+    heard = watch[SILENT] <= timeout
     watch[_HEARD] = min(watch[_HEARD] + T, RESUME) if heard else 0.0
+    present, fall = watch[_LIMIT], watch[_FALL]
     for g in range(2):
-        size, limit = length(held, g), watch[_LIMIT + g]
+        size, limit = length(held, g), present[g]
         if heard:
-            watch[_FALL + g] = 0.0
+            fall[g] = 0.0
             start = size if watch[_HEARD] < RESUME else limit
             limit = min(full[g], start + full[g] * T / RESUME)
         else:
-            if watch[_FALL + g] == 0.0:
+            if fall[g] == 0.0:
                 limit = min(limit, size)
-                watch[_FALL + g] = limit / STOP
-            limit = max(0.0, limit - watch[_FALL + g] * T)
-        watch[_LIMIT + g] = limits[g] = limit
+                fall[g] = limit / STOP
+            limit = max(0.0, limit - fall[g] * T)
+        present[g] = limits[g] = limit
 
 
 @njit(cache=True)
@@ -124,10 +132,10 @@ def slave_command_into(alive, fault, T, timeout, wanted, watch, command):
         command: (7,) written, X_WS.
     """
     _listen(alive, fault, T, watch)
-    last, before = watch[_LAST : _LAST + 7], watch[_BEFORE : _BEFORE + 7]
-    start, velocity = watch[_FROM : _FROM + 7], watch[_VELOCITY : _VELOCITY + 6]
+    last, before = watch[_LAST], watch[_BEFORE]
+    start, velocity = watch[_FROM], watch[_VELOCITY]
     step = np.empty(6)
-    if watch[_SILENT] <= timeout:
+    if watch[SILENT] <= timeout:
         watch[_RESUMING] = min(watch[_RESUMING] + T, RESUME)
     elif watch[_RESUMING] > 0.0:
         difference_into(last, before, velocity)

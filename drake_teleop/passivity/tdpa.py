@@ -42,20 +42,25 @@ and credits the smaller input, so that the account holds for either.
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import (
     COMMAND,
+    COMMAND_POSE,
+    COMMAND_TWIST,
     DAMPING,
     HELD,
     LEDGER,
-    LIMIT,
     LOST,
-    METHOD,
-    OWN,
+    MOTION_SCALE,
     RECEIVED,
     SENT,
     STEPS,
     STIFFNESS,
+    own_memory,
+    own_parameters,
 )
 from drake_teleop.passivity.packet import (
     ENERGY,
@@ -86,17 +91,22 @@ _TRAVEL = (1e-3, 1e-2)
 _FADING = (0.02, 0.2)
 
 # In the packet: number of the newest packet that the master has; what the slave may give out.
-_ECHO, _SLAVES_LEDGER = INTEGRAL, OTHER_ENERGY
+_ECHO, _SLAVES_LEDGER = INTEGRAL.start, OTHER_ENERGY
 
 # Parameters.
-_RELEASE, _DRAIN, _DRIFT_RATE, _RESERVE = METHOD, METHOD + 1, METHOD + 2, METHOD + 3
-_DRAG, _HAND = METHOD + 5, METHOD + 7
+_places = own_parameters()
+_RELEASE, _DRAIN, _DRIFT_RATE = _places.number(), _places.number(), _places.number()
+_RESERVE, _DRAG, _HAND = _places.vector(2), _places.vector(2), _places.vector(2)  # in power units
 # Memory of the master: share of the wrench that is withheld, energy kept.
-_WITHHELD_SHARE, _KEPT = OWN, OWN + 2
+_places = own_memory()
+_WITHHELD_SHARE, _KEPT = _places.vector(2), _places.vector(2)
 # Memory of the slave: work in and out at the actual and the commanded motion; withheld command;
 # filtered wrench; stiffness of the contact; number of the packet with the end of a quick onset.
-_IN, _OUT, _IN_COMMAND, _OUT_COMMAND, _WITHHELD = OWN, OWN + 2, OWN + 4, OWN + 6, OWN + 8
-_FILTERED, _CONTACT, _ONSET = OWN + 14, OWN + 20, OWN + 22
+_places = own_memory()
+_IN, _OUT = _places.vector(2), _places.vector(2)
+_IN_COMMAND, _OUT_COMMAND = _places.vector(2), _places.vector(2)
+_WITHHELD, _FILTERED = _places.vector(6), _places.vector(6)
+_CONTACT, _ONSET = _places.vector(2), _places.vector(2)
 
 
 @dataclass
@@ -126,15 +136,11 @@ class TdpaConfig:
         "of the hand, to which the filter of the returned wrench is set; 0: no filter",
     )
 
-    def packed(self) -> list[float]:
-        """The values in the order in which the steps read them."""
-        pairs = (self.reserve, self.drag, self.hand_stiffness)
-        return [
-            self.release,
-            self.drain_rate,
-            self.drift_rate,
-            *(value for pair in pairs for value in pair),
-        ]
+    def pack_into(self, p: NDArray[np.float64]) -> None:
+        """Writes the values to where the steps read them."""
+        p[_RELEASE], p[_DRAIN], p[_DRIFT_RATE] = self.release, self.drain_rate, self.drift_rate
+        p[_RESERVE], p[_DRAG] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
+        p[_HAND] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
 
 
 def charged() -> TdpaConfig:
@@ -145,70 +151,75 @@ def charged() -> TdpaConfig:
 @njit(cache=True)
 def receive(received, memory):
     """Adds what the other end has put in since the last step to this end's ledger."""
+    ledger, accounted, counter = memory[LEDGER], memory[RECEIVED], received[ENERGY]
     for g in range(2):
-        more = received[ENERGY + g] - memory[RECEIVED + g]
+        more = counter[g] - accounted[g]
         if more > 0.0:
-            memory[LEDGER + g] += more
-            memory[RECEIVED + g] += more
+            ledger[g] += more
+            accounted[g] += more
 
 
 @njit(cache=True)
-def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """One step of the master's end; see `methods.master_step`."""
     receive(received, memory)
     drain, release = min(T * p[_DRAIN], 1.0), T / p[_RELEASE] if p[_RELEASE] > 0.0 else 1.0
+    wanted = received[WRENCH]
     for i in range(6):
-        wrench[i] = received[WRENCH + i]
+        wrench[i] = wanted[i]
+    ledger, kept, withheld = memory[LEDGER], memory[_KEPT], memory[_WITHHELD_SHARE]
     for g in range(2):
-        limit(wrench, g, p[LIMIT + g])
-        share = min(1.0, 1.0 - memory[_WITHHELD_SHARE + g] + release)
+        limit(wrench, g, limits[g])
+        share = min(1.0, 1.0 - withheld[g] + release)
         drained = dot(wrench, dx, g)
-        most = drain * (memory[LEDGER + g] + memory[_KEPT + g])
+        most = drain * (ledger[g] + kept[g])
         if share * drained > most:
             share = most / drained
-        memory[_WITHHELD_SHARE + g] = 1.0 - share
-        memory[LOST + g] += (1.0 - share) * drained
+        withheld[g] = 1.0 - share
+        memory[LOST][g] += (1.0 - share) * drained
         scale(wrench, g, share)
-        _drag(g, received[_SLAVES_LEDGER + g], dx, T, p, memory, wrench)
+        _drag(g, received[_SLAVES_LEDGER][g], dx, limits, T, p, memory, wrench)
         _account(g, dot(wrench, dx, g), p, memory)
-        if p[_DRAG + g] > 0.0:
+        if p[_DRAG][g] > 0.0:
             _pass_on(g, p, memory)
-        packet[ENERGY + g] = memory[SENT + g]
-    memory[HELD : HELD + 6] = wrench
+        packet[ENERGY][g] = memory[SENT][g]
+    memory[HELD] = wrench
     fill(pose, twist, wrench, packet)
     packet[_ECHO] = received[SEQUENCE]
 
 
 @njit(cache=True)
-def _drag(g, slaves_ledger, dx, T, p, memory, wrench):
+def _drag(g, slaves_ledger, dx, limits, T, p, memory, wrench):
     """Adds the drag to the wrench; along dx, whose work is accounted: it never drains."""
-    short = min(memory[LEDGER + g] + memory[_KEPT + g], slaves_ledger) < p[_RESERVE + g]
-    if p[_DRAG + g] > 0.0 and short:
-        damping = p[_DRAG + g] / max(length(dx, g), _FADING[g] * T)
+    drag, level = p[_DRAG][g], memory[LEDGER][g] + memory[_KEPT][g]
+    if drag > 0.0 and min(level, slaves_ledger) < p[_RESERVE][g]:
+        damping = drag / max(length(dx, g), _FADING[g] * T)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] -= damping * dx[i]
-        limit(wrench, g, p[LIMIT + g])
+        limit(wrench, g, limits[g])
 
 
 @njit(cache=True)
 def _pass_on(g, p, memory):
     """Sends back what the master's end has beyond the reserve: the slave's end may need it."""
-    surplus = memory[LEDGER + g] + memory[_KEPT + g] - p[_RESERVE + g]
-    surplus = min(max(surplus, 0.0), memory[LEDGER + g])
-    memory[LEDGER + g] -= surplus
-    memory[SENT + g] += surplus
+    ledger = memory[LEDGER]
+    surplus = ledger[g] + memory[_KEPT][g] - p[_RESERVE][g]
+    surplus = min(max(surplus, 0.0), ledger[g])
+    ledger[g] -= surplus
+    memory[SENT][g] += surplus
 
 
 @njit(cache=True)
 def _account(g, drained, p, memory):
     """Takes what the wrench drained from the ledger, then from what was kept; or sends input."""
+    ledger, kept = memory[LEDGER], memory[_KEPT]
     if drained > 0.0:
-        kept = min(memory[LEDGER + g] - drained, 0.0)
-        memory[LEDGER + g] = max(memory[LEDGER + g] - drained, 0.0)
+        more = min(ledger[g] - drained, 0.0)
+        ledger[g] = max(ledger[g] - drained, 0.0)
     else:
-        kept = min(-_SHARE_KEPT * drained, max(p[_RESERVE + g] - memory[_KEPT + g], 0.0))
-        memory[SENT + g] -= drained + kept
-    memory[_KEPT + g] = max(memory[_KEPT + g] + kept, 0.0)
+        more = min(-_SHARE_KEPT * drained, max(p[_RESERVE][g] - kept[g], 0.0))
+        memory[SENT][g] -= drained + more
+    kept[g] = max(kept[g] + more, 0.0)
 
 
 @njit(cache=True)
@@ -217,32 +228,32 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     receive(received, memory)
     for g in range(2):
         work = dot(wrench, dx, g)
-        memory[_IN + g] += max(work, 0.0)
-        memory[_OUT + g] += max(-work, 0.0)
+        memory[_IN][g] += max(work, 0.0)
+        memory[_OUT][g] += max(-work, 0.0)
     if arrived(received):
         _follow(received, wrench, T, p, memory)
     for g in range(2):
         # Both are increasing, and so is the smaller of them.
-        memory[SENT + g] = min(memory[_IN + g], memory[_IN_COMMAND + g])
-        memory[LEDGER + g] = _paid(memory, g)
-        packet[ENERGY + g] = memory[SENT + g]
-        packet[_SLAVES_LEDGER + g] = memory[LEDGER + g]
+        memory[SENT][g] = min(memory[_IN][g], memory[_IN_COMMAND][g])
+        memory[LEDGER][g] = _paid(memory, g)
+        packet[ENERGY][g] = memory[SENT][g]
+        packet[_SLAVES_LEDGER][g] = memory[LEDGER][g]
         _filter(g, received, dx, wrench, T, p, memory)
-    command[:] = memory[COMMAND : COMMAND + 13]
-    memory[HELD : HELD + 6] = wrench
-    fill(pose, twist, memory[_FILTERED : _FILTERED + 6], packet)
+    command[:] = memory[COMMAND]
+    memory[HELD] = wrench
+    fill(pose, twist, memory[_FILTERED], packet)
 
 
 @njit(cache=True)
 def _filter(g, received, dx, wrench, T, p, memory):
     """Filters the wrench that is sent."""
-    filtered, hand = memory[_FILTERED : _FILTERED + 6], p[_HAND + g]
+    filtered, hand = memory[_FILTERED], p[_HAND][g]
     rate, onset, gain = 1.0, 0.0, 0.0
     if hand > 0.0:
         gain = max(_contact_stiffness(g, dx, wrench, T, memory), 0.0) / hand
         # The servo's lag counts as delay.
         round_trip = max(memory[STEPS] - received[_ECHO], 1.0) * T
-        lag = round_trip + p[DAMPING + g] / p[STIFFNESS + g]
+        lag = round_trip + p[DAMPING][g] / p[STIFFNESS][g]
         size, filtered_size = length(wrench, g), length(filtered, g)
         quick = min(T / _QUICK, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
@@ -251,8 +262,8 @@ def _filter(g, received, dx, wrench, T, p, memory):
         else:
             if filtered_size * (1.0 + gain) < _COMPLETE * size:
                 onset = quick
-                memory[_ONSET + g] = memory[STEPS]
-            if lag > _QUICK and received[_ECHO] < memory[_ONSET + g]:
+                memory[_ONSET][g] = memory[STEPS]
+            if lag > _QUICK and received[_ECHO] < memory[_ONSET][g]:
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):
         now = filtered[i]
@@ -262,27 +273,27 @@ def _filter(g, received, dx, wrench, T, p, memory):
 @njit(cache=True)
 def _contact_stiffness(g, dx, wrench, T, memory):
     """-df.dx / dx.dx of the contact, forgotten with the way travelled [N/m, N m/rad]."""
-    size = length(dx, g)
+    size, stiffness = length(dx, g), memory[_CONTACT]
     if size > _TRAVEL[g] * T:
-        change = dot(wrench, dx, g) - dot(memory[HELD : HELD + 6], dx, g)
+        change = dot(wrench, dx, g) - dot(memory[HELD], dx, g)
         forget = min(size / _TRAVEL[g], 1.0)
-        memory[_CONTACT + g] += forget * (-change / (size * size) - memory[_CONTACT + g])
-    return memory[_CONTACT + g]
+        stiffness[g] += forget * (-change / (size * size) - stiffness[g])
+    return stiffness[g]
 
 
 @njit(cache=True)
 def _paid(memory, g):
     """What the hand has paid for and was not given out; negative if the servo gave too much."""
-    return memory[RECEIVED + g] - max(memory[_OUT + g], memory[_OUT_COMMAND + g])
+    return memory[RECEIVED][g] - max(memory[_OUT][g], memory[_OUT_COMMAND][g])
 
 
 @njit(cache=True)
 def _follow(received, wrench, T, p, memory):
     """Moves the command towards the received pose, as far as it is paid for."""
-    now, withheld = memory[COMMAND : COMMAND + 7], memory[_WITHHELD : _WITHHELD + 6]
-    step = memory[COMMAND + 7 : COMMAND + 13]
+    now, withheld = memory[COMMAND_POSE], memory[_WITHHELD]
+    step = memory[COMMAND_TWIST]
     later = 1.0 - min(T * p[_DRIFT_RATE], 1.0)
-    difference_into(received[POSE : POSE + 7], now, step)
+    difference_into(received[POSE], now, step)
     for i in range(6):
         step[i] -= later * withheld[i]
     # Where what is withheld passes half a turn, its sign changes: no whole turn in a step.
@@ -291,11 +302,11 @@ def _follow(received, wrench, T, p, memory):
         pressing, paid = -dot(wrench, step, g), max(_paid(memory, g), 0.0)
         if pressing > paid:
             scale(step, g, paid / pressing)
-            memory[LOST + g] += pressing - paid
+            memory[LOST][g] += pressing - paid
             pressing = paid
-        memory[_OUT_COMMAND + g] += max(pressing, 0.0)
-        memory[_IN_COMMAND + g] += max(-pressing, 0.0)
+        memory[_OUT_COMMAND][g] += max(pressing, 0.0)
+        memory[_IN_COMMAND][g] += max(-pressing, 0.0)
     moved_into(now, step, now)
-    difference_into(received[POSE : POSE + 7], now, withheld)
+    difference_into(received[POSE], now, withheld)
     for i in range(6):
         step[i] /= T

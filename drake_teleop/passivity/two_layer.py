@@ -25,19 +25,23 @@ tanks end a limit cycle soon, because it lives on what they hold.
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import (
     COMMAND,
+    COMMAND_POSE,
+    COMMAND_TWIST,
     DAMPING,
     HELD,
     LEDGER,
-    LIMIT,
     LOST,
-    METHOD,
-    OWN,
     RECEIVED,
     SENT,
     STIFFNESS,
+    own_memory,
+    own_parameters,
 )
 from drake_teleop.passivity.packet import (
     ENERGY,
@@ -56,11 +60,14 @@ from drake_teleop.passivity.packet import (
 from drake_teleop.quantities import quantity
 
 # Parameters; those of two numbers are for translation and rotation.
-_SEND, _INITIAL, _LEVEL = METHOD, METHOD + 1, METHOD + 3
-_CAPACITY, _DAMPER, ACCELERATION, _DRAIN = METHOD + 5, METHOD + 7, METHOD + 9, METHOD + 11
+_places = own_parameters()
+_SEND, _DRAIN = _places.number(), _places.number()
+_INITIAL, _LEVEL, _CAPACITY = _places.vector(2), _places.vector(2), _places.vector(2)
+_DAMPER, ACCELERATION = _places.vector(2), _places.vector(2)
 _RESERVE = 0.01  # share of the capacity
 # Memory of the slave: pull of the spring, pull of the damper.
-_SPRING, _BRAKE = OWN, OWN + 6
+_places = own_memory()
+_SPRING, _BRAKE = _places.vector(6), _places.vector(6)
 
 
 @dataclass
@@ -85,86 +92,89 @@ class TwoLayerConfig:
         [20.0, 200.0], "m/s^2, rad/s^2", 0.0, 1e6, "a_max, largest acceleration of either end"
     )
 
-    def packed(self) -> list[float]:
-        """The values in the order in which the steps read them."""
-        rest = (self.initial, self.level, self.capacity, self.damper, self.acceleration)
-        return [self.send_rate, *(value for pair in rest for value in pair), self.drain_rate]
+    def pack_into(self, p: NDArray[np.float64]) -> None:
+        """Writes the values to where the steps read them."""
+        p[_SEND], p[_DRAIN] = self.send_rate, self.drain_rate
+        p[_INITIAL], p[_LEVEL], p[_CAPACITY] = self.initial, self.level, self.capacity
+        p[_DAMPER], p[ACCELERATION] = self.damper, self.acceleration
 
 
 @njit(cache=True)
 def initialize(p, memory):
     """Fills the tank at the start."""
-    for g in range(2):
-        memory[LEDGER + g] = p[_INITIAL + g]
+    memory[LEDGER] = p[_INITIAL]
 
 
 @njit(cache=True)
 def _exchange(received, dx, T, p, memory, packet):
     """Work of the held wrench, receiving and sending: all before a new wrench is limited."""
+    ledger, accounted, sent_so_far = memory[LEDGER], memory[RECEIVED], memory[SENT]
+    held, capacity = memory[HELD], p[_CAPACITY]
     for g in range(2):
-        level = memory[LEDGER + g] - dot(memory[HELD : HELD + 6], dx, g)
-        more = received[ENERGY + g] - memory[RECEIVED + g]
+        level = ledger[g] - dot(held, dx, g)
+        more = received[ENERGY][g] - accounted[g]
         if more > 0.0:
             level = max(level, 0.0) + more
-            memory[RECEIVED + g] += more
-        sent = min(T * p[_SEND], 1.0) * max(level - _RESERVE * p[_CAPACITY + g], 0.0)
+            accounted[g] += more
+        sent = min(T * p[_SEND], 1.0) * max(level - _RESERVE * capacity[g], 0.0)
         level -= sent
-        lost = max(level - p[_CAPACITY + g], 0.0)
-        memory[SENT + g] += sent
-        memory[LOST + g] += lost
-        memory[LEDGER + g] = level - lost
-        packet[ENERGY + g] = memory[SENT + g]
+        lost = max(level - capacity[g], 0.0)
+        sent_so_far[g] += sent
+        memory[LOST][g] += lost
+        ledger[g] = level - lost
+        packet[ENERGY][g] = sent_so_far[g]
 
 
 @njit(cache=True)
 def _cost(f, dx, g, T, p):
     """The most that a wrench can cost until the next step [J]."""
-    return dot(f, dx, g) + length(f, g) * p[ACCELERATION + g] * T * T
+    return dot(f, dx, g) + length(f, g) * p[ACCELERATION][g] * T * T
 
 
 @njit(cache=True)
 def _afford(f, dx, g, T, p, memory):
     """Shortens group g of a wrench to what the tank can pay for."""
-    cost, level = _cost(f, dx, g, T, p), max(memory[LEDGER + g], 0.0)
+    cost, level = _cost(f, dx, g, T, p), max(memory[LEDGER][g], 0.0)
     if cost > level:
         scale(f, g, level / cost)
 
 
 @njit(cache=True)
-def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """One step of the master's end; see `methods.master_step`."""
     _exchange(received, dx, T, p, memory, packet)
+    ledger, wanted = memory[LEDGER], received[WRENCH]
     for g in range(2):
-        damping = p[_DAMPER + g] * max(p[_LEVEL + g] - memory[LEDGER + g], 0.0)
+        damping = p[_DAMPER][g] * max(p[_LEVEL][g] - ledger[g], 0.0)
         for i in range(3 * g, 3 * g + 3):
-            wrench[i] = received[WRENCH + i] - damping * twist[i]
-        limit(wrench, g, p[LIMIT + g])
+            wrench[i] = wanted[i] - damping * twist[i]
+        limit(wrench, g, limits[g])
         drained = dot(wrench, dx, g)
-        most = min(T * p[_DRAIN], 1.0) * max(memory[LEDGER + g], 0.0)
+        most = min(T * p[_DRAIN], 1.0) * max(ledger[g], 0.0)
         if drained > most:
             scale(wrench, g, most / drained)
         _afford(wrench, dx, g, T, p, memory)
-    memory[HELD : HELD + 6] = wrench
+    memory[HELD] = wrench
     fill(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """One step of the slave's end; see `methods.slave_step`."""
-    spring, brake = memory[_SPRING : _SPRING + 6], memory[_BRAKE : _BRAKE + 6]
+    spring, brake = memory[_SPRING], memory[_BRAKE]
     _exchange(received, dx, T, p, memory, packet)
-    target = memory[COMMAND : COMMAND + 7]
+    target = memory[COMMAND_POSE]
     if arrived(received):
-        target = received[POSE : POSE + 7]
+        target = received[POSE]
     difference_into(target, pose, spring)
-    pull = memory[HELD : HELD + 6]
+    pull, K, D = memory[HELD], p[STIFFNESS], p[DAMPING]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
-            spring[i] *= p[STIFFNESS + g]
-            brake[i] = -p[DAMPING + g] * twist[i]
+            spring[i] *= K[g]
+            brake[i] = -D[g] * twist[i]
             pull[i] = spring[i] + brake[i]
         # The spring is shortened first and leaves the reserve, so that an empty tank brakes.
-        room = max(memory[LEDGER + g] - _RESERVE * p[_CAPACITY + g], 0.0)
+        room = max(memory[LEDGER][g] - _RESERVE * p[_CAPACITY][g], 0.0)
         if _cost(pull, dx, g, T, p) > room:
             room -= _cost(brake, dx, g, T, p)
             cost = _cost(spring, dx, g, T, p)
@@ -173,9 +183,17 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
                 pull[i] = share * spring[i] + brake[i]
             _afford(pull, dx, g, T, p, memory)
         for i in range(3 * g, 3 * g + 3):
-            spring[i] = (pull[i] - brake[i]) / p[STIFFNESS + g]
-    moved_into(pose, spring, memory[COMMAND : COMMAND + 7])
-    for i in range(6):
-        memory[COMMAND + 7 + i] = received[VELOCITY + i]
-    command[:] = memory[COMMAND : COMMAND + 13]
+            spring[i] = (pull[i] - brake[i]) / K[g]
+    moved_into(pose, spring, memory[COMMAND_POSE])
+    memory[COMMAND_TWIST] = received[VELOCITY]
+    command[:] = memory[COMMAND]
     fill(pose, twist, wrench, packet)
+
+
+@njit(cache=True)
+def command_left(wanted, command, pose, twist, p, memory):
+    """Notes how the servo pulls at the command that has left; see `methods.Methods`."""
+    spring, held, K, D = memory[_SPRING], memory[HELD], p[STIFFNESS], p[DAMPING]
+    difference_into(command, pose, spring)
+    for i in range(6):
+        held[i] = K[i // 3] * spring[i] - D[i // 3] * twist[i]

@@ -30,17 +30,21 @@ push it back takes energy that nobody has paid for. Pressed anew it is as deep a
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import (
     COMMAND,
+    COMMAND_POSE,
+    COMMAND_TWIST,
     HELD,
     LEDGER,
-    LIMIT,
     LOST,
-    METHOD,
-    OWN,
     RECEIVED,
     SENT,
+    own_memory,
+    own_parameters,
 )
 from drake_teleop.passivity.packet import (
     ENERGY,
@@ -56,15 +60,14 @@ from drake_teleop.passivity.packet import (
 from drake_teleop.quantities import quantity
 
 # Parameters.
-_IMPEDANCE, _FILTER, _MATCHING, _PATIENCE, _DRIFT_RATE = (
-    METHOD,
-    METHOD + 2,
-    METHOD + 3,
-    METHOD + 4,
-    METHOD + 5,
-)
+_places = own_parameters()
+IMPEDANCE = _places.vector(2)
+_FILTER, _MATCHING = _places.number(), _places.number()
+_PATIENCE, _DRIFT_RATE = _places.number(), _places.number()
 # Memory: integral of the wave played out, of the wave sent, the wave of this step; silence [s].
-_PLAYED, _INTEGRAL, _WAVE, _SILENT, _DRIFT = OWN, OWN + 6, OWN + 12, OWN + 18, OWN + 19
+_places = own_memory()
+_PLAYED, _INTEGRAL, _WAVE = _places.vector(6), _places.vector(6), _places.vector(6)
+_SILENT, _DRIFT = _places.number(), _places.vector(6)
 
 
 @dataclass
@@ -85,9 +88,10 @@ class WaveConfig:
         2.0, "1/s", 0.0, 1e3, "rate at which drift is corrected where that takes no work"
     )
 
-    def packed(self) -> list[float]:
-        """The values in the order in which the steps read them."""
-        return [*self.impedance, self.filter, self.matching, self.patience, self.drift_rate]
+    def pack_into(self, p: NDArray[np.float64]) -> None:
+        """Writes the values to where the steps read them."""
+        p[IMPEDANCE], p[_FILTER], p[_MATCHING] = self.impedance, self.filter, self.matching
+        p[_PATIENCE], p[_DRIFT_RATE] = self.patience, self.drift_rate
 
 
 @njit(cache=True)
@@ -97,48 +101,50 @@ def _play(received, T, p, memory, wave):
     If a share a of what is left, d, is played in each step, that costs a |d|^2 / (2 T (2 - a)) in
     all: a is the filter's, or so small that the energy in store pays for that.
     """
+    ledger, accounted, played = memory[LEDGER], memory[RECEIVED], memory[_PLAYED]
+    integral = received[INTEGRAL]
     for g in range(2):
-        more = received[ENERGY + g] - memory[RECEIVED + g]
+        more = received[ENERGY][g] - accounted[g]
         if more > 0.0:
-            memory[LEDGER + g] += more
-            memory[RECEIVED + g] += more
+            ledger[g] += more
+            accounted[g] += more
         for i in range(3 * g, 3 * g + 3):
-            wave[i] = received[INTEGRAL + i] - memory[_PLAYED + i]
-        left, store = dot(wave, wave, g), 2.0 * T * memory[LEDGER + g]
+            wave[i] = integral[i] - played[i]
+        left, store = dot(wave, wave, g), 2.0 * T * ledger[g]
         share = T / (T + p[_FILTER])
         if share * left > (2.0 - share) * store:
             share = 2.0 * store / (left + store)
         for i in range(3 * g, 3 * g + 3):
-            memory[_PLAYED + i] += share * wave[i]
+            played[i] += share * wave[i]
             wave[i] *= share / T
-        memory[LEDGER + g] = max(memory[LEDGER + g] - 0.5 * T * dot(wave, wave, g), 0.0)
+        ledger[g] = max(ledger[g] - 0.5 * T * dot(wave, wave, g), 0.0)
 
 
 @njit(cache=True)
-def master_step(received, fresh, pose, twist, dx, hand, T, p, memory, wrench, packet):
+def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """One step of the master's end; see `methods.master_step`."""
-    wave = memory[_WAVE : _WAVE + 6]
+    wave, integral, sent = memory[_WAVE], memory[_INTEGRAL], packet[INTEGRAL]
     _play(received, T, p, memory, wave)
     for g in range(2):
-        b = p[_IMPEDANCE + g]
+        b = p[IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = math.sqrt(2.0 * b) * wave[i] - b * dx[i] / T
             # As if it could all be displayed, so that no momentum is missing on the line.
-            memory[_INTEGRAL + i] += (b * dx[i] - wrench[i] * T) / math.sqrt(2.0 * b)
-            packet[INTEGRAL + i] = memory[_INTEGRAL + i]
-        limit(wrench, g, p[LIMIT + g])
+            integral[i] += (b * dx[i] - wrench[i] * T) / math.sqrt(2.0 * b)
+            sent[i] = integral[i]
+        limit(wrench, g, limits[g])
         # Not negative: of a wrench that was shortened even more is left than the wave going back.
         left = 0.5 * T * dot(wave, wave, g) - dot(wrench, dx, g)
-        memory[SENT + g] += max(left, 0.0)
-        packet[ENERGY + g] = memory[SENT + g]
-    memory[HELD : HELD + 6] = wrench
+        memory[SENT][g] += max(left, 0.0)
+        packet[ENERGY][g] = memory[SENT][g]
+    memory[HELD] = wrench
     fill(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """One step of the slave's end; see `methods.slave_step`."""
-    now, step = memory[COMMAND : COMMAND + 7], memory[COMMAND + 7 : COMMAND + 13]
+    now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
     memory[_SILENT] = 0.0 if fresh else memory[_SILENT] + T
     if memory[_SILENT] <= p[_PATIENCE]:
         _reflect(received, wrench, T, p, memory)
@@ -150,29 +156,27 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     else:
         step[:] = 0.0
         _rest(wrench, T, p, memory)
-    packet[INTEGRAL : INTEGRAL + 6] = memory[_INTEGRAL : _INTEGRAL + 6]
-    packet[ENERGY : ENERGY + 2] = memory[SENT : SENT + 2]
-    command[:] = memory[COMMAND : COMMAND + 13]
-    memory[HELD : HELD + 6] = wrench
+    packet[INTEGRAL] = memory[_INTEGRAL]
+    packet[ENERGY] = memory[SENT]
+    command[:] = memory[COMMAND]
+    memory[HELD] = wrench
     fill(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def _reflect(received, wrench, T, p, memory):
     """Step of the command under the wave and the contact wrench, and the wave that goes back."""
-    wave, step = memory[_WAVE : _WAVE + 6], memory[COMMAND + 7 : COMMAND + 13]
+    wave, step, integral = memory[_WAVE], memory[COMMAND_TWIST], memory[_INTEGRAL]
     _play(received, T, p, memory, wave)
     for g in range(2):
-        b, damper = p[_IMPEDANCE + g], p[_MATCHING] * p[_IMPEDANCE + g]
+        b, damper = p[IMPEDANCE][g], p[_MATCHING] * p[IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
             step[i] = T * (math.sqrt(2.0 * b) * wave[i] + wrench[i]) / (b + damper)
-            memory[_INTEGRAL + i] += T * wave[i] + math.sqrt(2.0 / b) * (
-                T * wrench[i] - damper * step[i]
-            )
+            integral[i] += T * wave[i] + math.sqrt(2.0 / b) * (T * wrench[i] - damper * step[i])
         damped = damper * dot(step, step, g) / T
         left = 0.5 * T * dot(wave, wave, g) + dot(wrench, step, g) - damped
-        memory[LOST + g] += damped
-        memory[SENT + g] += max(left, 0.0)
+        memory[LOST][g] += damped
+        memory[SENT][g] += max(left, 0.0)
 
 
 @njit(cache=True)
@@ -181,24 +185,25 @@ def _rest(wrench, T, p, memory):
 
     It is reflected as by a rigid wall. What comes later has only to make up for the rest.
     """
-    wave = memory[_WAVE : _WAVE + 6]
+    wave, ledger = memory[_WAVE], memory[LEDGER]
+    played, integral = memory[_PLAYED], memory[_INTEGRAL]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
-            wave[i] = -wrench[i] / math.sqrt(2.0 * p[_IMPEDANCE + g])
+            wave[i] = -wrench[i] / math.sqrt(2.0 * p[IMPEDANCE][g])
         energy = 0.5 * T * dot(wave, wave, g)
-        if energy <= memory[LEDGER + g]:
-            memory[LEDGER + g] -= energy
-            memory[SENT + g] += energy
+        if energy <= ledger[g]:
+            ledger[g] -= energy
+            memory[SENT][g] += energy
             for i in range(3 * g, 3 * g + 3):
-                memory[_PLAYED + i] += T * wave[i]
-                memory[_INTEGRAL + i] -= T * wave[i]
+                played[i] += T * wave[i]
+                integral[i] -= T * wave[i]
 
 
 @njit(cache=True)
 def _correct(received, wrench, T, p, memory):
     """Adds a step towards the received pose where it does not press on what the slave touches."""
-    drift, step = memory[_DRIFT : _DRIFT + 6], memory[COMMAND + 7 : COMMAND + 13]
-    difference_into(received[POSE : POSE + 7], memory[COMMAND : COMMAND + 7], drift)
+    drift, step = memory[_DRIFT], memory[COMMAND_TWIST]
+    difference_into(received[POSE], memory[COMMAND_POSE], drift)
     for g in range(2):
         if dot(wrench, drift, g) >= 0.0:
             for i in range(3 * g, 3 * g + 3):

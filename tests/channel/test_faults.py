@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.channel import network
-from drake_teleop.channel.channel import _MEMORY_S, channel_step, initial_ends
+from drake_teleop.channel.channel import MEMORY_S, channel_step, initial_ends
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.passivity.memory import DAMPING, HELD, STIFFNESS
 from drake_teleop.passivity.methods import METHODS, PassivityConfig, parameters
@@ -81,8 +81,8 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
         )  # fmt: skip
         found.touched[k] = wall < 0.0
         found.command[k], found.felt[k], found.ports[k] = received, felt, ports
-        pull = p[STIFFNESS] * (received[4] - slave[4]) - p[DAMPING] * velocity
-        found.servo[k] = pull, ends[_MEMORY_S + HELD]
+        pull = p[STIFFNESS][0] * (received[4] - slave[4]) - p[DAMPING][0] * velocity
+        found.servo[k] = pull, ends[MEMORY_S][HELD][0]
     return found
 
 

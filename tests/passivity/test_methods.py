@@ -14,7 +14,7 @@ from drake_teleop.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.passivity.memory import MEMORY
+from drake_teleop.passivity.memory import LIMIT, MEMORY
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -80,7 +80,7 @@ def run(method, config, master_poses, slave_poses, f_e, newest):
             twist = dx[end, k] / T
             if end == 0:
                 master_step(
-                    m, received, fresh, pose[k], twist, dx[end, k], np.zeros(6), T, p,
+                    m, received, fresh, pose[k], twist, dx[end, k], np.zeros(6), p[LIMIT], T, p,
                     memory[end], wrench[k], sent[end, k],
                 )  # fmt: skip
             else:
@@ -157,11 +157,11 @@ def test_what_is_not_finite_gives_no_force_and_leaves_the_ledgers_alone(method, 
     received, zero = np.zeros(PACKET_SIZE), np.zeros(6)
     wrench, command, packet = np.ones(6), np.zeros(13), np.zeros(PACKET_SIZE)
     m = METHODS.index(method)
-    master_step(m, received, False, START, zero, zero, zero, T, p, memory, wrench, packet)
+    master_step(m, received, False, START, zero, zero, zero, p[LIMIT], T, p, memory, wrench, packet)
     before = memory.copy()
     received[20] = bad
     wrench[:] = 1.0
-    master_step(m, received, True, START, zero, zero, zero, T, p, memory, wrench, packet)
+    master_step(m, received, True, START, zero, zero, zero, p[LIMIT], T, p, memory, wrench, packet)
     assert (wrench == 0).all() and packet[HEALTHY] == 0 and np.isfinite(packet).all()
     np.testing.assert_array_equal(memory[1:], before[1:])
     slave_step(m, received, True, START, zero, zero, zero, T, p, memory, command, packet)

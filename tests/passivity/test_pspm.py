@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.passivity.memory import LEDGER, LOST, RECEIVED, SENT
+from drake_teleop.passivity.memory import LEDGER, LIMIT, LOST, RECEIVED, SENT
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -41,7 +41,7 @@ def test_stored_energy_is_what_was_put_in(end):
     config = PassivityConfig(method="pspm", servo_stiffness=[300.0, 5.0], servo_damping=[2.0, 0.02])
     p, m = parameters(config), METHODS.index("pspm")
     memory = initial_memory("pspm", p, START)
-    first, work = memory[LEDGER : LEDGER + 2].copy(), np.zeros(2)
+    first, work = memory[LEDGER].copy(), np.zeros(2)
     other = initial_memory("pspm", p, START)
     held, before, e = np.zeros(6), START.copy(), np.zeros(6)
     ours, theirs = motion(rng), motion(rng)
@@ -68,24 +68,25 @@ def test_stored_energy_is_what_was_put_in(end):
                     received,
                 )  # fmt: skip
             master_step(
-                m, received, fresh, pose, twist, dx, np.zeros(6), T, p, memory, wrench, packet
-            )
+                m, received, fresh, pose, twist, dx, np.zeros(6), p[LIMIT], T, p, memory,
+                wrench, packet,
+            )  # fmt: skip
             held = wrench.copy()
             e = (wrench + B * twist) / K_h
             spring = 0.5 * K_h * e**2
         else:
             if fresh:
                 master_step(
-                    m, spare, True, target, dx_other / T, dx_other, np.zeros(6), T, p, other,
-                    wrench, received,
+                    m, spare, True, target, dx_other / T, dx_other, np.zeros(6), p[LIMIT], T, p,
+                    other, wrench, received,
                 )  # fmt: skip
             slave_step(m, received, fresh, pose, twist, dx, f_e, T, p, memory, output, packet)
             difference_into(output[:7], pose, e)
             held = K * e - D * twist
             spring = 0.5 * K * e**2
-        left = memory[LEDGER : LEDGER + 2] + groups(spring)
-        put_in = first + memory[RECEIVED : RECEIVED + 2] - work
-        put_in -= memory[SENT : SENT + 2] + memory[LOST : LOST + 2]
+        left = memory[LEDGER] + groups(spring)
+        put_in = first + memory[RECEIVED] - work
+        put_in -= memory[SENT] + memory[LOST]
         np.testing.assert_allclose(left, put_in, rtol=0, atol=1e-9)
         largest = max(largest, np.abs(work).max())
     assert largest > 0.01, "nothing happened"

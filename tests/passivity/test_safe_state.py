@@ -18,6 +18,7 @@ from drake_teleop.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.master.phantom import FORCE_LIMIT
+from drake_teleop.passivity.memory import LIMIT
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -184,9 +185,13 @@ def test_a_packet_holds_nothing_that_was_in_its_memory_before(method):
     p = parameters(PassivityConfig(method=method))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
     number, still = METHODS.index(method), np.zeros(6)
-    for step, out in ((master_step, np.zeros(6)), (slave_step, np.zeros(13))):
+    for step, limits, out in (
+        (master_step, [p[LIMIT]], np.zeros(6)),
+        (slave_step, [], np.zeros(13)),
+    ):
         packet = np.full(PACKET_SIZE, np.nan)
         memory = initial_memory(method, p, pose)
         received = np.zeros(PACKET_SIZE)
-        step(number, received, False, pose, still, still, still, PERIOD, p, memory, out, packet)
+        motion = (pose, still, still, still, *limits)
+        step(number, received, False, *motion, PERIOD, p, memory, out, packet)
         assert np.isfinite(packet).all()

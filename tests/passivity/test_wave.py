@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drake_teleop.passivity.memory import LIMIT
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -37,9 +38,10 @@ def line(config, motion, contact, forward, backward):
         pose[4], dx[0] = x, x - motion[max(k - 1, 0)]
         received = sent[1, k - backward] if k >= backward else nothing
         master_step(
-            WAVE, received, True, pose, dx / T, dx, zero, T, p, memory[0], wrench[k], sent[0, k]
-        )
-        u[k] = (sent[0, k, INTEGRAL] - (sent[0, k - 1, INTEGRAL] if k else 0.0)) / T
+            WAVE, received, True, pose, dx / T, dx, zero, p[LIMIT], T, p, memory[0], wrench[k],
+            sent[0, k],
+        )  # fmt: skip
+        u[k] = (sent[0, k, INTEGRAL][0] - (sent[0, k - 1, INTEGRAL][0] if k else 0.0)) / T
         received = sent[0, k - forward] if k >= forward else nothing
         f_e = zero.copy()
         f_e[0] = contact(u[k - forward] if k >= forward else 0.0, command[k - 1, 4])
