@@ -12,7 +12,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.environment.point_contact import ContactPairs, indentation
+from drake_teleop.environment.point_contact import ContactPairs, contact_force, indentation
 from drake_teleop.environment.slot import PEG_RADIUS, TIP_BALL, UPPER_BALL, Slot, TouchAsSlot
 from drake_teleop.replay import ReplayScene
 from drake_teleop.scenario import LoadScenario, replace
@@ -67,6 +67,15 @@ def test_both_sides_of_a_contact_together_are_what_the_slot_says():
     )
 
 
+def test_a_ball_that_leaves_quickly_is_let_go():
+    """Hunt and Crossley: k x (1 + d times the speed inwards), and no pull where that is negative."""
+    pair = slave_at(Slot(stiffness=3e3, dissipation=0.7, friction=0.0)).contact_pairs[0]
+    up, force = np.array([0.0, 0.6, 0.8]), np.zeros(3)
+    for outwards, share in ((-1.0, 1.7), (0.0, 1.0), (1.0, 0.3), (2.0, 0.0)):
+        contact_force(pair, 1e-3, up, outwards * up, force)
+        np.testing.assert_allclose(force, 3.0 * share * up, atol=1e-12)
+
+
 def profile(slot: Slot) -> np.ndarray:
     """Corners of the right half of the section [m]: (y, z) in M from the floor to far outside."""
     edge, c = slot.width / 2, slot.chamfer
@@ -110,6 +119,15 @@ def test_the_boxes_are_the_section(yaw, chamfer, clearance, depth, x, y, z):
         assert deepest == pytest.approx(expected, abs=1e-9)
     else:
         assert deepest <= 1e-9
+
+
+def test_walls_tops_and_floor_end_flush():
+    """Where a block ends there is nothing more to touch."""
+    pairs = pairs_of_a_ball(Slot(position=[0.0, 0.0, 0.0]))
+    level = np.all(pairs[:, 4:13].round(12) == np.eye(3).ravel(), axis=1)  # all but the chamfers
+    assert np.count_nonzero(level) == 5
+    ends = np.abs(pairs[level, 14]) + pairs[level, 17]
+    np.testing.assert_allclose(ends, ends[0], rtol=1e-12)
 
 
 #: Both balls are between the walls, and neither is on the floor or at the chamfers' edges.

@@ -46,6 +46,7 @@ def test_a_ramp_is_late_by_the_lag_or_not_at_all(delay: float, wait: int) -> Non
     slope = np.array([1.0, 2, 3, 4, 5, 6])
     np.testing.assert_allclose((ramp - late.contact)[1000:] / slope, late.lag_s, rtol=1e-6)
     np.testing.assert_allclose(late.scaled, 2 * late.contact, atol=1e-12)
+    np.testing.assert_array_equal(late.contact[: wait + 1], 0.0)  # until the first has come
     ahead = causal_wrenches(ramp, ramp, DT, mode="predicted", **options)
     np.testing.assert_allclose(ahead.contact[1000:], ramp[1000:], rtol=1e-6)
 

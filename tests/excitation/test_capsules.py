@@ -1,0 +1,31 @@
+"""Capsules around shapes: they hold them, and not much more."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from pydrake.geometry import Box, Cylinder
+
+from drake_teleop.excitation.capsules import Capsule, bounding_capsule
+
+
+@pytest.mark.parametrize("long", [0, 1, 2])
+def test_a_capsule_around_a_beam_lies_along_it(long):
+    size = np.full(3, 0.1)
+    size[long] = 1.0
+    capsule = bounding_capsule(Box(size))
+    for corner in product(*[(-s / 2, s / 2) for s in size]):
+        assert capsule.holds(Capsule(np.array([corner, corner]), 0.0))
+    # The beam's edges are 0.071 m from its axis; a ball about it would have 0.505 m.
+    assert 0.0707 <= capsule.radius < 0.15
+    ends = np.delete(capsule.ends, long, axis=1)
+    np.testing.assert_array_equal(ends, 0.0)
+    assert np.abs(capsule.ends[:, long]).max() <= 0.5
+
+
+def test_a_capsule_around_a_rod_is_hardly_thicker():
+    capsule = bounding_capsule(Cylinder(0.05, 0.8))
+    assert 0.05 <= capsule.radius < 0.07
+    assert np.ptp(capsule.ends[:, 2]) <= 0.8
