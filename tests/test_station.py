@@ -63,7 +63,14 @@ def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
     ("touched", "at_once"),
     [
         ({}, 0),
-        ({"sheet_spring": SheetSpring(position=[0.55, 0.0, 0.246])}, 1),
+        # The hand slower than the motors, whose torques the samples in between depend on.
+        (
+            {
+                "sheet_spring": SheetSpring(position=[0.55, 0.0, 0.246]),
+                "rates__hand_hz": 1000.0,
+            },
+            1,
+        ),
         # Down to the floor, along a wall; what it does to the hand is another question.
         (
             {
