@@ -68,7 +68,7 @@ def test_both_sides_of_a_contact_together_are_what_the_slot_says():
 
 
 def test_a_ball_that_leaves_quickly_is_let_go():
-    """Hunt and Crossley: k x (1 + d times the speed inwards), and no pull where that is negative."""
+    """Hunt and Crossley: k x (1 + d times the speed inwards), and no pull where that is less."""
     pair = slave_at(Slot(stiffness=3e3, dissipation=0.7, friction=0.0)).contact_pairs[0]
     up, force = np.array([0.0, 0.6, 0.8]), np.zeros(3)
     for outwards, share in ((-1.0, 1.7), (0.0, 1.0), (1.0, 0.3), (2.0, 0.0)):
