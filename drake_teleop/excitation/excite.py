@@ -44,7 +44,6 @@ class Excitation:
             see `predicted_deviations`.
         uses: of every limit, as checked, the largest first.
         history: (K, 2) thread CPU time [s] and best value of the criterion until then.
-        starts: how many candidates led to something feasible.
     """
 
     robot: Robot
@@ -54,7 +53,6 @@ class Excitation:
     deviations: Array
     uses: list[Use]
     history: Array
-    starts: int
 
 
 def excite(
@@ -101,7 +99,6 @@ def excite(
         _deviations(robot, trajectory),
         uses,
         np.array([(it.seconds, value) for it, value in zip(found, best, strict=True)]),
-        len({iterate.start for iterate in found}),
     )
 
 
