@@ -1,4 +1,4 @@
-"""What lies between master and slave: network and method (long: a step, and its block, in order).
+"""What lies between master and slave: a network, and a method that keeps the station passive.
 
 At every period both ends take one step of the method (`drake_teleop.passivity`), and what they send
 travels through one line of the network each (`drake_teleop.channel.network`). The block works in
