@@ -23,8 +23,8 @@ import numpy as np
 
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.comparison.one_dof import (
+    REFERENCE,
     Figures,
-    OneDof,
     Task,
     figures,
     operators_intent,
@@ -69,7 +69,7 @@ class Row:
 
 
 def _run(method: str, wall: float, network: NetworkConfig, seed: int, task: Task) -> Figures:
-    model = OneDof(wall_stiffness=wall)
+    model = dataclasses.replace(REFERENCE, wall_stiffness=wall)
     intent = operators_intent(task)
     run = run_one_dof(model, PassivityConfig(method=method), network, seed=seed, intent=intent)
     return figures(run, model, task)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.comparison.one_dof import (
     PERIOD,
-    OneDof,
+    REFERENCE,
     OneDofRun,
     Task,
     operators_intent,
@@ -116,7 +116,8 @@ def _some_networks(job: tuple[int, int]) -> list[Row]:
         for seed in range(*job):
             rng = np.random.default_rng(seed)
             lines = [rough_line(path, rng) for path in paths]
-            model = OneDof(wall_stiffness=float(np.exp(rng.uniform(np.log(100), np.log(5000)))))
+            wall = float(np.exp(rng.uniform(np.log(100), np.log(5000))))
+            model = dataclasses.replace(REFERENCE, wall_stiffness=wall)
             for row in rows:
                 config = PassivityConfig(method=row.method, force_limit=LIMIT)
                 row.add(run_one_dof(model, config, *lines, timeout=TIMEOUT, intent=intent))
@@ -127,7 +128,7 @@ def study(networks: int, processes: int = 2) -> list[Row]:
     """Runs every method over the networks."""
     share = max(1, -(-networks // (16 * processes)))
     jobs = [(first, min(first + share, networks)) for first in range(0, networks, share)]
-    run_one_dof(OneDof(), PassivityConfig(), NetworkConfig())  # compiles, before processes fork
+    run_one_dof(REFERENCE, PassivityConfig(), NetworkConfig())  # compiles, before processes fork
     if processes > 1:
         with multiprocessing.get_context("fork").Pool(processes) as pool:
             parts = pool.map(_some_networks, jobs, chunksize=1)

@@ -22,41 +22,65 @@ from numpy.typing import NDArray
 Complex = NDArray[np.complex128]
 
 
-@dataclass(frozen=True)
-class OneAxis:
-    """One direction; the defaults are those of the paper's station, held with a medium grip.
+@dataclass(frozen=True, kw_only=True)
+class Axis:
+    """What every model of one direction has: hand, slave with its servo, tool, wall.
+
+    The defaults are those of the paper's station, held with a medium grip.
 
     Args:
         hand_mass, hand_damping, hand_stiffness: [kg], [N s/m], [N/m].
-        device_mass, device_damping: [kg], [N s/m].
+        device_mass: [kg].
         slave_mass: effective mass of arm and tool where the environment pushes [kg].
         position_gain, velocity_gain: k_p, k_v of the servo [1/s].
         ideal_servo: the slave is where it is told to be.
         tool_mass: beyond the sensor [kg].
-        mass_error: of the estimate, estimated minus true tool mass [kg].
-        force_scale, position_scale: k_f, slave to master, and l_p, master to slave.
+        force_scale: k_f, slave to master.
         sigma, gamma: of the elimination.
-        delay: of the network, one way [s].
-        wall_stiffness, wall_damping: of the environment [N/m], [N s/m].
+        wall_stiffness: of the environment [N/m].
     """
 
     hand_mass: float = 0.25
     hand_damping: float = 8.0
     hand_stiffness: float = 250.0
     device_mass: float = 0.15
-    device_damping: float = 0.5
     slave_mass: float = 15.13
     position_gain: float = 2 * np.pi * 12.0
     velocity_gain: float = 2 * np.pi * 70.0
     ideal_servo: bool = False
     tool_mass: float = 3.13
-    mass_error: float = 0.0
     force_scale: float = 1 / 17.5
-    position_scale: float = 1.0
     sigma: float = 0.0
     gamma: float = 1.0
-    delay: float = 0.0
     wall_stiffness: float = 5100.0
+
+    @property
+    def servo_stiffness(self) -> float:
+        """m_s k_v k_p [N/m], between the command and the slave."""
+        return self.slave_mass * self.velocity_gain * self.position_gain
+
+    @property
+    def servo_damping(self) -> float:
+        """m_s k_v [N s/m], between the slave and the world."""
+        return self.slave_mass * self.velocity_gain
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneAxis(Axis):
+    """One direction of the linear analysis.
+
+    Args:
+        device_damping: [N s/m].
+        mass_error: of the estimate, estimated minus true tool mass [kg].
+        position_scale: l_p, master to slave.
+        delay: of the network, one way [s].
+        wall_damping: of the environment [N s/m].
+    """
+
+    device_damping: float = 0.5
+    mass_error: float = 0.0
+    position_scale: float = 1.0
+    delay: float = 0.0
     wall_damping: float = 0.0
 
     @property

@@ -39,9 +39,8 @@ def worst_frequency(model: OneDof, round_trip: float) -> float:
 def _resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
     """Re Z at `_FREQUENCIES` [N s/m]."""
     s = 1j * _FREQUENCIES
-    servo, mass = model.servo_frequency, model.slave_mass
-    D, K = 2 * mass * servo, mass * servo**2
-    slave = mass * s**2 + D * s + K + model.wall_stiffness
+    D, K = model.servo_damping, model.servo_stiffness
+    slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
     closed_loop = 1.0 if model.ideal_servo else K / slave
     late = np.exp(-s * (round_trip + 1.5 * PERIOD))
     contact = model.gamma * model.wall_stiffness / s

@@ -5,7 +5,8 @@ servo, the environment a stiff wall. Between them is the station's own channel,
 `drake_teleop.channel.channel.channel_step`, with motion along x alone:
 
     (m_h + m_m) a = K_h (x_i - x) + B_h (v_i - v) - f_c tanh(v / v_c) + f    hand and device
-    m_s a_s = K (x_cmd - x_s) - D v_s + f_w                                  slave and its servo
+    m_s a_s = K (x_cmd - x_s) - D v_s + f_w                                  slave and its servo,
+                                                                             K = D k_p, D = m_s k_v
     f_w = -k_e max(x_s - x_w, 0)                                             wall
     f_e = k_f (gamma f_w - sigma m_t a_s)                                    what is sent back
 
@@ -22,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
+from drake_teleop.analysis.one_axis import Axis
 from drake_teleop.channel import network
 from drake_teleop.channel.channel import channel_step, initial_ends
 from drake_teleop.channel.network import NetworkConfig
@@ -51,23 +53,25 @@ class Task:
     judged: float = 1.9  #: length of the windows in which the station has to be at rest
 
 
-@dataclass(frozen=True)
-class OneDof:
-    """The two masses and what is around them; the defaults are those of the paper's station."""
+@dataclass(frozen=True, kw_only=True)
+class OneDof(Axis):
+    """`Axis` with a device that does not damp but rubs."""
 
-    hand_mass: float = 0.2  #: kg
-    hand_damping: float = 5.0  #: N s/m
-    hand_stiffness: float = 300.0  #: N/m
-    device_mass: float = 0.15  #: kg
     device_friction: float = 0.05  #: N, Coulomb
-    slave_mass: float = 15.13  #: kg, arm and tool at the flange
-    servo_frequency: float = 117.0  #: rad/s, critically damped: -3 dB at 12 Hz, 17 ms late
-    ideal_servo: bool = False  #: the slave is where it is told to be
-    tool_mass: float = 3.13  #: kg, beyond the sensor
-    wall_stiffness: float = 5100.0  #: N/m
-    force_scale: float = 1 / 17.5  #: k_f
-    sigma: float = 0.0
-    gamma: float = 1.0
+
+
+REFERENCE = OneDof(
+    hand_mass=0.2,
+    hand_damping=5.0,
+    hand_stiffness=300.0,
+    position_gain=58.5,
+    velocity_gain=234.0,
+)
+"""What the figures of docs/delay.md, notebook 02 and benchmarks/README.md are of.
+
+Not the station's medium grip, and not its servo: this one is critically damped and softer, 207
+instead of 502 kN/m, -3 dB at 12 instead of 14 Hz, 17 instead of 13 ms late.
+"""
 
 
 @dataclass(frozen=True)
@@ -151,11 +155,11 @@ def run_one_dof(
     Raises:
         DrakeTeleopError: for a network that cannot be.
     """
-    scale, servo = model.force_scale, model.slave_mass * model.servo_frequency
+    scale = model.force_scale
     passivity = dataclasses.replace(
         passivity,
-        servo_stiffness=[servo * model.servo_frequency] * 2,
-        servo_damping=[2 * servo] * 2,
+        servo_stiffness=[model.servo_stiffness] * 2,
+        servo_damping=[model.servo_damping] * 2,
     )
     p = methods.parameters(passivity, [scale, scale])
     intent = operators_intent() if intent is None else intent
@@ -172,13 +176,17 @@ def run_one_dof(
     ]
     states = [network.initial_state(line, np.zeros(PACKET_SIZE)) for line in lines]
     ends = initial_ends(passivity.method, p, start)
-    numbers = np.array([float(getattr(model, entry.name)) for entry in dataclasses.fields(model)])
+    numbers = (
+        model.hand_mass + model.device_mass, model.hand_damping, model.hand_stiffness,
+        model.device_friction, model.slave_mass, model.servo_stiffness, model.servo_damping,
+        model.ideal_servo, model.tool_mass, model.wall_stiffness, scale, model.sigma, model.gamma,
+    )  # fmt: skip
     # These methods know the force of the slave's motor, which is therefore held over a period; for
     # the others the command is interpolated over it.
     held = passivity.method in AT_THE_MOTOR and not model.ideal_servo
     rows = _simulate(
-        METHODS.index(passivity.method), numbers, held, p, *lines, *states, ends, start, timeout,
-        np.ascontiguousarray(intent),
+        METHODS.index(passivity.method), tuple(map(float, numbers)), held, p, *lines, *states,
+        ends, start, timeout, np.ascontiguousarray(intent),
     )  # fmt: skip
     t = np.arange(len(intent), dtype=np.float64) * PERIOD
     master, slave, command, felt, wall = rows.T[:5]
@@ -284,10 +292,8 @@ def _simulate(
     intent,
 ):  # fmt: skip
     """(N, 9) rows [master, slave, command, felt, wall, energy (hand, slave), silence (both)]."""
-    mass, damping, stiffness = model[0] + model[3], model[1], model[2]
-    friction, slave_mass, frequency, ideal = model[4], model[5], model[6], model[7]
-    tool_mass, wall_stiffness, scale, sigma, gamma = model[8:13]
-    K, D = slave_mass * frequency * frequency, 2.0 * slave_mass * frequency
+    mass, damping, stiffness, friction, slave_mass, K, D, ideal = model[:8]
+    tool_mass, wall_stiffness, scale, sigma, gamma = model[8:]
     frame = np.zeros(11)
     frame[0] = frame[4] = frame[8] = frame[9] = frame[10] = 1.0
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()

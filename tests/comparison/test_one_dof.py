@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 
@@ -9,10 +10,13 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from drake_teleop.analysis.delayed_loop import delay_margin, station_loop
+from drake_teleop.analysis.one_axis import Axis, OneAxis, servo_response
 from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import PERIOD, OneDof, figures, run_one_dof
+from drake_teleop.comparison.one_dof import PERIOD, REFERENCE, OneDof, figures, run_one_dof
 from drake_teleop.operator.operator import GRIPS
 from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.slave.joint_control import JointControlConfig
 
 DEVICE_MASS, DEVICE_DAMPING = 0.15, 0.5
 
@@ -119,15 +123,53 @@ def test_the_light_hand_meets_its_unstable_window_in_free_motion():
     assert not any(grows(without, delay, -0.5) for delay in (190, 260, 330))
 
 
-def test_without_a_method_the_station_is_unstable_from_15_ms_on():
-    model, none = OneDof(), PassivityConfig()
-    stable = {}
-    for delay in (0.002, 0.015, 0.05):
-        run = run_one_dof(model, none, NetworkConfig(delay=delay / 2))
-        stable[delay] = figures(run, model)
-    assert [result.stable for result in stable.values()] == [True, False, False]
-    assert abs(stable[0.002].force_error) < 1e-3
-    assert stable[0.05].least_energy < -1.0
+def test_hand_and_servo_are_those_of_the_station_unless_they_are_of_the_reference():
+    hand, servo, model = GRIPS["medium"], JointControlConfig(), OneDof()
+    assert (model.hand_mass, model.hand_damping) == (hand.mass, hand.damping)
+    assert model.hand_stiffness == hand.stiffness
+    assert model.position_gain == 2 * math.pi * servo.position_bandwidth_hz
+    assert model.velocity_gain == 2 * math.pi * servo.velocity_bandwidth_hz
+
+    def late_and_half_power(axis: OneDof) -> tuple[float, float]:
+        """Delay at low frequency [s], and where the slave has 1 / sqrt(2) of the command [Hz]."""
+        axis = OneAxis(position_gain=axis.position_gain, velocity_gain=axis.velocity_gain)
+
+        def excess(f: float) -> float:
+            return abs(servo_response(axis, np.array([2j * math.pi * f]))[0]) - math.sqrt(0.5)
+
+        slow = servo_response(axis, np.array([1e-3j]))[0]
+        return -np.angle(slow) / 1e-3, brentq(excess, 1.0, 100.0)
+
+    assert late_and_half_power(model) == pytest.approx((13.3e-3, 14.4), rel=0.01)
+    assert late_and_half_power(REFERENCE) == pytest.approx((17.1e-3, 12.0), rel=0.01)
+    stiffness = [axis.servo_stiffness for axis in (model, REFERENCE)]
+    assert stiffness == pytest.approx([502e3, 207e3], rel=0.01)
+    assert REFERENCE.servo_damping**2 == pytest.approx(
+        4 * REFERENCE.slave_mass * REFERENCE.servo_stiffness, rel=1e-12
+    )
+
+
+@pytest.mark.parametrize(("model", "longest"), [(OneDof(), 0.028), (REFERENCE, 0.008)])
+def test_how_long_a_round_trip_is_borne_without_a_method(model, longest):
+    none, found = PassivityConfig(), {}
+    for round_trip in (0.002, longest, longest + 0.002, 0.05):
+        run = run_one_dof(model, none, NetworkConfig(delay=round_trip / 2))
+        found[round_trip] = figures(run, model)
+    assert [result.stable for result in found.values()] == [True, True, False, False]
+    assert abs(found[0.002].force_error) < 1e-3
+    assert found[0.05].least_energy < -1.0
+
+
+@pytest.mark.parametrize("model", [OneDof(), REFERENCE])
+def test_simulation_and_linear_analysis_are_of_one_model(model):
+    shared = {entry.name: getattr(model, entry.name) for entry in dataclasses.fields(Axis)}
+    margin = float(delay_margin(station_loop(OneAxis(**shared, device_damping=DEVICE_DAMPING))))
+    damped = dataclasses.replace(
+        model, hand_damping=model.hand_damping + DEVICE_DAMPING, device_friction=0.0
+    )
+    expected = margin / PERIOD - 1.5
+    found = longest_round_trip(damped, 0.02, 1, round(2 * expected) + 4)
+    assert found == pytest.approx(expected, abs=1.0)
 
 
 def test_the_same_seed_gives_the_same_run():
