@@ -25,7 +25,7 @@ from drake_teleop.operator.operator import MinimumJerk
 from drake_teleop.reproduction.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import advance, simulate
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station import GetBlock, MakeTeleopStation
 
 _TIGHT = {"simulation__max_step": 4e-5, "simulation__accuracy": 1e-10}
 _REPEATS, _PIECES = 5, 16
@@ -124,7 +124,7 @@ def against_the_port(scenario: Scenario) -> float:
     scenario = replace(scenario, wrist_sensor__ideal=True)
     simulator = MakeMovingStation(scenario)
     station, context = simulator.get_system(), simulator.get_context()
-    plant, sensor = (station.GetSubsystemByName(name) for name in ("slave_plant", "wrist_sensor"))
+    plant, sensor = (GetBlock(station, name) for name in ("slave_plant", "wrist_sensor"))
     joints = list(plant.GetJointIndices())
     weld = joints.index(plant.GetJointByName("sensor_weld").index())
     largest, period = 0.0, 1 / scenario.rates.hand_hz

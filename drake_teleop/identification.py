@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.framework import Diagram
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.check import check
@@ -31,7 +31,7 @@ from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import ArmModel, accelerations
-from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.plant import NominalSlave
 from drake_teleop.station import MakeIdentificationStation
 
 Array = NDArray[np.float64]
@@ -97,8 +97,7 @@ class LoadIdentification:
 
 def slave_arm(scenario: Scenario) -> ArmModel:
     """The arm of a scenario's slave, with tool and payload as its load."""
-    slave = scenario.slave
-    return AddSlavePlant(DiagramBuilder(), slave.position, None, payload=slave.payload).arm
+    return NominalSlave(scenario.slave.payload).arm
 
 
 def identification_scenario(scenario: Scenario, seed: int) -> Scenario:

@@ -14,6 +14,7 @@ import yaml
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from drake_teleop.channel.channel import Channel
+from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
@@ -113,6 +114,11 @@ class Scenario:
     def environment(self) -> SheetSpring | Slot | None:
         """What there is to touch."""
         return self.sheet_spring if self.slot is None else self.slot
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether nothing but wires lies between master and slave."""
+        return self.passivity.method == "none" and self.channel.lines() == (NetworkConfig(),) * 2
 
     def check(self, where: str = "scenario") -> None:
         """Checks every value.

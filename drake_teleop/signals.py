@@ -20,7 +20,7 @@ _STATE = " ".join([f"q_{i}" for i in range(1, 7)] + [f"v_{i}" for i in range(1, 
 _STATE_UNITS = "rad,rad,rad,rad,rad,rad,rad/s,rad/s,rad/s,rad/s,rad/s,rad/s"
 _JOINTS = "joint_1 joint_2 joint_3 joint_4 joint_5 joint_6"
 
-#: Everything that a station can record.
+#: Everything that a station can record, in the order of the log.
 SIGNALS = {
     signal.name: signal
     for signal in (
@@ -44,19 +44,27 @@ SIGNALS = {
             "N,N,N,N m,N m,N m,kg,kg m,kg m,kg m" + ",kg m^2" * 6,
             "offsets and phi, Eq. (7)",
         ),
+        _signal("slave_state", _STATE, _STATE_UNITS, "true joint angles and velocities, at t"),
+        _signal("joint_torque", _JOINTS, "N m", "of the slave's motors"),
         _signal(
             "load_state",
             "state",
             "1",
             "learning, settled, disturbed, changed: load/online/watched.py",
         ),
-        _signal("scaled_wrench_S", *_WRENCH, "F' of Fig. 2, before the scale to the master"),
-        _signal("contact_wrench_S", *_WRENCH, "Eq. (13), calculated contact wrench"),
-        _signal("contact", "contact", "1", "1 while the slave's detector notices a contact"),
-        _signal("contact_at_hand", "contact", "1", "the same as it has arrived at the hand"),
         _signal("true_contact_wrench_W", *_WRENCH, "environment on the tool, about the origin"),
         _signal("sheet_state", "z v_z", "m,m/s", "deflection of the sheet spring's end, upwards"),
         _signal("intent", *_POSE, "where the operator wants the stylus, X_BE"),
+        _signal("hand_wrench_E", *_WRENCH, "hand on the stylus at Eo, in B"),
+        _signal("master_state", _STATE, _STATE_UNITS, "joint angles and velocities of the device"),
+        _signal("pose_master", *_POSE, "of the stylus, X_BE"),
+        _signal("twist_master", *_TWIST, "of the stylus in the device's base"),
+        _signal("pose_command", *_POSE, "setpoint of the slave, X_WS"),
+        _signal("joint_command", _JOINTS, "rad", "from the inverse kinematics"),
+        _signal("ik_status", "status", "1", "of the inverse kinematics, 0 = fine"),
+        _signal("scaled_wrench_S", *_WRENCH, "F' of Fig. 2, before the scale to the master"),
+        _signal("contact_wrench_S", *_WRENCH, "Eq. (13), calculated contact wrench"),
+        _signal("force_to_master", *_WRENCH, "what the device displays, within its limits"),
         _signal(
             "task_state",
             "phase outcome noticed threshold trust",
@@ -64,12 +72,6 @@ SIGNALS = {
             "of the operator's task: phase, 1 done or -1 given up, 1 while contact is noticed, from"
             " which felt force on it is, and trust: operator/task.py",
         ),
-        _signal("pose_master", *_POSE, "of the stylus, X_BE"),
-        _signal("twist_master", *_TWIST, "of the stylus in the device's base"),
-        _signal("master_state", _STATE, _STATE_UNITS, "joint angles and velocities of the device"),
-        _signal("hand_wrench_E", *_WRENCH, "hand on the stylus at Eo, in B"),
-        _signal("force_to_master", *_WRENCH, "what the device displays, within its limits"),
-        _signal("pose_command", *_POSE, "setpoint of the slave, X_WS"),
         _signal("pose_received", *_POSE, "of the setpoint, what comes out of the channel, X_WS"),
         _signal(
             "ports",
@@ -78,9 +80,7 @@ SIGNALS = {
             "energy put into the channel at its ends, in the master's power units; how long each"
             " end has heard nothing",
         ),
-        _signal("joint_command", _JOINTS, "rad", "from the inverse kinematics"),
-        _signal("ik_status", "status", "1", "of the inverse kinematics, 0 = fine"),
-        _signal("slave_state", _STATE, _STATE_UNITS, "true joint angles and velocities, at t"),
-        _signal("joint_torque", _JOINTS, "N m", "of the slave's motors"),
+        _signal("contact", "contact", "1", "1 while the slave's detector notices a contact"),
+        _signal("contact_at_hand", "contact", "1", "the same as it has arrived at the hand"),
     )
 }

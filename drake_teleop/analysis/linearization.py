@@ -50,7 +50,7 @@ from drake_teleop.sensor.sensor_chain import without
 from drake_teleop.simulation import MakeSimulator
 from drake_teleop.slave.arm import jacobian
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station import GetBlock, MakeTeleopStation
 
 Array = NDArray[np.float64]
 
@@ -383,7 +383,7 @@ class _Period:
         self._simulator = MakeSimulator(self._diagram, smooth.simulation)
         # Steps that followed the error would follow the displacements too.
         self._simulator.get_mutable_integrator().set_fixed_step_mode(True)
-        plant = self._diagram.GetSubsystemByName("slave_plant")
+        plant = self._system("slave_plant")
         self._arm = ArmModelFromPlant(plant, plant.GetModelInstanceByName("rx90")).table
         self._push = ExternallyAppliedSpatialForce()
         self._push.body_index = plant.GetBodyByName("tool").index()
@@ -410,7 +410,7 @@ class _Period:
         self._simulator.Initialize()
 
     def _system(self, name: str) -> Any:
-        return self._diagram.GetSubsystemByName(name)
+        return GetBlock(self._diagram, name)
 
     def _context(self, name: str) -> Any:
         root = self._simulator.get_mutable_context()
@@ -611,14 +611,14 @@ def _smooth(scenario: Scenario) -> Scenario:
 
 
 def _remove_friction(diagram: Diagram) -> None:
-    plant = diagram.GetSubsystemByName("slave_plant")
-    scene_graph = diagram.GetSubsystemByName("scene_graph")
+    plant = GetBlock(diagram, "slave_plant")
+    scene_graph = GetBlock(diagram, "scene_graph")
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
     for geometry in inspector.GetAllGeometryIds(Role.kProximity):
         properties = inspector.GetProximityProperties(geometry)
         properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(0.0, 0.0))
         scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
-    diagram.GetSubsystemByName("wrist_sensor").contact_pairs[:, FRICTION] = 0.0
+    GetBlock(diagram, "wrist_sensor").contact_pairs[:, FRICTION] = 0.0
 
 
 def _check_rates(scenario: Scenario) -> None:

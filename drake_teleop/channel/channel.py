@@ -25,7 +25,6 @@ from drake_teleop.channel import network
 from drake_teleop.channel.network import PRESETS, NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT, weak_callback
-from drake_teleop.load.sample import JOINT_POSITION, SATURATED, sample_size
 from drake_teleop.passivity import methods
 from drake_teleop.passivity.memory import LIMIT, MEMORY, Slots
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
@@ -48,8 +47,6 @@ from drake_teleop.passivity.safe_state import (
     slave_command_into,
 )
 from drake_teleop.quantities import choice, quantity
-from drake_teleop.quaternions import quaternion_of
-from drake_teleop.slave.arm import ArmModel, forward_kinematics
 
 _NETWORKS = ("custom", *PRESETS)
 
@@ -292,18 +289,6 @@ def _to_master(wrench, frame, out):
             out[3 * g + i] = total * scales[g]
 
 
-@njit(cache=True)
-def _slave_pose_into(arm, q, pose):
-    """X_WS (7,) of the arm at q."""
-    R, p = np.empty((3, 3)), np.empty(3)
-    forward_kinematics(arm, q, R, p)
-    orientation = quaternion_of(R)
-    for i in range(4):
-        pose[i] = orientation[i]
-    for i in range(3):
-        pose[4 + i] = p[i]
-
-
 class TeleopChannel(LeafSystem):
     """The network, and at both of its ends the method that keeps the station passive.
 
@@ -322,7 +307,8 @@ class TeleopChannel(LeafSystem):
         - pose_command: (7,) X_WS, after kinematic scaling
         - wrench_B: (6,) F_E_B, what the hand should feel, from force scaling [N, N m]
         - hand_wrench_E: (6,) of the hand on the stylus at E, in B [N, N m]
-        - sample: the wrist sensor's, see `drake_teleop.load.sample`
+        - pose_slave: (7,) X_WS, actual
+        - saturated: (1,) 1 while the wrench is not to be trusted
         - contact: (1,) whether the slave's detector notices a contact; unconnected 0
         output_ports:
         - pose_received: (7,) X_WS that the slave shall follow
@@ -334,7 +320,6 @@ class TeleopChannel(LeafSystem):
     Args:
         channel: the network.
         passivity: the method.
-        arm: the slave's kinematics.
         R_WB: (3, 3) alignment of the master's base with the world.
         scales: (2,) slave over master, of translation and rotation.
         force_scale: slave to master.
@@ -349,7 +334,6 @@ class TeleopChannel(LeafSystem):
         self,
         channel: Channel,
         passivity: PassivityConfig,
-        arm: ArmModel,
         R_WB: NDArray[np.float64],
         scales: NDArray[np.float64],
         force_scale: float,
@@ -367,16 +351,16 @@ class TeleopChannel(LeafSystem):
             )
         ]
         parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
-        self._method, self._arm = METHODS.index(passivity.method), arm.table
+        self._method = METHODS.index(passivity.method)
         self._constants = (
             *(period, channel.timeout, np.concatenate([R_WB.ravel(), scales]), parameters),
             *lines,
         )
-        self._slave_pose = np.empty(7)
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._wrench = self.DeclareVectorInputPort("wrench_B", 6)
         self._hand = self.DeclareVectorInputPort("hand_wrench_E", 6)
-        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints))
+        self._slave = self.DeclareVectorInputPort("pose_slave", 7)
+        self._saturated = self.DeclareVectorInputPort("saturated", 1)
         self._contact = self.DeclareVectorInputPort("contact", 1)
         ends = initial_ends(passivity.method, parameters, start)
         state = [*(network.initial_state(p, np.zeros(PACKET_SIZE)) for p in lines), ends]
@@ -404,15 +388,13 @@ class TeleopChannel(LeafSystem):
         *state, received = step.get_mutable_value()
         for part, group in zip(state, self._groups, strict=True):
             part[:] = context.get_discrete_state(group).value()
-        sample = self._sample.Eval(context)
-        _slave_pose_into(self._arm, sample[JOINT_POSITION], self._slave_pose)
         channel_step(
             self._method,
             self._pose.Eval(context),
             self._wrench.Eval(context),
             self._hand.Eval(context),
-            self._slave_pose,
-            sample[SATURATED] > 0.5,
+            self._slave.Eval(context),
+            self._saturated.Eval(context)[0] > 0.5,
             self._contact.Eval(context)[0] if self._contact.HasValue(context) else 0.0,
             *self._constants,
             *state,

@@ -23,6 +23,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_teleop._compiled import njit
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.operator import decision
 from drake_teleop.operator import perception as feeling
@@ -228,17 +229,24 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
 
 
 @njit(cache=True)
-def _wanted_into(packed, start, memory, time, pose, twist):
-    """The intent's segments, and on top of them what the task asks for; no memory: no task."""
+def _wanted_into(packed, start, moving, memory, time, pose, twist):
+    """The intent's segments, and on top of them what the task asks for; no memory: no task.
+
+    `start` (7,) moves by itself with the twist `moving` (6,).
+    """
     intent_into(packed, start, time, pose, twist)
+    for k in range(6):
+        twist[k] += moving[k]
     if memory.shape[0] > 0:
         add_plan_into(memory, time, pose, twist)
 
 
 @njit(cache=True)
-def _wrench_now(packed, start, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench):
+def _wrench_now(
+    packed, start, moving, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench
+):  # fmt: skip
     """`_wanted_into` and `hand_wrench_into` in one call of compiled code."""
-    _wanted_into(packed, start, memory, time, wanted, wanted_twist)
+    _wanted_into(packed, start, moving, memory, time, wanted, wanted_twist)
     hand_wrench_into(impedance, wanted, wanted_twist, pose, twist, wrench)
 
 
@@ -295,6 +303,9 @@ class Operator(LeafSystem):
         input_ports:
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B
+        - intended_pose: (7,) X_BE that the operator wants, in place of the config's intent; may be
+          left unconnected
+        - intended_twist: (6,) its twist [v; omega] of E in B; unconnected zero
         - slave_state: [q; v] of the slave, for what is seen of the tool (with a task)
         output_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
@@ -308,6 +319,9 @@ class Operator(LeafSystem):
         training: what a task needs to be known of the station.
         arm: the slave's, likewise.
         tip: (6,) the tool's tip in S and where it starts in W [m], likewise.
+
+    Raises:
+        DrakeTeleopError: from the simulation, if what is intended is not finite.
     """
 
     __slots__ = ONE_DICT
@@ -325,14 +339,18 @@ class Operator(LeafSystem):
         self._impedance = np.array(
             [hand.stiffness, hand.damping, hand.rotational_stiffness, hand.rotational_damping]
         )
-        self._intent = pack_intent(config.intent)
-        self._start = np.array(start, dtype=float)
+        # Segments, the pose that they are relative to, and how that moves.
+        self._intent = (pack_intent(config.intent), np.array(start, dtype=float), np.zeros(6))
         self._wanted, self._wanted_twist = np.empty(7), np.empty(6)
         self._no_memory = np.empty(0)
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
+        self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
+        self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
         self._has_task = config.task is not None
-        held, moving = {self._pose.ticket(), self._twist.ticket()}, {self.time_ticket()}
+        held = {self._pose.ticket(), self._twist.ticket()}
+        intended = {self._intended_pose.ticket(), self._intended_twist.ticket()}
+        moving = intended | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
                 raise ValueError("a task needs training, arm and tip")
@@ -395,10 +413,26 @@ class Operator(LeafSystem):
             return self._no_memory
         return context.get_discrete_state(self._groups[1]).value()
 
+    def _intention(self, context: Context) -> tuple[NDArray[np.float64], ...]:
+        """What the plan is added to: segments, the pose they are relative to, its twist."""
+        if not self._intended_pose.HasValue(context):
+            return self._intent
+        segments, _, still = self._intent
+        pose = self._intended_pose.Eval(context)
+        known = self._intended_twist.HasValue(context)
+        twist = self._intended_twist.Eval(context) if known else still
+        size = math.sqrt(pose[:4] @ pose[:4])
+        if not (np.isfinite(pose).all() and np.isfinite(twist).all() and size > 0.0):
+            raise DrakeTeleopError(
+                f"what the operator wants at {context.get_time():g} s is no finite pose or twist",
+                where="intended_pose",
+                remedy="give X_BE [qw qx qy qz px py pz] in m, and [v; omega] in m/s, rad/s",
+            )
+        return segments[:0], np.concatenate([pose[:4] / size, pose[4:]]), twist
+
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         _wrench_now(
-            self._intent,
-            self._start,
+            *self._intention(context),
             self._memory(context),
             context.get_time(),
             self._impedance,
@@ -411,4 +445,4 @@ class Operator(LeafSystem):
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
         time, pose, memory = context.get_time(), output.get_mutable_value(), self._memory(context)
-        _wanted_into(self._intent, self._start, memory, time, pose, self._wanted_twist)
+        _wanted_into(*self._intention(context), memory, time, pose, self._wanted_twist)

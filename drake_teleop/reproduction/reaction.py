@@ -10,15 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import Diagram
 
 from drake_teleop.identification import sensor_samples, slave_arm
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.pages.progress import Progress
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.simulation import MakeSimulator, advance, read_log
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station import GetBlock, MakeTeleopStation
 
 Array = NDArray[np.float64]
 
@@ -38,7 +36,7 @@ def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:
     phi = slave_arm(scenario).phi_load
     ideal = replace(scenario, wrist_sensor__ideal=True, rates__sensor_hz=rate)
     station = MakeTeleopStation(ideal, load_estimate=np.concatenate([np.zeros(6), phi]))
-    plant, simulator = _plant(station), MakeSimulator(station, simulation)
+    plant, simulator = GetBlock(station, "slave_plant"), MakeSimulator(station, simulation)
     context = plant.GetMyContextFromRoot(simulator.get_context())
     reactions = plant.get_reaction_forces_output_port()
     weld = plant.GetJointByName("sensor_weld")
@@ -58,7 +56,3 @@ def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:
     return contact_wrench(
         wrenches[taken[started]], np.zeros(6), s[started], omega[started], alpha[started], phi
     )
-
-
-def _plant(station: Diagram) -> MultibodyPlant:
-    return station.GetSubsystemByName("slave_plant")

@@ -25,6 +25,7 @@ from pydrake.systems.framework import (
     DiscreteValues,
     EventStatus,
     LeafSystem,
+    OutputPort,
 )
 from pydrake.systems.primitives import Demultiplexer, RandomSource
 
@@ -465,11 +466,10 @@ def AddWristSensor(
     period: float,
     held: float,
     q_start: Array,
-) -> None:
-    """Adds "wrist_sensor" and its noise, and what divides its port: for each part of a sample
-    "sample_parts" has a port, for all of them and for the sample's time "wrist_sample".
+) -> dict[str, OutputPort]:
+    """Adds "wrist_sensor" and its noise, and what divides its port, for Drake numbers the parts.
 
-    What remains to be connected is the state and the torque of the arm.
+    What remains to be connected is the state, the acceleration and the torque of the arm.
 
     Args:
         builder: the diagram that holds the plant.
@@ -479,6 +479,9 @@ def AddWristSensor(
         period: sampling period [s].
         held: for how long the motors hold a torque [s].
         q_start: (n,) where the arm rests before the first sample [rad].
+
+    Returns:
+        The ports by name: "sample", each of its parts, see `sample_parts`, and "sample_time".
     """
     sensor = WristSensor(slave, config, motion, period, held, q_start)
     builder.AddNamedSystem("wrist_sensor", sensor)
@@ -496,10 +499,13 @@ def AddWristSensor(
         builder.Connect(
             slave.plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")
         )
-    sizes = list(sample_parts(slave.arm.num_joints).values())
+    parts = sample_parts(slave.arm.num_joints)
+    sizes = list(parts.values())
     step = sensor.GetOutputPort("step")
-    size, rest = sum(sizes), step.size() - sum(sizes)
-    splits = {"wrist_sample": [size, 1, rest - 1], "sample_parts": [*sizes, rest]}
-    for name, split in splits.items():
-        splitter = builder.AddNamedSystem(name, Demultiplexer(split))
+    rest = step.size() - sum(sizes)
+    whole = builder.AddNamedSystem("wrist_sample", Demultiplexer([sum(sizes), rest]))
+    divided = builder.AddNamedSystem("sample_parts", Demultiplexer([*sizes, 1, rest - 1]))
+    for splitter in (whole, divided):
         builder.Connect(step, splitter.get_input_port())
+    ports = {name: divided.get_output_port(i) for i, name in enumerate([*parts, "sample_time"])}
+    return ports | {"sample": whole.get_output_port(0)}

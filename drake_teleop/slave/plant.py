@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,17 @@ class SlavePlant:
     def tip(self) -> NDArray[np.float64]:
         """(3,) p_STip, where the tool makes contact [m]."""
         return self.plant.GetFrameByName("tip").GetFixedPoseInBodyFrame().translation()
+
+
+def NominalSlave(payload: Payload) -> SlavePlant:
+    """The slave by itself, with nothing to touch, for its numbers: arm and tip."""
+    return _nominal_slave(payload.mass, *payload.com)
+
+
+@lru_cache(maxsize=4)  # to parse the models takes longer than to build a station of them
+def _nominal_slave(mass: float, *com: float) -> SlavePlant:
+    payload = Payload(mass=mass, com=list(com))
+    return AddSlavePlant(DiagramBuilder(), [], None, np.zeros(6), payload)
 
 
 def AddSlavePlant(

@@ -28,7 +28,7 @@ from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import MakeSimulator, read_log
 from drake_teleop.slave.arm import forward_kinematics, inverse_dynamics, jacobian
 from drake_teleop.slave.plant import home_position
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station import GetBlock, MakeTeleopStation
 
 PERIOD = 5e-4
 UP = (0.0, 0.0, 1.0)
@@ -281,7 +281,7 @@ def test_multipliers_predict_a_slow_decay():
     diagram = MakeTeleopStation(scenario, load_estimate=estimate)
     simulator = MakeSimulator(diagram, scenario.simulation)
     simulator.Initialize()
-    master = diagram.GetSubsystemByName("master_device")
+    master = GetBlock(diagram, "master_device")
     context = master.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     state = context.get_mutable_discrete_state(0).get_mutable_value()
     state[6:] = np.linalg.solve(phantom.jacobian(state[:6]), [0, 0, 2e-3, 0, 0, 0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import PassThrough
 
 from drake_teleop.channel import channel
 from drake_teleop.channel.channel import Channel, channel_step
@@ -13,6 +14,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.operator.operator import OperatorConfig, Sine
 from drake_teleop.passivity.safe_state import RESUME, STOP
 from drake_teleop.scenario import Scenario, replace
+from drake_teleop.sides.channel import MakeChannel
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.plant import AddSlavePlant
 from drake_teleop.station import MakeTeleopStation
@@ -64,13 +66,11 @@ def test_without_a_method_it_is_a_delay_in_both_directions(steps, load_estimate)
     assert felt.max() > 0.1
 
 
-def test_an_ideal_network_without_a_method_is_no_block(load_estimate):
-    station = MakeTeleopStation(moving(), load_estimate=load_estimate)
-    assert not station.HasSubsystemNamed("channel")
-    preset = MakeTeleopStation(
-        moving(channel=Channel(network="ideal")), load_estimate=load_estimate
-    )
-    assert not preset.HasSubsystemNamed("channel")
+@pytest.mark.parametrize("channel", [Channel(), Channel(network="ideal")])
+def test_an_ideal_network_without_a_method_is_wires(channel):
+    side = MakeChannel(moving(channel=channel))
+    assert [type(block) for block in side.GetSystems()] == [PassThrough, PassThrough]
+    assert not side.HasInputPort("hand_wrench_E") and not side.HasOutputPort("ports")
 
 
 def test_the_ports_count_the_work_of_the_hand(load_estimate):

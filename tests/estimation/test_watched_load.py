@@ -27,7 +27,7 @@ from drake_teleop.operator.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import MakeSimulator, advance, read_log, simulate
 from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
+from drake_teleop.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
 
 GRASP = 3.0
 MASS, COM, INERTIA = 0.8, [0.04, 0.0, 0.16], [8e-4, 8e-4, 4e-4]
@@ -67,13 +67,13 @@ def tool():
 
 def grasp(station, simulator):
     """From now on the tool holds the object: in the plant, and in what the sensor feels."""
-    plant = station.GetSubsystemByName("slave_plant")
+    plant = GetBlock(station, "slave_plant")
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     body = plant.GetBodyByName("tool")
     inertia = body.CalcSpatialInertiaInBodyFrame(context)
     inertia += SpatialInertia.MakeFromCentralInertia(MASS, COM, RotationalInertia(*INERTIA))
     body.SetSpatialInertiaInBodyFrame(context, inertia)
-    station.GetSubsystemByName("wrist_sensor").phi[:] += OBJECT
+    GetBlock(station, "wrist_sensor").phi[:] += OBJECT
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from drake_teleop.scenario import Scenario, replace
 from drake_teleop.simulation import MakeSimulator, advance
 from drake_teleop.slave.payload import Payload
 from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station import GetBlock, MakeTeleopStation
 
 HELD = Payload(mass=2.0, com=[0.02, -0.03, 0.16])
 
@@ -42,7 +42,7 @@ def test_the_sensor_feels_it_as_its_joint_does():
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
     context = simulator.get_context()
-    plant, sensor = (station.GetSubsystemByName(name) for name in ("slave_plant", "wrist_sensor"))
+    plant, sensor = (GetBlock(station, name) for name in ("slave_plant", "wrist_sensor"))
     joints = list(plant.GetJointIndices())
     weld = joints.index(plant.GetJointByName("sensor_weld").index())
     sizes = []

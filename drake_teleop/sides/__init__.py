@@ -1,0 +1,1 @@
+"""The three parts of a station: master side, channel, slave side (docs/station.md)."""

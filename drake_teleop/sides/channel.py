@@ -1,0 +1,74 @@
+"""The channel: what lies between master and slave; nothing, or a network and a passivity method."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.math import RollPitchYaw
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import PassThrough
+
+from drake_teleop.channel.channel import TeleopChannel
+from drake_teleop.scenario import Scenario
+from drake_teleop.sides.ports import export
+from drake_teleop.slave.plant import R_WS_HOME
+
+
+def MakeChannel(scenario: Scenario) -> Diagram:
+    """The network with the method that keeps the station passive at both of its ends.
+
+    An ideal network without a method is nothing but wires.
+
+    .. pydrake_system::
+
+        name: channel
+        input_ports:
+        - pose_command: (7,) X_WS, from the master side
+        - wrench_B: (6,) F_E_B, what the hand should feel, from the slave side [N, N m]
+        - contact: (1,) the flag of the slave's detector (with contact detection)
+        - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m] (over a network)
+        - pose_slave: (7,) X_WS of the slave, actual (over a network)
+        - saturated: (1,) 1 while the wrench is not to be trusted (over a network)
+        output_ports:
+        - pose_to_slave: (7,) X_WS that the slave shall follow
+        - wrench_to_master: (6,) F_E_B that the hand shall feel [N, N m]
+        - contact_at_hand: signal (with contact detection)
+        - pose_received, ports: signals (over a network)
+    """
+    builder = DiagramBuilder()
+    if scenario.is_direct:
+        wires = [("pose_command", "pose_to_slave", 7), ("wrench_B", "wrench_to_master", 6)]
+        if scenario.contact_detection is not None:
+            wires.append(("contact", "contact_at_hand", 1))
+        for entry, exit_, size in wires:
+            wire = builder.AddNamedSystem(f"wire_of_{entry}", PassThrough(size))
+            builder.ExportInput(wire.get_input_port(), entry)
+            builder.ExportOutput(wire.get_output_port(), exit_)
+        return builder.Build()
+    scaling = scenario.kinematic_scaling
+    channel = builder.AddNamedSystem(
+        "channel",
+        TeleopChannel(
+            scenario.channel,
+            scenario.passivity,
+            RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
+            np.array([scaling.translation_scale, scaling.rotation_scale]),
+            scenario.force_scaling.force_scale,
+            np.array([*R_WS_HOME.ToQuaternion().wxyz(), *scenario.slave.position]),
+            1 / scenario.rates.hand_hz,
+            scenario.simulation.seed,
+        ),
+    )
+    for name in ("pose_command", "wrench_B", "hand_wrench_E", "pose_slave", "saturated"):
+        builder.ExportInput(channel.GetInputPort(name), name)
+    if scenario.contact_detection is not None:
+        builder.ExportInput(channel.GetInputPort("contact"), "contact")
+        export(builder, channel, "contact_at_hand")
+    export(
+        builder,
+        channel,
+        "pose_received",
+        "ports",
+        pose_to_slave="pose_received",
+        wrench_to_master="wrench_received",
+    )
+    return builder.Build()

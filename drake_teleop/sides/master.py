@@ -1,0 +1,109 @@
+"""The master side: the operator holds the haptic device, whose motion is scaled for the slave."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RollPitchYaw
+from pydrake.systems.framework import Diagram, DiagramBuilder
+
+from drake_teleop.channel.network import mean_delay
+from drake_teleop.master.device import MasterDevice
+from drake_teleop.master.force_display import ForceDisplay
+from drake_teleop.master.phantom import inverse_kinematics
+from drake_teleop.operator.decision import Training
+from drake_teleop.operator.operator import Operator
+from drake_teleop.scaling.kinematic_scaling import KinematicScaling
+from drake_teleop.scenario import Scenario
+from drake_teleop.sides.ports import export
+from drake_teleop.slave.plant import R_WS_HOME, NominalSlave
+
+#: How often the clutch is looked at [s]; an event at 2 kHz would cost time.
+CLUTCH_PERIOD = 0.01
+
+
+def MakeMasterSide(scenario: Scenario) -> Diagram:
+    """Operator, haptic device, kinematic scaling and force display.
+
+    .. pydrake_system::
+
+        name: master_side
+        input_ports:
+        - wrench_command: (6,) F_E_B, what the hand shall feel [N, N m]
+        - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
+        - intended_pose: (7,) X_BE that the operator wants, in place of the scenario's intent; may
+          be left unconnected
+        - intended_twist: (6,) its twist [v; omega] in B; unconnected zero
+        - slave_state: [q; v] of the slave, whose tool the operator sees (with a task)
+        output_ports:
+        - pose_command: (7,) X_WS, setpoint of the slave
+        - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m]
+        - intent, master_state, pose_master, twist_master, force_to_master: signals
+        - task_state: signal (with a task)
+
+    Raises:
+        DrakeTeleopError: for a value that cannot be right.
+    """
+    hand, scaling = scenario.operator.hand, scenario.kinematic_scaling
+    start_B = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
+    start_W = np.array([*R_WS_HOME.ToQuaternion().wxyz(), *scenario.slave.position])
+    builder = DiagramBuilder()
+
+    operator = builder.AddNamedSystem("operator", _operator(scenario, start_B))
+    device = builder.AddNamedSystem(
+        "master_device",
+        MasterDevice(
+            1 / scenario.rates.hand_hz,
+            hand_mass=hand.mass,
+            hand_inertia=hand.inertia,
+            q_initial=inverse_kinematics(start_B),
+            friction=scenario.master.friction,
+        ),
+    )
+    builder.Connect(operator.GetOutputPort("hand_wrench_E"), device.GetInputPort("hand_wrench_E"))
+    builder.Connect(device.GetOutputPort("pose_master"), operator.GetInputPort("pose_master"))
+    builder.Connect(device.GetOutputPort("twist_master"), operator.GetInputPort("twist_master"))
+    builder.ExportInput(operator.GetInputPort("intended_pose"), "intended_pose")
+    builder.ExportInput(operator.GetInputPort("intended_twist"), "intended_twist")
+    if scenario.operator.task is not None:
+        builder.ExportInput(operator.GetInputPort("slave_state"), "slave_state")
+        export(builder, operator, "task_state")
+    export(builder, operator, "intent", "hand_wrench_E")
+    export(builder, device, "pose_master", "twist_master", master_state="state")
+
+    kinematic_scaling = builder.AddNamedSystem(
+        "kinematic_scaling", KinematicScaling(scaling, CLUTCH_PERIOD, start_W)
+    )
+    builder.Connect(
+        device.GetOutputPort("pose_master"), kinematic_scaling.GetInputPort("pose_master")
+    )
+    builder.ExportInput(kinematic_scaling.GetInputPort("clutch"), "clutch")
+    export(builder, kinematic_scaling, "pose_command")
+
+    display = builder.AddNamedSystem("force_display", ForceDisplay())
+    builder.Connect(device.GetOutputPort("state"), display.GetInputPort("master_state"))
+    builder.Connect(display.GetOutputPort("motor_torque"), device.GetInputPort("motor_torque"))
+    builder.ExportInput(display.GetInputPort("wrench_command"), "wrench_command")
+    export(builder, display, "force_to_master")
+    return builder.Build()
+
+
+def _operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator:
+    """The operator; for a task it sees the tool, and has been trained on this station."""
+    if scenario.operator.task is None:
+        return Operator(scenario.operator, start_B)
+    scaling, forces = scenario.kinematic_scaling, scenario.force_scaling
+    forward, backward = (mean_delay(line) for line in scenario.channel.lines())
+    training = Training(
+        RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
+        scaling.translation_scale,
+        forces.scales()[2] * forces.force_scale,
+        forward,
+        backward,
+        scenario.simulation.seed,
+    )
+    slave = NominalSlave(scenario.slave.payload)
+    tip_W = np.array(scenario.slave.position) + R_WS_HOME.matrix() @ slave.tip
+    return Operator(
+        scenario.operator, start_B, training, slave.arm, np.concatenate([slave.tip, tip_W])
+    )

@@ -1,0 +1,249 @@
+"""The slave side: the arm follows a pose, and its wrist sensor tells contact from the tool."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RollPitchYaw
+from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
+from pydrake.systems.primitives import Demultiplexer
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.estimation.contact_detection import ContactDetection
+from drake_teleop.estimation.load_estimator import LoadEstimator
+from drake_teleop.load.contact.noise_floor import NoiseFloor
+from drake_teleop.load.sample import sample_parts
+from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.scaling.force_scaling import ForceScaling
+from drake_teleop.scenario import Scenario
+from drake_teleop.sensor.motion_estimation import estimated_motion_std
+from drake_teleop.sensor.wrist_sensor import AddWristSensor
+from drake_teleop.sides.ports import export
+from drake_teleop.slave.forward_kinematics import ForwardKinematics
+from drake_teleop.slave.inverse_kinematics import InverseKinematics
+from drake_teleop.slave.joint_control import JointControl
+from drake_teleop.slave.joint_trajectory import JointTrajectory
+from drake_teleop.slave.monitor import SlaveMonitor
+from drake_teleop.slave.plant import AddSlavePlant, SlavePlant
+from drake_teleop.slave.tool_contact import ToolContact
+
+Array = NDArray[np.float64]
+
+#: How often the monitor looks [s]; an event at 2 kHz would cost time.
+MONITOR_PERIOD = 0.01
+
+
+def MakeSlaveSide(
+    scenario: Scenario,
+    *,
+    load_estimate: Array | None = None,
+    load_covariance: Array | None = None,
+    noise_floor: NoiseFloor | None = None,
+) -> Diagram:
+    """Inverse kinematics, joint control, arm, wrist sensor, load estimator, elimination.
+
+    .. pydrake_system::
+
+        name: slave_side
+        input_ports:
+        - pose_command: (7,) X_WS that it shall follow
+        output_ports:
+        - wrench_B: (6,) F_E_B, what the hand should feel, in the master's base [N, N m]
+        - pose_slave: (7,) X_WS, actual, of the last sample's joint angles (over a network)
+        - saturated: (1,) 1 while the wrench is not to be trusted; a signal too
+        - contact: (1,) 1 in contact; a signal too (with contact detection)
+        - the parts of a sample (`sample_parts`), load_estimate, slave_state, joint_torque,
+          joint_command, ik_status, scaled_wrench_S, contact_wrench_S: signals
+        - load_state (if the load is watched), true_contact_wrench_W (with something to touch),
+          sheet_state (with a sheet spring): signals
+
+    Args:
+        scenario, load_estimate, load_covariance, noise_floor: as for `MakeTeleopStation`.
+
+    Raises:
+        DrakeTeleopError: for a value that cannot be right, a start out of reach, scales that mean
+            something only if the load is known while it is not, or detection without its floor.
+    """
+    _check_load_is_known(scenario, load_estimate)
+    builder = DiagramBuilder()
+    body = _add_body(builder, scenario, load_estimate, load_covariance)
+    arm = body.slave.arm
+
+    ik = builder.AddNamedSystem("inverse_kinematics", InverseKinematics(arm.lower, arm.upper))
+    builder.Connect(body.sample["joint_position"], ik.GetInputPort("joint_position"))
+    builder.Connect(
+        ik.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
+    )
+    builder.Connect(ik.GetOutputPort("ik_status"), body.monitor.GetInputPort("ik_status"))
+    builder.ExportInput(ik.GetInputPort("pose_command"), "pose_command")
+    export(builder, ik, "joint_command")
+    export(builder, body.monitor, "ik_status")
+
+    R_WB = RollPitchYaw(scenario.kinematic_scaling.alignment).ToRotationMatrix().matrix()
+    force_scaling = builder.AddNamedSystem(
+        "force_scaling", ForceScaling(scenario.force_scaling, arm, R_WB)
+    )
+    estimate = body.load_estimator.GetOutputPort("load_estimate")
+    builder.Connect(body.sample["sample"], force_scaling.GetInputPort("sample"))
+    builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
+    export(builder, force_scaling, "wrench_B")
+    both = builder.AddNamedSystem("scaled_and_contact", Demultiplexer([6, 6]))
+    builder.Connect(force_scaling.GetOutputPort("scaled_and_contact_S"), both.get_input_port())
+    builder.ExportOutput(both.get_output_port(0), "scaled_wrench_S")
+    builder.ExportOutput(both.get_output_port(1), "contact_wrench_S")
+
+    if not scenario.is_direct:
+        kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))
+        builder.Connect(body.sample["joint_position"], kinematics.GetInputPort("joint_position"))
+        export(builder, kinematics, "pose_slave")
+
+    if scenario.contact_detection is not None:
+        if noise_floor is None:
+            raise DrakeTeleopError(
+                "nobody knows how large the contact wrench is in free motion",
+                where="contact_detection",
+                remedy="pass the noise_floor of identify_load, as load_estimate",
+            )
+        detection = builder.AddNamedSystem(
+            "contact_detection",
+            ContactDetection(
+                scenario.contact_detection, noise_floor, arm, 1 / scenario.rates.estimator_hz
+            ),
+        )
+        builder.Connect(body.sample["sample"], detection.GetInputPort("sample"))
+        builder.Connect(estimate, detection.GetInputPort("load_estimate"))
+        export(builder, detection, "contact")
+    return builder.Build()
+
+
+def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
+    """The slave without a master: its joints run through an excitation trajectory (section IV).
+
+    It starts at the trajectory's start; `trajectory` runs once, after the settling time. Its ports
+    are those signals of `MakeSlaveSide` that need no command and no elimination.
+    """
+    builder = DiagramBuilder()
+    start, _, _ = trajectory.evaluate(0.0)
+    body = _add_body(builder, scenario, q_start=start)
+    command = builder.AddNamedSystem(
+        "joint_trajectory", JointTrajectory(trajectory, scenario.simulation.settle)
+    )
+    builder.Connect(
+        command.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
+    )
+    export(builder, command, "joint_command")
+    return builder.Build()
+
+
+@dataclass(frozen=True)
+class _Body:
+    """Plant, joint control, wrist sensor, load estimator and monitor, wired to each other."""
+
+    slave: SlavePlant
+    joint_control: LeafSystem
+    monitor: LeafSystem
+    load_estimator: LeafSystem
+    sample: dict[str, OutputPort]
+
+
+def _add_body(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    load_estimate: Array | None = None,
+    load_covariance: Array | None = None,
+    q_start: Array | None = None,
+) -> _Body:
+    """Adds what every slave has; the joint command is left open."""
+    rates, sensor = scenario.rates, scenario.wrist_sensor
+    slave = AddSlavePlant(
+        builder,
+        scenario.slave.position,
+        scenario.environment,
+        q_start,
+        scenario.slave.payload,
+    )
+    arm, plant = slave.arm, slave.plant
+    start = plant.GetDefaultPositions(slave.instance)
+    state = plant.get_state_output_port(slave.instance)
+    builder.ExportOutput(state, "slave_state")
+
+    control = builder.AddNamedSystem(
+        "joint_control",
+        JointControl(arm, scenario.joint_control, 1 / rates.joint_control_hz, start),
+    )
+    torque = control.GetOutputPort("joint_torque")
+    builder.Connect(state, control.GetInputPort("slave_state"))
+    builder.Connect(torque, plant.get_actuation_input_port(slave.instance))
+    export(builder, control, "joint_torque")
+
+    monitor = builder.AddNamedSystem("monitor", SlaveMonitor(arm, MONITOR_PERIOD))
+    builder.Connect(state, monitor.GetInputPort("slave_state"))
+
+    sample = AddWristSensor(
+        builder,
+        slave,
+        sensor,
+        scenario.motion_estimation,
+        1 / rates.sensor_hz,
+        1 / rates.joint_control_hz,
+        start,
+    )
+    wrist = builder.GetSubsystemByName("wrist_sensor")
+    acceleration = plant.get_generalized_acceleration_output_port(slave.instance)
+    builder.Connect(state, wrist.GetInputPort("slave_state"))
+    builder.Connect(acceleration, wrist.GetInputPort("slave_acceleration"))
+    builder.Connect(torque, wrist.GetInputPort("joint_torque"))
+    for name in (*sample_parts(arm.num_joints), "sample_time"):
+        builder.ExportOutput(sample[name], name)
+
+    estimator = builder.AddNamedSystem(
+        "load_estimator",
+        LoadEstimator(
+            scenario.load_estimator,
+            sensor.wrench_std(),
+            estimated_motion_std(
+                scenario.motion_estimation, sensor, arm.num_joints, 1 / rates.sensor_hz
+            ),
+            1 / rates.estimator_hz,
+            sample["sample"].size(),
+            np.zeros(16) if load_estimate is None else load_estimate,
+            load_covariance,
+            scenario.force_scaling.gripper_phi,
+        ),
+    )
+    # Only when it learns or watches: at 8 kHz even a wire that nobody reads costs time.
+    if scenario.load_estimator.enabled or scenario.load_estimator.watch:
+        builder.Connect(sample["sample"], estimator.GetInputPort("sample"))
+    export(builder, estimator, "load_estimate")
+    if scenario.load_estimator.watch:
+        export(builder, estimator, "load_state")
+
+    if slave.can_touch:
+        _add_tool_contact(builder, slave, state)
+    return _Body(slave, control, monitor, estimator, sample)
+
+
+def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputPort) -> None:
+    contact = builder.AddNamedSystem(
+        "tool_contact",
+        ToolContact(slave.arm, slave.contact_pairs, moves=slave.sheet is not None),
+    )
+    builder.Connect(state, contact.GetInputPort("slave_state"))
+    export(builder, contact, "true_contact_wrench_W")
+    if slave.sheet is not None:
+        sheet = slave.plant.get_state_output_port(slave.sheet)
+        builder.Connect(sheet, contact.GetInputPort("sheet_state"))
+        builder.ExportOutput(sheet, "sheet_state")
+
+
+def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
+    sigma_gripper, sigma_object, gamma = scenario.force_scaling.scales()
+    needed = not sigma_gripper == sigma_object == gamma
+    if needed and estimate is None and not scenario.load_estimator.enabled:
+        raise DrakeTeleopError(
+            "sigma and gamma differ, but the load is not known",
+            where="load_estimate",
+            remedy="pass the estimate of identify_load, or set load_estimator.enabled",
+        )

@@ -1,0 +1,51 @@
+"""The slave's pose, from its joint angles as the encoders read them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_teleop.lifetime import ONE_DICT, weak_callback
+from drake_teleop.quaternions import quaternion_of
+from drake_teleop.slave.arm import ArmModel, forward_kinematics
+
+
+@njit(cache=True)
+def pose_into(arm, q, pose):
+    """X_WS (7,) [qw qx qy qz px py pz] of the arm at q (n,) [rad]."""
+    R, p = np.empty((3, 3)), np.empty(3)
+    forward_kinematics(arm, q, R, p)
+    orientation = quaternion_of(R)
+    for i in range(4):
+        pose[i] = orientation[i]
+    for i in range(3):
+        pose[4 + i] = p[i]
+
+
+class ForwardKinematics(LeafSystem):
+    """Where the slave is.
+
+    .. pydrake_system::
+
+        name: ForwardKinematics
+        input_ports:
+        - joint_position: (n,) [rad]
+        output_ports:
+        - pose_slave: (7,) X_WS
+
+    Args:
+        arm: the slave's kinematics.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, arm: ArmModel) -> None:
+        super().__init__()
+        self._arm = arm.table
+        self._q = self.DeclareVectorInputPort("joint_position", arm.num_joints)
+        inputs = {self._q.ticket()}
+        self.DeclareVectorOutputPort("pose_slave", 7, weak_callback(self._calc), inputs)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        pose_into(self._arm, self._q.Eval(context), output.get_mutable_value())

@@ -1,0 +1,223 @@
+"""The three sides: their written contract, sides of one's own, an intent from outside."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource
+
+from drake_teleop.channel.channel import Channel
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.load.contact.noise_floor import NoiseFloor
+from drake_teleop.operator.operator import OperatorConfig, Sine, intent_at
+from drake_teleop.operator.task import Touch
+from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
+from drake_teleop.sides.channel import MakeChannel
+from drake_teleop.sides.master import MakeMasterSide
+from drake_teleop.sides.slave import MakeSlaveSide
+from drake_teleop.signals import SIGNALS
+from drake_teleop.simulation import MakeSimulator, simulate
+from drake_teleop.station import GetBlock, MakeTeleopStation
+
+PAGE = (Path(__file__).parents[1] / "docs" / "station.md").read_text(encoding="utf-8")
+ROWS = re.findall(r"^\| (\w+) \| `(\w+)` \| (in|out) \| (\d+) \| (.*?) \|", PAGE, re.M)
+CODE = re.findall(r"```python\n(.*?)```", PAGE, re.S)
+SHORT = Simulation(settle=0.0, duration=0.3)
+
+
+def floor() -> NoiseFloor:
+    rising, still = np.zeros((6, 2)), np.zeros(6)
+    return NoiseFloor(
+        np.ones(6), np.identity(16), rising, np.identity(6), still, reached=np.ones(3)
+    )
+
+
+def sides(scenario: Scenario) -> dict[str, Diagram]:
+    return {
+        "master_side": MakeMasterSide(scenario),
+        "channel": MakeChannel(scenario),
+        "slave_side": MakeSlaveSide(scenario, load_estimate=np.ones(16), noise_floor=floor()),
+    }
+
+
+def ports(side: Diagram, direction: str) -> dict[str, int]:
+    count = side.num_input_ports() if direction == "in" else side.num_output_ports()
+    get = side.get_input_port if direction == "in" else side.get_output_port
+    return {get(i).get_name(): get(i).size() for i in range(count)}
+
+
+def written(name: str, direction: str, without: tuple[str, ...] = ()) -> dict[str, int]:
+    return {
+        port: int(size)
+        for side, port, way, size, meaning in ROWS
+        if side == name and way == direction and not any(word in meaning for word in without)
+    }
+
+
+@pytest.mark.parametrize("direct", [True, False], ids=["direct", "network"])
+def test_the_ports_are_those_of_the_written_contract(direct):
+    scenario = replace(LoadScenario("contact_transition"), operator__task=Touch())
+    absent = ("over a network",)
+    if not direct:
+        scenario = replace(scenario, channel=Channel(network="lan"))
+        scenario = replace(scenario, contact_detection=ContactDetectionConfig())
+        absent = ()
+    else:
+        absent = ("over a network", "with contact detection")
+    for name, side in sides(scenario).items():
+        assert ports(side, "in") == written(name, "in", absent)
+        # What is no signal has to be in the contract, and what is in the contract to be there.
+        found, agreed = ports(side, "out"), written(name, "out", absent)
+        assert {port: size for port, size in found.items() if port not in SIGNALS} == {
+            port: size for port, size in agreed.items() if port not in SIGNALS
+        }
+        assert agreed.items() <= found.items()
+        for port, size in found.items():
+            assert port not in SIGNALS or size == len(SIGNALS[port].components)
+
+
+def test_the_pages_own_sides_work(tmp_path, monkeypatch):
+    """A master in thirty lines and a recorded log for a slave, as docs/station.md shows them."""
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    for block in CODE:
+        exec(compile(block, "station.md", "exec"), names)
+    recorded, result = names["recorded"], names["result"]
+    t, start = result.t, np.array(names["scenario"].slave.position)
+    circle = 0.01 * np.stack(
+        [np.cos(2 * np.pi * t) - 1, np.sin(2 * np.pi * t), np.zeros_like(t)], axis=1
+    )
+    np.testing.assert_allclose(result["pose_command"][:, 4:], start + circle, atol=1e-12)
+    assert list(result) == ["pose_command"]
+    # It was made to feel what was felt when the log was recorded.
+    simulator = MakeSimulator(names["replayed"], names["scenario"].simulation)
+    simulator.AdvanceTo(0.4 + 1e-4)
+    station = names["replayed"]
+    master = station.GetSubsystemByName("master_side")
+    context = master.GetMyContextFromRoot(simulator.get_context())
+    felt = np.linalg.norm(recorded["force_to_master"][:401, :3], axis=1)
+    assert master.GetOutputPort("largest_force").Eval(context)[0] == felt.max() > 1.0
+    # Led from outside, the stylus has gone up by nearly what was wanted.
+    assert names["lifted"][6] - names["scenario"].master.position[2] == pytest.approx(
+        0.02, abs=5e-3
+    )
+
+
+class Intent(LeafSystem):
+    """The scenario's own intent, from outside."""
+
+    def __init__(self, segments, start) -> None:
+        super().__init__()
+        self._segments, self._start = segments, start
+        time = {self.time_ticket()}
+        self.DeclareVectorOutputPort("intended_pose", 7, self._pose, time)
+        self.DeclareVectorOutputPort("intended_twist", 6, self._twist, time)
+
+    def _pose(self, context, output: BasicVector) -> None:
+        output.SetFromVector(intent_at(self._segments, self._start, context.get_time())[0][0])
+
+    def _twist(self, context, output: BasicVector) -> None:
+        output.SetFromVector(intent_at(self._segments, self._start, context.get_time())[1][0])
+
+
+def test_an_intent_from_a_port_moves_the_station_as_the_scenarios_own_does():
+    sine = Sine(
+        duration=10.0, ramp=0.05, frequency=3.0, translation=[0.01, 0.02, 0.015],
+        rotation=[0.1, -0.2, 0.1],
+    )  # fmt: skip
+    scenario = replace(Scenario(), simulation=SHORT, operator=OperatorConfig(intent=[sine]))
+    own = simulate(MakeTeleopStation(scenario), SHORT)
+
+    idle = replace(scenario, operator=OperatorConfig())
+    builder = DiagramBuilder()
+    station = builder.AddNamedSystem("station", MakeTeleopStation(idle))
+    start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
+    intent = builder.AddSystem(Intent([sine], start))
+    for name in ("intended_pose", "intended_twist"):
+        builder.Connect(intent.GetOutputPort(name), station.GetInputPort(name))
+    simulator = MakeSimulator(builder.Build(), SHORT)
+    simulator.AdvanceTo(SHORT.duration)
+    context = station.GetMyContextFromRoot(simulator.get_context())
+    for name in ("pose_master", "force_to_master", "slave_state"):
+        led = station.GetOutputPort(name).Eval(context)
+        np.testing.assert_allclose(led, own[name][-1], rtol=0, atol=1e-12)
+    assert np.abs(own["pose_master"][-1] - own["pose_master"][0]).max() > 1e-3
+
+
+def test_without_a_twist_the_damping_holds_the_hand_back_and_nonsense_is_refused():
+    station = MakeTeleopStation(Scenario())
+    simulator = MakeSimulator(station, SHORT)
+    context, port = simulator.get_mutable_context(), station.GetInputPort("intended_pose")
+    # The size of a quaternion means nothing.
+    port.FixValue(context, [2.0, 0.0, 0.0, 0.0, 0.27, 0.0, 0.05])
+    intent = station.GetOutputPort("intent").Eval(context)
+    np.testing.assert_array_equal(intent, [1.0, 0.0, 0.0, 0.0, 0.27, 0.0, 0.05])
+    hand = station.GetOutputPort("hand_wrench_E").Eval(context)
+    assert hand[2] == pytest.approx(0.02 * Scenario().operator.hand.stiffness)
+    station.GetInputPort("intended_twist").FixValue(context, [0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
+    faster = station.GetOutputPort("hand_wrench_E").Eval(context)
+    assert faster[2] - hand[2] == pytest.approx(0.5 * Scenario().operator.hand.damping)
+    for bad in ([np.nan] * 7, [0.0] * 7):
+        port.FixValue(context, bad)
+        with pytest.raises(DrakeTeleopError, match="intended_pose"):
+            station.GetOutputPort("hand_wrench_E").Eval(context)
+
+
+class Silent(LeafSystem):
+    """A side with ports of given sizes that put out zeros."""
+
+    def __init__(self, inputs: dict[str, int], outputs: dict[str, int]) -> None:
+        super().__init__()
+        for name, size in inputs.items():
+            self.DeclareVectorInputPort(name, size)
+        for name, size in outputs.items():
+            self.DeclareVectorOutputPort(name, size, lambda context, output: None)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"master": ({"wrench_command": 6}, {})}, "master_side: there is no output port 'pose_c"),
+        ({"master": ({}, {"pose_command": 7})}, "master_side: there is no input port 'wrench_c"),
+        ({"master": ({"wrench_command": 6}, {"pose_command": 6})}, "'pose_command' has 6 .* 7"),
+        ({"slave": ({"pose_command": 7}, {})}, "slave_side: there is no output port 'wrench_B'"),
+        ({"slave": ({"pose_command": 7}, {"wrench_B": 3})}, "'wrench_B' has 3 numbers.* 6"),
+    ],
+)
+def test_a_side_without_its_ports_is_one_clear_error(options, message):
+    own = {name: Silent(*sizes) for name, sizes in options.items()}
+    with pytest.raises(DrakeTeleopError, match=rf"{message}.*docs/station\.md"):
+        MakeTeleopStation(Scenario(), **own)
+
+
+def test_a_network_needs_more_of_a_slave_of_ones_own():
+    scenario = replace(Scenario(), channel=Channel(delay=0.01))
+    slave = Silent({"pose_command": 7}, {"wrench_B": 6})
+    with pytest.raises(DrakeTeleopError, match="slave_side: there is no output port 'pose_slave'"):
+        MakeTeleopStation(scenario, slave=slave)
+    whole = Silent({"pose_command": 7}, {"wrench_B": 6, "pose_slave": 7, "saturated": 1})
+    assert "pose_received" in simulate(MakeTeleopStation(scenario, slave=whole), SHORT)
+
+
+def test_blocks_are_found_in_whichever_side_they_are():
+    station = MakeTeleopStation(Scenario())
+    for name in ("operator", "master_device", "slave_plant", "force_scaling", "monitor"):
+        assert GetBlock(station, name).get_name() == name
+
+
+def test_a_direct_channel_is_wires():
+    builder = DiagramBuilder()
+    channel = builder.AddSystem(MakeChannel(Scenario()))
+    pose, wrench = np.arange(1.0, 8.0), np.arange(-3.0, 3.0)
+    for name, value in (("pose_command", pose), ("wrench_B", wrench)):
+        source = builder.AddSystem(ConstantVectorSource(value))
+        builder.Connect(source.get_output_port(), channel.GetInputPort(name))
+    diagram = builder.Build()
+    context = channel.GetMyContextFromRoot(diagram.CreateDefaultContext())
+    for name, value in (("pose_to_slave", pose), ("wrench_to_master", wrench)):
+        np.testing.assert_array_equal(channel.GetOutputPort(name).Eval(context), value)
