@@ -9,6 +9,7 @@ import pytest
 from pydrake.geometry import Box, Cylinder
 
 from drake_teleop.excitation.capsules import Capsule, bounding_capsule
+from drake_teleop.excitation.scene import CLEARANCE, _kept_distance
 
 
 @pytest.mark.parametrize("long", [0, 1, 2])
@@ -29,3 +30,14 @@ def test_a_capsule_around_a_rod_is_hardly_thicker():
     capsule = bounding_capsule(Cylinder(0.05, 0.8))
     assert 0.05 <= capsule.radius < 0.07
     assert np.ptp(capsule.ends[:, 2]) <= 0.8
+
+
+def test_what_capsules_keep_allows_for_three_quarters_of_what_they_are_too_large():
+    """Shapes that nearly touch, capsules 0 to 100 mm nearer: 25 mm are allowed for."""
+    touching, far = np.linspace(-0.01, 0.004, 101), np.full(101, 0.2)
+    nearer = touching - np.linspace(0.0, 0.1, 101)
+    kept = _kept_distance(np.concatenate([touching, far]), np.concatenate([nearer, far]))
+    assert kept == pytest.approx(CLEARANCE - 0.025)
+    # But where shapes are free, capsules stay so in nine of ten postures.
+    free = np.linspace(0.06, 0.16, 101)
+    assert _kept_distance(free, free - 0.07) == pytest.approx(0.0, abs=1e-12)
