@@ -87,7 +87,10 @@ def numeric_files(root: Path, only: str = "") -> list[str]:
         if (
             only in file
             and not shows
-            and (room in ROOMS or (room == path.name and "@njit" in text))
+            and (
+                room in ROOMS
+                or (room == path.name and re.search("^@(njit|register_jitable)", text, re.M))
+            )
         ):
             files.append(file)
     return files
