@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.quaternions import quaternion_of
 from drake_teleop.slave.arm import ArmModel, forward_kinematics
