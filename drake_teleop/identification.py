@@ -24,6 +24,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.noise_floor import NoiseFloor, finite_covariance
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import Identification
+from drake_teleop.load.online.methods import METHODS
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.pages.progress import Progress, Stage, silent
 from drake_teleop.result import SimulationResult
@@ -38,7 +39,6 @@ Array = NDArray[np.float64]
 
 # The trajectory belongs to the arm, not to the run's seed.
 _DESIGN_SEED = 0
-_RECURSIVE = {"rls": "recursive least squares", "rtls": "recursive total least squares"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ def identify_load(
     batch = batch_identification(scenario, wrench, s, omega, alpha, scenario.rates.log_hz)
     kappa = criteria_of(robot, trajectory)["kappa_w10"]
     estimate = result["load_estimate"][-1]
-    method = _RECURSIVE[scenario.load_estimator.method]
+    method = METHODS[scenario.load_estimator.method].method
     return LoadIdentification(trajectory, result, estimate, batch, kappa, factor, method)
 
 

@@ -121,7 +121,7 @@ class ReplayScene:
         self._sheet = None
         if scenario.environment is not None:
             touched = AddEnvironment(self.plant, scenario.environment)
-            self._sheet = touched if scenario.slot is None else None
+            self._sheet = None if scenario.environment.moving_part is None else touched
         self._master = _add_master(self.plant)
         finalize(self.plant)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
@@ -203,15 +203,10 @@ def _furnish(meshcat: Meshcat, scenario: Scenario) -> None:
     height = _TABLE_TOP - 0.03
     for i, (dx, dy) in enumerate(((-0.31, -0.27), (-0.31, 0.27), (0.13, -0.27), (0.13, 0.27))):
         box(f"leg_{i}", (0.04, 0.04, height), (x + dx, y + dy, height / 2), _STEEL)
-    if scenario.sheet_spring is not None:
-        sx, sy, sz = scenario.sheet_spring.position
-        height = sz - 0.15  # the model's bench ends there
-        if height > 0:
-            box("plinth", (0.34, 0.24, height), (sx + 0.065, sy, height / 2), _STEEL)
-    elif scenario.slot is not None:
-        (sx, sy, _), height = scenario.slot.position, scenario.slot.foot
-        if height > 0:
-            box("plinth", (0.16, 0.16, height), (sx, sy, height / 2), _STEEL)
+    stand = None if scenario.environment is None else scenario.environment.stand
+    if stand is not None and stand.height > 0:
+        size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
+        box("plinth", size, (*centre, stand.height / 2), _STEEL)
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
     meshcat.SetProperty("/Background", "top_color", [0.97, 0.98, 1.0])

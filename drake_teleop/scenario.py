@@ -15,6 +15,7 @@ from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.environment.environment import Environment
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
@@ -111,9 +112,19 @@ class Scenario:
     slot: Slot | None = None
 
     @property
-    def environment(self) -> SheetSpring | Slot | None:
+    def environment(self) -> Environment | None:
         """What there is to touch."""
-        return self.sheet_spring if self.slot is None else self.slot
+        return next((getattr(self, name) for name in self._environments), None)
+
+    @property
+    def _environments(self) -> list[str]:
+        """The fields that say what there is to touch: a field of a kind of `Environment` is one."""
+        names = [entry.name for entry in dataclasses.fields(self)]
+        return [name for name in names if isinstance(getattr(self, name), Environment)]
+
+    def without_environment(self) -> "Scenario":
+        """The same with nothing to touch."""
+        return dataclasses.replace(self, **dict.fromkeys(self._environments))  # type: ignore[arg-type]
 
     @property
     def is_direct(self) -> bool:
@@ -130,10 +141,10 @@ class Scenario:
         self.force_scaling.scales(f"{where}:force_scaling")
         self.load_estimator.check(f"{where}:load_estimator")
         self.wrist_sensor.check(f"{where}:wrist_sensor", self.rates.sensor_hz)
-        if self.sheet_spring is not None and self.slot is not None:
+        if len(self._environments) > 1:
             raise DrakeTeleopError(
-                "there are a sheet_spring and a slot to touch",
-                where=f"{where}:slot",
+                f"there are a {' and a '.join(self._environments)} to touch",
+                where=f"{where}:{self._environments[-1]}",
                 remedy="leave one of them out",
             )
         _check_task(self, where)

@@ -121,7 +121,7 @@ def analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str,
     contact = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
 
     progress = stage("Linearise the Diagram")
-    free = linearize(replace(linear, sheet_spring=None, slot=None), load_estimate=estimate)
+    free = linearize(linear.without_environment(), load_estimate=estimate)
     progress(0.5)
     points = [("free motion", free, axis)]
     if scenario.sheet_spring is not None:

@@ -230,7 +230,7 @@ def measured_figures(
     The device's Coulomb friction is left out here too: what it does depends on the amplitude.
     """
     coulomb = dataclasses.replace(scenario.master.friction, coulomb=[0.0] * 6)
-    smooth = replace(scenario, sheet_spring=None, slot=None, master__friction=coulomb)
+    smooth = replace(scenario.without_environment(), master__friction=coulomb)
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     if scenario.wrist_sensor.ideal:
         estimate[:6] = 0.0

@@ -14,12 +14,15 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PrismaticSpring
 
+from drake_teleop.environment.environment import Environment, Stand
 from drake_teleop.quantities import quantity
 from drake_teleop.resources import models_dir
 
+_BENCH = 0.15  # from the lower face of the model's bench to the leaf [m]
+
 
 @dataclass
-class SheetSpring:
+class SheetSpring(Environment):
     """Where the leaf is and what it is made of. Lengths in m, SI throughout."""
 
     position: list[float] = quantity(
@@ -57,6 +60,21 @@ class SheetSpring:
     def largest_small_deflection(self) -> float:
         """10 % of the length [m]: beyond it the linear leaf is no longer a good model."""
         return 0.1 * self.length
+
+    @property
+    def moving_part(self) -> tuple[float, float, float]:
+        """Mass [kg], stiffness [N/m] and damping [N s/m] of the leaf's end."""
+        return self.effective_mass, self.stiffness, self.damping
+
+    @property
+    def stand(self) -> Stand:
+        """From the floor to the model's bench."""
+        x, y, z = self.position
+        return Stand(0.34, 0.24, x + 0.065, y, z - _BENCH)
+
+    def AddTo(self, plant: MultibodyPlant) -> ModelInstanceIndex:
+        """See `AddSheetSpring`."""
+        return AddSheetSpring(plant, self)
 
 
 def AddSheetSpring(plant: MultibodyPlant, sheet: SheetSpring) -> ModelInstanceIndex:

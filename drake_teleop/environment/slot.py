@@ -30,6 +30,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
 
+from drake_teleop.environment.environment import Environment, Stand
 from drake_teleop.quantities import quantity
 
 #: The peg's balls [m]: their radius, and z_S of their centres. The first is that of tool.sdf; where
@@ -43,7 +44,7 @@ _BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
 
 
 @dataclass
-class Slot:
+class Slot(Environment):
     """Where the slot is, its shape, and how the balls of the peg touch it."""
 
     position: list[float] = quantity(
@@ -86,6 +87,19 @@ class Slot:
     def X_WM(self) -> RigidTransform:
         """M is the middle of the mouth, x along the slot, z up."""
         return RigidTransform(RollPitchYaw(0.0, 0.0, self.yaw), self.position)
+
+    @property
+    def stand(self) -> Stand:
+        """From the floor to the slot's foot."""
+        return Stand(0.16, 0.16, self.position[0], self.position[1], self.foot)
+
+    def AddTo(self, plant: MultibodyPlant) -> ModelInstanceIndex:
+        """See `AddSlot`."""
+        return AddSlot(plant, self)
+
+    def PrepareTool(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+        """See `TouchAsSlot`."""
+        TouchAsSlot(plant, scene_graph, self)
 
 
 def AddSlot(plant: MultibodyPlant, slot: Slot) -> ModelInstanceIndex:

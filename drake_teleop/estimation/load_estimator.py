@@ -20,8 +20,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.online.change import change_parameters
-from drake_teleop.load.online.recursive import RecursiveEstimator, RecursiveLeastSquares
-from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
+from drake_teleop.load.online.methods import METHODS
 from drake_teleop.load.online.watched import (
     LEARNING,
     SETTLED,
@@ -45,7 +44,7 @@ class LoadEstimatorConfig:
     """Learn from every sample. Only in free motion: a contact wrench would be taken for load."""
     forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor a sample; 1 = none")
     method: str = choice(
-        "rls", ("rls", "rtls"), "recursive least squares, or total: allows for noisy accelerations"
+        "rls", tuple(METHODS), "recursive least squares, or total: allows for noisy accelerations"
     )
     settled_bound: float = quantity(
         0.05, "1", 1e-6, 10.0, "predicted uncertainty that counts as settled, of a natural value"
@@ -58,7 +57,7 @@ class LoadEstimatorConfig:
 
     def check(self, where: str) -> None:
         """Raises DrakeTeleopError, naming `where`, if what it would watch cannot be trusted."""
-        if self.enabled and self.watch and self.method != "rtls":
+        if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
                 f"the covariance of '{self.method}' is too small to notice a change by",
                 where=f"{where}.method",
@@ -116,7 +115,9 @@ class LoadEstimator(LeafSystem):
                 where="load_estimator.watch",
                 remedy="set load_estimator.enabled, or pass load_estimate with load_covariance",
             )
-        self._estimator = _estimator(config, noise_std, motion_std)
+        self._estimator = METHODS[config.method].for_noise(
+            noise_std, motion_std, forgetting=config.forgetting, bound=config.settled_bound
+        )
         start = np.asarray(initial, dtype=float)
         memory = self._estimator.initial_memory(start)
         self._shape, self._watches, self._period = memory.shape, config.watch, period
@@ -178,12 +179,3 @@ class LoadEstimator(LeafSystem):
             estimate, memory = state.value(0), state.value(1)
             settled = self._estimator.settled_at(estimate, memory.reshape(self._shape))
             output[0] = SETTLED if settled else LEARNING
-
-
-def _estimator(
-    config: LoadEstimatorConfig, noise_std: NDArray[np.float64], motion_std: NDArray[np.float64]
-) -> RecursiveEstimator:
-    options = {"forgetting": config.forgetting, "bound": config.settled_bound}
-    if config.method == "rtls":
-        return RecursiveTotalLeastSquares(noise_std, motion_std, **options)
-    return RecursiveLeastSquares(noise_std, **options)

@@ -14,9 +14,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, M
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, WeldJoint
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.environment.environment import Environment
 from drake_teleop.environment.point_contact import WIDTH, ContactPairs
-from drake_teleop.environment.sheet_spring import AddSheetSpring, SheetSpring
-from drake_teleop.environment.slot import AddSlot, Slot, TouchAsSlot
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.resources import models_dir
 from drake_teleop.slave.arm import ArmModel
@@ -39,7 +38,7 @@ class SlavePlant:
         instance: the arm with its tool.
         tool: the tool's body.
         arm: kinematics and dynamics up to S, with the tool as its load.
-        sheet: the leaf's model instance, if there is one: what moves when it is touched.
+        sheet: model instance of what moves when it is touched, such as the leaf, if anything does.
         contact_pairs: (k, 27) what may touch, see `ContactPairs`; none without an environment.
         leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] of the leaf, and its acceleration by
             gravity [m/s^2]; without one, a mass that nothing moves.
@@ -78,7 +77,7 @@ def _nominal_slave(mass: float, *com: float) -> SlavePlant:
 def AddSlavePlant(
     builder: DiagramBuilder,
     position: list[float],
-    environment: SheetSpring | Slot | None,
+    environment: Environment | None,
     q_start: NDArray[np.float64] | None = None,
     payload: Payload | None = None,
 ) -> SlavePlant:
@@ -111,26 +110,22 @@ def AddSlavePlant(
     pairs, leaf = np.zeros((0, WIDTH)), np.array([1.0, 0.0, 0.0, 0.0])
     if environment is not None and touched is not None:
         _remove_visuals(plant, scene_graph)
-        if isinstance(environment, Slot):
-            TouchAsSlot(plant, scene_graph, environment)
+        environment.PrepareTool(plant, scene_graph)
         inspector = scene_graph.model_inspector()
         pairs = ContactPairs(plant, inspector, tool, touched, environment.slip)
     sheet = None
-    if isinstance(environment, SheetSpring):
+    if environment is not None and environment.moving_part is not None:
         sheet = touched
-        law = [environment.effective_mass, environment.stiffness, environment.damping]
-        leaf = np.array([*law, plant.gravity_field().gravity_vector()[2]])
+        leaf = np.array([*environment.moving_part, plant.gravity_field().gravity_vector()[2]])
     arm = ArmModelFromPlant(plant, instance, "sensor")
     start = home_position(arm, position) if q_start is None else q_start
     plant.SetDefaultPositions(instance, start)
     return SlavePlant(plant, instance, tool, arm, sheet, pairs, leaf)
 
 
-def AddEnvironment(plant: MultibodyPlant, environment: SheetSpring | Slot) -> ModelInstanceIndex:
+def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> ModelInstanceIndex:
     """Adds what there is to touch to a plant that has the tool and is not finalized."""
-    if isinstance(environment, SheetSpring):
-        return AddSheetSpring(plant, environment)
-    return AddSlot(plant, environment)
+    return environment.AddTo(plant)
 
 
 def ParseSlave(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, BodyIndex]:

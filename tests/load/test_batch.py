@@ -13,7 +13,7 @@ from load_cases import OFFSETS, TOOL, rich_motion, rotations
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.batch.consistent import Prior
-from drake_teleop.load.batch.methods import METHODS, NAMES, identify_batch
+from drake_teleop.load.batch.methods import METHODS, identify_batch
 from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.batch.record import Options, Record
 from drake_teleop.load.identification import METHODS as KNOWN_NAMES
@@ -59,7 +59,7 @@ def test_exact_without_noise(method, noise):
     result = identify_batch(*record(), method=method, noise=noise)
     np.testing.assert_allclose(estimate(result), TRUTH, rtol=0, atol=1e-9)
     assert result.identification.identifiable.all()
-    assert result.identification.method == NAMES[method] in KNOWN_NAMES
+    assert result.identification.method == METHODS[method].name in KNOWN_NAMES
     assert not result.rejected.any()
 
 
@@ -249,7 +249,9 @@ def test_consistent_is_the_constrained_total():
     F = F + WRENCH_NOISE * rng.normal(size=F.shape)
     s, omega, alpha = motion
     s, alpha = s + 0.3 * rng.normal(size=s.shape), alpha + 3.0 * rng.normal(size=s.shape)
-    fits = [METHODS[m](Record(F, s, omega, alpha), Options(noise)) for m in ("total", "consistent")]
+    fits = [
+        METHODS[m].fit(Record(F, s, omega, alpha), Options(noise)) for m in ("total", "consistent")
+    ]
     gram, right, free = fits[0].form[:3]
     found = fits[1].form.theta
     assert not is_physically_consistent(free[6:]) and is_physically_consistent(found[6:])
@@ -338,7 +340,7 @@ def test_a_file_of_each(tmp_path):
         result.save(tmp_path / "identification.json")
         loaded = Identification.load(tmp_path / "identification.json")
         np.testing.assert_array_equal(loaded.phi, result.phi)
-        assert loaded.method == NAMES[method]
+        assert loaded.method == METHODS[method].name
 
 
 def test_bad_input_is_named():

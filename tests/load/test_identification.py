@@ -261,7 +261,7 @@ def hole(document):
         (put("mass", 99.0), "json:mass: does not follow from phi"),
         (put("com", [0.0, 0.0]), "json:com: has shape"),
         (put("physically_consistent", False), "json:physically_consistent: does not follow"),
-        (put("method", ["guess"]), "json:method: is not one of"),
+        (put("method", ["guess"]), "json:method: is no text"),
         (put("samples", "many"), "json:samples: holds no numbers"),
     ],
 )

@@ -36,6 +36,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -171,25 +172,23 @@ def _loss(whole: Fit, kept: Moments) -> float:
     return float(np.sqrt(np.max(variances[1] / variances[0])))
 
 
-METHODS: dict[str, Callable[[Record, Options], Fit]] = {
-    "ordinary": _ordinary,
-    "whitened": _whitened,
-    "robust": _robust,
-    "total": _total,
-    "consistent": _consistent,
+class Method(NamedTuple):
+    """An estimator, and what `Identification.method` calls it."""
+
+    name: str
+    fit: Callable[[Record, Options], Fit]
+
+
+METHODS = {
+    "ordinary": Method("batch least squares", _ordinary),
+    "whitened": Method("whitened least squares", _whitened),
+    "robust": Method("robust least squares", _robust),
+    "total": Method("total least squares", _total),
+    "consistent": Method("physically consistent least squares", _consistent),
 }
-"""The estimators by name, all with one signature."""
+"""The estimators by name, all with one signature: a line here enters one."""
 
 DEFAULT_METHOD = "consistent"
-
-NAMES = {
-    "ordinary": "batch least squares",
-    "whitened": "whitened least squares",
-    "robust": "robust least squares",
-    "total": "total least squares",
-    "consistent": "physically consistent least squares",
-}
-"""What `Identification.method` calls them."""
 
 
 def identify_batch(
@@ -233,7 +232,7 @@ def identify_batch(
         )
     _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     record = Record(*rows)
-    fit = METHODS[method](
+    fit = METHODS[method].fit(
         record, Options(noise or Noise(), offsets, shared_noise, prior, ellipsoid)
     )
     equations = NormalEquations(np.diag(fit.form.weights) ** -0.5)
@@ -256,7 +255,7 @@ def identify_batch(
         identifiable=worth_stating(deviations, theta[6:]) & ~dominated,
         prior_dominated=dominated,
         residual_rms=np.sqrt(np.diag(residual_covariance(Z, theta)).clip(0.0)),
-        method=NAMES[method],
+        method=METHODS[method].name,
     )
     return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note, equations)
 

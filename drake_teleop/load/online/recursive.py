@@ -123,6 +123,8 @@ class RecursiveEstimator(ABC):
     method: str
     #: Numbers that a sample has to begin with.
     sample_size = 15
+    #: Whether its covariance can be believed when the measured motion is noisy.
+    allows_for_noisy_motion = False
 
     def __init__(
         self,
@@ -140,6 +142,13 @@ class RecursiveEstimator(ABC):
         self._prior = positive("prior_std", prior_std, 16) ** 2
         self._theta, self._samples = np.zeros(16), 0
         self._memory = self.initial_memory(self._theta)
+
+    @classmethod
+    def for_noise(
+        cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
+    ) -> RecursiveEstimator:
+        """One for noise of the wrench (6,) and of the motion (9,), if it allows for that."""
+        return cls(noise_std, forgetting=forgetting, bound=bound)
 
     @property
     def phi(self) -> Array:

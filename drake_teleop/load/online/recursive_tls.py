@@ -184,6 +184,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     """
 
     method = "recursive total least squares"
+    allows_for_noisy_motion = True
 
     def __init__(
         self,
@@ -197,6 +198,12 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         if (self._motion_std < 0.0).any():
             raise DrakeTeleopError("is negative", where="motion_std")
         super().__init__(noise_std, forgetting, prior_std, bound)
+
+    @classmethod
+    def for_noise(
+        cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
+    ) -> RecursiveTotalLeastSquares:
+        return cls(noise_std, motion_std, forgetting=forgetting, bound=bound)
 
     @property
     def noise_scale(self) -> float:

@@ -1,0 +1,145 @@
+"""The recipes of CONTRIBUTING.md, followed in a copy of the package."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+RECIPES = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(# drake_teleop/.*?|--- .*?)^```$", RECIPES, re.M | re.S)
+
+
+def follow(package: Path) -> None:
+    """Writes the files of the recipes, and their lines below the lines that they name."""
+    for text in blocks("python"):
+        first, _, rest = text.partition("\n")
+        new = package / first.removeprefix("# ")
+        assert not new.exists()
+        new.write_text(rest)
+    for text in blocks("diff"):
+        first, *lines = text.splitlines()
+        file = package / first.removeprefix("--- ")
+        source = file.read_text()
+        for before, line in zip(lines[::2], lines[1::2], strict=True):
+            assert before[0] == " " and line[0] == "+"
+            assert source.count(f"\n{before[1:]}\n") == 1
+            source = source.replace(f"\n{before[1:]}\n", f"\n{before[1:]}\n{line[1:]}\n")
+        file.write_text(source)
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory) -> Path:
+    """A checkout with a method, an estimator and an environment more; compiled code goes along."""
+    folder = tmp_path_factory.mktemp("checkout")
+    for part in ("drake_teleop", "models"):
+        shutil.copytree(ROOT / part, folder / part)
+    follow(folder)
+    return folder
+
+
+def run(copy: Path, script: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=copy, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_there_is_a_recipe_for_each_kind_of_part():
+    assert len(blocks("python")) == len(blocks("diff")) == 3
+
+
+@pytest.mark.slow
+def test_a_station_with_the_new_method(copy):
+    """All of the wrench is what there is without a method, none of it is none."""
+    run(
+        copy,
+        """
+import numpy as np
+from drake_teleop.passivity.methods import METHODS
+from drake_teleop.scenario import ScenarioFromData
+from drake_teleop.simulation import simulate
+from drake_teleop.station import MakeTeleopStation
+
+assert "share" in METHODS
+
+def force(**passivity):
+    data = {
+        "simulation": {"duration": 0.02, "settle": 0.0},
+        "passivity": passivity,
+        "channel": {"network": "lan"},
+    }
+    scenario = ScenarioFromData(data, "test.yaml")
+    return simulate(MakeTeleopStation(scenario), scenario.simulation)["force_to_master"]
+
+nothing, all_of_it = force(method="none"), force(method="share", share={"share": 1.0})
+assert np.abs(nothing).max() > 1.0  # the tool's weight
+np.testing.assert_array_equal(all_of_it, nothing)
+assert (force(method="share", share={"share": 0.0}) == 0.0).all()
+""",
+    )
+
+
+@pytest.mark.slow
+def test_an_identification_with_the_new_estimator(copy):
+    run(
+        copy,
+        """
+import numpy as np
+from drake_teleop.load.batch.data_sheet import NOISE
+from drake_teleop.load.batch.methods import identify_batch
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.regressor import non_contact_wrench
+
+rng = np.random.default_rng(1)
+s, omega, alpha = rng.normal(size=(3, 200, 3)) * [[[9.0]], [[2.0]], [[5.0]]]
+phi = np.array([3.0, 0.1, -0.2, 0.3, 0.05, 0.0, 0.001, 0.06, 0.002, 0.02])
+offsets = np.arange(6.0)
+result = identify_batch(offsets + non_contact_wrench(s, omega, alpha, phi), s, omega, alpha,
+                        method="data_sheet")
+np.testing.assert_allclose(result.identification.phi, phi, atol=1e-10)
+np.testing.assert_allclose(result.identification.offsets, offsets, atol=1e-9)
+np.testing.assert_array_equal(result.noise, NOISE)
+result.identification.save("identification.json")
+loaded = Identification.load("identification.json")
+assert loaded.method == "least squares with the data sheet's noise"
+""",
+    )
+
+
+@pytest.mark.slow
+def test_a_station_with_the_new_environment(copy):
+    """The tip begins 0.1 mm deep in the table, which pushes it up with k x."""
+    run(
+        copy,
+        """
+import numpy as np
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.scenario import ScenarioFromData
+from drake_teleop.simulation import simulate
+from drake_teleop.station import MakeTeleopStation
+
+data = {
+    "simulation": {"duration": 0.01, "settle": 0.0},
+    "table": {"position": [0.55, 0.0, 0.45 - 0.2 + 1e-4 - 0.01]},
+}
+scenario = ScenarioFromData(data, "test.yaml")
+result = simulate(MakeTeleopStation(scenario), scenario.simulation)
+np.testing.assert_allclose(result["true_contact_wrench_W"][0, :3], [0, 0, 2e5 * 1e-4], atol=1e-6)
+assert "sheet_state" not in result.signals
+try:
+    ScenarioFromData(data | {"slot": {}}, "test.yaml")
+except DrakeTeleopError as error:
+    assert "a slot and a table" in str(error), error
+else:
+    raise AssertionError("two environments")
+""",
+    )
