@@ -149,6 +149,17 @@ def test_gradients_of_criterion_and_limits(arm, name):
         np.testing.assert_allclose(gradients[:, k] / scale, numeric / scale, rtol=0, atol=2e-5)
 
 
+def test_candidates_begin_all_over_the_middle_of_the_range(arm):
+    limits, rng = limits_of(arm), np.random.default_rng(1)
+    home = np.zeros(6)
+    problem = Problem(Task(arm.table, limits, Criterion("kappa_w10", SCALES), home, 6.0, 3))
+    starts = np.array([problem.candidate(rng, near_home=False)[:6] for _ in range(50)])
+    share = np.abs(starts - limits.q_middle) / limits.q_half
+    assert np.all(share <= 0.6) and np.all(share.max(axis=0) > 0.5)
+    near = np.array([problem.candidate(rng, near_home=True)[:6] for _ in range(50)])
+    assert np.abs(near - home).max() < 0.5
+
+
 def test_distances_of_capsules():
     """Crossing lines, parallel segments, end to end, and points."""
     ends = np.array(

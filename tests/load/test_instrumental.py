@@ -63,6 +63,19 @@ def test_it_is_three_stage_least_squares(own):
     np.testing.assert_allclose(theta(estimator), found, rtol=1e-4, atol=1e-6)
 
 
+def test_the_prior_weighs_as_its_deviations_say():
+    """After one sample, which leaves most to the prior; against the stacked matrices."""
+    F, motion, commanded = record(7, samples=1)
+    deviations = 0.2 * np.array(PRIOR_STD)
+    estimator = learnt(F, motion, commanded, prior_std=deviations)
+    X, Y = stacked(motion)[0], stacked(np.split(commanded, 3, axis=1))[0]
+    W = np.linalg.inv((F.T @ F + 20.0 * np.diag(NOISE**2)) / 21)
+    prior = np.diag(deviations**-2)
+    first = np.linalg.solve(Y.T @ W @ Y + prior, Y.T @ W @ X).T
+    found = np.linalg.solve(first @ (Y.T @ W @ X) + prior, first @ (Y.T @ W @ F[0]))
+    np.testing.assert_allclose(theta(estimator), found, rtol=1e-5, atol=1e-7)
+
+
 def test_the_bias_is_gone_without_knowing_the_noise_and_the_covariance_is_honest():
     errors, leasts, squares = [], [], []
     for seed in range(30):

@@ -1,0 +1,33 @@
+"""Orientations in every form that a log may have."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.logs.read.jackknife import solve
+from drake_teleop.logs.read.rotations import rotation_matrices
+
+VECTORS = np.vstack([np.zeros((1, 3)), 3 * np.random.default_rng(2).uniform(-1, 1, (50, 3))])
+
+
+@pytest.mark.parametrize(
+    "form", ["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector"]
+)
+def test_a_rotation_is_the_same_in_every_form(form: str) -> None:
+    R = Rotation.from_rotvec(VECTORS)
+    columns = {
+        "matrix": R.as_matrix().reshape(-1, 9),
+        "quaternion_wxyz": R.as_quat(scalar_first=True),
+        "quaternion_xyzw": R.as_quat(),
+        "rotation_vector": VECTORS,
+    }
+    np.testing.assert_allclose(rotation_matrices(columns[form], form), R.as_matrix(), atol=1e-12)
+
+
+def test_what_leaves_no_residual_at_all_is_solved() -> None:
+    exact = np.array([0.3, -2.0])
+    x, deviations = solve(lambda x: np.outer(np.arange(60.0), [1, 1, 1]) * (x - exact).sum(), exact)
+    np.testing.assert_array_equal(x, exact)
+    assert np.isinf(deviations).all()  # the sum alone is determined
