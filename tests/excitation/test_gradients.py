@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from itertools import count
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
@@ -13,6 +16,7 @@ from drake_teleop.excitation.criteria import (
     Scales,
     characteristic_length,
 )
+from drake_teleop.excitation.design import _Search
 from drake_teleop.excitation.limits import LIMITS, Limits, capsule_distances, empty_motions
 from drake_teleop.excitation.prediction import SensorNoise, predicted_deviations
 from drake_teleop.excitation.problem import Problem, Task
@@ -158,6 +162,21 @@ def test_candidates_begin_all_over_the_middle_of_the_range(arm):
     assert np.all(share <= 0.6) and np.all(share.max(axis=0) > 0.5)
     near = np.array([problem.candidate(rng, near_home=True)[:6] for _ in range(50)])
     assert np.abs(near - home).max() < 0.5
+
+
+def test_the_best_candidates_within_the_limits_are_followed_first():
+    """Slack in the limits is worth nothing, but what is beyond them costs."""
+    numbers = count(-1)  # the search evaluates one before it begins
+    uses = {0: 1.5, 60: 0.1}
+    problem = SimpleNamespace(
+        candidate=lambda rng, near_home: np.array([next(numbers)]),
+        evaluate=lambda x, *sharpness: SimpleNamespace(
+            log_criterion=0.01 * x[0], uses=np.full(2, uses.get(x[0], 0.9))
+        ),
+    )
+    search = _Search(problem, 1, None, lambda *_: None)
+    followed = search.candidates(np.random.default_rng(0))
+    assert [int(next(followed)[0]) for _ in range(8)] == list(range(1, 9))
 
 
 def test_distances_of_capsules():

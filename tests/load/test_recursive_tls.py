@@ -93,6 +93,12 @@ def test_the_bias_of_the_inertias_is_gone_and_the_covariance_is_honest():
     assert honest.mean() == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.filterwarnings("error")
+def test_before_the_first_sample_there_is_the_prior():
+    estimator = RecursiveTotalLeastSquares(NOISE, MOTION)
+    np.testing.assert_allclose(estimator.covariance, np.diag(np.square(PRIOR_STD)), rtol=1e-12)
+
+
 def test_finds_the_noises_common_scale():
     F, motion = record(0, scale=0.35)
     estimator = learnt(F, motion)

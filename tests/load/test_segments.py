@@ -78,6 +78,19 @@ def test_a_contact_between_two_loads_is_left_out(bench):
         assert [before.load.mass, after.load.mass] == pytest.approx([3.13, 3.93], rel=0.01)
 
 
+def test_a_contact_does_not_cut_a_load_in_two(bench):
+    """Pushed for half a second, some time before the object is grasped."""
+    t = np.arange(0.0, bench.DURATION, bench.PERIOD)
+    pushed = (t > 1.2) & (t < 1.7)
+    for seed in SEEDS[:3]:
+        F, *measured = bench.record("JR3", seed, "grasp")
+        F[pushed] += np.outer(20.0 + 20.0 * np.sin(9.0 * t[pushed]), [1.0, 0.2, -1.0, 0.1, 0.2, 0])
+        before, after = segments(F, *measured, bench.PERIOD)
+        assert before.start == 0
+        assert before.stop == after.start == pytest.approx(3025, abs=35)
+        assert [before.load.mass, after.load.mass] == pytest.approx([3.13, 3.93], rel=0.01)
+
+
 @settings(max_examples=5, deadline=None)
 @given(rotations())
 def test_the_axes_of_the_sensor_do_not_matter(R):

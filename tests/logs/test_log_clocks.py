@@ -43,6 +43,10 @@ def test_good_stamps_are_left_alone() -> None:
     np.testing.assert_allclose(scaled - t[0] - 0.5, 1.001 * (t - t[0]), atol=1e-6)
 
 
+def test_five_hertz_are_enough() -> None:
+    assert len(clock_of(np.arange(9.0) * 0.19).t) == 9
+
+
 def test_rows_without_a_stamp_are_left_out() -> None:
     clock = clock_of([0.0, 0.1, NAN, NAN, 0.4, 0.5])
     assert clock.rows.tolist() == [0, 1, 4, 5] and clock.total == 6
@@ -68,6 +72,7 @@ def test_rows_that_are_repeated_with_their_stamp_are_left_out() -> None:
         (np.arange(9.0) * 1e6, {}, "probably `unit: ns`"),
         (np.arange(9.0) * 1e-3, {"unit": "ms"}, "a rate of 1e+06 Hz; probably `unit: s`"),
         (np.arange(9.0) * 0.5, {"unit": "s"}, "a rate of 2 Hz; probably `unit: ms`"),
+        (np.arange(9.0) * 0.21, {"unit": "s"}, "a rate of 4.76 Hz; probably `unit: ms`"),
         (np.arange(9.0) * 20, {"unit": "s"}, "a rate of 0.05 Hz; probably `unit: ms`"),
         ([0, 0.01, 0.02, 0.03, 99, 99.01], {}, "longest 99 s to row 6 of log.csv; cut the log"),
         ([*np.arange(200) * 0.01, *[2.0] * 400, 2.01], {}, "stand still around row 2"),
