@@ -9,7 +9,15 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.sample import sample_parts
 from drake_teleop.signals import LOG, SIGNALS
+
+#: Ports that hold several signals side by side, in the order of `SIGNALS`: to read one port takes
+#: less time than to read its parts.
+TOGETHER = {
+    "sample": tuple(sample_parts(0)),
+    "scaled_and_contact_S": ("scaled_wrench_S", "contact_wrench_S"),
+}
 
 
 def export(builder: DiagramBuilder, block: System, *names: str, **renamed: str) -> None:
@@ -39,19 +47,25 @@ def wire(builder: DiagramBuilder, source: System, name: str, target: System, ent
 
 
 def record(builder: DiagramBuilder, name: str, sides: Iterable[System], log_hz: float) -> Diagram:
-    """Exports and records every port that is a signal, in the order of `SIGNALS`."""
+    """Exports and records every port that is a signal, in the order of `SIGNALS`.
+
+    What lies side by side in one port of a side (`TOGETHER`) is recorded from there.
+    """
     outputs = {
         port.get_name(): port
         for side in sides
         for port in (side.get_output_port(i) for i in range(side.num_output_ports()))
     }
-    ports = [outputs[signal] for signal in SIGNALS if signal in outputs]
+    signals = [signal for signal in SIGNALS if signal in outputs]
+    for signal in signals:
+        builder.ExportOutput(outputs[signal], signal)
+    wide = {part: name for name, parts in TOGETHER.items() if name in outputs for part in parts}
+    ports = [outputs[name] for name in dict.fromkeys(wide.get(name, name) for name in signals)]
     # One wide log: at 8 kHz each further system with events of its own costs time at every step.
-    wide = builder.AddNamedSystem("log_input", Multiplexer([port.size() for port in ports]))
+    row = builder.AddNamedSystem("log_input", Multiplexer([port.size() for port in ports]))
     for index, port in enumerate(ports):
-        builder.ExportOutput(port, port.get_name())
-        builder.Connect(port, wide.get_input_port(index))
-    log = LogVectorOutput(wide.get_output_port(), builder, 1 / log_hz)
+        builder.Connect(port, row.get_input_port(index))
+    log = LogVectorOutput(row.get_output_port(), builder, 1 / log_hz)
     log.set_name(LOG)
     diagram = builder.Build()
     diagram.set_name(name)

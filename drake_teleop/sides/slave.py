@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
-from pydrake.systems.primitives import Demultiplexer
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.estimation.contact_detection import ContactDetection
 from drake_teleop.estimation.load_estimator import LoadEstimator
 from drake_teleop.load.contact.noise_floor import NoiseFloor
-from drake_teleop.load.sample import sample_parts
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.scaling.force_scaling import ForceScaling
 from drake_teleop.scenario import Scenario
@@ -58,6 +56,7 @@ def MakeSlaveSide(
           joint_command, ik_status, scaled_wrench_S, contact_wrench_S: signals
         - load_state (if the load is watched), true_contact_wrench_W (with something to touch),
           sheet_state (with a sheet spring): signals
+        - sample, scaled_and_contact_S: several of these side by side, for the log
 
     Args:
         scenario, load_estimate, load_covariance, noise_floor: as for `MakeTeleopStation`.
@@ -88,11 +87,8 @@ def MakeSlaveSide(
     estimate = body.load_estimator.GetOutputPort("load_estimate")
     builder.Connect(body.sample["sample"], force_scaling.GetInputPort("sample"))
     builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
-    export(builder, force_scaling, "wrench_B")
-    both = builder.AddNamedSystem("scaled_and_contact", Demultiplexer([6, 6]))
-    builder.Connect(force_scaling.GetOutputPort("scaled_and_contact_S"), both.get_input_port())
-    builder.ExportOutput(both.get_output_port(0), "scaled_wrench_S")
-    builder.ExportOutput(both.get_output_port(1), "contact_wrench_S")
+    scaled = ("scaled_wrench_S", "contact_wrench_S", "scaled_and_contact_S")
+    export(builder, force_scaling, "wrench_B", *scaled)
 
     if not scenario.is_direct:
         kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))
@@ -195,8 +191,8 @@ def _add_body(
     builder.Connect(state, wrist.GetInputPort("slave_state"))
     builder.Connect(acceleration, wrist.GetInputPort("slave_acceleration"))
     builder.Connect(torque, wrist.GetInputPort("joint_torque"))
-    for name in (*sample_parts(arm.num_joints), "sample_time"):
-        builder.ExportOutput(sample[name], name)
+    for name, port in sample.items():
+        builder.ExportOutput(port, name)
 
     estimator = builder.AddNamedSystem(
         "load_estimator",
