@@ -297,8 +297,10 @@ class TeleopChannel(LeafSystem):
     last good wrench is kept.
 
     The wrench that follows from a pose acts at once, while the device leaves that pose, so that
-    wrench times increment is exactly the work of the device's port. Hence it is an output that
-    depends on the inputs, and means something at the instants of the period only.
+    wrench times increment of the command is the work of the device's port: exactly for translation,
+    and for rotation that is scaled by 1 (a scaled turn whose axis moves has not the scaled angular
+    velocity of the hand). Hence it is an output that depends on the inputs, and means something at
+    the instants of the period only.
 
     .. pydrake_system::
 
