@@ -164,6 +164,18 @@ def test_candidates_begin_all_over_the_middle_of_the_range(arm):
     assert np.abs(near - home).max() < 0.5
 
 
+def test_slow_candidates_are_large_as_the_square_of_their_period(arm):
+    """Of the same accelerations, where velocities and the range have room."""
+    wide = np.full(6, 1e3)
+    limits = limits_of(arm)._replace(q_half=wide, velocity=wide, acceleration=np.ones(6))
+    coefficients = []
+    for period in (3.0, 6.0):
+        task = Task(arm.table, limits, Criterion("kappa_w10", SCALES), np.zeros(6), period, 3)
+        rng = np.random.default_rng(2)
+        coefficients.append(Problem(task).candidate(rng, near_home=True)[6:])
+    np.testing.assert_allclose(coefficients[1], 4.0 * coefficients[0], rtol=1e-12)
+
+
 def test_the_best_candidates_within_the_limits_are_followed_first():
     """Slack in the limits is worth nothing, but what is beyond them costs."""
     numbers = count(-1)  # the search evaluates one before it begins

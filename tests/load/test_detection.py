@@ -237,6 +237,15 @@ def test_a_contact_that_flickers_is_one_and_ends_after_the_hold(statistic):
     np.testing.assert_array_equal(np.flatnonzero(flags), np.arange(100, 195 + 21))
 
 
+def test_a_weak_force_keeps_a_contact_whatever_the_hold():
+    """Two standard deviations are none in one sample, and plain in the longest window, 64."""
+    contact = np.zeros((2500, 6))
+    contact[100:200, 2], contact[200:1500, 2] = 30.0 * NOISE[2], 2.0 * NOISE[2]
+    for hold in (100, 300):
+        flags = ContactDetector(white(), 8.0, hold=hold).detect(contact, *at_rest(2500))
+        assert flags[100:1500].all() and not flags[1500 + 64 + hold :].any()
+
+
 def test_a_long_contact_is_over_at_once_and_the_next_is_noticed():
     contact = np.zeros((20_000, 6))
     contact[100:15_000, 0] = contact[15_100:, 0] = 30.0 * NOISE[0]

@@ -11,7 +11,7 @@ from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import PARAMETERS, Identification
-from drake_teleop.load.normal_equations import NormalEquations, identify
+from drake_teleop.load.normal_equations import NormalEquations, _pseudo_inverse, identify
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data"
@@ -304,3 +304,11 @@ def test_bad_input_is_named():
         identify(F[:2], *(x[:2] for x in motion))
     with pytest.raises(DrakeTeleopError, match="no mass can be told"):
         identify(np.zeros((10, 6)), *motion)
+
+
+@pytest.mark.parametrize(("rest", "known"), [(4.0, False), (50.0, True)])
+def test_what_is_determined_is_measured_against_the_largest_eigenvalue(rest, known):
+    """Sixteen columns that are all but one: the largest eigenvalue is 16, the others are `rest`."""
+    gram = np.ones((16, 16)) + rest * 1e-12 * np.eye(16)
+    undetermined = _pseudo_inverse(gram, np.zeros(16, dtype=bool))[1]
+    assert np.all(undetermined != known)

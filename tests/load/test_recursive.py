@@ -172,6 +172,19 @@ def test_settles_when_the_bound_is_reached():
     assert 2 < settled[0] < settled[1] < settled[2] < 3000
 
 
+def test_a_load_on_an_axis_can_be_settled_and_no_load_cannot():
+    F, motion = noisy_record(3000)
+    estimator = RecursiveLeastSquares(NOISE)
+    theta = np.zeros(16)
+    memory = estimator.initial_memory(theta)
+    for sample in zip(F, *motion, strict=True):
+        estimator.update_into(theta, memory, np.concatenate(sample))
+    theta[7] = 0.0
+    assert estimator.settled_at(theta, memory)
+    theta[6] = 0.0
+    assert not estimator.settled_at(theta, memory)
+
+
 def test_bad_input_is_named_and_leaves_the_estimate():
     F, motion = noisy_record(5)
     estimator = learnt(F, motion)

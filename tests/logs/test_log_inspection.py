@@ -73,6 +73,19 @@ def test_a_planted_error_is_named_and_no_other(
     assert says in found[name]
 
 
+def test_rows_that_were_written_twice_are_named(tmp_path: Path) -> None:
+    found = findings(tmp_path, {key: np.repeat(x, 2, axis=0) for key, x in good().items()})
+    assert set(found) == {"clock jump", "repeated rows"}
+    assert "every value is held for 2 rows" in found["repeated rows"]
+
+
+def test_a_wrong_clock_is_named_to_the_millisecond(tmp_path: Path) -> None:
+    columns = good()
+    columns["wrench_t"] = columns["t"] + 0.507
+    found = findings(tmp_path, columns)
+    assert "wrench.time.offset: -0.507" in found["clock"]
+
+
 def test_a_lag_of_6_ms_is_named(tmp_path: Path) -> None:
     found = findings(tmp_path, good(delay_s=0.006))
     assert set(found) == {"lag"}

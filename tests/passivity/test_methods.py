@@ -14,7 +14,7 @@ from drake_teleop.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.passivity.memory import LIMIT, MEMORY
+from drake_teleop.passivity.memory import LEDGER, LIMIT, MEMORY, SENT
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -30,6 +30,7 @@ from drake_teleop.passivity.packet import (
     difference_into,
     moved_into,
 )
+from drake_teleop.passivity.two_layer import TwoLayerConfig, _exchange
 from drake_teleop.quantities import check_ranges
 from drake_teleop.quaternions import multiply, normalized, rotate
 
@@ -214,3 +215,15 @@ def test_a_slave_whose_inertia_is_felt_is_not_left_behind(sigma):
     run = run_one_dof(model, PassivityConfig(method="charged_tdpa"), network)
     assert np.abs(run.slave[-1000:] - run.master[-1000:]).max() < 10e-3
     assert run.wall.min() < -10.0, "the wall should have been pressed"
+
+
+def test_a_tank_that_sends_all_at_once_is_not_overdrawn():
+    """A thousand times its content in a second, every millisecond and every ten."""
+    p = parameters(PassivityConfig(method="two_layer", two_layer=TwoLayerConfig(send_rate=1000.0)))
+    for step in (T, 10 * T):
+        memory, packet = initial_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
+        full = memory[LEDGER].copy()
+        assert np.all(full > 0.0)
+        _exchange(np.zeros(PACKET_SIZE), np.zeros(6), step, p, memory, packet)
+        assert np.all(memory[LEDGER] >= 0.0)
+        np.testing.assert_allclose(memory[LEDGER] + memory[SENT], full, rtol=1e-12)

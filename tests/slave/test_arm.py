@@ -246,6 +246,15 @@ def test_limits_are_read_from_the_model():
     np.testing.assert_array_equal(arm.effort_limit, np.full(7, 40.0))
 
 
+def test_of_two_motors_on_a_joint_the_weaker_one_is_the_limit():
+    plant = MultibodyPlant(0.0)
+    (arm,) = Parser(plant).AddModelsFromString(other_arm_urdf(), "urdf")
+    plant.AddJointActuator("second", plant.GetJointByName("j3", arm), effort_limit=7.0)
+    plant.Finalize()
+    limits = ArmModelFromPlant(plant, arm, "ft").effort_limit
+    np.testing.assert_array_equal(limits, [40.0, 40.0, 7.0, 40.0, 40.0, 40.0, 40.0])
+
+
 def test_what_is_no_serial_chain_is_refused():
     with pytest.raises(DrakeTeleopError, match="no frame named 'elsewhere'"):
         ArmModelFromPlant(*rx90_plant()[:2], "elsewhere")
