@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+import pytest
 from hypothesis import settings
 
 # One thread of BLAS in each process: the matrices are small, and threads that wait for a core which
@@ -14,3 +15,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # every machine and day.
 settings.register_profile("drake_teleop", deadline=None, derandomize=True)
 settings.load_profile("drake_teleop")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The notebooks first: what takes longest must not be what the other worker waits for."""
+    items.sort(key=lambda item: item.path.name != "test_notebooks.py")
