@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drake_teleop.logs.check.load_fit import white_noise
+from drake_teleop.logs.check.load_fit import LoadFit, white_noise
 
 
 def test_white_noise_is_seen_under_a_smooth_motion() -> None:
@@ -14,3 +14,8 @@ def test_white_noise_is_seen_under_a_smooth_motion() -> None:
     found = white_noise(motion + sigma * rng.normal(size=(len(t), 3)))
     np.testing.assert_allclose(found, sigma, rtol=0.05)
     assert not white_noise(motion[:3]).any()
+
+
+def test_a_good_fit_explains_most_and_has_a_mass() -> None:
+    assert LoadFit(0.001, 1.0).good
+    assert not LoadFit(0.9, 1.0).good and not LoadFit(0.001, -1.0).good

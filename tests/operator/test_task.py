@@ -12,10 +12,10 @@ from drake_teleop.identification import slave_arm
 from drake_teleop.master.device import JointFriction
 from drake_teleop.noise import random_normal
 from drake_teleop.operator import decision
-from drake_teleop.operator.decision import DONE, OVER, PHASE, SEEKING
+from drake_teleop.operator.decision import DONE, OVER, PHASE, SEEKING, STOPPING
 from drake_teleop.operator.minimum_jerk import add_plan_into, plan_move
 from drake_teleop.operator.perception import NOTICED, Perception, perceive
-from drake_teleop.operator.task import Insert, Press, Reach, Touch
+from drake_teleop.operator.task import Insert, Press, Reach, Touch, check_task
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
@@ -126,6 +126,9 @@ def test_contact_is_noticed_and_the_hand_stops(touch):
         # It has stopped: what the tool does to the leaf no longer changes.
         force = contact_force(result)
         assert force[-1] > 0.5 and np.ptp(force[-200:]) < 2.0
+        # A stop takes its time, and it rests for 0.3 s, the default.
+        stopping = result.t[result["task_state"][:, PHASE] == STOPPING]
+        assert np.ptp(stopping) > decision.STOP + 0.29
         # And the run ends with the task.
         assert 0.0 <= result.t[-1] - measures["task_time_s"] < 0.03
 
@@ -254,6 +257,12 @@ def test_the_operators_noise_is_normal():
 def test_a_task_that_cannot_be_done_is_refused(changes, message):
     with pytest.raises(DrakeTeleopError, match=message):
         replace(Scenario(), **changes).check()
+
+
+def test_a_target_that_begins_where_the_tool_is_not_is_far_enough():
+    check_task(Reach(translation=[0.0, 0.03, 0.0], width=0.04), "task")
+    with pytest.raises(DrakeTeleopError, match=r"not more than 0\.02 m"):
+        check_task(Reach(translation=[0.0, 0.019, 0.0], width=0.04), "task")
 
 
 def test_a_scenario_without_task_has_nothing_to_measure(reach):
