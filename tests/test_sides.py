@@ -210,6 +210,15 @@ def test_blocks_are_found_in_whichever_side_they_are():
         assert GetBlock(station, name).get_name() == name
 
 
+def test_a_channel_of_two_wires_is_left_out_of_the_station():
+    seen = replace(Scenario(), contact_detection=ContactDetectionConfig())
+    far = replace(Scenario(), channel=Channel(delay=0.01))
+    assert not MakeTeleopStation(Scenario()).HasSubsystemNamed("channel")
+    assert MakeTeleopStation(far).HasSubsystemNamed("channel")
+    station = MakeTeleopStation(seen, load_estimate=np.zeros(16), noise_floor=floor())
+    assert station.HasSubsystemNamed("channel") and station.HasOutputPort("contact_at_hand")
+
+
 def test_a_direct_channel_is_wires():
     builder = DiagramBuilder()
     channel = builder.AddSystem(MakeChannel(Scenario()))

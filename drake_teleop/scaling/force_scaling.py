@@ -216,8 +216,13 @@ class ForceScaling(LeafSystem):
         )
 
     def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
-        inputs = (*self._inputs(context), *self._now(context))
-        _felt_into(*inputs, self._arm, self._R_WB, output.get_mutable_value())
+        _felt_into(
+            *self._inputs(context),
+            *self._now(context),
+            self._arm,
+            self._R_WB,
+            output.get_mutable_value(),
+        )
 
     def _now(self, context: Context) -> tuple[NDArray[np.float64], float]:
         return context.get_numeric_parameter(self._change).value(), context.get_time()

@@ -179,6 +179,15 @@ def remember_step(tail, time, state, sheet):
 
 
 @njit(cache=True)
+def _postpone(memory, tail, longest, time, state, sheet):
+    """Puts a step's end into the queue in `memory`, see `sample_step`; whether there was room."""
+    if memory[tail + 1] >= longest:
+        return False
+    remember_step(memory[tail:], time, state, sheet)
+    return True
+
+
+@njit(cache=True)
 def sample_step(
     physics, sensor, period, time, state, sheet, tau, applied_W, noise, memory, until_now,
     touching_W, result,
@@ -420,18 +429,21 @@ class WristSensor(LeafSystem):
         sample_step(*self._inputs(context), True, touching_W, output.get_mutable_value())
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if self._longest > 1 and not self._is_due(context.get_time()):
-            tail = discrete_state.get_mutable_value(0)[self._sensor[3] :]
-            if tail[1] < self._longest:
-                state, sheet = self._state.Eval(context), self._sheet_state(context)
-                remember_step(tail, context.get_time(), state, sheet)
+        time = context.get_time()
+        if self._longest > 1 and not self._is_due(time):
+            memory = discrete_state.get_mutable_value(0)
+            state, sheet = self._state.Eval(context), self._sheet_state(context)
+            if _postpone(memory, self._sensor[3], self._longest, time, state, sheet):
                 return
         discrete_state.set_value(0, self._step.Eval(context)[sample_size(self._n) + 1 :])
 
     def _is_due(self, time: float) -> bool:
         """Whether now the torque may change, or the noise."""
-        margin = _SAME * self._period
-        return any(abs(time - hold * round(time / hold)) < margin for hold in self._holds)
+        # Written out, because in contact it is asked at every step.
+        margin, (held, block) = _SAME * self._period, self._holds
+        if abs(time - held * round(time / held)) < margin:
+            return True
+        return abs(time - block * round(time / block)) < margin
 
     def _check(self, context: Context) -> EventStatus:
         n = self._n
