@@ -381,7 +381,7 @@ def test_every_tool_without_noise(utias, method):
 
 @pytest.mark.slow
 def test_utias_protocol(utias):
-    for level, methods in utias.run(TOOLS, seeds=5).items():
+    for level, methods in utias.run(TOOLS, seeds=3).items():
         *errors, consistent = methods["consistent"]
         assert (np.array(errors) <= utias.TARGETS[level][:3]).all(), (level, errors)
         assert consistent == 100.0
