@@ -115,6 +115,7 @@ def test_how_far_the_models_are_from_the_diagram(diagrams):
         np.testing.assert_allclose(off.ravel(), [float(x) for x in said], atol=0.01, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_what_llewellyn_lacks_and_what_the_grips_bear(diagrams):
     omega, H, axis, _ = diagrams["real"]
     H = absorb(H, hand=-1j * omega * axis.hand_mass)
@@ -132,6 +133,7 @@ def test_what_llewellyn_lacks_and_what_the_grips_bear(diagrams):
     assert softest == pytest.approx(1e3 * float(limit), rel=0.01)
 
 
+@pytest.mark.slow
 def test_errors_of_the_load():
     error, sampling = np.arange(0.0, 14.0, 0.01), Sampling(low_pass_hz=500.0)
     for grip, *said in rows("grip | bound, kg"):

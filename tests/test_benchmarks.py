@@ -113,6 +113,7 @@ def test_no_mutation_of_text_messages_and_defaults(changed: dict[str, set[str]])
     assert not [line for line in lines if re.search("share|Half|too few|len|x [-+*/] ", line)]
 
 
+@pytest.mark.slow
 def test_a_mutant_is_killed_or_named_and_the_sources_stay_as_they_are(tmp_path: Path) -> None:
     files = {
         "drake_teleop/__init__.py": "",

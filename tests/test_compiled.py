@@ -73,6 +73,7 @@ def package(tmp_path, monkeypatch):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "old", "new", "expected"),
     [
@@ -190,6 +191,7 @@ Path(f"{me} has ended").touch()
 """
 
 
+@pytest.mark.slow
 def test_two_first_runs_side_by_side_leave_the_right_code(tmp_path):
     """With numba's own cache, `double(1.5)` is 2 from then on."""
     (tmp_path / "shared.py").write_text(

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from drake_teleop.scenario import LoadScenario
 
@@ -38,6 +39,7 @@ def figures(row: str) -> tuple[list[bool], list[float]]:
     return ["unstable" in force for force in felt], steady
 
 
+@pytest.mark.slow
 def test_its_table_is_what_its_script_prints(capsys):
     (script,) = re.findall("```python\n(.*?)```", TEXT, re.S)
     exec(compile(script, "delay.md", "exec"), {})

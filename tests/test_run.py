@@ -129,6 +129,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(quick):
     assert logs[0] != logs[2]
 
 
+@pytest.mark.slow
 def test_a_scenario_that_learns_needs_no_identification_before(quick):
     summary, out = quick("learning")
     assert not (out / "identification.json").exists()
@@ -143,6 +144,7 @@ def test_a_saturated_sensor_is_reported_with_its_time(quick):
     assert warning.startswith("the wrist sensor saturates from 0.")
 
 
+@pytest.mark.slow
 def test_a_pose_out_of_reach_is_reported_with_its_time(quick):
     summary, _ = quick(
         "far", "kinematic_scaling: {translation_scale: 30}\nslave: {position: [0.6, 0, 0.6]}"
@@ -153,6 +155,7 @@ def test_a_pose_out_of_reach_is_reported_with_its_time(quick):
     )
 
 
+@pytest.mark.slow
 def test_the_table_says_the_warnings(tmp_path, capsys):
     path = tmp_path / "loud.yaml"
     path.write_text(QUICK + "wrist_sensor: {force_range: [100, 100, 31]}")

@@ -265,6 +265,7 @@ def test_ideal_sensor_and_true_load_leave_nothing(slave):
     assert np.abs(result["contact_wrench_S"]).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_the_slave_follows_the_scaled_master(slave):
     scenario = vertical(
         0.02, 0.5, kinematic_scaling__translation_scale=2.0, simulation__duration=2.0
@@ -285,6 +286,7 @@ def test_the_slave_follows_the_scaled_master(slave):
     np.testing.assert_allclose(slave_offset[50:], 2 * late[50:], atol=0.03 * np.ptp(slave_offset))
 
 
+@pytest.mark.slow
 def test_a_delay_delays_both_directions(slave):
     # A light load: with sigma = 1 the felt rotational inertia is larger than the hand's and the
     # device's, and any delay makes the loop unstable.
@@ -311,6 +313,7 @@ def test_an_open_clutch_stops_the_slave(slave):
     assert abs(master[6] - 0.03) > 0.005
 
 
+@pytest.mark.slow
 def test_scales_change_while_running_without_a_step_of_the_force(slave):
     """From the whole inertia at 1/17.5 to none at 1/10, in the middle of a fast movement."""
     scenario = vertical(0.03, 1.0)

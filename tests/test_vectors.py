@@ -48,6 +48,7 @@ def test_adding_is_to_the_place_that_is_named():
     np.testing.assert_array_equal(x, [0, 0, *(a + b), 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 3, 6])
 def test_cholesky_and_solve_are_those_of_numpy_and_read_the_lower_half_only(n):
     random = np.random.default_rng(n)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drake_teleop._compiled import njit
 from drake_teleop.passivity import none
 from drake_teleop.passivity.memory import HELD, MOTION_SCALE, own_parameters
-from drake_teleop.passivity.packet import WRENCH, limit
+from drake_teleop.passivity.packet import limit
 from drake_teleop.quantities import quantity
 
 _OWN_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
@@ -39,7 +39,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     for g in range(2):
         limit(wrench, g, p[_OWN_LIMIT][g])
     memory[HELD] = wrench
-    packet[WRENCH] = wrench
 
 
 @njit(cache=True)

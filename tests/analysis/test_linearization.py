@@ -190,6 +190,7 @@ def test_continuous_closed_form_with_the_delays_of_holds_and_filter(sigma):
     assert (difference(H, paper) < 0.01).all()
 
 
+@pytest.mark.slow
 def test_tool_that_turns_when_it_is_pushed():
     """Sideways the tool's centre of mass moves 0.61 times as much as So, or as the tip."""
     scenario = replace(LoadScenario("ideal_sensor"), force_scaling__sigma=1.0)
@@ -207,6 +208,7 @@ def test_tool_that_turns_when_it_is_pushed():
     assert np.abs(H[:, 0, 0] / paper[:, 0, 0] - 1).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_sideways_the_tip_gives_way_through_the_hands_wrist():
     """A push at the tip is a torque at the hand, whose turn the tool follows: 130 times as soft."""
     scenario = replace(LoadScenario("ideal_sensor"), operator=OperatorConfig(grip="medium"))
@@ -273,6 +275,7 @@ def vertical_mode(system: Linearization) -> complex:
     return np.log(z[np.argmax(np.abs(seen * push) * lasting)]) / PERIOD
 
 
+@pytest.mark.slow
 def test_multipliers_predict_a_slow_decay():
     scenario = frictionless(LoadScenario("ideal_sensor"))
     scenario = replace(scenario, operator=OperatorConfig(grip="light"), master__position=DECOUPLED)

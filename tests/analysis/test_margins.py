@@ -149,6 +149,7 @@ def growth(m, b, k, mu, K, delay, *, longest=60.0, step=2.5e-4):
     return _growth(m, b, k, mu, K, max(round(delay / step), 1), int(longest / step), step)
 
 
+@pytest.mark.slow
 def test_boundaries_in_time():
     """Two milliseconds within the margin motion dies out, two beyond it grows.
 

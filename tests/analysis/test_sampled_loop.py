@@ -268,6 +268,7 @@ def test_unstable_without_delay_and_stable_for_any() -> None:
     assert (unstable_multipliers(firm, np.geomspace(5e-4, 100.0, 1000)) == 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "axis", [held("medium", wall_stiffness=2.5e3), held("firm", wall_stiffness=2e4)]
 )

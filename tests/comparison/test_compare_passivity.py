@@ -67,6 +67,7 @@ def test_presets_reach_around_the_earth_and_to_the_moon():
     }
 
 
+@pytest.mark.slow
 def test_the_longest_round_trip_ends_at_the_first_that_is_not_stable():
     assert study.longest_round_trip("none", OneDof(wall_stiffness=500.0), 0.0, 0.0, [0]) == 1.0
     assert study.longest_round_trip("none", OneDof(wall_stiffness=20000.0), 0.0, 0.0, [0]) == 0.0

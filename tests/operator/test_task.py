@@ -95,6 +95,7 @@ def test_what_happens_is_the_seeds(reach):
     assert not np.array_equal(other["hand_wrench_E"], reach[0]["hand_wrench_E"])
 
 
+@pytest.mark.slow
 def test_the_picture_is_as_late_as_the_line():
     """One movement is enough for a large target; that it is there, is seen both ways later."""
     task = with_task(Reach(translation=[0.0, 0.08, -0.06], width=0.04))
@@ -104,6 +105,7 @@ def test_the_picture_is_as_late_as_the_line():
     assert far - near == pytest.approx(2 * 0.15, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("there", "back"), [(0.03, 0.22), (0.22, 0.03)])
 def test_lines_that_differ_are_waited_for_each_in_its_place(there, back):
     """The tool moves after the one delay and is seen after the other: together a round trip."""

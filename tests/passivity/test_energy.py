@@ -37,6 +37,7 @@ def test_tdpa_never_gives_out_more_than_was_put_in(least):
     assert least["tdpa"]["stronger"] <= 1e-12, "the wrench became stronger"
 
 
+@pytest.mark.slow
 def test_what_is_charged_by_drag_is_not_given_out_twice(least):
     assert least["charged_tdpa"]["energy"] >= -1e-9
     assert least["charged_tdpa"]["stronger"] <= 0.28 + 1e-12, "stronger by more than the drag"

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_methods import line, poses, run, wrenches
+from test_methods import T, line, poses, run, wrenches
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.passivity.energy import created, in_flight, ledger, port_work
-from drake_teleop.passivity.memory import MEMORY
-from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.passivity.memory import LEDGER, LIMIT, MEMORY
+from drake_teleop.passivity.methods import (
+    METHODS,
+    PassivityConfig,
+    initial_memory,
+    master_step,
+    parameters,
+)
+from drake_teleop.passivity.packet import OTHER_ENERGY, PACKET_SIZE, POSE
 
 
 def test_work_of_a_held_wrench_is_exact_however_coarse_the_samples():
@@ -48,6 +55,28 @@ def test_what_tdpa_has_on_its_books_is_the_work_at_the_hand():
     kept = put_in - hand.sent + hand.received - hand.stored
     assert (kept >= -1e-12).all() and (kept <= [2e-3 + 1e-12, 1e-4 + 1e-12]).all()
     assert (in_flight(hand, slave) >= 0.0).all() and (hand.lost > 0.0).any()
+
+
+@pytest.mark.parametrize("short", [None, "master", "slave"])
+def test_the_drag_is_felt_only_while_an_end_holds_less_than_the_reserve(short):
+    """All of it, against the motion, at a speed beyond the fading one."""
+    config = PassivityConfig(method="charged_tdpa")
+    p, dx, wrench = parameters(config), np.zeros(6), np.zeros(6)
+    dx[:3] = 1e-3 * np.array([2.0, -1.0, 2.0]) / 3
+    memory = initial_memory("charged_tdpa", p, poses(np.random.default_rng(0), 1)[0])
+    received, packet = np.zeros(PACKET_SIZE), np.zeros(PACKET_SIZE)
+    received[POSE] = [1, 0, 0, 0, 0, 0, 0]
+    received[OTHER_ENERGY] = 0.0 if short == "slave" else 1.0
+    memory[LEDGER] = 0.0 if short == "master" else 1.0
+    master_step(
+        METHODS.index("charged_tdpa"), received, True, received[POSE], dx / T, dx, np.zeros(6),
+        p[LIMIT], T, p, memory, wrench, packet,
+    )  # fmt: skip
+    if short is None:
+        np.testing.assert_array_equal(wrench, 0.0)
+    else:
+        drag = np.array(config.charged_tdpa.drag[0])
+        np.testing.assert_allclose(wrench[:3], -drag * dx[:3] / 1e-3, rtol=1e-12)
 
 
 def test_created_energy_never_falls():

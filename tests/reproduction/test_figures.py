@@ -45,6 +45,7 @@ def test_all_subplots_have_the_same_scale_and_show_everything():
     np.testing.assert_array_equal(figure.axes[1].lines[0].get_ydata(), 0.5 * RAW)
 
 
+@pytest.mark.slow
 def test_the_right_hand_axis_is_the_masters():
     figure = scaling()
     render(figure)  # secondary axes get their limits when they are drawn

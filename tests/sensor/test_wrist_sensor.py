@@ -91,6 +91,7 @@ def test_channels_are_independent_and_other_seeds_give_other_noise():
     np.testing.assert_array_equal(wrench, at_rest(config)["measured_wrench_S"])
 
 
+@pytest.mark.slow
 def test_the_converter_quantises_before_the_filter():
     """The reading at rest is a whole number of quanta, whatever the truth is."""
     result = at_rest(dataclasses.replace(QUIET, resolution=2.5e-4))

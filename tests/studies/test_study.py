@@ -280,6 +280,7 @@ def test_a_run_that_ends_its_process_is_a_row(tmp_path, cluster):
     assert not list(tmp_path.glob("running/*"))
 
 
+@pytest.mark.slow
 def test_processes_that_never_begin_are_an_error(tmp_path):
     study = Study(factors=[Factor("a.b", values=[1.0, 2.0, 3.0])])
     with pytest.raises(DrakeTeleopError, match="processes end before they begin"):

@@ -1,0 +1,37 @@
+"""What a whole log can hide: streams that are folded, and the first guess of a lag."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.logs.read.imu_clock import best_shift
+from drake_teleop.logs.read.streams import Stream, on_clock
+
+
+@pytest.mark.parametrize("ratio", [1.5, 4.0])
+def test_what_a_slower_clock_cannot_show_is_not_folded_down(ratio):
+    """A tone above half the clock's rate, of a stream that is little or much faster than it."""
+    t, rate = np.arange(0, 4, 0.01), 100.0 * ratio
+    fast = np.arange(0, 4, 1 / rate)
+    tone, slow = np.sin(2 * np.pi * 61.0 * fast), np.sin(2 * np.pi * 3.0 * fast)
+    stream = Stream("wrench", fast)
+    seen = on_clock(t, stream, np.stack([tone, slow], axis=1))[50:-50]
+    # Butterworth of second order at 0.4 of the rate, forth and back.
+    assert np.abs(seen[:, 0]).max() < 1.02 / (1 + (61 / 40) ** 4)
+    np.testing.assert_allclose(seen[:, 1], np.sin(2 * np.pi * 3.0 * t)[50:-50], atol=0.01)
+
+
+@pytest.mark.parametrize("lag", [-0.173, 0.0, 0.062])
+def test_the_first_guess_of_a_lag_is_the_lag(lag):
+    """Before any refinement, and with axes that are turned."""
+    rng = np.random.default_rng(2)
+    clock = np.arange(0, 12, 0.005)
+    kernel = np.exp(-0.5 * (np.arange(-40, 41) / 12) ** 2)
+    noise = rng.normal(size=(3, len(clock)))
+    signal = np.array([np.convolve(row, kernel, mode="same") for row in noise]).T
+    t = np.arange(1, 11, 0.01)
+    shown = np.stack([np.interp(t, clock - lag, column) for column in signal.T], axis=1)
+    turned = signal[:, [1, 2, 0]] * [1.0, -1.0, 1.0]
+    found = best_shift(t, [(shown, turned)], clock, 0.5, np.zeros((len(t), 1)))
+    assert found == pytest.approx(lag, abs=2e-3)
