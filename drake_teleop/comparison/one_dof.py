@@ -308,8 +308,9 @@ def _simulate(
         hand[0] = stiffness * (intent[k, 0] - x) + damping * (intent[k, 1] - v)
         pose_m[4], pose_s[4] = x, x_s
         before = received[4]
+        # No literal False: for that the whole channel would be compiled once more.
         channel_step(
-            method, pose_m, wrench, hand, pose_s, False, 0.0, PERIOD, timeout, frame, p,
+            method, pose_m, wrench, hand, pose_s, np.bool_(False), 0.0, PERIOD, timeout, frame, p,
             forward_line, backward_line, forward, backward, ends, received, ports, felt,
         )  # fmt: skip
         command = received[4]
