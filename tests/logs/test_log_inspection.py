@@ -73,6 +73,15 @@ def test_a_planted_error_is_named_and_no_other(
     assert says in found[name]
 
 
+def test_two_errors_at_once_are_both_named(tmp_path: Path) -> None:
+    columns = good()
+    planted.turned_imu(columns)
+    planted.inverted(columns)
+    found = findings(tmp_path, columns)
+    assert set(found) == {"inverted orientation", "swapped axes"}
+    assert "[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]" in found["swapped axes"]
+
+
 def test_rows_that_were_written_twice_are_named(tmp_path: Path) -> None:
     found = findings(tmp_path, {key: np.repeat(x, 2, axis=0) for key, x in good().items()})
     assert set(found) == {"clock jump", "repeated rows"}

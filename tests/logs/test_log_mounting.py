@@ -54,28 +54,30 @@ class Recorder:
     seed: int = 0
     noise: float = 1.0
     motion: Any = motion_at
+    seconds: float = 6.0
+    lag: float = LAG
 
     def tables(self) -> dict[Path, Table]:
-        """6 s; noise and bias of a small MEMS IMU, of a wrist sensor, and of joint encoders."""
+        """Noise and bias of a small MEMS IMU, of a wrist sensor, and of joint encoders."""
         rng, p = np.random.default_rng(self.seed), self.p_SoIo_S
 
         def noisy(x: np.ndarray, *sizes: float) -> np.ndarray:
             return x + self.noise * rng.normal(size=x.shape) * np.repeat(sizes, 3)
 
-        t = np.arange(0, 6, 1 / 500)
+        t = np.arange(0, self.seconds, 1 / 500)
         m = self.motion(t)
         wrench = non_contact_wrench(m.specific_force, m.omega, m.alpha, PHI)
         wrench = noisy(wrench, 0.1, 0.005) + OFFSETS
         columns = {"w": {"t": t, "f": wrench[:, :3], "m": wrench[:, 3:]}}
-        t = np.arange(0, 6, 1 / 250) + 0.0013
-        m = self.motion(t - LAG)
+        t = np.arange(0, self.seconds, 1 / 250) + 0.0013
+        m = self.motion(t - self.lag)
         s = m.specific_force + np.cross(m.alpha, p) + np.cross(m.omega, np.cross(m.omega, p))
         columns["i"] = {
             "t": t,
             "s": noisy(s @ self.R_SI, 0.06) + 0.3 * rng.normal(size=3),
             "omega": noisy(m.omega @ self.R_SI, 2e-3) + 0.01 * rng.normal(size=3),
         }
-        t = np.arange(0, 6, 1 / 125) + 0.0021
+        t = np.arange(0, self.seconds, 1 / 125) + 0.0021
         m = self.motion(t)
         wobble = Rotation.from_rotvec(noisy(np.zeros((len(t), 3)), 1e-4)).as_matrix()
         columns["p"] = {"t": t, "q": quaternions(m.R_WS @ wobble), "p": noisy(m.p_WS, 5e-5)}
@@ -141,6 +143,13 @@ def test_any_mounting_is_found_within_what_is_stated(
     assert found.deviations_deg.max() < 0.1
     assert found.lever.deviations.max() < 5e-4
     assert found.lag_s == pytest.approx(LAG, abs=3e-4)
+
+
+@pytest.mark.parametrize(("lag", "is_found"), [(0.9, True), (1.2, False)])
+def test_the_clock_is_looked_for_within_a_second(lag: float, is_found: bool) -> None:
+    found = mounting(Recorder(a_rotation(3), np.array([0.05, -0.03, 0.08]), seconds=8.0, lag=lag))
+    assert found.fits == is_found
+    assert (found.lag_s == pytest.approx(lag, abs=1e-3)) == is_found
 
 
 @pytest.mark.slow
