@@ -340,6 +340,7 @@ class WristSensor(LeafSystem):
             self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
         self.DeclareDiscreteState(memory)
         self._result = np.zeros(len(first) + 1 + len(memory))
+        self._remains = slice(len(first) + 1, None)  # of a step: the memory
         self._step = self.DeclareVectorOutputPort(
             "step", len(self._result), weak_callback(self._calc_step)
         )
@@ -376,7 +377,7 @@ class WristSensor(LeafSystem):
     def take_samples(self, context: Context) -> None:
         """Takes the samples before now, for who wants to see the state that results."""
         sample_step(*self._inputs(context), False, self._nothing, self._result)
-        context.SetDiscreteState(self._result[sample_size(self._n) + 1 :])
+        context.SetDiscreteState(self._result[self._remains])
 
     def bring_up_to_date(self, context: Context) -> None:
         """Makes now the end of the last step, with the samples before now taken.
@@ -429,13 +430,12 @@ class WristSensor(LeafSystem):
         sample_step(*self._inputs(context), True, touching_W, output.get_mutable_value())
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        time = context.get_time()
-        if self._longest > 1 and not self._is_due(time):
-            memory = discrete_state.get_mutable_value(0)
+        if self._longest > 1 and not self._is_due(context.get_time()):
+            memory, time = discrete_state.get_mutable_value(0), context.get_time()
             state, sheet = self._state.Eval(context), self._sheet_state(context)
             if _postpone(memory, self._sensor[3], self._longest, time, state, sheet):
                 return
-        discrete_state.set_value(0, self._step.Eval(context)[sample_size(self._n) + 1 :])
+        discrete_state.set_value(0, self._step.Eval(context)[self._remains])
 
     def _is_due(self, time: float) -> bool:
         """Whether now the torque may change, or the noise."""
