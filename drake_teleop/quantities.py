@@ -38,6 +38,13 @@ def choice(default: str, choices: Sequence[str], doc: str) -> Any:
     return dataclasses.field(default=default, metadata={"choices": tuple(choices), "doc": doc})
 
 
+def plain(default: Any, doc: str) -> Any:
+    """A dataclass field holding a flag, a word, a whole number, or a list of these or of blocks."""
+    if isinstance(default, list):
+        return dataclasses.field(default_factory=lambda: list(default), metadata={"doc": doc})
+    return dataclasses.field(default=default, metadata={"doc": doc})
+
+
 def check_structure(schema: type, data: Any, where: str) -> None:
     """Checks parsed YAML against a dataclass before it is loaded.
 

@@ -25,7 +25,7 @@ from drake_teleop.master.device import JointFriction
 from drake_teleop.operator.operator import OperatorConfig
 from drake_teleop.operator.task import check_task
 from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.quantities import check_ranges, check_structure, choice, quantity
+from drake_teleop.quantities import check_ranges, check_structure, choice, plain, quantity
 from drake_teleop.resources import scenarios_dir
 from drake_teleop.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
@@ -66,9 +66,10 @@ class Simulation:
     )
     max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
     accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "of error-controlled integrators")
-    seed: int = 0
-    end_with_task: bool = False
-    """Whether the run ends, within 20 ms, when the operator has done its task or given up."""
+    seed: int = plain(0, "of everything random; the same seed gives the same log")
+    end_with_task: bool = plain(
+        False, "end the run within 20 ms when the operator has done its task or given up"
+    )
 
 
 @dataclass
@@ -93,7 +94,7 @@ class Slave:
 class Scenario:
     """One complete setup of the station of the paper's Fig. 4."""
 
-    description: str = ""
+    description: str = plain("", "what the scenario is about")
     simulation: Simulation = field(default_factory=Simulation)
     rates: Rates = field(default_factory=Rates)
     operator: OperatorConfig = field(default_factory=OperatorConfig)

@@ -46,7 +46,7 @@ from drake_teleop.passivity.safe_state import (
     master_limits_into,
     slave_command_into,
 )
-from drake_teleop.quantities import choice, quantity
+from drake_teleop.quantities import choice, plain, quantity
 
 _NETWORKS = ("custom", *PRESETS)
 
@@ -56,8 +56,9 @@ class Channel(NetworkConfig):
     """The network between master and slave; its own fields are those of `custom`."""
 
     network: str = choice("custom", _NETWORKS, "a preset, or the network that these fields say")
-    backward: NetworkConfig | None = None
-    """From slave to master; null: as from master to slave."""
+    backward: NetworkConfig | None = plain(
+        None, "from slave to master; null: as from master to slave"
+    )
     timeout: float = quantity(
         0.1, "s", 1e-3, 0.2, "without a packet for so long, an end goes into its safe state"
     )

@@ -39,7 +39,7 @@ from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.noise import random_bits
 from drake_teleop.passivity.packet import POSE, VELOCITY, WRENCH, arrived, moved_into
-from drake_teleop.quantities import check_ranges, choice, quantity
+from drake_teleop.quantities import check_ranges, choice, plain, quantity
 
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
 LONGEST_DELAY = 10.0  # [s], which bounds the memory
@@ -67,16 +67,22 @@ class NetworkConfig:
     duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of the arriving packets that come twice")
     rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "packets per second at most; null: all")
     playout: float = quantity(0.0, "s", 0.0, LONGEST_DELAY, "least age of a packet that is used")
-    redundant: bool = False
-    """Each packet repeats the samples that the playout buffer may still wait for."""
-    trace: str | None = None
-    """A recording of the delay, in the place of delay, jitter and distribution: a CSV file with the
-    columns `time` [s], increasing, and `delay` [s], one-way, empty if the packet was lost. Between
-    its rows the last one holds; after its end it starts again."""
-    silence: str = choice("hold", _SILENCE, "what the receiver reads at steps without a new packet")
-    """All cumulative parts stay as they are: nothing is added while nothing comes. The others:
-    hold: as in the newest packet. zero: velocity and wrench are zero, the null packet of wave
-    variables. extrapolate: the pose moves on with its velocity, for 0.1 s; then it stands still."""
+    redundant: bool = plain(
+        False, "each packet repeats the samples that the playout buffer may still wait for"
+    )
+    trace: str | None = plain(
+        None,
+        "a recording of the delay, in the place of delay, jitter and distribution: a CSV file with "
+        "the columns `time` [s], increasing, and `delay` [s], one-way, empty if the packet was "
+        "lost; between its rows the last one holds, after its end it starts again",
+    )
+    silence: str = choice(
+        "hold",
+        _SILENCE,
+        "what the receiver reads at steps without a new packet: the newest one's values; no "
+        "velocity and no wrench, the null packet of wave variables; or a pose that moves on with "
+        "its velocity for 0.1 s. Cumulative parts stay as they are",
+    )
 
     def check(self, where: str = "network") -> None:
         """Checks every value, but not the trace, which is read by `parameters`.

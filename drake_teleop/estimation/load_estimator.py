@@ -30,7 +30,7 @@ from drake_teleop.load.online.watched import (
     watched_update,
 )
 from drake_teleop.load.sample import SATURATED
-from drake_teleop.quantities import choice, quantity
+from drake_teleop.quantities import choice, plain, quantity
 
 # Samples between two looks at whether it has settled.
 _CHECK = 16
@@ -40,8 +40,10 @@ _CHECK = 16
 class LoadEstimatorConfig:
     """Recursive estimation with offsets, Eqs. (7)-(8)."""
 
-    enabled: bool = False
-    """Learn from every sample. Only in free motion: a contact wrench would be taken for load."""
+    enabled: bool = plain(
+        False,
+        "learn from every sample; only in free motion: a contact wrench would be taken for load",
+    )
     forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor a sample; 1 = none")
     method: str = choice(
         "rls", tuple(METHODS), "recursive least squares, or total: allows for noisy accelerations"
@@ -49,8 +51,10 @@ class LoadEstimatorConfig:
     settled_bound: float = quantity(
         0.05, "1", 1e-6, 10.0, "predicted uncertainty that counts as settled, of a natural value"
     )
-    watch: bool = False
-    """Freeze a load that has settled, or was given with its covariance; notice when it changes."""
+    watch: bool = plain(
+        False,
+        "freeze a load that has settled, or was given with its covariance; notice when it changes",
+    )
     model_error: float = quantity(
         0.0, "1", 0.0, 0.5, "watch: share of the wrench that gains, cross-talk and delays make"
     )

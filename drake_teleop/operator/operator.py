@@ -31,7 +31,7 @@ from drake_teleop.operator.decision import Training
 from drake_teleop.operator.minimum_jerk import add_plan_into
 from drake_teleop.operator.perception import Perception, perceive_into
 from drake_teleop.operator.task import Insert, Movement, Press, Reach, Task, Touch
-from drake_teleop.quantities import choice, quantity
+from drake_teleop.quantities import choice, plain, quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, rotate
 from drake_teleop.slave.arm import ArmModel, forward_kinematics
 
@@ -98,10 +98,12 @@ class OperatorConfig:
     """How the hand holds the stylus and what it wants to do with it."""
 
     grip: str = choice("medium", tuple(GRIPS), "stiffness, damping and mass of the hand")
-    intent: list[MinimumJerk | Sine] = field(default_factory=list)
-    """Moves and oscillations relative to the start pose; they may overlap, and add up."""
-    task: Reach | Touch | Press | Insert | None = None
-    """What the operator does by eye and by feel, on top of the intent; null: nothing."""
+    intent: list[MinimumJerk | Sine] = plain(
+        [], "moves and oscillations relative to the start pose; they may overlap, and add up"
+    )
+    task: Reach | Touch | Press | Insert | None = plain(
+        None, "what the operator does by eye and by feel, on top of the intent; null: nothing"
+    )
     perception: Perception = field(default_factory=Perception)
     movement: Movement = field(default_factory=Movement)
 

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
-from drake_teleop.quantities import choice, quantity
+from drake_teleop.quantities import choice, plain, quantity
 from drake_teleop.vectors import apply, cross, cross_matrix, nine, plus_cross, three
 
 #: Samples that share one block of random numbers: one event of a noise source, one step of a walk.
@@ -59,20 +59,22 @@ class WristSensorConfig:
         default="custom",
         init=False,
         compare=False,
-        metadata={"choices": ("custom", *_PRESET_NAMES), "doc": "figures of what is not given"},
+        metadata={
+            "choices": ("custom", *_PRESET_NAMES),
+            "doc": "in a file: whose figures the fields have that the file leaves out; custom: the "
+            'defaults. In Python: `dataclasses.replace(PRESETS["ati_gamma_imu"], force_noise=0.1)`',
+        },
     )
-    """In a scenario file: whose figures the fields have that the file leaves out; custom: the
-    defaults. In Python: `dataclasses.replace(PRESETS["ati_gamma_imu"], force_noise=0.1)`."""
-    ideal: bool = False
-    """The truth at the sampling instant, at So in S: none of the parts."""
+    ideal: bool = plain(False, "the truth at the sampling instant, at So in S: none of the parts")
 
     gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest of force and torque")
     cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "largest, of one range for a full other one")
     misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from S to the wrench's real axes")
     acceleration_gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest of the accelerations")
     acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from A to real axes")
-    unit: int = 0
-    """Which of many sensors of the kind: draws the calibration errors inside their bounds."""
+    unit: int = plain(
+        0, "which of many sensors of the kind: draws the calibration errors inside their bounds"
+    )
 
     p_SoAo_S: list[float] = quantity(
         [0.0, 0.0, 0.0175], "m", -1.0, 1.0, "place of the acceleration part"
@@ -110,8 +112,7 @@ class WristSensorConfig:
     resolution: float = quantity(2.5e-4, "1", 0.0, 0.1, "quantum as a fraction of the range")
     encoder_resolution: float = quantity(1.745e-5, "rad", 0.0, 0.1, "resolver step, 0.001 deg")
 
-    saturates: bool = True
-    """Readings end at the ranges, and `saturated` says so."""
+    saturates: bool = plain(True, "readings end at the ranges, and `saturated` says so")
     force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "fx, fy, fz")
     torque_range: list[float] = quantity([12.0, 12.0, 12.0], "N m", 0.01, 1e4, "about So")
     acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "specific force")

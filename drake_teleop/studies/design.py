@@ -1,7 +1,6 @@
 """What a study varies, and by which design: the file, and the points that follow from it."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
-import dataclasses
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.quantities import check_ranges, choice, quantity
+from drake_teleop.quantities import check_ranges, choice, plain, quantity
 from drake_teleop.studies.measures import MEASURES, default_measures
 
 Array = NDArray[np.float64]
@@ -27,14 +26,13 @@ _CANDIDATES = 1024
 class Factor:
     """A field of the scenario that the study varies: over a list of what it takes, or a range."""
 
-    field: str = ""
-    """`block.field`, as it stands in a scenario file."""
-    values: list[float] = dataclasses.field(default_factory=list)
-    words: list[str] = dataclasses.field(default_factory=list)
-    flags: list[bool] = dataclasses.field(default_factory=list)
-    vectors: list[list[float]] = dataclasses.field(default_factory=list)
-    low: float | None = None
-    high: float | None = None
+    field: str = plain("", "`block.field`, as it stands in a scenario file")
+    values: list[float] = plain([], "the numbers that it takes")
+    words: list[str] = plain([], "the words that it takes, in place of numbers")
+    flags: list[bool] = plain([], "likewise")
+    vectors: list[list[float]] = plain([], "likewise")
+    low: float | None = plain(None, "where its range begins, in place of a list")
+    high: float | None = plain(None, "where its range ends")
     levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
 
     def listed(self) -> Sequence[Value]:
@@ -92,22 +90,25 @@ class Factor:
 class Study:
     """What a study varies, by which design, and what it measures."""
 
-    description: str = ""
-    scenario: str = "contact_transition"
-    """Name of a shipped one, or a YAML file; its path is relative to the study's file."""
-    factors: list[Factor] = dataclasses.field(default_factory=list)
+    description: str = plain("", "what the study is about")
+    scenario: str = plain(
+        "contact_transition",
+        "name of a shipped one, or a YAML file; its path is relative to the study's file",
+    )
+    factors: list[Factor] = plain([], "the fields that it varies")
     design: str = choice(
         "factorial",
         ("factorial", "sobol", "adaptive"),
         "every combination of the values, scrambled Sobol points, or a search for the best point",
     )
     samples: int = quantity(64, "1", 1, 2**20, "points of a Sobol (a power of two) or adaptive one")
-    objective: str = ""
-    """The measure whose mean over the repeats an adaptive design makes small."""
+    objective: str = plain(
+        "", "the measure whose mean over the repeats an adaptive design makes small"
+    )
     batch: int = quantity(8, "1", 1, 2**10, "points that an adaptive design chooses at once")
     repeats: int = quantity(1, "1", 1, 1e6, "runs of each point, each with a seed of its own")
     seed: int = quantity(0, "1", 0, 1e9, "of the Sobol points, and of the first repeat")
-    measures: list[str] = dataclasses.field(default_factory=default_measures)
+    measures: list[str] = plain(default_measures(), "what it measures of each run")
     force_threshold: float = quantity(1.0, "N", 0.0, 1e3, "of time_above_force_s")
 
     def check(self, where: str) -> None:

@@ -1,0 +1,111 @@
+"""The fields of scenarios and studies as a list: what each is called, takes and means.
+
+Help texts, references and schemas are made from it, so that each says what the checks do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from dataclasses import dataclass
+from typing import Any
+
+_KINDS = {float: "number", int: "whole number", bool: "true or false", str: "word"}
+
+
+@dataclass(frozen=True)
+class FieldInfo:
+    """What is known of a field.
+
+    Attributes:
+        name: as it stands in a file.
+        kind: "number", "whole number", "true or false", "word" or "block", of the innermost items.
+        lists: how many lists lie around it: 0 for one value, 1 for a list of them.
+        length: of the list; None if it may be any, or is none.
+        optional: whether it may be null.
+        default: what it is if nothing is said; of an instance, what it is there.
+        unit: "1" for none; empty if it is no quantity.
+        low, high: the closed range of a quantity.
+        choices: the words that may stand there; none: any.
+        blocks: for a block the dataclasses that may stand there; a tag such as !Touch tells which
+            of several is meant.
+        meaning: one line or more for people.
+    """
+
+    name: str
+    kind: str
+    lists: int
+    length: int | None
+    optional: bool
+    default: Any
+    unit: str
+    low: float | None
+    high: float | None
+    choices: tuple[str, ...]
+    blocks: tuple[type, ...]
+    meaning: str
+
+    @property
+    def range(self) -> str:
+        """The range with the unit, or the choices, or the kinds of block, for people."""
+        if self.unit:
+            unit = "" if self.unit == "1" else f" {self.unit}"
+            return f"{self.low:.7g} to {self.high:.7g}{unit}"
+        if self.choices:
+            return ", ".join(self.choices)
+        return " or ".join(block.__name__ for block in self.blocks)
+
+
+def fields_of(config: Any) -> list[FieldInfo]:
+    """The fields of a block of a scenario or a study, in their order.
+
+    For what stands inside a block, ask again with its `default`: the same block may have other
+    defaults at another place.
+
+    Args:
+        config: a dataclass of `quantity`, `choice`, `plain` and blocks, or an instance of one.
+    """
+    return [_info(entry, config) for entry in dataclasses.fields(config)]
+
+
+def _info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
+    lists, items, optional = _unfold(entry.type)
+    blocks = tuple(item for item in items if item not in _KINDS)
+    known = entry.metadata
+    return FieldInfo(
+        name=entry.name,
+        kind="block" if blocks else _KINDS[items[0]],
+        lists=lists,
+        length=known.get("length"),
+        optional=optional,
+        default=_default(entry) if isinstance(config, type) else getattr(config, entry.name),
+        unit=known.get("unit", ""),
+        low=known.get("low"),
+        high=known.get("high"),
+        choices=known.get("choices", ()),
+        blocks=blocks,
+        meaning=known.get("doc") or _first_line(blocks[0]),
+    )
+
+
+def _unfold(hint: Any) -> tuple[int, tuple[Any, ...], bool]:
+    """list[A | B] | None as (1, (A, B), True)."""
+    if typing.get_origin(hint) is list:
+        lists, items, _ = _unfold(typing.get_args(hint)[0])
+        return lists + 1, items, False
+    if typing.get_origin(hint) not in (typing.Union, types.UnionType):
+        return 0, (hint,), False
+    options = tuple(option for option in typing.get_args(hint) if option is not type(None))
+    lists, items, _ = _unfold(options[0]) if len(options) == 1 else (0, options, False)
+    return lists, items, len(options) < len(typing.get_args(hint))
+
+
+def _default(entry: dataclasses.Field[Any]) -> Any:
+    if entry.default_factory is not dataclasses.MISSING:
+        return entry.default_factory()
+    return entry.default
+
+
+def _first_line(block: type) -> str:
+    return (block.__doc__ or "").partition("\n")[0]
