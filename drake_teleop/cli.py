@@ -273,10 +273,10 @@ def analyze(scenario: str, direction: str, out: Path, quiet: bool) -> None:
 @click.option("--networks", type=option.Names(), help="Presets.  [default: lan to lunar]")
 @click.option("--methods", type=option.Names(), help="Methods.  [default: all]")
 @click.option(
-    "--jobs", type=click.IntRange(min=1), help="Processes at once.  [default: one for each core]"
+    "--jobs", type=option.Whole(min=1), help="Processes at once.  [default: one for each core]"
 )
 @option.out("compare-passivity")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--seed", type=option.Whole(min=0), default=0, show_default=True)
 @option.quiet
 def compare_passivity(
     networks: tuple[str, ...] | None,
@@ -306,7 +306,7 @@ def compare_passivity(
 @cli.command()
 @click.argument("study", type=option.PATH)
 @click.option(
-    "--jobs", type=click.IntRange(min=1), help="Processes at once.  [default: one for each core]"
+    "--jobs", type=option.Whole(min=1), help="Processes at once.  [default: one for each core]"
 )
 @click.option(
     "--cluster",
@@ -329,14 +329,14 @@ def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: 
 
 @cli.command("scaling-study")
 @click.option(
-    "--jobs", type=click.IntRange(min=1), help="Processes at once.  [default: one for each core]"
+    "--jobs", type=option.Whole(min=1), help="Processes at once.  [default: one for each core]"
 )
 @click.option(
     "--cluster",
     metavar="ADDRESS",
     help="Of a Dask scheduler, which has the processes; or local, for one on this machine.",
 )
-@click.option("--repeats", type=click.IntRange(min=1), help="Seeds of each point.  [default: 12]")
+@click.option("--repeats", type=option.Whole(min=1), help="Seeds of each point.  [default: 12]")
 @option.out("scaling-study")
 @option.quiet
 def scaling_study(
@@ -386,7 +386,7 @@ def scaling_study(
 @click.option(
     "--period", type=option.Number(0.5, 600), default=6.0, show_default=True, metavar="SECONDS"
 )
-@click.option("--harmonics", type=click.IntRange(2, 20), default=5, show_default=True)
+@click.option("--harmonics", type=option.Whole(2, 20), default=5, show_default=True)
 @click.option(
     "--time",
     "seconds",
@@ -394,7 +394,7 @@ def scaling_study(
     metavar="SECONDS",
     help="CPU time of the optimiser.  [default: four starts, the same on every machine]",
 )
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--seed", type=option.Whole(min=0), default=0, show_default=True)
 @option.out("excite")
 @option.quiet
 def excite(

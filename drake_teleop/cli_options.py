@@ -12,6 +12,23 @@ import click
 PATH = click.Path(path_type=Path)
 
 
+def _check_range(
+    kind: click.FloatRange | click.IntRange,
+    number: float,
+    param: click.Parameter | None,
+    ctx: click.Context | None,
+) -> None:
+    """Refuses what is outside, in words: click's own would be `x>=0`."""
+    low, high = kind.min, kind.max
+    if high is not None and not (low or 0) <= number <= high:
+        kind.fail(f"{number:g} is outside {low or 0:g} to {high:g}", param, ctx)
+    if low is not None and (number < low or (kind.min_open and number == low)):
+        text = (
+            f"{number:g} is not above {low:g}" if kind.min_open else f"{number:g} is below {low:g}"
+        )
+        kind.fail(text, param, ctx)
+
+
 class Number(click.FloatRange):
     """A finite number in a range: click's own lets "nan" and "inf" through."""
 
@@ -20,9 +37,21 @@ class Number(click.FloatRange):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        number = super().convert(value, param, ctx)
+        number: float = click.FLOAT.convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
+        _check_range(self, number, param, ctx)
+        return number
+
+
+class Whole(click.IntRange):
+    """A whole number in a range."""
+
+    name = "integer"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        number: int = click.INT.convert(value, param, ctx)
+        _check_range(self, number, param, ctx)
         return number
 
 
@@ -43,7 +72,7 @@ def out(command: str) -> Callable[[Any], Any]:
     return click.option("--out", type=PATH, default=default, show_default=True, metavar="DIR")
 
 
-seed = click.option("--seed", type=click.IntRange(min=0), help="Instead of the scenario's seed.")
+seed = click.option("--seed", type=Whole(min=0), help="Instead of the scenario's seed.")
 quiet = click.option("--quiet", is_flag=True, help="No progress bars, no tables.")
 cutoff = click.option(
     "--cutoff",

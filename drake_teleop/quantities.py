@@ -104,11 +104,12 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
         raise DrakeTeleopError(
             f"has {len(numbers)} numbers", where=place, remedy=f"give {length} numbers"
         )
-    low, high, unit = metadata["low"], metadata["high"], metadata["unit"]
+    low, high = metadata["low"], metadata["high"]
+    unit = "" if metadata["unit"] == "1" else f" {metadata['unit']}"
     for number in numbers:
         if not math.isfinite(number) or not low <= number <= high:
             raise DrakeTeleopError(
-                f"{number:g} {unit} is outside the range {low:g} to {high:g} {unit}",
+                f"{number:g}{unit} is outside {low:g} to {high:g}{unit}",
                 where=place,
                 remedy=f"check the value and its unit ({metadata['doc']})",
             )

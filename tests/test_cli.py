@@ -95,6 +95,20 @@ def test_wrong_usage_is_one_error_line_and_status_2(capsys, arguments):
 
 
 @pytest.mark.parametrize(
+    ("option", "number", "says"),
+    [
+        ("--harmonics", "1", "1 is outside 2 to 20"),
+        ("--harmonics", "21", "21 is outside 2 to 20"),
+        ("--period", "1000", "1000 is outside 0.5 to 600"),
+        ("--time", "0", "0 is not above 0"),
+        ("--seed", "-3", "-3 is below 0"),
+    ],
+)
+def test_a_range_is_said_in_words(capsys, option, number, says):
+    assert run_main(capsys, "excite", option, number)[2].endswith(f"'{option}': {says}\n")
+
+
+@pytest.mark.parametrize(
     ("exception", "status", "message"),
     [
         (DrakeTeleopError("no such\nfield", where="a.yaml:x"), 2, "error: a.yaml:x: no such field"),

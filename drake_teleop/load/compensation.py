@@ -191,7 +191,7 @@ def scales_from_eta(eta: float) -> tuple[float, float, float]:
         DrakeTeleopError: if eta is not within [0, 1].
     """
     if not 0.0 <= eta <= 1.0:
-        raise DrakeTeleopError(f"{eta} is not within 0 to 1", where="eta")
+        raise DrakeTeleopError(f"{eta:g} is outside 0 to 1", where="eta")
     return 0.0, float(eta), 1.0
 
 

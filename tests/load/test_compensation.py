@@ -97,7 +97,7 @@ def test_scales_are_not_negative(name, value):
 
 @pytest.mark.parametrize("eta", [-0.01, 1.01, np.nan])
 def test_eta_is_a_share(eta):
-    with pytest.raises(DrakeTeleopError, match=r"^eta: .* is not within 0 to 1"):
+    with pytest.raises(DrakeTeleopError, match=r"^eta: .* is outside 0 to 1"):
         scales_from_eta(eta)
     with pytest.raises(DrakeTeleopError, match=r"^eta: "):
         modified_phi(TOOL, TOOL, eta)

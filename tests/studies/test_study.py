@@ -497,7 +497,7 @@ def test_a_preset_brings_its_values(files):
         (("operator.grip, words: [light, firm]", "force_scaling.sigma, values: [1]"), "twice"),
         (("force_scaling.sigma", "simulation.seed"), "factors[0].field: the seed is no factor"),
         (("tiny.yaml", "none.yaml"), "there is no scenario"),
-        (("repeats: 2", "repeats: 0"), "repeats: 0 1 is outside"),
+        (("repeats: 2", "repeats: 0"), "repeats: 0 is outside 1 to"),
         (("repeats: 2", "repeat: 2"), "did you mean 'repeats'"),
         (("repeats: 2", "design: taguchi"), "design: 'taguchi' is not known"),
         (("repeats: 2", "{design: sobol, samples: 48}"), "is not YAML"),
