@@ -1,6 +1,6 @@
 """Draws the pictures of README and docs into docs/figures.
 
-The station, Fig. 8 as `reproduce` makes it, and the noise of the wrist sensor.
+The station, Fig. 8 as `reproduce` makes it, the sample log, and the noise of the wrist sensor.
 
 Run it as `python docs/make_figures.py`.
 """
@@ -18,7 +18,20 @@ from matplotlib.axes import Axes
 from matplotlib.patches import FancyBboxPatch
 from scipy.signal import welch
 
-from drake_teleop.pages.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, house_style
+from drake_teleop.logs.detection import detect_log
+from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.sample import sample_log_command
+from drake_teleop.pages.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    VERMILION,
+    Picture,
+    house_style,
+    shade_contact,
+)
 from drake_teleop.reproduction.reproduce import reproduce_command
 from drake_teleop.sensor.sensor_chain import PRESETS, without
 from drake_teleop.sensor.sensor_noise import (
@@ -206,6 +219,29 @@ def noise_figure() -> Picture:
     return figure
 
 
+def log_figure(folder: Path) -> Picture:
+    """|F| of the sample log's second record: measured, without the weight, and of the contact."""
+    sample_log_command(folder, quiet=True)
+    load = identify_log(folder / "free.yaml").identification
+    found = detect_log(folder / "touched.yaml", load, free=folder / "free.yaml")
+    log = found.eliminated
+    assert log.gravity_only is not None  # its pose is known
+    curves = (
+        ("measured, without offsets", log.measured, GREY),
+        ("without the weight", log.gravity_only, ORANGE),
+        ("contact force", log.contact, BLUE),
+    )
+    with house_style():
+        figure = Picture(figsize=(8.2, 2.8), facecolor="white")
+        axes = figure.subplots()
+        for name, wrench, colour in curves:
+            axes.plot(log.log.t, np.linalg.norm(wrench[:, :3], axis=1), color=colour, label=name)
+        shade_contact(axes, log.log.t, found.touched)
+        axes.set(xlabel="time [s]", ylabel="$|F|$ [N]", xlim=(0, 9), ylim=(0, None))
+        figure.legend(loc="outside upper center", ncols=3)
+    return figure
+
+
 def main() -> None:
     FIGURES.mkdir(exist_ok=True)
     # Without date and random ids, so that the same script draws the same file.
@@ -213,6 +249,7 @@ def main() -> None:
         station_figure().savefig(FIGURES / "station.svg", metadata={"Date": None})
         noise_figure().savefig(FIGURES / "sensor_noise.svg", metadata={"Date": None})
     with tempfile.TemporaryDirectory() as folder:
+        log_figure(Path(folder) / "sample").savefig(FIGURES / "log.png")
         reproduce_command(Path(folder))
         shutil.copy(Path(folder) / "fig8.png", FIGURES / "result.png")
 

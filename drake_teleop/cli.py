@@ -247,6 +247,21 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
     inspect_command(log, out, quiet=quiet)
 
 
+@cli.command("sample-log")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@option.out("sample-log")
+@option.quiet
+def sample_log(seed: int, out: Path, quiet: bool) -> None:
+    """Write a simulated log to try these commands on.
+
+    Wrench and pose of an arm with a gripper, in free motion and touched three times, as two
+    recorders with their own clocks, rates and units wrote them, and what is in them (truth.json).
+    """
+    from drake_teleop.logs.sample import sample_log_command
+
+    sample_log_command(out, seed=seed, quiet=quiet)
+
+
 @cli.command()
 @click.argument("scenario")
 @click.option(

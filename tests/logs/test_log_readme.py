@@ -1,4 +1,4 @@
-"""The README's log description and its two commands do what they say, word for word."""
+"""The README's commands for logs, word for word, on the sample log; they find what is in it."""
 
 from __future__ import annotations
 
@@ -6,51 +6,90 @@ import json
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-import polars as pl
 import pytest
-from known_motion import Motion, motion_at, quaternions
 
 from drake_teleop.cli import main
-from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.sample import sample_log_command
 
-README = Path(__file__).parents[2] / "README.md"
-PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
-OFFSETS = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
+README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
 
 
 def block(language: str, start: str) -> str:
-    (found,) = re.findall(f"```{language}\n({re.escape(start)}.*?)```", README.read_text(), re.S)
+    (found,) = re.findall(f"```{language}\n({re.escape(start)}.*?)```", README, re.S)
     return found
 
 
+def contents(path: str) -> Any:
+    return json.loads(Path(path).read_text())
+
+
 @pytest.fixture(scope="module")
-def motion() -> Motion:
-    return motion_at(np.arange(0.0, 8.0, 2e-3))
+def folder(tmp_path_factory):
+    """Where the README's commands have been run."""
+    folder = tmp_path_factory.mktemp("readme")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for command in block("sh", ".venv/bin/drake-teleop sample-log").splitlines():
+            program, *arguments = shlex.split(command)
+            assert program == ".venv/bin/drake-teleop"
+            with pytest.raises(SystemExit) as stop:
+                main(arguments)
+            assert stop.value.code == 0, command
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def here(folder, monkeypatch):
+    monkeypatch.chdir(folder)
 
 
 @pytest.mark.slow
-def test_a_robots_log_as_in_the_readme(tmp_path, monkeypatch, capsys, motion):
-    monkeypatch.chdir(tmp_path)
-    wrench = OFFSETS + non_contact_wrench(motion.specific_force, motion.omega, motion.alpha, PHI)
-    write("wrench.csv", "time Fx Fy Fz Tx Ty Tz", 1e3 * motion.t, -wrench)
-    q = quaternions(motion.R_WS)[:, [1, 2, 3, 0]]
-    write("tcp.csv", "time qx qy qz qw x y z", 1e3 * motion.t, q, 1e3 * motion.p_WS)
-    Path("robot.yaml").write_text(block("yaml", "wrench:"))
-    for command in block("sh", ".venv/bin/drake-teleop identify").splitlines():
-        program, *arguments = shlex.split(command)
-        assert program == ".venv/bin/drake-teleop"
-        with pytest.raises(SystemExit) as stop:
-            main(arguments)
-        assert stop.value.code == 0, capsys.readouterr().err
-    load = json.loads(Path("out/load/identification.json").read_text())
-    assert load["mass"] == pytest.approx(1.7, abs=0.005)
-    assert load["offsets"] == pytest.approx(OFFSETS, abs=0.05)
-    summary = json.loads(Path("out/free/summary.json").read_text())
-    assert summary["residual_rms"] < 0.02 * summary["raw_rms"]
+def test_the_description_is_the_one_that_the_readme_shows():
+    assert Path("out/sample/free.yaml").read_text() == block("yaml", "# A gripper")
 
 
-def write(name: str, columns: str, *values: np.ndarray) -> None:
-    pl.DataFrame(np.column_stack(values), schema=columns.split()).write_csv(name)
+@pytest.mark.slow
+def test_nothing_is_wrong_with_the_sample_but_that_its_pose_is_late():
+    assert [found["name"] for found in contents("out/inspect/summary.json")["findings"]] == ["lag"]
+
+
+@pytest.mark.slow
+def test_the_load_is_identified():
+    truth, load = contents("out/sample/truth.json"), contents("out/load/identification.json")
+    assert all(load["identifiable"])
+    for name, value in {"mass": 5e-4, "com": 1e-4, "delay_s": 3e-4}.items():
+        assert load[name] == pytest.approx(truth[name], abs=value)
+    assert load["inertia_com"] == [pytest.approx(row, abs=5e-5) for row in truth["inertia_com"]]
+    assert load["offsets"][:3] == pytest.approx(truth["offsets"][:3], abs=5e-3)
+    assert load["offsets"][3:] == pytest.approx(truth["offsets"][3:], abs=5e-4)
+
+
+@pytest.mark.slow
+def test_what_is_left_is_the_touches():
+    truth = contents("out/sample/truth.json")["contacts"]
+    free = contents("out/load/summary.json")["residual_rms_force"]
+    assert free < 0.1  # N, of the sensor's noise after the low-pass
+    assert max(peak["peak_N"] for peak in truth) < contents("out/touched/summary.json")["raw_rms"]
+    found = contents("out/detect/summary.json")["contacts"]
+    assert len(found) == len(truth)
+    for contact, touch in zip(found, truth, strict=True):
+        assert contact["peak_N"] == pytest.approx(touch["peak_N"], rel=0.03)
+        assert contact["start_s"] == pytest.approx(touch["start_s"], abs=0.015)
+        assert contact["stop_s"] == pytest.approx(touch["stop_s"], abs=0.06)
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_bytes(tmp_path):
+    def written(folder: Path) -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    shipped = written(Path("out/sample"))
+    assert sum(map(len, shipped.values())) < 1e6
+    sample_log_command(tmp_path, quiet=True)
+    assert written(tmp_path) == shipped
+    sample_log_command(tmp_path, seed=1, quiet=True)
+    other = written(tmp_path)
+    same = {name for name in shipped if other[name] == shipped[name]}
+    assert same == {"free.yaml", "touched.yaml", "truth.json"}

@@ -1,0 +1,263 @@
+"""What `drake-teleop sample-log` writes: a log to try the commands on, simulated.
+
+An arm with the lengths of a UR5e carries a gripper on a wrist sensor. It moves without touching
+anything (free.yaml), and then while somebody touches its fingertips (touched.yaml). Wrench and pose
+come from two recorders: other rates, clocks and units, noise, offsets, and a pose that is late. The
+commands read these files and nothing else; truth.json is for whoever wants to compare.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.logs.figures import plain, write_summary
+from drake_teleop.logs.read.description import STANDARD_GRAVITY, UNITS
+
+Array = NDArray[np.float64]
+
+MASS, COM = 0.95, np.array([0.004, -0.011, 0.058])
+INERTIA_COM = np.array([[1.4e-3, 5e-5, 0.0], [5e-5, 1.9e-3, -8e-5], [0.0, -8e-5, 9e-4]])
+"""The gripper: kg, m, kg m^2, in S; about a Robotiq 2F-85."""
+TIP_S = np.array([0.0, 0.0, 0.17])
+OFFSETS = np.array([[4.2, -6.1, 11.3, 0.21, -0.14, 0.05], [4.5, -6.0, 10.9, 0.21, -0.15, 0.05]])
+"""[f; tau] of the sensor in either record, N and N m: they drift between the two."""
+NOISE = np.repeat([0.08, 0.003], 3)
+POSE_DELAY_S = 0.013
+CLOCK_S = 48213.4
+"""What the controller's clock shows when that of the sensor shows 0."""
+
+WRENCH_HZ, POSE_HZ = 500.0, 125.0
+PERIOD_S, REST_S = 8.0, 0.5
+_JITTER_S = 5e-5
+
+# UR5e, from the table of its maker: d, a [m] and alpha [rad] after Denavit and Hartenberg.
+_DH = np.array(
+    [
+        [0.1625, 0.0, np.pi / 2],
+        [0.0, -0.425, 0.0],
+        [0.0, -0.3922, 0.0],
+        [0.1333, 0.0, np.pi / 2],
+        [0.0997, 0.0, -np.pi / 2],
+        [0.0996, 0.0, 0.0],
+    ]
+)
+_HOME = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
+_SIZE = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])  # of the joints' motion [rad]
+_HARMONICS = 6
+
+
+@dataclass(frozen=True)
+class Touch:
+    """A push at the fingertips that rises and falls as a half sine.
+
+    Args:
+        start_s, stop_s: of the sensor's clock.
+        push_W: (3,) largest force on the gripper, in the world [N].
+    """
+
+    start_s: float
+    stop_s: float
+    push_W: tuple[float, float, float]
+
+    def force(self, t: Array) -> Array:
+        """(N, 3) in the world, at times t (N,)."""
+        share = np.clip((t - self.start_s) / (self.stop_s - self.start_s), 0, 1)
+        return np.outer(np.sin(np.pi * share), self.push_W)
+
+
+TOUCHES = (
+    Touch(2.1, 2.2, (0.0, 9.0, 0.0)),
+    Touch(4.4, 4.9, (-3.0, 0.0, 6.0)),
+    Touch(6.9, 6.98, (4.0, -2.0, 0.0)),
+)
+"""A tap, a push, a light tap; less than what the gripper's weight and inertia make."""
+
+_DESCRIPTION = """\
+# A gripper on a lab arm, {what}: made by drake-teleop sample-log.
+wrench:
+  file: {name}_wrench.csv           # 500 Hz
+  time: {{column: time, unit: ms}}
+  force: {{columns: [Fx, Fy, Fz], unit: lbf}}
+  torque: {{columns: [Tx, Ty, Tz], unit: lbf in}}
+  sign: -1                        # the sensor reports what the load exerts on it, as most do
+pose:                             # of the sensor
+  file: {name}_pose.csv             # 125 Hz
+  time: {{column: uptime, offset: {offset}}}   # s; the arm's clock is ahead by that much
+  orientation: {{columns: [rx, ry, rz], form: rotation_vector, unit: deg}}
+  position: {{columns: [x, y, z], unit: mm}}
+"""
+
+
+def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict[str, Any]:
+    """Writes both records, their descriptions, truth.json and summary.json into `out`.
+
+    Args:
+        seed: of the noise; the same seed gives the same bytes.
+
+    Returns:
+        the summary: seed, files, duration_s, wrench_hz, pose_hz.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    random = np.random.default_rng(seed)
+    records = {"free": ((), "in free motion"), "touched": (TOUCHES, "touched three times")}
+    files = []
+    for row, (name, (touches, what)) in enumerate(records.items()):
+        text = _DESCRIPTION.format(what=what, name=name, offset=-CLOCK_S)
+        (out / f"{name}.yaml").write_text(text, encoding="utf-8")
+        _write_wrench(out / f"{name}_wrench.csv", _motion(row), touches, OFFSETS[row], random)
+        _write_pose(out / f"{name}_pose.csv", _motion(row), random)
+        files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
+    (out / "truth.json").write_text(json.dumps(plain(_truth()), indent=2) + "\n", encoding="utf-8")
+    summary = {
+        "seed": seed,
+        "files": [*files, "truth.json"],
+        "duration_s": PERIOD_S + 2 * REST_S,
+        "wrench_hz": WRENCH_HZ,
+        "pose_hz": POSE_HZ,
+    }
+    write_summary(out, summary)
+    if not quiet:
+        _print(out)
+    return summary
+
+
+def _truth() -> dict[str, Any]:
+    """Names, units and signs of identification.json, and of the contacts of `eliminate`."""
+    return {
+        "mass": MASS,
+        "com": COM,
+        "inertia_com": INERTIA_COM,
+        "phi": phi_from_mass_com_inertia(MASS, COM, INERTIA_COM),
+        "offsets": OFFSETS[0],
+        "offsets_touched": OFFSETS[1],
+        "delay_s": POSE_DELAY_S,
+        "contacts": [
+            {
+                "start_s": touch.start_s,
+                "stop_s": touch.stop_s,
+                "peak_N": np.linalg.norm(touch.push_W),
+            }
+            for touch in TOUCHES
+        ],
+    }
+
+
+def _print(out: Path) -> None:
+    from rich.console import Console
+
+    load = "out/load/identification.json"
+    for line in (
+        f"a gripper in free motion ({out}/free.yaml) and touched three times ({out}/touched.yaml)",
+        "try:",
+        f"  drake-teleop inspect {out}/free.yaml",
+        f"  drake-teleop identify {out}/free.yaml --out out/load",
+        f"  drake-teleop eliminate {out}/touched.yaml --load {load}",
+        f"  drake-teleop detect {out}/touched.yaml --load {load} --free {out}/free.yaml",
+        f"what they should find is in {out}/truth.json",
+    ):
+        Console(soft_wrap=True).print(line, highlight=False, markup=False)
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """What the arm does, from `REST_S` before to `REST_S` after its trajectory."""
+
+    trajectory: FourierTrajectory
+
+    def at(self, t: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """s, omega, alpha (N, 3) in S, R_WS (N, 3, 3) and p_WS (N, 3) at times t (N,)."""
+        moving = np.clip(t - REST_S, 0, PERIOD_S)
+        return sensor_motion(*self.trajectory.evaluate(moving))
+
+
+def _motion(number: int) -> _Motion:
+    """One of the motions: harmonics of random size, always the same."""
+    random = np.random.default_rng([2009, number])
+    sine, cosine = random.normal(size=(2, 6, _HARMONICS - 1)) * _SIZE[:, np.newaxis] / 2
+    return _Motion(FourierTrajectory.at_rest(_HOME, sine, cosine, 1 / PERIOD_S))
+
+
+def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """The motion of the last link's frame, S, of the arm of the sample log.
+
+    Args:
+        q, qd, qdd: (N, 6) angles of the joints and their derivatives [rad, s].
+
+    Returns:
+        specific force [m/s^2], angular velocity and acceleration, (N, 3) in S; R_WS (N, 3, 3); p_WS
+        (N, 3) [m].
+    """
+    R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
+    p, omega, alpha = np.zeros((3, len(q), 3))
+    s = p + np.array([0.0, 0.0, STANDARD_GRAVITY])
+    for j, (d, a, twist) in enumerate(_DH):
+        z, rate = R[:, :, 2], qd[:, j, np.newaxis]
+        alpha = alpha + qdd[:, j, np.newaxis] * z + np.cross(omega, rate * z)
+        omega = omega + rate * z
+        turned = R @ _turns(q[:, j], 2)
+        r = turned @ [a, 0.0, d]
+        p, s = p + r, s + np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
+        R = turned @ _turns(np.array([twist]), 0)
+    in_S = (np.einsum("nji,nj->ni", R, x) for x in (s, omega, alpha))
+    return *in_S, R, p
+
+
+def _turns(angle: Array, axis: int) -> Array:
+    """(N, 3, 3) rotations by angles (N,) about x (0) or z (2)."""
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    R = np.tile(np.eye(3), (len(angle), 1, 1))
+    R[:, first, first] = R[:, second, second] = np.cos(angle)
+    R[:, second, first] = np.sin(angle)
+    R[:, first, second] = -R[:, second, first]
+    return R
+
+
+def _clock(rate_hz: float, random: np.random.Generator) -> Array:
+    """Times of the rows on the sensor's clock, not quite regular."""
+    t = np.arange(round((PERIOD_S + 2 * REST_S) * rate_hz)) / rate_hz
+    return t + _JITTER_S * random.uniform(0, 1, len(t))
+
+
+def _write_wrench(
+    path: Path,
+    motion: _Motion,
+    touches: tuple[Touch, ...],
+    offsets: Array,
+    random: np.random.Generator,
+) -> None:
+    t = _clock(WRENCH_HZ, random)
+    s, omega, alpha, R_WS, _ = motion.at(t)
+    phi = phi_from_mass_com_inertia(MASS, COM, INERTIA_COM)
+    wrench = non_contact_wrench(s, omega, alpha, phi) + offsets
+    for touch in touches:
+        push_S = np.einsum("nji,nj->ni", R_WS, touch.force(t))
+        # Whoever pushes takes that much off the sensor.
+        wrench -= np.hstack([push_S, np.cross(TIP_S, push_S)])
+    wrench += NOISE * random.normal(size=wrench.shape)
+    reading = -wrench / np.repeat([UNITS["lbf"], UNITS["lbf in"]], 3)
+    _write(path, "time Fx Fy Fz Tx Ty Tz", [1e3 * t, reading], 4)
+
+
+def _write_pose(path: Path, motion: _Motion, random: np.random.Generator) -> None:
+    from scipy.spatial.transform import Rotation
+
+    t = _clock(POSE_HZ, random)
+    _, _, _, R_WS, p_WS = motion.at(t - POSE_DELAY_S)
+    turn = Rotation.from_matrix(R_WS).as_rotvec(degrees=True)
+    _write(path, "uptime x y z rx ry rz", [t + CLOCK_S, 1e3 * p_WS, turn], 4)
+
+
+def _write(path: Path, names: str, columns: list[Array], digits: int) -> None:
+    import polars as pl
+
+    table = np.round(np.column_stack(columns), digits)
+    pl.DataFrame(table, schema=names.split()).write_csv(path, float_precision=digits)
