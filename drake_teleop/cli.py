@@ -46,15 +46,17 @@ def reproduce(out: Path, seed: int | None, quiet: bool) -> int:
 @click.argument("scenario")
 @option.out("run")
 @option.seed
+@click.option("--fresh", is_flag=True, help="Identify the load anew, also if it is in the cache.")
 @option.quiet
-def run(scenario: str, out: Path, seed: int | None, quiet: bool) -> None:
+def run(scenario: str, out: Path, seed: int | None, fresh: bool, quiet: bool) -> None:
     """Simulate one scenario.
 
-    SCENARIO is the name of a shipped one or a YAML file. Writes its log and its pictures.
+    SCENARIO is the name of a shipped one or a YAML file. Writes its log and its pictures. The load
+    that it identifies first is kept in the user's cache folder, or in $DRAKE_TELEOP_CACHE_DIR.
     """
     from drake_teleop.run import run_command
 
-    run_command(scenario, out, seed=seed, quiet=quiet)
+    run_command(scenario, out, seed=seed, fresh=fresh, quiet=quiet)
 
 
 @cli.command()

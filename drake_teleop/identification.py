@@ -26,6 +26,7 @@ from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.methods import METHODS
 from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.one_thread import one_blas_thread
 from drake_teleop.pages.progress import Progress, Stage, silent
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
@@ -148,7 +149,8 @@ def identify_load(
     result, factor = timed(station, scenario.simulation, stage("Identify the load"), log)
     usable = result["saturated"][:, 0] == 0
     wrench, s, omega, alpha = (signal[usable] for signal in sensor_samples(result))
-    batch = batch_identification(scenario, wrench, s, omega, alpha, scenario.rates.log_hz)
+    with one_blas_thread():
+        batch = batch_identification(scenario, wrench, s, omega, alpha, scenario.rates.log_hz)
     kappa = criteria_of(robot, trajectory)["kappa_w10"]
     estimate = result["load_estimate"][-1]
     method = METHODS[scenario.load_estimator.method].method

@@ -6,11 +6,14 @@ What the station knows about its load, by one rule:
   operator wants nothing either (the shipped "identification"), the slave alone runs an excitation
   trajectory as long as the scenario.
 - Every other scenario does what an honest user would: it first identifies the load with that
-  trajectory and its own sensor, from the sensor's samples alone.
+  trajectory and its own sensor, from the sensor's samples alone; or it takes what was found when
+  that was done before, see `drake_teleop.identified_load`.
 
 `summary.json` holds, beside what was run:
 
 =========================== =====================================================================
+load_source                 which load was used: "learnt while it ran", "identified before the run",
+                            or "cache", identified before an earlier run
 peak_measured_force_N       largest measured |f|, offsets removed; likewise peak_measured_torque_Nm;
                             this and the next two with the load estimate of the end
 peak_contact_force_N        largest calculated contact force; likewise peak_contact_torque_Nm
@@ -43,12 +46,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from drake_teleop.identification import (
-    identification_scenario,
     identify_load,
     sensor_samples,
     slave_arm,
     timed,
 )
+from drake_teleop.identified_load import identified_load
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.pages.progress import Stage, progress_bars, silent
@@ -63,6 +66,7 @@ Array = NDArray[np.float64]
 
 # After a contact has ended the sensor's filter still shows it for this long [s].
 FILTER_TAIL = 0.01
+_LEARNT = "learnt while it ran"
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,17 +77,24 @@ class ScenarioRun:
         scenario: with the seed that was used.
         result: the recorded signals.
         identification: what was found beforehand; None if the scenario learnt while it ran.
+        load_source: as in summary.json.
         real_time_factor: simulated over elapsed time.
     """
 
     scenario: Scenario
     result: SimulationResult
     identification: Identification | None
+    load_source: str
     real_time_factor: float
 
 
 def run_command(
-    scenario: str | Path, out: Path, *, seed: int | None = None, quiet: bool = False
+    scenario: str | Path,
+    out: Path,
+    *,
+    seed: int | None = None,
+    fresh: bool = False,
+    quiet: bool = False,
 ) -> dict[str, Any]:
     """Runs one scenario.
 
@@ -95,6 +106,7 @@ def run_command(
         scenario: the name of a shipped one, or a YAML file.
         out: the folder.
         seed: instead of the scenario's.
+        fresh: whether to identify the load anew although it was kept.
         quiet: no progress bars and no table.
 
     Returns:
@@ -113,7 +125,7 @@ def run_command(
     (out / "summary.json").unlink(missing_ok=True)
     try:
         with progress_bars(quiet) as stage:
-            run = run_scenario(setup, stage, log)
+            run = run_scenario(setup, stage, log, fresh=fresh)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(_kept(log)) from interrupt
     summary = {"scenario": str(scenario)} | summarise(run)
@@ -128,29 +140,36 @@ def run_command(
     return summary
 
 
-def run_scenario(scenario: Scenario, stage: Stage = silent, log: Path | None = None) -> ScenarioRun:
+def run_scenario(
+    scenario: Scenario,
+    stage: Stage = silent,
+    log: Path | None = None,
+    *,
+    fresh: bool = False,
+    loads: Path | None = None,
+) -> ScenarioRun:
     """Runs a scenario by the rule at the top of this module.
 
     Args:
         scenario: what to run.
         stage: where progress is shown.
         log: as `simulate` has it.
+        fresh, loads: `fresh` and `folder` of `identified_load`.
     """
     learns = scenario.load_estimator.enabled
     if learns and not scenario.operator.intent and scenario.operator.task is None:
         found = identify_load(scenario, stage, log=log)
-        return ScenarioRun(scenario, found.result, found.identification, found.real_time_factor)
-    identification, estimate, floor = None, None, None
+        return ScenarioRun(
+            scenario, found.result, found.identification, _LEARNT, found.real_time_factor
+        )
+    identification, estimate, floor, source = None, None, None, _LEARNT
     if not learns:
-        # Another seed: the noise of the run must not be the one that was learnt from.
-        before = identification_scenario(scenario, scenario.simulation.seed + 1)
-        found = identify_load(before, stage)
-        identification, estimate = found.identification, found.estimate
-        if scenario.contact_detection is not None:
-            floor = found.noise_floor(slave_arm(scenario))
+        load = identified_load(scenario, stage, fresh=fresh, folder=loads)
+        identification, estimate, floor = load.identification, load.estimate, load.noise_floor
+        source = "cache" if load.from_cache else "identified before the run"
     station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
     result, factor = timed(station, scenario.simulation, stage("Run the scenario"), log)
-    return ScenarioRun(scenario, result, identification, factor)
+    return ScenarioRun(scenario, result, identification, source, factor)
 
 
 def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
@@ -189,6 +208,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         "seed": run.scenario.simulation.seed,
         "duration_s": round(float(result.t[-1]), 6),
         "samples": len(result.t),
+        "load_source": run.load_source,
         **_peaks("peak_measured", "", measured),
         **_peaks("peak_contact", "", calculated),
         **_peaks("residual", "_max", calculated[free]),
@@ -312,6 +332,8 @@ def _print(summary: dict[str, Any], out: Path) -> None:
     console = Console()
     console.print(summary["description"] or summary["scenario"], style="bold", markup=False)
     console.print(table)
+    hint = "; --fresh identifies it anew" if summary["load_source"] == "cache" else ""
+    console.print(f"load: {summary['load_source']}{hint}", highlight=False)
     for k, (start, stop) in enumerate(summary["true_contact_s"]):
         noticed = ""
         if "contact_noticed_ms" in summary:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,14 @@ SECOND_HALF = (
     *("load", "logs"),  # in this order
     *("cli", "house", "malformed_input", "master", "passivity", "theory", "vectors"),
 )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """One cache of identified loads for all workers and their processes; never the user's."""
+    if not hasattr(config, "workerinput"):
+        folder = tempfile.TemporaryDirectory(prefix="drake_teleop-")
+        config.add_cleanup(folder.cleanup)
+        os.environ["DRAKE_TELEOP_CACHE_DIR"] = folder.name
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -159,12 +159,14 @@ def test_options_reach_the_commands(capsys, install):
     install("drake_teleop.reproduction.reproduce", "reproduce_command", note)
     install("drake_teleop.reproduction.report", "unaccepted", lambda summary: [])
     install("drake_teleop.logs.commands", "identify_command", note)
-    status, out, err = run_main(capsys, "run", "contact_transition", "--seed", "7", "--quiet")
+    status, out, err = run_main(
+        capsys, "run", "contact_transition", "--seed", "7", "--fresh", "--quiet"
+    )
     assert (status, out, err) == (0, "", "")
     run_main(capsys, "reproduce", "--out", "out/r")
     run_main(capsys, "identify", "a.yaml", "--delay", "0.006")
     assert calls == [
-        (("contact_transition", Path("out/run")), {"seed": 7, "quiet": True}),
+        (("contact_transition", Path("out/run")), {"seed": 7, "fresh": True, "quiet": True}),
         ((Path("out/r"),), {"seed": None, "quiet": False}),
         (
             (Path("a.yaml"), Path("out/identify")),

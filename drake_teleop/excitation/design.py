@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.excitation.problem import Evaluation, Problem, Task
 from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.one_thread import one_blas_thread
 
 Array = NDArray[np.float64]
 
@@ -76,7 +77,7 @@ def design(
         The feasible iterates as they were found; none if there were none.
     """
     search = _Search(Problem(task), starts, seconds, progress)
-    with suppress(_TimeIsUpError):
+    with one_blas_thread(), suppress(_TimeIsUpError):
         for candidate in search.candidates(np.random.default_rng(seed)):
             if seconds is None and search.start == starts:
                 break

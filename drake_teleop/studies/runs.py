@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drake_teleop._version import __version__
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.one_thread import one_blas_thread
 from drake_teleop.pages.progress import Progress, progress_bars
 from drake_teleop.studies.design import Study, Values
 from drake_teleop.studies.processes import Chunk, processes
@@ -137,15 +138,9 @@ def _duration(seconds: float) -> str:
 def _run_chunk(
     work: Work, names: Sequence[str], rows: Sequence[dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """The rows with their measures, or with the reason why a run has none.
-
-    With one thread of BLAS: sums over two differ in their last digits from those over one.
-    """
-    import scipy.linalg  # noqa: F401, what comes in later would have its threads
-    from threadpoolctl import threadpool_limits
-
+    """The rows with their measures, or with the reason why a run has none."""
     found = []
-    with threadpool_limits(1):
+    with one_blas_thread():
         for row in rows:
             values = {name: row[name] for name in names}
             try:

@@ -38,10 +38,7 @@ process is a failed run; only if there is one process for all does it end the st
 from __future__ import annotations
 
 import copy
-import hashlib
 import json
-import os
-import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,19 +50,11 @@ from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import (
-    identification_scenario,
-    identify_load,
-    slave_arm,
-)
-from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.quantities import check_ranges, check_structure
 from drake_teleop.resources import studies_dir
 from drake_teleop.result import SimulationResult
 from drake_teleop.run import run_scenario
 from drake_teleop.scenario import ReadScenario, Scenario, ScenarioFromData, ScenarioNames
-from drake_teleop.simulation import simulate
-from drake_teleop.station import MakeTeleopStation
 from drake_teleop.studies.design import Factor, Study, Values
 from drake_teleop.studies.effects import effects
 from drake_teleop.studies.measures import measured
@@ -108,38 +97,8 @@ class StationWork:
 
     def _simulated(self, scenario: Scenario) -> SimulationResult:
         """`run_scenario`, which identifies a load only once in a study."""
-        if scenario.load_estimator.enabled:
-            return run_scenario(scenario).result
-        estimate, floor = self._identified(scenario)
-        station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
-        return simulate(station, scenario.simulation)
-
-    def _identified(self, scenario: Scenario) -> tuple[Array, NoiseFloor | None]:
-        """The load's estimate, and the noise floor if the station detects contact."""
-        before = identification_scenario(scenario, scenario.simulation.seed + 1)
-        detects = scenario.contact_detection is not None
-        key = hashlib.sha256(repr((before, detects)).encode()).hexdigest()
-        path = self.loads / f"{key}.pickle"
-        if path not in _identified and path.exists():
-            _identified[path] = pickle.loads(path.read_bytes())
-        if path not in _identified:
-            found = identify_load(before)
-            floor = found.noise_floor(slave_arm(before)) if detects else None
-            _identified[path] = found.estimate, floor
-            if self.loads.parent.is_dir():  # not so on another machine of a cluster
-                _keep(path, pickle.dumps(_identified[path]))
-        return _identified[path]
-
-
-_identified: dict[Path, tuple[Array, NoiseFloor | None]] = {}
-
-
-def _keep(path: Path, content: bytes) -> None:
-    """Writes it, complete or not at all, whoever else does the same now."""
-    path.parent.mkdir(exist_ok=True)
-    unfinished = path.with_suffix(f".{os.getpid()}.unfinished")
-    unfinished.write_bytes(content)
-    unfinished.replace(path)
+        elsewhere = not self.loads.parent.is_dir()  # on another machine of a cluster
+        return run_scenario(scenario, loads=None if elsewhere else self.loads).result
 
 
 def study_command(

@@ -1,0 +1,210 @@
+"""Identified loads that are kept: the same bits, never stale, and no harm from damaged files."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drake_teleop import identified_load as module
+from drake_teleop.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.identified_load import CACHE_VARIABLE, identified_load
+from drake_teleop.load.contact.noise_floor import NoiseFloor
+from drake_teleop.load.identification import Identification
+from drake_teleop.run import run_command, run_scenario
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+
+# Numbers that no short decimal stands for, of a load that is about the tool.
+RNG = np.random.default_rng(1)
+COVARIANCE = np.diag(RNG.uniform(1e-9, 1e-7, 16))
+COVARIANCE[9, 9] = np.inf
+FOUND = Identification(
+    phi=np.array([3.13, 0.01, 0.02, 0.3, 0.05, 0.0, 0.0, 0.05, 0.0, 0.01])
+    + RNG.normal(0, 1e-9, 10),
+    offsets=RNG.normal(0, 0.1, 6),
+    covariance=COVARIANCE,
+    identifiable=np.arange(16) != 9,
+    condition_number=float(RNG.uniform(3, 4)),
+    delay_s=0.0,
+    residual_rms=RNG.uniform(0.1, 0.2, 6),
+    method="recursive total least squares",
+    samples=6001,
+    degrees_of_freedom=np.where(np.arange(16) < 3, np.inf, 77.3),
+)
+FLOOR = NoiseFloor(
+    RNG.uniform(0.1, 0.2, 6), np.eye(16) / 3, RNG.uniform(0, 1, (6, 2)), np.eye(6), np.full(6, 0.1)
+)
+DETECTS = replace(Scenario(), contact_detection=ContactDetectionConfig())
+
+
+@pytest.fixture
+def identifications(monkeypatch, tmp_path):
+    """The list of the scenarios that were identified; nothing is simulated for it."""
+    asked = []
+
+    def identify(scenario, stage):
+        asked.append(scenario)
+        return SimpleNamespace(identification=FOUND, noise_floor=lambda arm: FLOOR)
+
+    monkeypatch.setattr(module, "identify_load", identify)
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    return asked
+
+
+def same_bits(a, b) -> bool:
+    """Whether two dataclasses have the same types and bytes throughout."""
+    return type(a) is type(b) and all(
+        type(x) is type(y) and np.asarray(x).dtype == np.asarray(y).dtype
+        and np.asarray(x).tobytes() == np.asarray(y).tobytes()
+        for x, y in (
+            (getattr(a, field.name), getattr(b, field.name)) for field in dataclasses.fields(a)
+        )
+    )  # fmt: skip
+
+
+def test_what_was_identified_comes_back_bit_by_bit(identifications):
+    first, again = identified_load(DETECTS), identified_load(DETECTS)
+    assert (first.from_cache, again.from_cache, len(identifications)) == (False, True, 1)
+    assert same_bits(again.identification, FOUND)
+    assert same_bits(again.noise_floor, FLOOR)
+    assert again.estimate.tobytes() == np.concatenate([FOUND.offsets, FOUND.phi]).tobytes()
+
+
+def test_fresh_identifies_anew_and_keeps_that(identifications):
+    for fresh in (False, True, False):
+        identified_load(Scenario(), fresh=fresh)
+    assert len(identifications) == 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"slave__payload": dataclasses.replace(Scenario().slave.payload, mass=1e-13)},
+        {"slave__position": [0.55, 0.0, np.nextafter(0.45, 1)]},
+        {"slave__position": np.array([0.55, 0.0, np.nextafter(0.45, 1)])},
+        {"wrist_sensor__ideal": True},
+        {"motion_estimation__source": "encoders"},
+        {"joint_control__position_bandwidth_hz": 12.5},
+        {"rates__estimator_hz": 500.0},
+        {"simulation__seed": 1},
+        {"contact_detection": ContactDetectionConfig()},
+    ],
+    ids=lambda change: next(iter(change)),
+)  # fmt: skip
+def test_whatever_it_depends_on_makes_another(identifications, change):
+    identified_load(Scenario())
+    identified_load(replace(Scenario(), **change))
+    assert len(identifications) == 2
+
+
+def test_what_it_does_not_depend_on_makes_no_other(identifications):
+    identified_load(Scenario())
+    assert identified_load(
+        replace(Scenario(), operator__grip="firm", force_scaling__sigma=0.5, description="x")
+    ).from_cache
+
+
+def test_an_edit_of_sources_or_models_makes_another(identifications, tmp_path, monkeypatch):
+    package, models = tmp_path / "package", tmp_path / "models"
+    for folder, name in ((package / "room", "a.py"), (models, "tool.sdf")):
+        folder.mkdir(parents=True)
+        (folder / name).write_text("x = 1")
+    hashes = [module._sources(package, models)]
+    for path in (package / "room/a.py", models / "tool.sdf"):
+        path.write_text("x = 2")
+        hashes.append(module._sources(package, models))
+    (package / "room/a.py").rename(package / "room/b.py")
+    hashes.append(module._sources(package, models))
+    assert len(set(hashes)) == 4
+    for each in hashes:
+        monkeypatch.setattr(module, "_SOURCES", each)
+        identified_load(Scenario())
+    assert len(identifications) == 4
+
+
+def damaged(content: bytes) -> dict[str, bytes]:
+    middle = content.index(b"load.phi") + 200
+    flipped = bytearray(content)
+    flipped[middle] ^= 1
+    return {
+        "empty": b"",
+        "cut": content[: len(content) // 2],
+        "text": b"not an archive",
+        "flipped": bytes(flipped),
+    }
+
+
+@pytest.mark.parametrize("what", ["empty", "cut", "text", "flipped"])
+def test_a_damaged_file_is_ignored_and_renewed(identifications, tmp_path, what):
+    identified_load(Scenario())
+    (path,) = (tmp_path / "cache").iterdir()
+    path.write_bytes(damaged(path.read_bytes())[what])
+    assert not identified_load(Scenario()).from_cache
+    assert same_bits(identified_load(Scenario()).identification, FOUND)
+    assert len(identifications) == 2
+
+
+def test_a_pickled_object_is_not_read(identifications, tmp_path):
+    identified_load(Scenario())
+    (path,) = (tmp_path / "cache").iterdir()
+    with np.load(path) as archive:
+        columns = dict(archive)
+    np.savez(path, **columns | {"load.phi": columns["load.phi"].astype(object)})
+    assert not identified_load(Scenario()).from_cache
+
+
+def test_a_write_that_fails_leaves_nothing_and_is_no_error(identifications, tmp_path, monkeypatch):
+    identified_load(Scenario())
+    (path,) = (tmp_path / "cache").iterdir()
+
+    def full(file, **columns):
+        file.write(b"half of it")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    assert not identified_load(Scenario(), fresh=True).from_cache
+    assert list((tmp_path / "cache").iterdir()) == [path]
+    assert identified_load(Scenario()).from_cache  # who reads meanwhile finds the whole of the old
+    monkeypatch.setenv(CACHE_VARIABLE, str(path))  # a file, where the folder should be
+    assert not identified_load(Scenario()).from_cache
+
+
+def test_the_oldest_are_removed(identifications, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "LARGEST_NUMBER", 2)
+    for seed in range(3):
+        identified_load(replace(Scenario(), simulation__seed=seed))
+        for path in (tmp_path / "cache").iterdir():
+            os.utime(path, ns=(path.stat().st_mtime_ns - 10**9,) * 2)
+    assert len(list((tmp_path / "cache").iterdir())) == 2
+    assert identified_load(replace(Scenario(), simulation__seed=2)).from_cache
+    assert not identified_load(replace(Scenario(), simulation__seed=0)).from_cache
+
+
+def test_the_tests_do_not_touch_the_users_cache():
+    from platformdirs import user_cache_path
+
+    assert module.cache_folder() != user_cache_path("drake_teleop", appauthor=False)
+
+
+@pytest.mark.slow
+def test_a_run_says_which_load_it_used_and_is_the_same_with_either(
+    identifications, tmp_path, capsys
+):
+    path = tmp_path / "short.yaml"
+    path.write_text("simulation: {duration: 0.02, settle: 0.0}")
+    first = run_scenario(LoadScenario(path))
+    assert first.load_source == "identified before the run"
+    summary = run_command(path, tmp_path / "out")
+    assert summary["load_source"] == "cache"
+    assert "load: cache; --fresh identifies it anew" in capsys.readouterr().out
+    for name, write in (
+        ("log.parquet/row_0000000000.parquet", first.result.write_parquet),
+        ("identification.json", first.identification.save),
+    ):
+        write(tmp_path / "first")
+        assert (tmp_path / "first").read_bytes() == (tmp_path / "out" / name).read_bytes()
+    assert run_scenario(LoadScenario(path), fresh=True).load_source == first.load_source
+    assert len(identifications) == 2
