@@ -1,14 +1,20 @@
 """What a study's rows say about its factors: means with confidence intervals; the Pareto front.
 
-All points of a design have the same seeds, and the seeds are what the runs are a sample of. So each
-figure is calculated for each seed alone, and its interval is Student's for the mean over seeds.
-Differences between levels are taken within each seed: what a seed does to all points cancels. One
-repeat says nothing about other seeds, and has no intervals (nan).
+All points of a design have the same seeds, and the seeds are what the runs are a sample of. In a
+factorial design every level of a factor meets the same combinations of the others. So each mean
+is one over runs, calculated for each seed alone, and its interval is Student's for the mean over
+seeds. Differences between levels are taken within each seed: what a seed does to all points
+cancels. One repeat says nothing about other seeds, and has no intervals (nan).
+
+The points of any other design are a sample, too, and its levels differ by chance in what else is
+varied; likewise those of a factorial one if a point failed with every seed. There the effects are
+those of a regression, and the intervals hold for the design and the seeds together; see
+`level_model.py`. With one repeat the intervals of effects are those of the design alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,17 +23,15 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from drake_teleop.studies.design import Factor, Study
+from drake_teleop.studies.level_model import CONFIDENCE, Levels, level_model, levels_of
 
 if TYPE_CHECKING:
     import polars as pl
 
 Array = NDArray[np.float64]
 
-CONFIDENCE = 0.95
 #: What a designer of the loop gives and takes: the hand's effort against what it gets for it.
 PARETO = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
-# Equal parts of a range, of points that lie anywhere in it.
-_BINS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,23 +50,49 @@ class Estimate:
     effect_half: Array
 
 
-def levels_of(factor: Factor, column: Sequence[Any]) -> tuple[NDArray[np.int64], list[str]]:
-    """The level of each row, and the levels' names.
+@dataclass(frozen=True, eq=False)
+class MainEffect:
+    """What one factor does to a measure.
 
-    A range with many values is cut into equal parts, named by their middles.
+    Attributes:
+        names: of its n levels, or of parts of its range.
+        runs: (n,) at each.
+        mean: (n,) over all other factors and the seeds.
+        half: (n,) half the width of the interval of the mean.
+        effect: (n,) the difference of the mean from that over all levels.
+        effect_half: (n,) half the width of its interval.
+        fitted: whether a regression found it, see `level_model.py`.
     """
-    ranged = factor.low is not None and factor.high is not None
-    present = [value for value in factor.listed() if value in column]
-    if ranged and any(value not in present for value in column):
-        low, high = float(factor.low or 0.0), float(factor.high or 0.0)
-        share = (np.array(column, dtype=float) - low) / (high - low)
-        middles = low + (np.arange(_BINS) + 0.5) / _BINS * (high - low)
-        index = np.minimum((share * _BINS).astype(np.int64), _BINS - 1)
-        return index, [f"{middle:.3g}" for middle in middles]
-    return np.array([present.index(value) for value in column]), [_name(v) for v in present]
+
+    names: list[str]
+    runs: NDArray[np.int64]
+    mean: Array
+    half: Array
+    effect: Array
+    effect_half: Array
+    fitted: bool
 
 
-def estimated(values: Array, levels: NDArray[np.int64], seeds: Array, count: int) -> Estimate:
+@dataclass(frozen=True, eq=False)
+class PairMeans:
+    """The means of a measure over two factors.
+
+    Attributes:
+        fields: of the two, n and m levels.
+        names: of the levels.
+        mean: (n, m) over all other factors and the seeds.
+        fitted: whether a regression found it, see `level_model.py`.
+    """
+
+    fields: tuple[str, str]
+    names: tuple[list[str], list[str]]
+    mean: Array
+    fitted: bool
+
+
+def estimated(
+    values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
+) -> Estimate:
     """The mean of each of `count` levels, over seeds.
 
     Args:
@@ -87,26 +117,119 @@ def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
     """The main effects: a row for each measure, factor and level."""
     import polars as pl
 
-    seeds, table = rows["seed"].to_numpy(), []
-    for factor in varied(study):
-        levels, names = levels_of(factor, rows[factor.field].to_list())
-        for measure in study.measures:
-            found = estimated(numbers(rows, measure), levels, seeds, len(names))
-            middle = np.sum(found.mean) / len(names)
-            for index, name in enumerate(names):
-                table.append(
-                    {
-                        "measure": measure,
-                        "factor": factor.field,
-                        "level": name,
-                        "runs": int(np.sum(levels == index)),
-                        "mean": found.mean[index],
-                        "mean_half": found.half[index],
-                        "effect": found.mean[index] - middle,
-                        "effect_half": found.effect_half[index],
-                    }
-                )
+    table = [
+        {
+            "measure": measure,
+            "factor": field,
+            "level": name,
+            "runs": int(found.runs[index]),
+            "mean": found.mean[index],
+            "mean_half": found.half[index],
+            "effect": found.effect[index],
+            "effect_half": found.effect_half[index],
+        }
+        for measure in study.measures
+        for field, found in main_effects(study, rows, measure).items()
+        for index, name in enumerate(found.names)
+    ]
     return pl.DataFrame(table)
+
+
+def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
+    """What each factor does to a measure, by field; nothing if no run has it."""
+    data = _Data(study, rows, measure)
+    return (
+        {} if data.nothing else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
+    )
+
+
+def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
+    """The means of a measure over each pair of factors; none if there are too few points."""
+    data = _Data(study, rows, measure)
+    pairs = itertools.combinations(range(len(data.factors)), 2)
+    return [] if data.nothing else [found for pair in pairs if (found := data.pair(*pair))]
+
+
+class _Data:
+    """One measure at the points of a design, and how its effects are found: see above."""
+
+    def __init__(self, study: Study, rows: pl.DataFrame, measure: str) -> None:
+        self.factors = varied(study)
+        points, self.table = _points_and_seeds(rows, measure)
+        self.nothing = not len(points)
+        self.columns = [points[factor.field].to_list() for factor in self.factors]
+        self.balanced = study.design == "factorial" and len(points) == study.size()
+        self.model = None
+        if not self.balanced and not self.nothing:
+            self.model = level_model(self.factors, self.columns)
+
+    def main_effect(self, factor: int) -> MainEffect:
+        levels = self._levels(factor)
+        mean = half = effect = effect_half = np.full(len(levels.names), np.nan)
+        if self.model is not None:
+            effect, effect_half = (found[factor] for found in self.model.effects(self.table))
+            mean, half = self.model.means(self.table, factor)
+        elif self.balanced:
+            found = self._cells(levels.index, len(levels.names))
+            mean, half, effect_half = found.mean, found.half, found.effect_half
+            effect = mean - mean.mean()
+        runs = np.bincount(levels.index) * self.table.shape[1]
+        return MainEffect(
+            levels.names, runs, mean, half, effect, effect_half, self.model is not None
+        )
+
+    def pair(self, first: int, second: int) -> PairMeans | None:
+        a, b = self._levels(first), self._levels(second)
+        if self.balanced:
+            shape = len(a.names), len(b.names)
+            index = a.index * shape[1] + b.index
+            mean = self._cells(index, shape[0] * shape[1]).mean.reshape(shape)
+        elif self.model is not None and self.model.products:
+            mean = self.model.cells(self.table, first, second)
+        else:
+            return None
+        fields = self.factors[first].field, self.factors[second].field
+        return PairMeans(fields, (a.names, b.names), mean, not self.balanced)
+
+    def _levels(self, factor: int) -> Levels:
+        if self.model is not None:
+            return self.model.factors[factor]
+        return levels_of(self.factors[factor], self.columns[factor])
+
+    def _cells(self, index: NDArray[np.int64], count: int) -> Estimate:
+        seeds = self.table.shape[1]
+        places, of_seed = np.repeat(index, seeds), np.tile(np.arange(seeds), len(index))
+        return estimated(self.table.ravel(), places, of_seed, count)
+
+
+def _points_and_seeds(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
+    """The points at which a run has the measure, and (n, seeds) its values.
+
+    What a failed run lacks is taken as its point and its seed have it elsewhere: the point's other
+    runs alone would move it by what their seeds do to all points.
+    """
+    import polars as pl
+
+    points = rows.unique("point", keep="first").sort("point")
+    _, point = np.unique(rows["point"].to_numpy(), return_inverse=True)
+    seeds, seed = np.unique(rows["seed"].to_numpy(), return_inverse=True)
+    table = np.full((points.height, len(seeds)), np.nan)
+    table[point, seed] = numbers(rows, measure)
+    known = np.isfinite(table)
+    kept, table = known.any(axis=1), table[known.any(axis=1)][:, known.any(axis=0)]
+    return points.filter(pl.Series(kept)), _filled(table)
+
+
+def _filled(table: Array) -> Array:
+    """A table of points and seeds with sums of both where it has no number."""
+    known = np.isfinite(table)
+    if known.all():
+        return table
+    of_seed = np.zeros(table.shape[1])
+    for _ in range(100):  # least squares, in turns
+        of_point = np.mean(table - of_seed, axis=1, where=known)
+        of_seed = np.mean(table - of_point[:, None], axis=0, where=known)
+    return np.where(known, table, of_point[:, None] + of_seed)
 
 
 def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
@@ -172,7 +295,3 @@ def _interval(table: Array) -> tuple[Array, Array]:
         quantile = student.ppf(0.5 + CONFIDENCE / 2, np.maximum(count - 1, 1))
         half = quantile * np.sqrt(spread / count)
     return mean, np.where(count > 1, half, np.nan)
-
-
-def _name(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)

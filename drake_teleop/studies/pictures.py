@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,16 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drake_teleop.pages.style import BLUE, GREY, VERMILION, Picture, house_style
+from drake_teleop.studies import effects
 from drake_teleop.studies.design import Study
-from drake_teleop.studies.effects import (
-    CONFIDENCE,
-    PARETO,
-    estimated,
-    levels_of,
-    numbers,
-    pareto,
-    varied,
-)
+from drake_teleop.studies.effects import PARETO, numbers, pair_means, pareto, varied
+from drake_teleop.studies.level_model import CONFIDENCE
 
 if TYPE_CHECKING:
     import polars as pl
@@ -56,60 +49,56 @@ def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figur
 
     Bars are intervals of the level's difference from the mean of all, which is what a factor does.
     """
-    factors, seeds = varied(study), rows["seed"].to_numpy()
+    factors, fitted = varied(study), False
     with house_style():
         size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
         figure = Picture(figsize=size)
         grid = figure.subplots(len(measures), len(factors), squeeze=False, sharey="row")
-        for column, factor in enumerate(factors):
-            levels, names = levels_of(factor, rows[factor.field].to_list())
-            for axes, measure in zip(grid[:, column], measures, strict=True):
-                found = estimated(numbers(rows, measure), levels, seeds, len(names))
-                bars = np.nan_to_num(found.effect_half)
-                place = np.arange(len(names))
-                axes.errorbar(place, found.mean, bars, color=BLUE, marker="o", ms=3.5, capsize=3)
-                axes.set_xticks(place, names)
-                axes.set_xlim(-0.4, len(names) - 0.6)
-            grid[-1, column].set_xlabel(factor.field)
-        for axes, measure in zip(grid[:, 0], measures, strict=True):
-            axes.set_ylabel(measure, fontsize=7)
-        figure.suptitle(
-            f"Main effects{_caption(study, 'of a level against the mean')}", x=0.01, ha="left"
-        )
+        for line, measure in zip(grid, measures, strict=True):
+            found = effects.main_effects(study, rows, measure)
+            for axes, factor in zip(line, factors, strict=True):
+                _levels(axes, found[factor.field])
+                fitted |= found[factor.field].fitted
+            line[0].set_ylabel(measure, fontsize=7)
+        for axes, factor in zip(grid[-1], factors, strict=True):
+            axes.set_xlabel(factor.field)
+        figure.suptitle(f"Main effects{_effects_caption(study, fitted)}", x=0.01, ha="left")
     return figure
 
 
-def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure:
-    """The mean of a measure over each pair of factors."""
-    pairs = list(itertools.combinations(varied(study), 2))
-    seeds, values = rows["seed"].to_numpy(), numbers(rows, measure)
-    columns = min(len(pairs), 3)
-    lines = -(-len(pairs) // columns)
+def _levels(axes: Axes, found: effects.MainEffect) -> None:
+    place = np.arange(len(found.names))
+    bars = np.nan_to_num(found.effect_half)
+    axes.errorbar(place, found.mean, bars, color=BLUE, marker="o", ms=3.5, capsize=3)
+    axes.set_xticks(place, found.names)
+    axes.set_xlim(-0.4, len(place) - 0.6)
+    if np.isnan(found.mean).all():
+        axes.text(0.5, 0.5, "too few points", transform=axes.transAxes, ha="center", fontsize=8)
+
+
+def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
+    """The mean of a measure over each pair of factors; None if there are too few points for it."""
+    maps = pair_means(study, rows, measure)
+    if not maps:
+        return None
+    columns = min(len(maps), 3)
+    lines = -(-len(maps) // columns)
     with house_style():
         figure = Picture(figsize=(1.0 + 3.1 * columns, 0.6 + 2.6 * lines))
         grid = figure.subplots(lines, columns, squeeze=False)
-        maps = []
-        for first, second in pairs:
-            a, names_a = levels_of(first, rows[first.field].to_list())
-            b, names_b = levels_of(second, rows[second.field].to_list())
-            count = len(names_a) * len(names_b)
-            found = estimated(values, a * len(names_b) + b, seeds, count)
-            maps.append((found.mean.reshape(len(names_a), -1), names_a, names_b))
-        low = min(np.nanmin(table) for table, _, _ in maps)
-        high = max(np.nanmax(table) for table, _, _ in maps)
-        for axes, (first, second), (table, names_a, names_b) in zip(
-            grid.ravel(), pairs, maps, strict=False
-        ):
-            drawn = axes.imshow(table, origin="lower", aspect="auto", vmin=low, vmax=high)
+        low, high = (end([end(found.mean) for found in maps]) for end in (np.min, np.max))
+        for axes, found in zip(grid.ravel(), maps, strict=False):
+            drawn = axes.imshow(found.mean, origin="lower", aspect="auto", vmin=low, vmax=high)
             axes.grid(False)
-            axes.set_xticks(range(len(names_b)), names_b)
-            axes.set_yticks(range(len(names_a)), names_a)
-            axes.set_xlabel(second.field)
-            axes.set_ylabel(first.field)
-        for axes in grid.ravel()[len(pairs) :]:
+            axes.set_xticks(range(len(found.names[1])), found.names[1])
+            axes.set_yticks(range(len(found.names[0])), found.names[0])
+            axes.set_xlabel(found.fields[1])
+            axes.set_ylabel(found.fields[0])
+        for axes in grid.ravel()[len(maps) :]:
             axes.set_visible(False)
         figure.colorbar(drawn, ax=grid, label=measure)
-        figure.suptitle(f"Interactions: mean of {measure}", x=0.01, ha="left")
+        words = ", fitted: levels of each, and products" if maps[0].fitted else ""
+        figure.suptitle(f"Interactions: mean of {measure}{words}", x=0.01, ha="left")
     return figure
 
 
@@ -152,6 +141,13 @@ def _bars(axes: Axes, points: pl.DataFrame, name: str) -> None:
         points[name], points[PARETO[0]], half[1], half[0],
         color=VERMILION, marker="o", ms=4, lw=0, elinewidth=0.9, capsize=2,
     )  # fmt: skip
+
+
+def _effects_caption(study: Study, fitted: bool) -> str:
+    if not fitted:
+        return _caption(study, "of a level against the mean")
+    words = f"; bars: {CONFIDENCE:.0%} intervals of all levels against the mean, over the design"
+    return f"{words}; one seed" if study.repeats == 1 else f"{words} and {study.repeats} seeds"
 
 
 def _caption(study: Study, what: str) -> str:

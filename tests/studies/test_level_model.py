@@ -1,0 +1,144 @@
+"""Effects from designs that are not balanced: intervals hold what they promise, for any design."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.stats import qmc
+
+from drake_teleop.studies.design import Factor, Study
+from drake_teleop.studies.effects import effects, main_effects, pair_means
+from drake_teleop.studies.level_model import level_model, levels_of
+
+UNIT = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xyz"]
+EDGES = np.linspace(0.0, 1.0, 6)
+
+
+def known(points):
+    """Straight in x, bent in y, both together, and nothing in z."""
+    x, y, _ = points.T
+    return 5 * x + np.sin(5 * y) + 3 * x * y
+
+
+def true_effects() -> list[np.ndarray]:
+    """The means of `known` over each fifth of each factor, less the mean of all."""
+    middles = (EDGES[1:] + EDGES[:-1]) / 2 - 0.5
+    bent = -np.diff(np.cos(5 * EDGES)) / 5 / np.diff(EDGES)
+    return [6.5 * middles, bent - bent.mean() + 1.5 * middles, np.zeros(5)]
+
+
+@pytest.mark.parametrize(("noise", "seeds"), [(0.0, 1), (0.5, 3)])
+def test_all_effects_are_in_their_intervals_in_nine_of_ten_sobol_designs(noise, seeds):
+    random, truth = np.random.default_rng(0), true_effects()
+    inside, plain, null = [], [], []
+    for draw in range(200):
+        points = qmc.Sobol(3, seed=np.random.default_rng(draw)).random_base2(6)
+        table = known(points)[:, None] + random.normal(0, 1.0, seeds)  # what a seed does to all
+        table = table + random.normal(0, noise, table.shape)
+        model = level_model(UNIT, points.T.tolist())
+        found, halves = model.effects(table)
+        near = [np.abs(a - b) <= h for a, b, h in zip(found, truth, halves, strict=True)]
+        inside.append(np.concatenate(near).all())
+        cells = [table[model.factors[2].index == k].mean() for k in range(5)]
+        plain.append(np.ptp(cells))
+        null.append(np.ptp(found[2]))
+    assert np.mean(inside) >= 0.9
+    # Not by being wide: a factor that does nothing shows less than in plain means of cells.
+    assert np.median(null) < 0.5 * np.median(plain)
+
+
+def made_up(study: Study, value, fields=("a.x", "a.y", "a.w")) -> pl.DataFrame:
+    rows = study.rows(study.points())
+    for row in rows:
+        row["hand_work_J"] = value(*(row[field] for field in fields), row["seed"])
+    return pl.DataFrame(rows, infer_schema_length=None)
+
+
+def sobol(samples: int, repeats: int = 1, seed: int = 0) -> Study:
+    words = Factor("a.w", words=["ideal", "real", "other"])
+    return Study(
+        factors=[*UNIT[:2], words], design="sobol", samples=samples, repeats=repeats, seed=seed,
+        measures=["hand_work_J"],
+    )  # fmt: skip
+
+
+def force(x, y, word, seed):
+    """What the third factor does is 0.02 N, beside 6 N of the others."""
+    return 6 * x * (1 + y) + np.sin(5 * y) + 0.02 * (word == "real") + 0.1 * seed
+
+
+def test_a_factor_that_does_nothing_shows_nothing():
+    """Plain means of its three cells differ by 2.3 N here, because x and y differ in them."""
+    study = sobol(32, repeats=2, seed=104)
+    rows = made_up(study, force)
+    plain = rows.group_by("a.w").agg(pl.col("hand_work_J").mean())["hand_work_J"].to_numpy()
+    found = main_effects(study, rows, "hand_work_J")
+    word = found["a.w"]
+    assert word.names == ["ideal", "real", "other"]
+    assert np.ptp(plain) > 2.0
+    assert np.ptp(word.effect) < 0.1
+    assert np.all(np.abs(word.effect - np.array([-0.02, 0.04, -0.02]) / 3) <= word.effect_half)
+    # What the others do is seen; x is strongest at its ends.
+    assert np.all(np.abs(found["a.x"].effect) > found["a.x"].effect_half)
+
+
+def test_intervals_are_wide_if_seeds_differ_in_what_a_factor_does():
+    study = sobol(64, repeats=3)
+    alike = main_effects(study, made_up(study, force), "hand_work_J")
+    rows = made_up(study, lambda x, y, w, seed: force(x, y, w, seed) + seed * x)
+    apart = main_effects(study, rows, "hand_work_J")
+    assert apart["a.x"].effect_half[0] > 5 * alike["a.x"].effect_half[0]
+    assert apart["a.y"].effect_half[0] < 1.5 * alike["a.y"].effect_half[0]
+
+
+def test_what_is_exact_has_a_width_of_rounding():
+    study = sobol(64)
+    found = main_effects(study, made_up(study, lambda x, y, w, seed: 3 * x), "hand_work_J")
+    for name, truth in (("a.x", 3 * np.array([-0.4, -0.2, 0, 0.2, 0.4])), ("a.y", np.zeros(5))):
+        assert np.all(np.abs(found[name].effect - truth) <= found[name].effect_half)
+        assert np.all(found[name].effect_half < 1e-8)
+
+
+def test_a_point_that_failed_does_not_move_the_others():
+    """A factorial design without some of its points is not balanced any more."""
+    factors = [Factor("a.x", values=[0.0, 1.0, 4.0]), Factor("a.y", values=[1.0, 2.0, 3.0, 5.0])]
+    study = Study(factors=factors, repeats=2, measures=["hand_work_J"])
+    rows = made_up(study, lambda x, y, seed: 2.0 * x + 10.0 * y + seed, ("a.x", "a.y"))
+    whole = effects(study, rows)
+    broken = rows.with_columns(
+        hand_work_J=pl.when(pl.col("point").is_in([0, 5])).then(None).otherwise("hand_work_J")
+    )
+    np.testing.assert_allclose(effects(study, broken)["effect"], whole["effect"], atol=1e-9)
+    assert effects(study, broken)["runs"].sum() == 2 * (24 - 4)
+    # One run of a point, and its seed does not weigh less or more than before.
+    broken = rows.with_columns(
+        hand_work_J=pl.when(pl.col("run") == 3).then(None).otherwise("hand_work_J")
+    )
+    np.testing.assert_allclose(effects(study, broken)["mean"], whole["mean"], atol=1e-9)
+
+
+def test_means_over_pairs_are_those_of_the_function():
+    study = sobol(64)
+    rows = made_up(study, lambda x, y, w, seed: 8 * x * y + (3 * y if w == "real" else 0))
+    pairs = {found.fields: found for found in pair_means(study, rows, "hand_work_J")}
+    assert len(pairs) == 3
+    x, y = np.meshgrid(*(2 * [(EDGES[1:] + EDGES[:-1]) / 2]), indexing="ij")
+    np.testing.assert_allclose(pairs["a.x", "a.y"].mean, 8 * x * y + y, atol=1e-9)
+    expected = np.column_stack([4 * y[0], 7 * y[0], 4 * y[0]])
+    np.testing.assert_allclose(pairs["a.y", "a.w"].mean, expected, atol=1e-9)
+    few = sobol(16)
+    assert pair_means(few, made_up(few, force), "hand_work_J") == []
+
+
+def test_too_few_points_say_nothing():
+    study = sobol(2)
+    found = main_effects(study, made_up(study, force), "hand_work_J")
+    assert all(np.isnan(one.effect).all() for one in found.values())
+    nothing = made_up(study, lambda *_: None)
+    assert main_effects(study, nothing, "hand_work_J") == {}
+
+
+def test_words_that_no_run_has_are_no_levels():
+    factor = Factor("a.w", words=["a", "b", "c"])
+    assert levels_of(factor, ["c", "a", "c"]).names == ["a", "c"]
