@@ -18,8 +18,8 @@ from drake_teleop.errors import DrakeTeleopError
 def cli() -> None:
     """Bilateral teleoperation with non-contact force scaling: simulate it, and use it on logs.
 
-    Every command writes its figures by name into DIR/summary.json, and exits with status 2 and one
-    error line if its input cannot be used.
+    Every command with --out writes its figures by name into DIR/summary.json. A command whose input
+    cannot be used exits with status 2 and one error line.
     """
 
 
@@ -57,6 +57,24 @@ def run(scenario: str, out: Path, seed: int | None, fresh: bool, quiet: bool) ->
     from drake_teleop.run import run_command
 
     run_command(scenario, out, seed=seed, fresh=fresh, quiet=quiet)
+
+
+@cli.command("scenario")
+@click.argument("name", required=False)
+def print_scenario(name: str | None) -> None:
+    """Print a scenario with every field, to start from.
+
+    NAME is a shipped one or a YAML file; without it, the shipped ones are listed. Each field comes
+    with its range and its meaning: drake-teleop scenario press > mine.yaml
+    """
+    from drake_teleop.scenario import LoadScenario, ScenarioNames
+    from drake_teleop.scenario_reference import commented
+
+    if name is not None:
+        click.echo(commented(LoadScenario(name)), nl=False)
+        return
+    for shipped in ScenarioNames():
+        click.echo(f"{shipped:20} {LoadScenario(shipped).description}")
 
 
 @cli.command()

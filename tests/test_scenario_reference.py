@@ -1,0 +1,138 @@
+"""What is printed and written about the fields of a scenario is what the code takes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from pydrake.common.yaml import yaml_load
+
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.cli import main
+from drake_teleop.environment.slot import Slot
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.operator.operator import MinimumJerk, Sine
+from drake_teleop.operator.task import Press
+from drake_teleop.resources import scenarios_dir
+from drake_teleop.scenario import LoadScenario, Scenario, ScenarioFromData, ScenarioNames
+from drake_teleop.scenario_reference import commented, json_schema, reference
+from drake_teleop.sensor.sensor_chain import PRESETS
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def loaded(text: str) -> Scenario:
+    return ScenarioFromData(yaml_load(data=text), "printed.yaml")
+
+
+def taken_in(text: str, head: str) -> str:
+    """The text with one block that stands behind # taken in."""
+    lines = text.splitlines()
+    (first,) = (i for i, line in enumerate(lines) if line.startswith(f"{head}  #"))
+    mark = head[: head.index("#") + 1]
+    end = first + 1
+    while end < len(lines) and lines[end].startswith(f"{mark}   "):
+        end += 1
+    lines[first:end] = [line.replace("# ", "", 1) for line in lines[first:end]]
+    return "\n".join(lines)
+
+
+def test_the_docs_say_what_the_code_says() -> None:
+    """`python docs/make_reference.py` writes them."""
+    assert (DOCS / "scenario.md").read_text(encoding="utf-8") == reference()
+    assert (DOCS / "scenario.schema.json").read_text(encoding="utf-8") == json_schema()
+
+
+def test_every_link_in_the_reference_leads_to_a_block() -> None:
+    links = {part.partition(")")[0] for part in reference().split("](#")[1:]}
+    titles = [line[3:] for line in reference().splitlines() if line.startswith("## ")]
+    # As GitHub makes them: small letters, no points, colons and exclamation marks.
+    anchors = [title.lower().translate({ord(" "): "-", **dict.fromkeys(map(ord, ".:!"))})
+               for title in titles]  # fmt: skip
+    assert len(anchors) == len(links)
+    assert set(anchors) == links
+
+
+@pytest.mark.parametrize("name", ScenarioNames())
+def test_a_printed_scenario_loads_back(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["scenario", name])
+    assert stop.value.code == 0
+    assert loaded(capsys.readouterr().out) == LoadScenario(name)
+
+
+def test_a_file_with_a_preset_keeps_it() -> None:
+    scenario = loaded("wrist_sensor: {preset: ati_gamma_imu, force_noise: 0.125}")
+    again = loaded(commented(scenario))
+    assert again == scenario
+    assert again.wrist_sensor.preset == "ati_gamma_imu"
+
+
+def test_a_preset_can_be_changed_in_what_is_printed() -> None:
+    text = commented(Scenario()).replace("preset: custom", "preset: ati_gamma_imu")
+    assert loaded(text).wrist_sensor == PRESETS["ati_gamma_imu"]
+
+
+def test_what_stands_behind_a_sign_can_be_taken_in() -> None:
+    text = commented(Scenario())
+    assert loaded(taken_in(text, "# slot:")).slot == Slot()
+    assert loaded(taken_in(text, "  # task: !Press")).operator.task == Press()
+    assert loaded(taken_in(text, "  # intent:")).operator.intent == [MinimumJerk(), Sine()]
+    assert loaded(taken_in(text, "  # backward:")).channel.backward == NetworkConfig()
+
+
+def test_without_a_name_the_shipped_ones_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["scenario"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ScenarioNames()
+
+
+def as_an_editor_sees_it(text: str) -> Any:
+    """Parsed, without the tags, which no schema knows of."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(inner) for key, inner in value.items() if key != "_tag"}
+        return [plain(item) for item in value] if isinstance(value, list) else value
+
+    return plain(yaml_load(data=text))
+
+
+SCHEMA = jsonschema.Draft202012Validator(json.loads(json_schema()))
+
+
+@pytest.mark.parametrize("name", ScenarioNames())
+def test_the_schema_takes_what_is_shipped(name: str) -> None:
+    jsonschema.Draft202012Validator.check_schema(SCHEMA.schema)
+    SCHEMA.validate(as_an_editor_sees_it((scenarios_dir() / f"{name}.yaml").read_text()))
+
+
+def test_the_schema_takes_every_field() -> None:
+    SCHEMA.validate(as_an_editor_sees_it(commented(Scenario())))
+
+
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        ("force_scaling: {sgima: 0.5}", ["force_scaling"]),
+        ("force_scaling: {sigma: half}", ["force_scaling", "sigma"]),
+        ("force_scaling: {sigma: -1}", ["force_scaling", "sigma"]),
+        ("simulation: {duration: null}", ["simulation", "duration"]),
+        ("simulation: {seed: 0.5}", ["simulation", "seed"]),
+        ("simulation: {integrator: euler}", ["simulation", "integrator"]),
+        ("slave: {position: [0.5, 0.0]}", ["slave", "position"]),
+        ("slave: {position: [0.5, 0.0, 9.0]}", ["slave", "position", 2]),
+        ("load_estimator: {enabled: 1}", ["load_estimator", "enabled"]),
+        ("operator: {task: {force: 1000.0}}", ["operator", "task"]),
+        ("slot: 1", ["slot"]),
+    ],
+)
+def test_the_schema_refuses_what_the_library_refuses(text: str, field: list[str | int]) -> None:
+    with pytest.raises(DrakeTeleopError):
+        loaded(text)
+    (error,) = SCHEMA.iter_errors(as_an_editor_sees_it(text))
+    assert list(error.absolute_path) == field
