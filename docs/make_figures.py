@@ -1,13 +1,16 @@
 """Draws the pictures of README and docs into docs/figures.
 
-The station, Fig. 8 as `reproduce` makes it, the sample log, and the noise of the wrist sensor.
+The station, Fig. 8 as `reproduce` makes it and its scene in 3D, the sample log, and the noise of
+the wrist sensor.
 
-Run it as `python docs/make_figures.py`.
+Run it as `python docs/make_figures.py`. The scene is a picture of `replay.html` as Chromium shows
+it; without Chromium it stays as it is.
 """
 
 from __future__ import annotations
 
 import shutil
+import subprocess
 import tempfile
 from itertools import pairwise
 from pathlib import Path
@@ -242,6 +245,21 @@ def log_figure(folder: Path) -> Picture:
     return figure
 
 
+def scene_picture(film: Path, target: Path) -> None:
+    """The film of the contact at the instant at which the tool bends the leaf most."""
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        print(f"{target} stays as it is: there is no Chromium")
+        return
+    options = ("--headless", "--no-sandbox", "--hide-scrollbars", "--window-size=1200,760")
+    drawing = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+    subprocess.run(
+        [chromium, *options, *drawing, "--virtual-time-budget=4000", f"--screenshot={target}",
+         f"{film.resolve().as_uri()}#0.24"],
+        check=True, capture_output=True, timeout=300,
+    )  # fmt: skip
+
+
 def main() -> None:
     FIGURES.mkdir(exist_ok=True)
     # Without date and random ids, so that the same script draws the same file.
@@ -252,6 +270,7 @@ def main() -> None:
         log_figure(Path(folder) / "sample").savefig(FIGURES / "log.png")
         reproduce_command(Path(folder))
         shutil.copy(Path(folder) / "fig8.png", FIGURES / "result.png")
+        scene_picture(Path(folder) / "replay.html", FIGURES / "scene.png")
 
 
 if __name__ == "__main__":

@@ -51,8 +51,9 @@ def reproduce(out: Path, seed: int | None, quiet: bool) -> int:
 def run(scenario: str, out: Path, seed: int | None, fresh: bool, quiet: bool) -> None:
     """Simulate one scenario.
 
-    SCENARIO is the name of a shipped one or a YAML file. Writes its log and its pictures. The load
-    that it identifies first is kept in the user's cache folder, or in $DRAKE_TELEOP_CACHE_DIR.
+    SCENARIO is the name of a shipped one or a YAML file. Writes its log, its pictures and its film
+    in 3D. The load that it identifies first is kept in the user's cache folder, or in
+    $DRAKE_TELEOP_CACHE_DIR.
     """
     from drake_teleop.run import run_command
 
@@ -75,6 +76,24 @@ def print_scenario(name: str | None) -> None:
         return
     for shipped in ScenarioNames():
         click.echo(f"{shipped:20} {LoadScenario(shipped).description}")
+
+
+@cli.command()
+@click.argument("folder", type=option.PATH)
+@click.option(
+    "--scenario", metavar="SCENARIO", help="Of the log.  [default: the one that lies beside it]"
+)
+@option.out("replay")
+@option.quiet
+def replay(folder: Path, scenario: str | None, out: Path, quiet: bool) -> None:
+    """Show a logged run in 3D.
+
+    FOLDER is what `run` or `reproduce` wrote, or one log (.parquet) in it. Writes a film for each
+    log, one HTML file that any browser shows without a network.
+    """
+    from drake_teleop.replay import replay_command
+
+    replay_command(folder, out, scenario=scenario, quiet=quiet)
 
 
 @cli.command()
@@ -450,7 +469,8 @@ def excite(
     """Design a motion that shows all of a load.
 
     For the slave of SCENARIO, or with --model for another arm with SCENARIO's sensor. A Fourier
-    series from rest to rest, optimised, and checked against every limit and for collisions.
+    series from rest to rest, optimised, and checked against every limit and for collisions. Watch
+    it in 3D, excitation.html, before a robot runs it.
     """
     from drake_teleop.excitation.command import excite_command
 

@@ -1,109 +1,196 @@
-"""A simulation as a film: one HTML file with Meshcat in it, to be opened in any browser.
+"""A simulation as a film: `replay.html` of a run, and `drake-teleop replay` of any logged run.
 
-The slave at its bench, the haptic device on a table beside it, and forces as arrows. Blue at the
-stylus: what the wrist sensor measures, which is what the hand would feel. Orange at the stylus and
-at the tool's tip: the calculated contact force. All are drawn in the size that they have at the
-slave, 4 mm a newton.
+The slave at its bench, the haptic device on a table beside it, and forces as arrows. Blue at wrist
+and stylus: what the wrist sensor measures, which is what the hand would feel. Orange at the tool's
+tip and at the stylus: the calculated contact force. All are drawn in the size that they have at the
+slave, 3 mm a newton.
+
+`replay` finds the scenario of a log beside it: `scenario.yaml` beside `log.parquet`, which `run`
+writes, or the YAML file of the log's own name, as in the folder `logs` of `reproduce`.
 """
 
 from __future__ import annotations
 
-import gc
-import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
+import json
+from collections.abc import Container, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import (
-    Box,
-    Cylinder,
-    Meshcat,
-    MeshcatAnimation,
-    MeshcatCone,
-    MeshcatParams,
-    MeshcatVisualizer,
-    Rgba,
-)
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.geometry import Box, Meshcat, MeshcatVisualizer, Rgba
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.film import Arrow, Film, Reading, Show, frame_times, plain_room
 from drake_teleop.master.phantom import serial_joint_angles
+from drake_teleop.pages.style import BLUE, VERMILION, contact_spans
 from drake_teleop.resources import models_dir
 from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import Scenario
+from drake_teleop.scenario import LoadScenario, Scenario
+from drake_teleop.scenario_reference import commented
 from drake_teleop.slave.plant import AddEnvironment, ParseSlave, finalize
 
 Array = NDArray[np.float64]
-
-FRAMES_PER_SECOND = 50
+Signals = Mapping[str, Array]
 
 _TABLE_TOP = 0.60
 # Where the haptic device stands: origin of its base frame B in W [m].
 _P_WB = np.array([1.15, -0.10, _TABLE_TOP + 0.28])  # the device's foot is 0.28 m below B
-_CAMERA, _TARGET = (0.80, -1.25, 0.95), (0.72, 0.0, 0.56)
+_CAMERA, _TARGET = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
+_WITHOUT_MASTER = np.array([-0.3, 0.0, 0.0])  # where both are then
+
 
 _FLOOR, _WOOD, _STEEL = Rgba(0.93, 0.94, 0.95), Rgba(0.78, 0.66, 0.50), Rgba(0.40, 0.43, 0.47)
-_MEASURED, _CONTACT = Rgba(0.0, 0.447, 0.698), Rgba(0.835, 0.369, 0.0)
-_METRES_PER_NEWTON = 0.004
 _GRIP_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
-_BESIDE_TIP_W = np.array([-0.06, 0.0, 0.0])  # at the tip itself the tool would hide the arrow
-_SHAFT, _HEAD = 0.006, 0.03  # radius of an arrow's shaft, length of its head [m]
+_WRIST_S = np.array([0.0, 0.0, -0.085])  # of the arm
+# In arm and tool themselves an arrow would be hidden.
+_BESIDE_WRIST_W, _BESIDE_TIP_W = np.array([0.07, -0.09, 0.0]), np.array([-0.06, 0.0, 0.0])
+
+# Signals without which there is nothing to see, and those that are shown if they were recorded.
+_NEEDED = ("slave_state", "measured_wrench_S", "load_estimate")
+_SHOWN = ("master_state", "contact_wrench_S", "force_to_master", "sheet_state")
+
+
+def replay_command(
+    run: Path, out: Path, *, scenario: str | Path | None = None, quiet: bool = False
+) -> dict[str, Any]:
+    """Writes the films of logged runs and summary.json, which says where they are.
+
+    Args:
+        run: a folder that `run` or `reproduce` wrote, or a log in it.
+        out: the folder of the films: replay.html, or for several runs one by the name of each log.
+        scenario: of the log, a shipped one or a YAML file; by default what lies beside it.
+        quiet: prints nothing.
+
+    Returns:
+        The summary.
+
+    Raises:
+        DrakeTeleopError: if there is no log of a run, or not its scenario.
+    """
+    logs = _logs(run)
+    films = []
+    for log in logs:
+        path = out / ("replay.html" if len(logs) == 1 else f"{log.stem}.html")
+        result = SimulationResult.scan_parquet(log)
+        write_replay(path, result, LoadScenario(scenario or _scenario_of(log)))
+        films.append({"log": str(log), "film": str(path), "duration_s": float(result.t[-1])})
+        if not quiet:
+            print(f"written {path} ({path.stat().st_size / 1e6:.1f} MB): open it in a browser")
+    summary = {"films": films}
+    text = json.dumps(summary, indent=2, allow_nan=False)
+    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    return summary
+
+
+def write_scenario(path: Path, scenario: Scenario) -> None:
+    """Writes every field of a scenario to a YAML file, for `LoadScenario`."""
+    path.write_text(commented(scenario), encoding="utf-8")
 
 
 def write_replay(
-    path: Path, result: SimulationResult, scenario: Scenario, *, slow_motion: float = 1.0
+    path: Path, result: SimulationResult, scenario: Scenario, *, slow_motion: float | None = None
 ) -> None:
-    """Writes the film of a teleoperation run.
+    """Writes the film of a run.
 
     Args:
         path: of the HTML file.
-        result: with slave_state, master_state, contact_wrench_S, measured_wrench_S, load_estimate
-            and, with a sheet spring, sheet_state.
+        result: with slave_state, measured_wrench_S, load_estimate and, for all that there is to
+            see, master_state, contact_wrench_S, force_to_master and sheet_state.
         scenario: that was run.
-        slow_motion: seconds of the film for one second of the run.
+        slow_motion: seconds of the film for one second of the run, to begin with; by default as
+            many as make it last 6 s.
+
+    Raises:
+        DrakeTeleopError: if signals are missing.
     """
-    # Meshcat may be destroyed by no other thread than the one that made it, and Drake's objects
-    # hold on to each other until the garbage collector comes, in whichever thread: it comes here.
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        path.write_text(_film(result, scenario, slow_motion), encoding="utf-8")
-        gc.collect()
-    finally:
-        if collects:
-            gc.enable()
+    missing = [name for name in _NEEDED if name not in result]
+    if missing or not len(result.t):
+        raise DrakeTeleopError(
+            f"cannot be shown: it holds no {', '.join(missing) or 'samples'}",
+            where="replay",
+            remedy="give the log of a station with its own slave",
+        )
+    times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
+    rows = _nearest(result.t, times)
+    # Of a log on the disk each signal is read once, and no more of it is kept than is shown.
+    signals = {name: result[name][rows] for name in (*_NEEDED, *_SHOWN) if name in result}
+    contact = np.zeros(len(result.t), dtype=bool)
+    if "true_contact_wrench_W" in result:
+        contact = np.any(result["true_contact_wrench_W"] != 0, axis=1)
+    film = Film(
+        scenario.description or "A run of the station",
+        times,
+        slow_motion,
+        readings=_readings(signals),
+        shaded=contact_spans(result.t, contact),
+        notes=("Arrows: 3 mm a newton, as large as at the slave.",),
+        curves="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
+    )
+
+    def make_scene(meshcat: Meshcat) -> Show:
+        scene = ReplayScene(meshcat, scenario, signals)
+        return lambda film_time, frame: scene.show(film_time, signals, frame)
+
+    film.write(path, make_scene)
 
 
-def _film(result: SimulationResult, scenario: Scenario, slow_motion: float) -> str:
-    with _quiet_drake():  # nobody is to connect to its server
-        meshcat = Meshcat(MeshcatParams(host="localhost"))
-    scene = ReplayScene(meshcat, scenario)
-    meshcat.StartRecording(FRAMES_PER_SECOND, set_visualizations_while_recording=False)
-    span = result.t[-1] - result.t[0]
-    for frame in range(int(span * slow_motion * FRAMES_PER_SECOND) + 1):
-        film_time = frame / FRAMES_PER_SECOND
-        instant = result.t[0] + film_time / slow_motion
-        scene.show(film_time, result, int(np.argmin(np.abs(result.t - instant))))
-    meshcat.StopRecording()
-    meshcat.get_mutable_recording().set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
-    meshcat.PublishRecording()
-    return meshcat.StaticHtml()
+def _nearest(t: Array, times: Array) -> NDArray[np.int64]:
+    """The rows of sorted (N,) `t` that are nearest to `times`."""
+    after = np.clip(np.searchsorted(t, times), 1, max(len(t) - 1, 1))
+    after = np.minimum(after, len(t) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(times - t[before] <= t[after] - times, before, after)
 
 
-@contextmanager
-def _quiet_drake() -> Iterator[None]:
-    logger = logging.getLogger("drake")
-    level = logger.level
-    logger.setLevel(logging.WARNING)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
+def _readings(signals: Signals) -> list[Reading]:
+    measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
+    readings = [Reading("Measured at the wrist", "N", _norm(measured), BLUE, arrow=True)]
+    if "contact_wrench_S" in signals:
+        contact = _norm(signals["contact_wrench_S"][:, :3])
+        readings.append(Reading("Contact, calculated", "N", contact, VERMILION, arrow=True))
+    if "force_to_master" in signals:
+        readings.append(Reading("Shown to the hand", "N", _norm(signals["force_to_master"][:, :3])))
+    return readings
+
+
+def _norm(vectors: Array) -> Array:
+    return np.linalg.norm(vectors, axis=1)
+
+
+def _logs(run: Path) -> list[Path]:
+    """The logs with a scenario beside them in a folder, or the log itself."""
+    if not run.exists():
+        raise DrakeTeleopError("there is no such folder", where=str(run))
+    if run.suffix == ".parquet":
+        return [run]
+    if (run / "log.parquet").exists():
+        return [run / "log.parquet"]
+    logs = sorted(log for log in run.glob("logs/*.parquet") if log.with_suffix(".yaml").exists())
+    if not logs:
+        raise DrakeTeleopError(
+            "holds no log of a run",
+            where=str(run),
+            remedy="give a folder that drake-teleop run or reproduce wrote, or a log.parquet; a"
+            " study keeps measures, no logs: run one of its points as a scenario",
+        )
+    return logs
+
+
+def _scenario_of(log: Path) -> Path:
+    for path in (log.with_suffix(".yaml"), log.parent / "scenario.yaml"):
+        if path.exists():
+            return path
+    raise DrakeTeleopError(
+        "does not say of which scenario it is",
+        where=str(log),
+        remedy="give --scenario, a shipped one or a YAML file",
+    )
 
 
 class ReplayScene:
@@ -114,7 +201,8 @@ class ReplayScene:
         context: of the plant, in the posture that was shown last.
     """
 
-    def __init__(self, meshcat: Meshcat, scenario: Scenario) -> None:
+    def __init__(self, meshcat: Meshcat, scenario: Scenario, recorded: Container[str]) -> None:
+        """What was not `recorded` is not shown."""
         builder = DiagramBuilder()
         self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
         self._slave, _ = ParseSlave(self.plant)
@@ -122,65 +210,63 @@ class ReplayScene:
         if scenario.environment is not None:
             touched = AddEnvironment(self.plant, scenario.environment)
             self._sheet = None if scenario.environment.moving_part is None else touched
-        self._master = _add_master(self.plant)
+        self._master = _add_master(self.plant) if "master_state" in recorded else None
         finalize(self.plant)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
         self._diagram: Diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self.context = self.plant.GetMyMutableContextFromRoot(self._root)
-        _furnish(meshcat, scenario)
+        _furnish(meshcat, scenario, with_table=self._master is not None)
         # The device's base stands along the world's axes here, whatever its alignment in the run.
         alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
         self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
-        self._felt = _Arrow(meshcat, "measured_at_stylus", _MEASURED)
-        self._contact = _Arrow(meshcat, "contact_at_stylus", _CONTACT)
-        self._touch = _Arrow(meshcat, "contact_at_tip", _CONTACT)
+        kinds = [("measured", "wrist", BLUE)]
+        if "contact_wrench_S" in recorded:
+            kinds.append(("contact", "tip", VERMILION))
+        self._arrows = [
+            (force, place, Arrow(meshcat, f"{force}_at_{place}", colour))
+            for force, at_slave, colour in kinds
+            for place in ((at_slave,) if self._master is None else (at_slave, "stylus"))
+        ]
 
-    def show(self, film_time: float, result: SimulationResult, sample: int) -> None:
-        """Shows a sample (its index) of a run, at a time of the film [s]."""
+    def show(self, film_time: float, signals: Mapping[str, Array], sample: int) -> None:
+        """Shows a sample (its index) of signals of a run, at a time of the recording [s]."""
         self._root.SetTime(film_time)
         plant, context = self.plant, self.context
-        master = serial_joint_angles(result["master_state"][sample, :6])
-        plant.SetPositions(context, self._slave, result["slave_state"][sample, :6])
-        plant.SetPositions(context, self._master, master)
+        plant.SetPositions(context, self._slave, signals["slave_state"][sample, :6])
+        if self._master is not None:
+            master = serial_joint_angles(signals["master_state"][sample, :6])
+            plant.SetPositions(context, self._master, master)
         if self._sheet is not None:
-            plant.SetPositions(context, self._sheet, result["sheet_state"][sample, :1])
+            plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
         self._diagram.ForcedPublish(self._root)
-        # Eq. (1) is what the sensor exerts on the load: the arrows show what the load exerts.
-        R_WS = plant.GetFrameByName("sensor").CalcPoseInWorld(context).rotation().matrix()
-        measured = result["measured_wrench_S"][sample, :3] - result["load_estimate"][sample, :3]
-        measured, contact = -R_WS @ measured, -R_WS @ result["contact_wrench_S"][sample, :3]
-        pen = plant.GetFrameByName("stylus").CalcPoseInWorld(context) @ _GRIP_E
-        tip = plant.GetFrameByName("tip").CalcPoseInWorld(context).translation()
-        self._felt.show(film_time, pen, self._R_BW @ measured)
-        self._contact.show(film_time, pen, self._R_BW @ contact)
-        self._touch.show(film_time, tip + _BESIDE_TIP_W, contact)
+        forces, places = self._forces(signals, sample), self._places()
+        for force, place, arrow in self._arrows:
+            f_W = forces[force]
+            arrow.show(film_time, places[place], self._R_BW @ f_W if place == "stylus" else f_W)
 
+    def _forces(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
+        """In W. Eq. (1) is what the sensor exerts on the load; these are what the load exerts."""
+        R_WS = self.plant.GetFrameByName("sensor").CalcPoseInWorld(self.context).rotation().matrix()
+        offset = signals["load_estimate"][sample, :3]
+        forces = {"measured": -R_WS @ (signals["measured_wrench_S"][sample, :3] - offset)}
+        if "contact_wrench_S" in signals:
+            forces["contact"] = -R_WS @ signals["contact_wrench_S"][sample, :3]
+        return forces
 
-class _Arrow:
-    """A force at a place; its length follows the force."""
+    def _places(self) -> dict[str, Array]:
+        """Where arrows begin, in W."""
 
-    def __init__(self, meshcat: Meshcat, name: str, colour: Rgba) -> None:
-        self._meshcat, self._path = meshcat, f"/forces/{name}"
-        meshcat.SetObject(f"{self._path}/shaft/scaled", Cylinder(_SHAFT, 1.0), colour)
-        # The cone's tip is at its origin and it widens along its z axis.
-        head = MeshcatCone(_HEAD, 0.4 * _HEAD, 0.4 * _HEAD)
-        meshcat.SetObject(f"{self._path}/head/scaled", head, colour)
+        def pose(frame: str) -> RigidTransform:
+            return self.plant.GetFrameByName(frame).CalcPoseInWorld(self.context)
 
-    def show(self, film_time: float, place: Array, force: Array) -> None:
-        length = _METRES_PER_NEWTON * float(np.linalg.norm(force))
-        shaft = max(length - _HEAD, 1e-3)
-        along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()
-        R = along.matrix()
-        middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _HEAD) * R[:, 2]
-        back = along @ RotationMatrix.MakeXRotation(np.pi)
-        put = self._meshcat.SetTransform
-        put(f"{self._path}/shaft", RigidTransform(along, middle), film_time)
-        put(f"{self._path}/head", RigidTransform(back, tip), film_time)
-        scale = self._meshcat.SetProperty
-        size = min(1.0, length / _HEAD)
-        scale(f"{self._path}/shaft/scaled", "scale", [size, size, shaft], film_time)
-        scale(f"{self._path}/head/scaled", "scale", [size, size, size], film_time)
+        places = {
+            "wrist": pose("sensor") @ _WRIST_S + _BESIDE_WRIST_W,
+            "tip": pose("tip").translation() + _BESIDE_TIP_W,
+        }
+        if self._master is not None:
+            places["stylus"] = pose("stylus") @ _GRIP_E
+        return places
 
 
 def _add_master(plant: MultibodyPlant) -> ModelInstanceIndex:
@@ -190,25 +276,24 @@ def _add_master(plant: MultibodyPlant) -> ModelInstanceIndex:
     return master
 
 
-def _furnish(meshcat: Meshcat, scenario: Scenario) -> None:
-    """Floor, table, the plinth below what is touched, light and camera."""
+def _furnish(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
+    """Floor, the device's table, the plinth below what is touched, light and camera."""
 
     def box(name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba):
         meshcat.SetObject(f"/room/{name}", Box(*size), colour)
         meshcat.SetTransform(f"/room/{name}", RigidTransform(np.array(centre)))
 
     box("floor", (8.0, 8.0, 0.02), (0.6, 0.5, -0.011), _FLOOR)
-    x, y, _ = _P_WB
-    box("table", (0.50, 0.60, 0.03), (x - 0.09, y, _TABLE_TOP - 0.015), _WOOD)
-    height = _TABLE_TOP - 0.03
-    for i, (dx, dy) in enumerate(((-0.31, -0.27), (-0.31, 0.27), (0.13, -0.27), (0.13, 0.27))):
-        box(f"leg_{i}", (0.04, 0.04, height), (x + dx, y + dy, height / 2), _STEEL)
+    if with_table:
+        x, y, _ = _P_WB
+        box("table", (0.50, 0.60, 0.03), (x - 0.09, y, _TABLE_TOP - 0.015), _WOOD)
+        height = _TABLE_TOP - 0.03
+        for i, (dx, dy) in enumerate(((-0.31, -0.27), (-0.31, 0.27), (0.13, -0.27), (0.13, 0.27))):
+            box(f"leg_{i}", (0.04, 0.04, height), (x + dx, y + dy, height / 2), _STEEL)
     stand = None if scenario.environment is None else scenario.environment.stand
     if stand is not None and stand.height > 0:
         size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
         box("plinth", size, (*centre, stand.height / 2), _STEEL)
-    for path in ("/Grid", "/Axes"):
-        meshcat.SetProperty(path, "visible", False)
-    meshcat.SetProperty("/Background", "top_color", [0.97, 0.98, 1.0])
-    meshcat.SetProperty("/Background", "bottom_color", [0.86, 0.89, 0.93])
-    meshcat.SetCameraPose(_CAMERA, _TARGET)
+    plain_room(meshcat)
+    aside = np.zeros(3) if with_table else _WITHOUT_MASTER
+    meshcat.SetCameraPose(_CAMERA + aside, _TARGET + aside)

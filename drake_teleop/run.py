@@ -56,6 +56,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.pages.progress import Stage, progress_bars, silent
 from drake_teleop.pages.style import contact_spans
+from drake_teleop.replay import write_replay, write_scenario
 from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.slave.inverse_kinematics import IkStatus
@@ -99,8 +100,9 @@ def run_command(
     """Runs one scenario.
 
     Writes log.parquet, sensor_log.parquet (canonical, for `drake-teleop identify`), overview.png,
-    identification.json (unless the scenario learnt while it ran) and summary.json into `out`. The
-    log is a folder, written while the station runs; the others follow at the end, the summary last.
+    replay.html (the film in 3D), scenario.yaml (all fields, as they were run), identification.json
+    (unless the scenario learnt while it ran) and summary.json into `out`. The log is a folder,
+    written while the station runs; all but the scenario follow at the end, the summary last.
 
     Args:
         scenario: the name of a shipped one, or a YAML file.
@@ -123,6 +125,8 @@ def run_command(
     # What stays of an earlier run must not be taken for this one's, should this one be interrupted.
     remove_log(log)
     (out / "summary.json").unlink(missing_ok=True)
+    out.mkdir(parents=True, exist_ok=True)
+    write_scenario(out / "scenario.yaml", setup)
     try:
         with progress_bars(quiet) as stage:
             run = run_scenario(setup, stage, log, fresh=fresh)
@@ -133,6 +137,7 @@ def run_command(
     if run.identification is not None:
         run.identification.save(out / "identification.json")
     overview(run.result).savefig(out / "overview.png")
+    write_replay(out / "replay.html", run.result, run.scenario)
     text = json.dumps(summary, indent=2, allow_nan=False)
     (out / "summary.json").write_text(text + "\n", encoding="utf-8")
     if not quiet:
@@ -342,7 +347,9 @@ def _print(summary: dict[str, Any], out: Path) -> None:
         console.print(f"contact from {start:.4f} to {stop:.4f} s{noticed}", highlight=False)
     for warning in summary["warnings"]:
         console.print(f"[bold yellow]warning:[/] {warning}", highlight=False)
-    console.print(f"written to {out}", highlight=False, markup=False)
+    console.print(
+        f"written to {out}; its film: {out / 'replay.html'}", highlight=False, markup=False
+    )
 
 
 def _ms(delay: float | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import socket
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 from pydrake.geometry import Meshcat, MeshcatParams
 
-from drake_teleop import replay
-from drake_teleop.replay import ReplayScene, write_replay
+from drake_teleop import film, replay
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.replay import ReplayScene, replay_command, write_replay, write_scenario
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
@@ -49,12 +51,17 @@ def arrows(monkeypatch) -> dict[str, np.ndarray]:
         def show(self, film_time, place, force):
             shown[self.name] = force
 
-    monkeypatch.setattr(replay, "_Arrow", Arrow)
+    monkeypatch.setattr(replay, "Arrow", Arrow)
     return shown
 
 
+def of_player(page: str) -> dict:
+    """What the page's player reads."""
+    return json.loads(re.search(r"const film = (.*);\n", page)[1])
+
+
 def test_master_and_slave_stand_as_recorded(meshcat, scenario, result):
-    scene = ReplayScene(meshcat, scenario)
+    scene = ReplayScene(meshcat, scenario, result)
     base = scene.plant.GetFrameByName("base", scene.plant.GetModelInstanceByName("master::phantom"))
     for sample in (0, 25):
         scene.show(0.0, result, sample)
@@ -76,38 +83,128 @@ def test_a_load_at_rest_pulls_the_hand_down_and_contact_pushes_it_up(
     weight = R_WS_HOME.inverse().matrix() @ [0.0, 0.0, 30.7]  # the sensor holds the load up
     recorded["measured_wrench_S"][:, :3] = weight
     recorded["contact_wrench_S"][:, :3] = -0.5 * weight
-    scene = ReplayScene(meshcat, scenario)
+    scene = ReplayScene(meshcat, scenario, result)
     scene.show(0.0, SimulationResult(result.t, recorded, result.specs), 0)
     # The tool swings by less than a degree.
     np.testing.assert_allclose(arrows["measured_at_stylus"], [0, 0, -30.7], atol=0.5)
     np.testing.assert_allclose(arrows["contact_at_stylus"], [0, 0, 15.35], atol=0.25)
+    np.testing.assert_allclose(arrows["measured_at_wrist"], arrows["measured_at_stylus"])
     np.testing.assert_allclose(arrows["contact_at_tip"], arrows["contact_at_stylus"])
 
 
-def test_the_film_is_one_page_that_needs_nothing_else(tmp_path, scenario, result):
-    path = tmp_path / "replay.html"
-    write_replay(path, result, scenario, slow_motion=5.0)
-    page = path.read_text(encoding="utf-8")
-    assert len(page) > 1e6  # Meshcat itself is inside
+def test_without_a_hand_there_is_the_slave_with_what_it_measures(meshcat, scenario, result, arrows):
+    """As of a run that identifies the load."""
+    names = ("slave_state", "measured_wrench_S", "load_estimate", "sheet_state")
+    recorded = {name: result[name] for name in names}
+    scene = ReplayScene(meshcat, scenario, recorded)
+    scene.show(0.0, recorded, 0)
+    assert list(arrows) == ["measured_at_wrist"]
+    assert not scene.plant.HasFrameNamed("stylus")
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory, scenario, result) -> str:
+    """The film of a folder as `run` leaves it."""
+    run, out = tmp_path_factory.mktemp("run"), tmp_path_factory.mktemp("out")
+    result.write_part(run / "log.parquet", 0)
+    write_scenario(run / "scenario.yaml", scenario)
+    summary = replay_command(run, out, quiet=True)
+    assert json.loads((out / "summary.json").read_text()) == summary
+    assert summary["films"][0]["film"] == str(out / "replay.html")
+    return (out / "replay.html").read_text(encoding="utf-8")
+
+
+def test_the_film_is_one_page_that_needs_nothing_else(page):
+    assert 1e6 < len(page) < 4e6  # Meshcat itself is inside
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=.?(http|//|/)", page)
+    # What the player asks Meshcat for.
+    assert all(
+        name in page
+        for name in ("var viewer =", "this.animator=", "seek(", "this.actions=", "this.gui=")
+    )
+    assert all(f'id="{name}"' in page for name in ("play", "clock", "time", "speed", "readings"))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("slow_motion", "frames"), [(1.0, 3), (10.0, 21)])
+def test_clock_and_newtons_beside_the_film_are_the_logs(page, scenario, result):
+    shown = of_player(page)
+    assert shown["title"] == scenario.description
+    assert (shown["start"], shown["span"]) == pytest.approx((0.0, 0.04))
+    assert shown["clock"] == "simulated time"
+    measured, contact, hand = shown["readings"]
+    assert measured["arrow"] and contact["arrow"] and not hand["arrow"]
+    # 40 ms a hundred times slower: a frame every 0.2 ms, of a log of 1 kHz.
+    assert (shown["slow_motion"], shown["frames"]) == (100, 201)
+    for reading, force in (
+        (measured, result["measured_wrench_S"] - result["load_estimate"][:, :6]),
+        (contact, result["contact_wrench_S"]),
+        (hand, result["force_to_master"]),
+    ):
+        assert reading["unit"] == "N"
+        newtons = np.linalg.norm(force[:, :3], axis=1)
+        np.testing.assert_allclose(reading["values"][::5], newtons, atol=6e-4)
+
+
+def test_every_field_of_the_scenario_lies_beside_the_log(tmp_path, scenario):
+    write_scenario(tmp_path / "scenario.yaml", scenario)
+    assert LoadScenario(tmp_path / "scenario.yaml") == scenario
+
+
+def test_all_logs_of_a_folder_are_replayed(tmp_path, scenario, result, monkeypatch):
+    monkeypatch.setattr(replay, "write_replay", lambda path, result, scenario: path.write_text("-"))
+    for name in ("b", "a", "without_scenario"):
+        result.write_part(tmp_path / "logs" / f"{name}.parquet", 0)
+    for name in "ab":
+        write_scenario(tmp_path / "logs" / f"{name}.yaml", scenario)
+    (tmp_path / "out").mkdir()
+    summary = replay_command(tmp_path, tmp_path / "out", quiet=True)
+    films = [tmp_path / "out" / "a.html", tmp_path / "out" / "b.html"]
+    assert [entry["film"] for entry in summary["films"]] == [str(film) for film in films]
+    with pytest.raises(DrakeTeleopError, match="does not say of which scenario it is; give --sc"):
+        replay_command(tmp_path / "logs" / "without_scenario.parquet", tmp_path / "out")
+
+
+def test_what_holds_no_run_is_said(tmp_path, scenario, result):
+    with pytest.raises(DrakeTeleopError, match=r"holds no log of a run; give .* a study keeps"):
+        replay_command(tmp_path, tmp_path)
+    wrench = SimulationResult(
+        result.t,
+        {"measured_wrench_S": result["measured_wrench_S"]},
+        [spec for spec in result.specs if spec.name == "measured_wrench_S"],
+    )
+    with pytest.raises(DrakeTeleopError, match="it holds no slave_state, load_estimate"):
+        write_replay(tmp_path / "replay.html", wrench, scenario)
+
+
+@pytest.mark.parametrize(("slow_motion", "frames"), [(1.0, 3), (10.0, 21), (50.0, 101)])
 def test_the_film_has_fifty_frames_a_second(
     tmp_path, monkeypatch, scenario, result, slow_motion, frames
 ):
-    shown = []
+    """Meshcat keeps a frame for every whole interval that has passed: none may get lost."""
+    kept = {}
 
-    def show(scene, film_time, result, sample):
-        shown.append((film_time, sample))
+    class Recorder:
+        def __init__(self, params):
+            pass
 
-    monkeypatch.setattr(ReplayScene, "show", show)
+        def StartRecording(self, rate, **options):
+            self.rate = rate
+
+        def __getattr__(self, name):
+            return lambda *arguments: "<body></body>"
+
+    class Scene:
+        def __init__(self, meshcat, scenario, recorded):
+            self.meshcat = meshcat
+
+        def show(self, film_time, signals, sample):
+            kept[np.floor(film_time * self.meshcat.rate)] = signals["slave_state"][sample]
+
+    monkeypatch.setattr(film, "Meshcat", Recorder)
+    monkeypatch.setattr(replay, "ReplayScene", Scene)
     write_replay(tmp_path / "replay.html", result, scenario, slow_motion=slow_motion)
-    times, samples = zip(*shown, strict=True)
-    assert len(shown) == frames
-    np.testing.assert_allclose(np.diff(times), 1 / 50)
-    np.testing.assert_allclose(result.t[list(samples)], np.array(times) / slow_motion, atol=1e-9)
+    assert list(kept) == list(range(frames))
+    nearest = np.rint(np.linspace(0, 40, frames) - 1e-9).astype(int)
+    np.testing.assert_array_equal(list(kept.values()), result["slave_state"][nearest])
 
 
 def test_its_server_is_gone_when_it_returns(tmp_path, result, scenario, monkeypatch):
@@ -119,7 +216,7 @@ def test_its_server_is_gone_when_it_returns(tmp_path, result, scenario, monkeypa
         ports.append(meshcat.port())
         return meshcat
 
-    monkeypatch.setattr(replay, "Meshcat", remember)
+    monkeypatch.setattr(film, "Meshcat", remember)
     replay.write_replay(tmp_path / "replay.html", result, scenario)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("localhost", ports[0]))

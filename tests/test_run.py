@@ -80,6 +80,8 @@ def test_everything_is_written(contact):
     log = pl.read_parquet(out / "sensor_log.parquet")
     np.testing.assert_array_equal(log["f_z"], result["measured_wrench_S"][:, 2])
     assert (out / "overview.png").read_bytes().startswith(b"\x89PNG")
+    assert LoadScenario(out / "scenario.yaml") == LoadScenario("contact_transition")
+    assert summary["description"] in (out / "replay.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -87,6 +89,7 @@ def test_the_shipped_identification_is_the_identification(identification):
     """Its sensor log gives the same load to the tools for recorded logs."""
     summary, out = identification
     assert summary["duration_s"] == 6.0
+    assert (out / "replay.html").exists()
     assert summary["residual_force_max_N"] < 1.5
     load = Identification.load(out / "identification.json")
     again = identify_log(out / "sensor_log.parquet", cutoff_hz=None, delay=0.0).identification

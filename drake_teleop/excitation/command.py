@@ -6,6 +6,7 @@ Writes into the folder
 trajectory.csv      one period at 1 kHz: t [s], then by joint q_NAME, qd_NAME, qdd_NAME [rad, s]
 excitation.yaml     the coefficients of Eqs. (9)-(10), for `FourierTrajectory.load`
 excitation.png      joint angles, wrench against the sensor's range, how the criterion fell
+excitation.html     the motion as a film in 3D, to be watched before a robot runs it
 summary.json        the figures
 =================== ============================================================================
 
@@ -29,6 +30,7 @@ from matplotlib.figure import Figure
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.check import RATE
 from drake_teleop.excitation.excite import Excitation, excite, sensor_motion
+from drake_teleop.excitation.motion_film import write_motion_film
 from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.pages.progress import Stage, progress_bars
@@ -114,6 +116,7 @@ def excite_command(
     table(found).write_csv(out / "trajectory.csv")
     found.trajectory.save(out / "excitation.yaml", robot.arm.joint_names)
     draw(found).savefig(out / "excitation.png")
+    write_motion_film(out / "excitation.html", found)
     text = json.dumps(summary, indent=2, allow_nan=False)
     (out / "summary.json").write_text(text + "\n", encoding="utf-8")
     if not quiet:
@@ -263,4 +266,8 @@ def _print(summary: dict[str, Any], out: Path) -> None:
         console.print(part)
     for words in summary["assumed"]:
         console.print(f"assumed: {words}", highlight=False, markup=False)
-    console.print(f"written to {out}", highlight=False, markup=False)
+    console.print(
+        f"written to {out}; watch {out / 'excitation.html'} before a robot runs it",
+        highlight=False,
+        markup=False,
+    )

@@ -43,7 +43,7 @@ from drake_teleop.identification import (
 )
 from drake_teleop.load.compensation import scaled_wrench
 from drake_teleop.pages.progress import Progress, Stage, progress_bars
-from drake_teleop.replay import write_replay
+from drake_teleop.replay import write_replay, write_scenario
 from drake_teleop.reproduction.figures import contact_figure, scaling_figure
 from drake_teleop.reproduction.reaction import eliminated_reaction
 from drake_teleop.reproduction.report import (
@@ -110,7 +110,7 @@ def reproduce_command(out: Path, *, seed: int | None = None, quiet: bool = False
     """Repeats the paper's experiments and writes what they show into `out`.
 
     summary.json, table.md (the paper against this run), fig6.png, fig7.png, fig8.png, replay.html,
-    report.html, identification.json, and the records in logs/.
+    report.html, identification.json, and in logs/ the records, each with its scenario.
 
     Args:
         out: the folder.
@@ -165,7 +165,7 @@ def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> Free
 def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
     """Runs the contact transition with a load estimate (16,), with and without the sheet."""
     touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
-    without = replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
+    without = _without_sheet(scenario)
     free = _simulate(without, estimate, stage("Fig. 8: the same without contact"))
     calculated_free = _scaled(free, estimate, 0.0)
     return ContactMotion(
@@ -294,6 +294,10 @@ def _at_the_hands_rate(scenario: Scenario, seed: int) -> Scenario:
     return replace(scenario, rates__log_hz=scenario.rates.hand_hz, simulation__seed=seed)
 
 
+def _without_sheet(scenario: Scenario) -> Scenario:
+    return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
+
+
 def _simulate(scenario: Scenario, estimate: Array, progress: Progress) -> SimulationResult:
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     return simulate(station, scenario.simulation, progress=progress)
@@ -375,14 +379,15 @@ def _write(
 ) -> None:
     force, torque, contact = runs
     (out / "logs").mkdir(parents=True, exist_ok=True)
-    for name, result in (
-        ("identification", load.result),
-        ("free_motion_force", force.result),
-        ("free_motion_torque", torque.result),
-        ("contact_transition", contact.touched),
-        ("contact_transition_without_sheet", contact.free),
+    for name, result, scenario in (
+        ("identification", load.result, identification_scenario(force.scenario, seed)),
+        ("free_motion_force", force.result, force.scenario),
+        ("free_motion_torque", torque.result, torque.scenario),
+        ("contact_transition", contact.touched, contact.scenario),
+        ("contact_transition_without_sheet", contact.free, _without_sheet(contact.scenario)),
     ):
         result.write_parquet(out / "logs" / f"{name}.parquet")
+        write_scenario(out / "logs" / f"{name}.yaml", scenario)
     load.result.sensor_log().write_parquet(out / "logs" / "identification_sensor_log.parquet")
     load.identification.save(out / "identification.json")
     text = json.dumps(summary, indent=2, allow_nan=False)

@@ -219,7 +219,7 @@ def test_contact_only_takes_energy_from_the_tool(inserted):
 
 def test_the_replay_shows_the_slot_where_it_is_and_the_peg_in_it(inserted):
     scenario, result = inserted
-    scene = ReplayScene(Meshcat(MeshcatParams(host="localhost")), scenario)
+    scene = ReplayScene(Meshcat(MeshcatParams(host="localhost")), scenario, result)
     scene.show(0.0, result, len(result.t) - 1)
     slot = scene.plant.GetBodyByName("slot").EvalPoseInWorld(scene.context)
     np.testing.assert_allclose(slot.translation(), scenario.slot.position)

@@ -17,8 +17,10 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.check import check, check_motion
 from drake_teleop.excitation.excite import excite, sensor_motion
 from drake_teleop.excitation.limits import LIMITS, empty_motions, motions_of, sensor_vectors
+from drake_teleop.excitation.motion_film import write_motion_film
 from drake_teleop.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
+from drake_teleop.film import Film
 from drake_teleop.identification import identify_load
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
@@ -40,6 +42,7 @@ from drake_teleop.sensor.sensor_chain import (
     sensor_chain,
     without,
 )
+from drake_teleop.slave.arm import forward_kinematics
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +110,41 @@ def test_the_executed_motion_keeps_the_limits(slave):
     norms = [np.linalg.norm(wrench[:, part], axis=1).max() for part in (slice(0, 3), slice(3, 6))]
     assert np.all(np.array(norms) < limits.sensor[:2])
     assert not found.result["saturated"].any()
+
+
+@pytest.mark.slow
+def test_the_film_shows_the_motion_that_was_designed(slave, short, tmp_path, monkeypatch):
+    """The link with the sensor is where the arm's own kinematics has it."""
+    shown = {}
+
+    class Canvas:
+        def SetTransform(self, path, X, time=None):
+            shown[path] = X
+
+        def __getattr__(self, name):
+            return lambda *arguments, **options: None
+
+    frames = []
+
+    def write(film, path, make_scene):
+        show = make_scene(Canvas())
+        for k in (0, 40):
+            show(0.0, k)
+            X_WB = shown[f"/arm/{int(slave.sensor_frame.body().index())}"]
+            frames.append(X_WB @ slave.sensor_frame.GetFixedPoseInBodyFrame())
+            q = short.trajectory.evaluate(film.times[k : k + 1])[0][0]
+            R, p = np.empty((3, 3)), np.empty(3)
+            forward_kinematics(slave.arm.table, q, R, p)
+            np.testing.assert_allclose(frames[-1].translation(), p, atol=1e-9)
+            np.testing.assert_allclose(frames[-1].rotation().matrix(), R, atol=1e-9)
+        force, speed = film.readings
+        assert force.values.max() < slave.limits.sensor[0]
+        assert speed.values[0] < 0.05 < speed.values.max()
+        assert film.slow_motion == 1.0
+
+    monkeypatch.setattr(Film, "write", write)
+    write_motion_film(tmp_path / "film.html", short)
+    assert np.linalg.norm(frames[1].translation() - frames[0].translation()) > 0.02
 
 
 @njit
@@ -377,6 +415,7 @@ def test_what_is_written_for_any_arm(foreign):
     summary = json.loads((out / "summary.json").read_text())
     assert all(use["share"] <= 1 for use in summary["limit_use"].values())
     assert (out / "excitation.png").stat().st_size > 20_000
+    assert 1e6 < (out / "excitation.html").stat().st_size < 4e6
     table = pl.read_csv(out / "trajectory.csv")
     assert table.shape == (4001, 1 + 3 * joints)
     q = table.select([f"q_j{k + 1}" for k in range(joints)]).to_numpy()

@@ -109,6 +109,14 @@ def test_everything_is_written(run):
     assert page.count("data:image/png;base64,") == 3
     assert "contact.true_s" in page
     assert (out / "replay.html").stat().st_size > 1e6
+    # With each record its scenario, for `replay`.
+    scenarios = sorted(path.stem for path in (out / "logs").glob("*.yaml"))
+    assert [f"{name}.parquet" for name in scenarios] == sorted(
+        path.name for path in (out / "logs").glob("*.parquet") if "sensor_log" not in path.name
+    )
+    assert LoadScenario(out / "logs" / "contact_transition.yaml").sheet_spring is not None
+    without = LoadScenario(out / "logs" / "contact_transition_without_sheet.yaml")
+    assert without.sheet_spring is None
     load = Identification.load(out / "identification.json")
     assert load.mass == summary["identification"]["mass_kg"]
     assert load.method == "recursive total least squares"

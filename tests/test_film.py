@@ -1,0 +1,42 @@
+"""Films: how many frames, and that nothing in them can break the page."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from drake_teleop.film import Film, Reading, frame_times
+
+
+@pytest.mark.parametrize(
+    ("seconds", "slow_motion", "frames"),
+    [(0.8, 10, 401), (6.0, 1, 301), (5.0, 2, 501), (59.0, 1, 2951), (36000.0, 1, 3001)],
+)
+def test_a_film_lasts_six_seconds_at_least_and_is_never_large(seconds, slow_motion, frames):
+    times, chosen = frame_times(1.0, 1.0 + seconds)
+    assert (chosen, len(times)) == (slow_motion, frames)
+    assert (times[0], times[-1]) == (1.0, 1.0 + seconds)
+
+
+def test_one_instant_is_a_film_too():
+    times, _ = frame_times(1.0, 1.0)
+    np.testing.assert_array_equal(times, [1.0, 1.0])
+
+
+def test_no_word_or_number_breaks_the_page(tmp_path):
+    reading = Reading("<b>", "N", np.array([np.nan, 1.23456, 20.0]), "#0072B2")
+    film = Film("</script><b>&", np.array([0.0, 0.5, 1.0]), 1.0, [reading], notes=("<i>",))
+    frames = []
+    film.write(tmp_path / "film.html", lambda meshcat: lambda film_time, k: frames.append(k))
+    assert frames == [0, 1, 2]
+    page = (tmp_path / "film.html").read_text(encoding="utf-8")
+    player = page[page.index('<div id="player">') :]
+    assert player.count("</script>") == 1
+    assert "<h1>&lt;/script&gt;&lt;b&gt;&amp;</h1>" in player
+    assert "<i>" not in player
+    found = json.loads(re.search(r"const film = (.*);\n", player)[1])
+    assert found["title"] == "</script><b>&"
+    assert found["readings"][0]["values"] == [None, 1.235, 20.0]
