@@ -15,6 +15,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.excitation.model_check import check_model
 
 # Of meshes that Drake can use as collision shapes.
 _READABLE = (".obj", ".gltf", ".vtk")
@@ -31,6 +32,7 @@ class ParsedModel:
         sensor_frame: S.
         efforts: torque limits by joint [N m]; Drake drops them where a URDF has no transmission.
         lost: which meshes are missing in the shape of which links; by what is wrong with them.
+        assumptions: on what else is missing.
         folder: of converted meshes; Drake reads them when it needs them.
     """
 
@@ -38,6 +40,7 @@ class ParsedModel:
     sensor_frame: Frame
     efforts: dict[str, float]
     lost: dict[str, list[str]]
+    assumptions: list[str]
     folder: TemporaryDirectory[str]
 
 
@@ -53,7 +56,8 @@ def ParseModel(
         package_paths: folders in which `package://` addresses are looked up.
 
     Raises:
-        DrakeTeleopError: if the file cannot be read, or has no such frame.
+        DrakeTeleopError: if the file cannot be read, has no such frame, or says what cannot be
+            true of an arm, see `check_model`.
     """
     if not path.is_file():
         raise DrakeTeleopError("there is no such file", where=str(path))
@@ -64,6 +68,7 @@ def ParseModel(
     kind = path.suffix.lower().removeprefix(".")
     efforts: dict[str, float] = {}
     lost: dict[str, list[str]] = {}
+    assumptions: list[str] = []
     converted = TemporaryDirectory(prefix="drake_teleop_")
     log = logging.getLogger("drake")
     level = log.level
@@ -74,6 +79,7 @@ def ParseModel(
         if root is None:
             instances = parser.AddModels(str(path))
         else:
+            assumptions = check_model(root, str(path))
             lost = _without_lost_meshes(root, packages, Path(converted.name))
             efforts = _efforts(root)
             text = ElementTree.tostring(root, encoding="unicode")
@@ -103,7 +109,7 @@ def ParseModel(
         )
     frame = plant.GetFrameByName(sensor_frame, having[0])
     _weld_base(plant, frame, {} if root is None else _peculiar_joints(root), str(path))
-    return ParsedModel(having[0], frame, efforts, lost, converted)
+    return ParsedModel(having[0], frame, efforts, lost, assumptions, converted)
 
 
 def _xml(path: Path) -> ElementTree.Element | None:

@@ -44,6 +44,7 @@ _LOAD_FACTOR = 1.3
 # What a payload of unknown shape looks like: centre of mass along z_S, radius of gyration [m].
 _PAYLOAD_COM, _PAYLOAD_GYRATION = 0.08, 0.05
 _PAYLOAD = 2.0
+_LEAST_PAYLOAD, _MOST_PAYLOAD = 1e-3, 1e4
 # What a model without limits gets: range [rad], speed [rad/s], time to full speed [s].
 _RANGE, _SPEED, _TIME_TO_SPEED = np.pi, np.pi, 0.4
 
@@ -146,12 +147,14 @@ def RobotFromModel(
     """
     efforts: dict[str, float] = {}
     lost: dict[str, list[str]] = {}
+    lacking: list[str] = []
     folders: list[TemporaryDirectory[str]] = []
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
         efforts.update(model.efforts)
         lost.update(model.lost)
+        lacking[:] = model.assumptions
         folders.append(model.folder)
         return model.instance, model.sensor_frame
 
@@ -161,6 +164,11 @@ def RobotFromModel(
         reserve = (_LOAD_FACTOR - 1) * load
     else:
         mass = _PAYLOAD if payload is None else payload
+        if not _LEAST_PAYLOAD <= mass <= _MOST_PAYLOAD:
+            raise DrakeTeleopError(
+                f"{mass:g} kg is outside {_LEAST_PAYLOAD:g} to {_MOST_PAYLOAD:g} kg",
+                where="--payload",
+            )
         if payload is None:
             assumptions.append(f"a load of {mass:g} kg (--payload)")
         if mass <= load[0]:
@@ -174,6 +182,7 @@ def RobotFromModel(
     assumptions += [
         f"shapes are missing of {', '.join(links)}: {what}" for what, links in lost.items()
     ]
+    assumptions += lacking
     scene.arm, completed = _completed(scene.arm, efforts, acceleration, str(path))
     return _robot(
         scene,
@@ -270,7 +279,18 @@ def _completed(
 ) -> tuple[ArmModel, list[str]]:
     """The arm with a limit for everything, and what was assumed for it."""
     n, assumptions = arm.num_joints, []
-    endless = ~(np.isfinite(arm.lower) & np.isfinite(arm.upper))
+    # From 0 to 0 is what exporters write when they do not know.
+    endless = ~(np.isfinite(arm.lower) & np.isfinite(arm.upper)) | (
+        (arm.lower == 0) & (arm.upper == 0)
+    )
+    stuck = ~endless & (arm.lower == arm.upper)
+    if stuck.any():
+        raise DrakeTeleopError(
+            f"{np.array(arm.joint_names)[stuck][0]} cannot move: both of its limits are "
+            f"{arm.lower[stuck][0]:g} rad",
+            where=where,
+            remedy="correct the limits, or make the joint a fixed one",
+        )
     lower, upper = np.where(endless, -_RANGE, arm.lower), np.where(endless, _RANGE, arm.upper)
     velocity = np.where(_given(arm.velocity_limit), arm.velocity_limit, _SPEED)
     effort = np.array([efforts.get(name, np.inf) for name in arm.joint_names])

@@ -352,12 +352,58 @@ def test_a_chain_that_drake_would_cut_is_refused(urdf, joint, expected):
 
 
 @pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('<parent link="l0"/>', '<parent link="l3"/>', "joints form a circle through l"),
+        ('<child link="finger"/>', '<child link="l3"/>', "l3 hangs on two joints, j3 and slide"),
+        (
+            'lower="0.1" upper="2.6"',
+            'lower="2.6" upper="0.1"',
+            "joint j3: lower limit 2.6 is above",
+        ),
+        ('lower="0.1" upper="2.6"', 'lower="0.1" upper="x"', "joint j3: upper 'x' is not a number"),
+        (
+            'lower="0.1" upper="2.6"',
+            'lower="0.1" upper="0.1"',
+            "j3 cannot move: both of its limits",
+        ),
+        ('velocity="2.5"', 'velocity="-2.5"', "joint j2: velocity limit -2.5 is negative"),
+        ('<mass value="0.3"/>', '<mass value="-0.3"/>', "link l6: mass -0.3 kg is negative"),
+        ('izz="0.015"', 'izz="15"', "link l3: no body has this inertia"),
+        ('izz="0.015"', 'izz="-0.015"', "link l3: no body has this inertia"),
+    ],
+)
+def test_what_cannot_be_true_of_an_arm_is_refused(urdf, old, new, expected):
+    text = urdf.read_text()
+    assert old in text
+    urdf.write_text(text.replace(old, new, 1))
+    with pytest.raises(DrakeTeleopError, match=expected):
+        RobotFromModel(urdf, "l6", WristSensorConfig())
+
+
+def test_an_sdf_is_checked_too(tmp_path):
+    path = write_sdf(tmp_path)
+    path.write_text(path.read_text().replace("<izz>0.04</izz>", "<izz>4</izz>", 1))
+    with pytest.raises(DrakeTeleopError, match="link l0: no body has this inertia"):
+        RobotFromModel(path, "wrist", WristSensorConfig())
+
+
+def test_limits_and_inertias_of_nothing_are_assumptions(urdf):
+    text = urdf.read_text().replace('lower="0.1" upper="2.6"', 'lower="0" upper="0"')
+    urdf.write_text(text.replace('<mass value="0.3"/>', '<mass value="0"/>'))
+    robot = RobotFromModel(urdf, "l6", WristSensorConfig())
+    assert "no inertia of l6" in robot.assumptions
+    assert any("a range of +-3.142 rad for j3" in words for words in robot.assumptions)
+
+
+@pytest.mark.parametrize(
     ("options", "expected"),
     [
         (["--sensor-frame", "nose"], "no frames are named 'nose'"),
         (["--sensor-frame", "l6", "--acceleration", "1,2"], "2 acceleration limits for 6 joints"),
         (["--sensor-frame", "l6", "--acceleration", "fast"], "--acceleration"),
         (["--sensor-frame", "l6", "--payload", "0.1"], "holds 0.9 kg beyond the sensor"),
+        (["--sensor-frame", "l6", "--payload", "1e-9"], "1e-09 kg is outside 0.001 to 10000 kg"),
         (["--sensor-frame", "finger"], "slide"),
         (["--sensor-frame", "l0"], "no revolute joint"),
         ([], "--sensor-frame"),

@@ -1,0 +1,125 @@
+"""What cannot be true of a robot model, said before Drake reads it.
+
+Drake follows a link with two parents or a circle of joints into an abort or for ever, and replaces
+an inertia that no body has by another one without telling. Here each is one error with the name of
+joint or link; what is merely missing is an assumption.
+"""
+
+from __future__ import annotations
+
+import math
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+
+_INERTIAS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+# How far principal moments may be from those of a body, for rounding in the file.
+_ROUNDING = 1e-3
+
+
+def check_model(root: Element, where: str) -> list[str]:
+    """Checks tree, limits and masses of a URDF or SDF.
+
+    Returns:
+        Assumptions: which links have no mass or no inertia.
+
+    Raises:
+        DrakeTeleopError: for a link with two parents, joints that form a circle, limits that are
+            no numbers or the wrong way round, a negative mass, an inertia that no body has.
+    """
+    _check_tree(root, where)
+    for joint in root.iter("joint"):
+        for limit in joint.iter("limit"):
+            _check_limit(limit, f"{where}: joint {joint.get('name', '')}")
+    without = [link.get("name", "") for link in root.iter("link") if _is_massless(link, where)]
+    return [f"no inertia of {', '.join(without)}"] if without else []
+
+
+def _check_tree(root: Element, where: str) -> None:
+    parents: dict[str, tuple[str, str]] = {}
+    for joint in root.iter("joint"):
+        parent, child = _end(joint, "parent"), _end(joint, "child")
+        if not parent or not child:  # of something else of this name, or Drake says what lacks
+            continue
+        name = joint.get("name", "")
+        if child in parents:
+            raise DrakeTeleopError(
+                f"{child} hangs on two joints, {parents[child][1]} and {name}",
+                where=where,
+                remedy="an arm is a tree: each link is the child of one joint",
+            )
+        parents[child] = parent, name
+    for start in parents:
+        link, passed = start, {start}
+        while link in parents:
+            link = parents[link][0]
+            if link in passed:
+                raise DrakeTeleopError(
+                    f"its joints form a circle through {link}",
+                    where=where,
+                    remedy="an arm is a tree: cut the loop, or model the chain to the sensor alone",
+                )
+            passed.add(link)
+
+
+def _end(joint: Element, name: str) -> str:
+    element = joint.find(name)
+    return "" if element is None else (element.get("link") or element.text or "").strip()
+
+
+def _check_limit(limit: Element, where: str) -> None:
+    def number(name: str) -> float | None:
+        text = limit.get(name) or limit.findtext(name)
+        return None if text is None else _number(text, name, where)
+
+    lower, upper = number("lower"), number("upper")
+    if lower is not None and upper is not None and lower > upper:
+        raise DrakeTeleopError(f"lower limit {lower:g} is above upper limit {upper:g}", where=where)
+    for name in ("velocity", "effort"):
+        value = number(name)
+        # Of SDF, -1 says that there is no limit.
+        if value is not None and value < 0 and not (value == -1 and limit.get(name) is None):
+            raise DrakeTeleopError(f"{name} limit {value:g} is negative", where=where)
+
+
+def _is_massless(link: Element, where: str) -> bool:
+    """Whether a link has shapes but no inertia; one that cannot be is an error.
+
+    A link without shapes is a frame, such as tool0.
+    """
+    place = f"{where}: link {link.get('name', '')}"
+    inertial = link.find("inertial")
+    mass_element = None if inertial is None else inertial.find("mass")
+    has_shape = link.find("collision") is not None or link.find("visual") is not None
+    if inertial is None or mass_element is None:
+        return has_shape
+    mass = _number(mass_element.get("value") or mass_element.text or "", "mass", place)
+    if mass < 0:
+        raise DrakeTeleopError(f"mass {mass:g} kg is negative", where=place)
+    element = inertial.find("inertia")
+    if element is None:
+        return has_shape
+    texts = {name: element.get(name) or element.findtext(name) or "0" for name in _INERTIAS}
+    xx, xy, xz, yy, yz, zz = (_number(texts[name], name, place) for name in _INERTIAS)
+    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    rounding = _ROUNDING * abs(moments[2])
+    if moments[0] < -rounding or moments[0] + moments[1] < moments[2] - rounding:
+        raise DrakeTeleopError(
+            "no body has this inertia: its principal moments are "
+            f"{moments[0]:.3g}, {moments[1]:.3g}, {moments[2]:.3g} kg m^2",
+            where=place,
+            remedy="all are positive, and none is more than the sum of the other two",
+        )
+    return has_shape and (mass == 0.0 or moments[2] == 0.0)
+
+
+def _number(text: str, name: str, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if math.isnan(value):
+        raise DrakeTeleopError(f"{name} {text.strip()!r} is not a number", where=where)
+    return value
