@@ -100,6 +100,10 @@ def in_g(c: Columns) -> None:
     c["s"] = c["s"] / 9.80665
 
 
+def in_mm(c: Columns) -> None:
+    c["p"] = 1e3 * c["p"]
+
+
 def degrees(c: Columns) -> None:
     c["omega"] = np.degrees(c["omega"])
 

@@ -29,6 +29,7 @@ PLANTED: list[tuple[Callable[[Columns], None], str, str, dict[str, bool]]] = [
     (planted.reversed_gravity, "reversed gravity", "imu.sign: -1", {"pose": False}),
     (planted.in_g, "units", "imu.specific_force.unit: g", {}),
     (planted.in_g, "units", "imu.specific_force.unit: g", {"pose": False}),
+    (planted.in_mm, "units", "pose.position.unit: mm", {"imu": False}),
     (planted.degrees, "degrees", "imu.angular_velocity.unit: deg/s", {}),
     (planted.degrees, "degrees", "imu.angular_velocity.unit: deg/s", {"pose": False}),
     (planted.degree_vectors, "degrees", "pose.orientation.unit: deg", {}),

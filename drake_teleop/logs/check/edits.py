@@ -133,7 +133,7 @@ def tried(function: Callable[[Description], Any], edited: Description) -> Any:
 
 
 def load_edits(description: Description) -> Iterator[Edit]:
-    """A wrench of the other sign or in other axes, a gyroscope in degrees, and `pose_edits`."""
+    """A wrench of the other sign or in other axes, other units of the motion, and `pose_edits`."""
     stream = "static" if description.static else "wrench"
     sensor: Any = getattr(description, stream)
     yield (
@@ -154,7 +154,16 @@ def load_edits(description: Description) -> Iterator[Edit]:
             Finding("base axes", f"the wrench is not in base axes; set {stream}.frame: sensor"),
             edit_field(description, f"{stream}.frame", "sensor"),
         )
-    imu = description.imu
+    imu, pose = description.imu, description.pose
+    if pose is not None and pose.position and (imu is None or imu.specific_force is None):
+        unit = "mm" if pose.position.unit == "m" else "m"
+        yield (
+            Finding(
+                "units",
+                f"the position is not in {pose.position.unit}; set pose.position.unit: {unit}",
+            ),
+            edit_field(description, "pose.position.unit", unit),
+        )
     if imu is not None and imu.angular_velocity and imu.angular_velocity.unit == "rad/s":
         yield (
             Finding("degrees", "the gyroscope is in degrees; set imu.angular_velocity.unit: deg/s"),
