@@ -11,6 +11,7 @@ from drake_teleop.logs.read.description import Description, load_description
 
 PAGE = Path(__file__).parents[2] / "docs" / "logs.md"
 EXAMPLES = re.findall(r"```yaml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+_, THREE_INSTRUMENTS, AT_REST, *_ = EXAMPLES
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
@@ -25,7 +26,7 @@ def test_the_examples_of_the_page_are_valid(tmp_path: Path, example: str) -> Non
 
 def test_the_page_documents_every_field() -> None:
     page = PAGE.read_text(encoding="utf-8")
-    assert len(EXAMPLES) == 4
+    assert len(EXAMPLES) == 5
     schema = Description.model_json_schema()
     fields = {name for entry in schema["$defs"].values() for name in entry["properties"]}
     units = {
@@ -37,7 +38,7 @@ def test_the_page_documents_every_field() -> None:
         assert re.search(rf"`([a-z_]+\.)?{re.escape(word)}`", page), word
 
 
-BASE = yaml.safe_load(EXAMPLES[0])
+BASE = yaml.safe_load(THREE_INSTRUMENTS)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +69,7 @@ BASE = yaml.safe_load(EXAMPLES[0])
 def test_errors_name_file_and_field(
     tmp_path: Path, where: tuple[str, ...], value: object, words: list[str]
 ) -> None:
-    data = yaml.safe_load(EXAMPLES[0])
+    data = yaml.safe_load(THREE_INSTRUMENTS)
     place = data
     for key in where[:-1]:
         place = place[key]
@@ -84,7 +85,7 @@ def test_errors_name_file_and_field(
         ("", ["holds no fields"]),
         ("static: {}", ["static.file: is missing", "add file"]),
         (yaml.safe_dump({"wrench": BASE["wrench"]}), ["without kinematics", "add imu or pose"]),
-        (EXAMPLES[1] + EXAMPLES[0].replace("gravity: 9.82 ", "#"), ["stand alone"]),
+        (AT_REST + THREE_INSTRUMENTS.replace("gravity: 9.82 ", "#"), ["stand alone"]),
     ],
 )
 def test_files_that_are_no_descriptions(tmp_path: Path, text: str, words: list[str]) -> None:
@@ -92,7 +93,7 @@ def test_files_that_are_no_descriptions(tmp_path: Path, text: str, words: list[s
 
 
 def test_what_is_left_to_the_data_needs_data(tmp_path: Path) -> None:
-    data = yaml.safe_load(EXAMPLES[0])
+    data = yaml.safe_load(THREE_INSTRUMENTS)
     omega = {"columns": ["wx", "wy", "wz"]}
     data["imu"] |= {"frame": "auto", "position": "auto", "angular_velocity": omega}
     path = tmp_path / "log.yaml"

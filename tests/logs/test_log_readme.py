@@ -13,11 +13,12 @@ import pytest
 from drake_teleop.cli import main
 from drake_teleop.logs.sample import sample_log_command
 
-README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[2]
 
 
-def block(language: str, start: str) -> str:
-    (found,) = re.findall(f"```{language}\n({re.escape(start)}.*?)```", README, re.S)
+def block(page: str, language: str, start: str) -> str:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    (found,) = re.findall(f"```{language}\n({re.escape(start)}.*?)```", text, re.S)
     return found
 
 
@@ -31,7 +32,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("readme")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        for command in block("sh", ".venv/bin/drake-teleop sample-log").splitlines():
+        for command in block("README.md", "sh", ".venv/bin/drake-teleop sample-log").splitlines():
             program, *arguments = shlex.split(command)
             assert program == ".venv/bin/drake-teleop"
             with pytest.raises(SystemExit) as stop:
@@ -46,8 +47,9 @@ def here(folder, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_description_is_the_one_that_the_readme_shows():
-    assert Path("out/sample/free.yaml").read_text() == block("yaml", "# A gripper")
+def test_the_description_is_the_one_that_the_docs_show():
+    shown = block("docs/logs.md", "yaml", "# A gripper")
+    assert Path("out/sample/free.yaml").read_text() == shown
 
 
 @pytest.mark.slow
