@@ -27,7 +27,7 @@ Show = Callable[[float, int], None]
 
 FRAMES_PER_SECOND = 50
 # A longer film has fewer frames a second, which the browser interpolates: 3 kB each.
-_MOST_FRAMES = 3000
+_MOST_FRAMES = 2000
 _SHORTEST = 6.0  # a film that nobody said how slow to make lasts that long at least [s]
 _SLOWER = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # speeds that the player has
 
@@ -158,7 +158,7 @@ def frame_times(start: float, stop: float, slow_motion: float | None = None) -> 
             player's speeds with which the film lasts 6 s.
 
     Returns:
-        (F,) times [s], 50 for each second of the film but no more than 3001, and the slow motion.
+        (F,) times [s], 50 for each second of the film but no more than 2001, and the slow motion.
     """
     span = stop - start
     if slow_motion is None:

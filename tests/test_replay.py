@@ -120,7 +120,14 @@ def test_the_film_is_one_page_that_needs_nothing_else(page):
     # What the player asks Meshcat for.
     assert all(
         name in page
-        for name in ("var viewer =", "this.animator=", "seek(", "this.actions=", "this.gui=")
+        for name in (
+            "var viewer =",
+            "viewer.animate()",
+            "this.animator=",
+            "seek(",
+            "this.actions=",
+            "this.gui=",
+        )
     )
     assert all(f'id="{name}"' in page for name in ("play", "clock", "time", "speed", "readings"))
 
