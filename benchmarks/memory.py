@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drake_teleop.identification import true_load
 from drake_teleop.operator.operator import Sine
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
@@ -65,7 +66,7 @@ def repeated_contact(seconds: float) -> Scenario:
 def measure(seconds: float, on_disk: bool) -> dict[str, float]:
     """Simulates, and looks at this process's memory after `FIRST` and at the end."""
     scenario = repeated_contact(seconds)
-    station = MakeTeleopStation(scenario, load_estimate=np.zeros(16))
+    station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     start, seen = time.process_time(), {}
 
     def look(done: float) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import reprlib
+from typing import Any
+
 
 class DrakeTeleopError(ValueError):
     """Input that cannot be used. Its message is one line: what is wrong, where, and the remedy.
 
     The command line prints it as a single ``error:`` line and exits with status 2. Programming
-    mistakes (a wrong type, a broken invariant) stay ordinary exceptions.
+    mistakes (a broken invariant, an argument that does not exist) stay ordinary exceptions.
 
     Args:
         what: what is wrong, in the user's words.
@@ -20,3 +23,16 @@ class DrakeTeleopError(ValueError):
         if remedy:
             text = f"{text}; {remedy}"
         super().__init__(" ".join(text.split()))
+
+
+def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = "") -> None:
+    """Refuses an argument of another kind here, not as a traceback from far below.
+
+    Raises:
+        DrakeTeleopError: with the argument's name `where`, what was wanted and what was found.
+    """
+    if not isinstance(value, kind):
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        wanted = " or ".join(one.__name__ for one in kinds)
+        found = reprlib.repr(value)
+        raise DrakeTeleopError(f"expected {wanted}, found {found}", where=where, remedy=remedy)

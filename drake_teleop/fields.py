@@ -9,9 +9,13 @@ import dataclasses
 import types
 import typing
 from dataclasses import dataclass
-from typing import Any
+from inspect import cleandoc
+from textwrap import TextWrapper
+from typing import Any, TypeVar
 
-_KINDS = {float: "number", int: "whole number", bool: "true or false", str: "word"}
+from drake_teleop.quantities import KINDS, check_name
+
+_Class = TypeVar("_Class", bound=type)
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,32 @@ class FieldInfo:
             return ", ".join(self.choices)
         return " or ".join(block.__name__ for block in self.blocks)
 
+    @property
+    def text(self) -> str:
+        """Its line of a help text."""
+        known = [self.range] if self.range else []
+        if self.default is None or self.kind != "block":
+            known.append(f"default {_shown(self.default)}")
+        return f"{self.name}: {self.meaning}" + (f" ({'; '.join(known)})" if known else "")
+
+
+def settings(block: _Class) -> _Class:
+    """Makes a dataclass of settings refuse what is no field of it, and its help tell the fields.
+
+    Written above `@dataclass`. Reading a field costs what it did.
+    """
+    block.__setattr__ = _set_known  # type: ignore[assignment]
+    wrap = TextWrapper(width=96, initial_indent=" " * 4, subsequent_indent=" " * 8)
+    lines = [wrap.fill(entry.text) for entry in fields_of(block)]
+    block.__doc__ = "\n".join([cleandoc(block.__doc__ or ""), "", "Attributes:", *lines, ""])
+    return block
+
+
+def _set_known(self: Any, name: str, value: Any) -> None:
+    if name not in self.__dataclass_fields__:
+        check_name(type(self), name, f"{type(self).__name__}.{name}")
+    object.__setattr__(self, name, value)
+
 
 def fields_of(config: Any) -> list[FieldInfo]:
     """The fields of a block of a scenario or a study, in their order.
@@ -71,11 +101,11 @@ def fields_of(config: Any) -> list[FieldInfo]:
 
 def _info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
     lists, items, optional = _unfold(entry.type)
-    blocks = tuple(item for item in items if item not in _KINDS)
+    blocks = tuple(item for item in items if item not in KINDS)
     known = entry.metadata
     return FieldInfo(
         name=entry.name,
-        kind="block" if blocks else _KINDS[items[0]],
+        kind="block" if blocks else KINDS[items[0]].removeprefix("a "),
         lists=lists,
         length=known.get("length"),
         optional=optional,
@@ -107,5 +137,11 @@ def _default(entry: dataclasses.Field[Any]) -> Any:
     return entry.default
 
 
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_shown, value))}]"
+    return f"{value:.6g}" if isinstance(value, float) else repr(value)
+
+
 def _first_line(block: type) -> str:
-    return (block.__doc__ or "").partition("\n")[0]
+    return (block.__doc__ or "").partition("\n")[0].rstrip(".")

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, expect
 from drake_teleop.excitation.check import check
 from drake_teleop.excitation.excite import criteria_of, excite
 from drake_teleop.excitation.robot import Robot, RobotFromScenario
+from drake_teleop.load.arrays import learnt
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.compensation import contact_wrench
@@ -29,7 +30,7 @@ from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.one_thread import one_blas_thread
 from drake_teleop.pages.progress import Progress, Stage, silent
 from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
+from drake_teleop.scenario import LoadScenario, Scenario, Simulation, check_scenario, replace
 from drake_teleop.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import ArmModel, accelerations
@@ -101,6 +102,11 @@ def slave_arm(scenario: Scenario) -> ArmModel:
     return NominalSlave(scenario.slave.payload).arm
 
 
+def true_load(scenario: Scenario) -> Array:
+    """(16,) Eq. (7) as the simulation has it, for comparisons: no offsets; tool and payload."""
+    return np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+
+
 def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
     """The shipped scenario "identification" with the slave and the sensor of another scenario.
 
@@ -131,15 +137,26 @@ def identify_load(
     """Runs an excitation trajectory, and identifies.
 
     Args:
-        scenario: with the load estimator enabled.
+        scenario: whose load estimator learns: the shipped "identification", or that with the slave
+            and the sensor of another one (`identification_scenario`).
         stage: where progress is shown.
         trajectory: to run, of the scenario's duration; a new one is designed if there is none.
         log: as `simulate` has it.
 
     Raises:
-        DrakeTeleopError: if no trajectory respects the limits of arm and sensor, or the one that
-            was given does not, or has another duration.
+        DrakeTeleopError: if the load estimator does not learn, no trajectory respects the limits
+            of arm and sensor, or the one that was given does not, or has another duration.
     """
+    check_scenario(scenario)
+    if not scenario.load_estimator.enabled:
+        raise DrakeTeleopError(
+            "the load estimator is off, so the load would not be learnt",
+            where="scenario:load_estimator.enabled",
+            remedy="call identified_load(scenario) of drake_teleop.identified_load, or pass "
+            'LoadScenario("identification")',
+        )
+    if trajectory is not None:
+        expect(FourierTrajectory, trajectory, "trajectory")
     robot = RobotFromScenario(scenario)
     if trajectory is None:
         trajectory = _designed(robot, scenario.simulation.duration, stage)
@@ -153,6 +170,7 @@ def identify_load(
         batch = batch_identification(scenario, wrench, s, omega, alpha, scenario.rates.log_hz)
     kappa = criteria_of(robot, trajectory)["kappa_w10"]
     estimate = result["load_estimate"][-1]
+    learnt("load_estimate", estimate[6:])
     method = METHODS[scenario.load_estimator.method].method
     return LoadIdentification(trajectory, result, estimate, batch, kappa, factor, method)
 

@@ -32,7 +32,7 @@ from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.identification import Identification
 from drake_teleop.pages.progress import Stage, silent
 from drake_teleop.resources import models_dir
-from drake_teleop.scenario import Scenario
+from drake_teleop.scenario import Scenario, check_scenario
 
 CACHE_VARIABLE = "DRAKE_TELEOP_CACHE_DIR"
 """The environment variable that names another folder than the user's cache folder."""
@@ -81,6 +81,7 @@ def identified_load(
         DrakeTeleopError: as `identify_load`. A file that cannot be read is made anew; that one
             cannot be written is no error.
     """
+    check_scenario(scenario)
     # Another seed: the noise of the run must not be the one that was learnt from.
     before = identification_scenario(scenario, scenario.simulation.seed + 1)
     detects = scenario.contact_detection is not None

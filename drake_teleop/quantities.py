@@ -8,13 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import math
+import numbers
+import reprlib
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from drake_teleop.errors import DrakeTeleopError
+
+KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
+"""What a field that is no block may hold, in words."""
 
 
 def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
@@ -63,27 +69,35 @@ def check_structure(schema: type, data: Any, where: str) -> None:
             where=where,
             remedy=f"the fields are {', '.join(_names(schema))}",
         )
-    hints = typing.get_type_hints(schema)
+    hints = _hints(schema)
     for key, value in data.items():
         if key == "_tag":
             continue
-        place = f"{where}.{key}" if ":" in where else f"{where}:{key}"
-        if key not in hints:
-            near = difflib.get_close_matches(str(key), _names(schema), n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"fields: {', '.join(_names(schema))}"
-            raise DrakeTeleopError("there is no such field", where=place, remedy=hint)
-        _check_kind(hints[key], value, place)
+        place = _inside(where, key)
+        check_name(schema, key, place)
+        _check_kind(hints[key], value, place, from_file=True)
+
+
+def check_name(schema: type, name: Any, where: str) -> None:
+    """Raises DrakeTeleopError, with the field that may be meant, unless the dataclass has it."""
+    names = _names(schema)
+    if name not in names:
+        near = difflib.get_close_matches(str(name), names, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"fields: {', '.join(names)}"
+        raise DrakeTeleopError("there is no such field", where=where, remedy=hint)
 
 
 def check_ranges(config: Any, where: str) -> None:
-    """Checks every field of a dataclass (and of the dataclasses inside it) against its range.
+    """Checks every field of a dataclass (and of the dataclasses inside it): kind and range.
 
     Raises:
-        DrakeTeleopError: naming the field, its unit and the range, for a value that is outside,
-            not finite, of the wrong length or not among the choices.
+        DrakeTeleopError: naming the field, its unit and the range, for a value that is of another
+            kind, outside, not finite, of the wrong length or not among the choices.
     """
-    for field, value in _fields(config):
-        place = f"{where}.{field.name}" if ":" in where else f"{where}:{field.name}"
+    hints = _hints(config.__class__)
+    for field in dataclasses.fields(config):
+        value, place = getattr(config, field.name), _inside(where, field.name)
+        _check_kind(hints[field.name], value, place, from_file=False)
         if "choices" in field.metadata:
             if value not in field.metadata["choices"]:
                 allowed = ", ".join(field.metadata["choices"])
@@ -98,15 +112,15 @@ def check_ranges(config: Any, where: str) -> None:
 
 
 def _check_range(metadata: Any, value: Any, place: str) -> None:
-    numbers = value if isinstance(value, list) else [value]
+    values = value if isinstance(value, list) else [value]
     length = metadata.get("length")
-    if length is not None and len(numbers) != length:
+    if length is not None and len(values) != length:
         raise DrakeTeleopError(
-            f"has {len(numbers)} numbers", where=place, remedy=f"give {length} numbers"
+            f"has {len(values)} numbers", where=place, remedy=f"give {length} numbers"
         )
     low, high = metadata["low"], metadata["high"]
     unit = "" if metadata["unit"] == "1" else f" {metadata['unit']}"
-    for number in numbers:
+    for number in values:
         if not math.isfinite(number) or not low <= number <= high:
             raise DrakeTeleopError(
                 f"{number:g}{unit} is outside {low:g} to {high:g}{unit}",
@@ -115,17 +129,29 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
             )
 
 
-def _fields(config: Any) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
-    for field in dataclasses.fields(config):
-        yield field, getattr(config, field.name)
+def _inside(where: str, name: Any) -> str:
+    return f"{where}.{name}" if ":" in where else f"{where}:{name}"
+
+
+@functools.cache
+def _hints(schema: type) -> dict[str, Any]:
+    return typing.get_type_hints(schema)
 
 
 def _names(schema: type) -> list[str]:
     return [field.name for field in dataclasses.fields(schema)]
 
 
-def _check_kind(hint: Any, value: Any, place: str) -> None:
-    """Descends into nested dataclasses and lists; refuses words where numbers are wanted."""
+def _check_kind(hint: Any, value: Any, place: str, *, from_file: bool) -> None:
+    """Descends into lists; refuses words where numbers are wanted, and the like.
+
+    Args:
+        hint: the type of the field.
+        value: what stands there.
+        place: for the message.
+        from_file: whether it is what a YAML parser made of a file. Then blocks are mappings, which
+            are descended into, and a number may be a word still, such as 1e-3.
+    """
     origin = typing.get_origin(hint)
     options = typing.get_args(hint) if origin in (typing.Union, types.UnionType) else (hint,)
     if value is None and type(None) in options:
@@ -133,7 +159,10 @@ def _check_kind(hint: Any, value: Any, place: str) -> None:
     options = tuple(option for option in options if option is not type(None))
     classes = (option for option in options if isinstance(option, type))
     variants = {option.__name__: option for option in classes if dataclasses.is_dataclass(option)}
-    if variants:
+    if variants and not from_file:
+        if not isinstance(value, tuple(variants.values())):
+            raise _unexpected(" or ".join(variants), value, place)
+    elif variants:
         tag = value.get("_tag", "").lstrip("!") if isinstance(value, dict) else ""
         if tag and tag not in variants:
             raise DrakeTeleopError(
@@ -142,26 +171,33 @@ def _check_kind(hint: Any, value: Any, place: str) -> None:
         check_structure(variants.get(tag) or next(iter(variants.values())), value, place)
     elif typing.get_origin(options[0]) is list:
         if not isinstance(value, list):
-            raise DrakeTeleopError(f"expected a list, found {value!r}", where=place)
+            raise _unexpected("a list", value, place, "write it in brackets: [...]")
         for index, item in enumerate(value):
-            _check_kind(typing.get_args(options[0])[0], item, f"{place}[{index}]")
-    elif options[0] is float and (isinstance(value, bool) or not _is_number(value)):
-        raise DrakeTeleopError(
-            f"expected a number, found '{value}'",
-            where=place,
-            remedy="write the number alone; its unit is in the field's name or documentation",
-        )
-    elif options[0] is int and not isinstance(value, int):
-        raise DrakeTeleopError(f"expected a whole number, found '{value}'", where=place)
-    elif options[0] is bool and not isinstance(value, bool):
-        raise DrakeTeleopError(f"expected true or false, found '{value}'", where=place)
-    elif options[0] is str and not isinstance(value, str):
-        raise DrakeTeleopError(f"expected a word, found {value!r}", where=place)
+            inner = typing.get_args(options[0])[0]
+            _check_kind(inner, item, f"{place}[{index}]", from_file=from_file)
+    elif not _is_of(options[0], value, from_file=from_file):
+        remedy = "write the number alone; its unit is in the field's name or documentation"
+        raise _unexpected(KINDS[options[0]], value, place, remedy if options[0] is float else "")
 
 
-def _is_number(value: Any) -> bool:
+def _is_of(kind: type, value: Any, *, from_file: bool) -> bool:
+    if kind in (bool, str):
+        return isinstance(value, kind)
+    if isinstance(value, bool):
+        return False
+    if kind is int:
+        return isinstance(value, numbers.Integral)
+    return isinstance(value, numbers.Real) or (from_file and _can_be_read_as_number(value))
+
+
+def _can_be_read_as_number(value: Any) -> bool:
     try:
         float(value)
     except (TypeError, ValueError):
         return False
     return True
+
+
+def _unexpected(wanted: str, found: Any, place: str, remedy: str = "") -> DrakeTeleopError:
+    shown = f"'{found}'" if isinstance(found, str) else reprlib.repr(found)
+    return DrakeTeleopError(f"expected {wanted}, found {shown}", where=place, remedy=remedy)

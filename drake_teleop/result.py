@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, expect
 
 if TYPE_CHECKING:
     import polars as pl
@@ -47,7 +47,7 @@ class Signal:
         description: one line for people.
 
     Raises:
-        ValueError: if there are not as many units as components.
+        DrakeTeleopError: if there are not as many units as components.
     """
 
     name: str
@@ -61,8 +61,8 @@ class Signal:
         units = (units,) * len(self.components) if isinstance(units, str) else tuple(units)
         object.__setattr__(self, "units", units)
         if len(units) != len(self.components):
-            raise ValueError(
-                f"signal {self.name}: {len(self.components)} components, {len(units)} units"
+            raise DrakeTeleopError(
+                f"{len(self.components)} components, {len(units)} units", where=self.name
             )
 
     @property
@@ -83,17 +83,17 @@ class SimulationResult:
         specs: what each signal is; the result keeps their order.
 
     Raises:
-        ValueError: if names, lengths or numbers of components do not fit together.
+        DrakeTeleopError: if names, lengths or numbers of components do not fit together.
     """
 
     def __init__(
         self, t: ArrayLike, signals: Mapping[str, ArrayLike], specs: Sequence[Signal]
     ) -> None:
-        self._t = _read_only(np.asarray(t, dtype=float))
+        self._t = _read_only(_numbers("t", t))
         self._specs = {spec.name: spec for spec in specs}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
-            raise ValueError(f"signals and specs differ in {', '.join(odd)}")
+            raise DrakeTeleopError(f"names and specs differ in {', '.join(odd)}", where="signals")
         self._values: Mapping[str, NDArray[np.float64]]
         if isinstance(signals, _SignalsOnDisk):
             self._values = signals
@@ -101,12 +101,12 @@ class SimulationResult:
             self._values = {name: self._checked(name, signals[name]) for name in self._specs}
 
     def _checked(self, name: str, values: ArrayLike) -> NDArray[np.float64]:
-        array = np.asarray(values, dtype=float)
+        array = _numbers(name, values)
         shape = (len(self._t), len(self._specs[name].components))
         if array.ndim == 1:
             array = array[:, np.newaxis]
         if array.shape != shape:
-            raise ValueError(f"signal {name} has shape {array.shape}, expected {shape}")
+            raise DrakeTeleopError(f"has shape {array.shape}, expected {shape}", where=name)
         return _read_only(array)
 
     @property
@@ -246,6 +246,7 @@ class SimulationResult:
         """
         import polars as pl
 
+        expect((str, Path), path, "result")
         path = Path(path)
         part = min(path.glob(_PART_NAMES), default=path)
         try:
@@ -393,6 +394,13 @@ def _components(spec: Signal) -> str:
 def _describe(spec: Signal) -> str:
     text = _components(spec)
     return f"{text}  {spec.description}" if spec.description else text
+
+
+def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise DrakeTeleopError(f"holds no numbers ({error})", where=name) from None
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:

@@ -52,13 +52,14 @@ from drake_teleop.identification import (
     timed,
 )
 from drake_teleop.identified_load import identified_load
+from drake_teleop.load.arrays import learnt
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.pages.progress import Stage, progress_bars, silent
 from drake_teleop.pages.style import contact_spans
 from drake_teleop.replay import write_replay, write_scenario
 from drake_teleop.result import SimulationResult, remove_log
-from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.scenario import LoadScenario, Scenario, check_scenario, replace
 from drake_teleop.slave.inverse_kinematics import IkStatus
 from drake_teleop.station import MakeTeleopStation
 from drake_teleop.task_measures import task_measures
@@ -160,7 +161,11 @@ def run_scenario(
         stage: where progress is shown.
         log: as `simulate` has it.
         fresh, loads: `fresh` and `folder` of `identified_load`.
+
+    Raises:
+        DrakeTeleopError: if the scenario cannot be used or a joint leaves its range.
     """
+    check_scenario(scenario)
     learns = scenario.load_estimator.enabled
     if learns and not scenario.operator.intent and scenario.operator.task is None:
         found = identify_load(scenario, stage, log=log)
@@ -189,8 +194,13 @@ def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
-    """(N, 6) Eq. (13) from the recorded samples and the load estimate of the end."""
+    """(N, 6) Eq. (13) from the recorded samples and the load estimate of the end.
+
+    Raises:
+        DrakeTeleopError: if that load was never learnt.
+    """
     estimate = result["load_estimate"][-1]
+    learnt("load_estimate", estimate[6:])
     wrench, s, omega, alpha = sensor_samples(result)
     return contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
 

@@ -18,14 +18,22 @@ from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.environment.environment import Environment
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, expect
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.estimation.load_estimator import LoadEstimatorConfig
+from drake_teleop.fields import settings
 from drake_teleop.master.device import JointFriction
 from drake_teleop.operator.operator import OperatorConfig
 from drake_teleop.operator.task import check_task
 from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.quantities import check_ranges, check_structure, choice, plain, quantity
+from drake_teleop.quantities import (
+    check_name,
+    check_ranges,
+    check_structure,
+    choice,
+    plain,
+    quantity,
+)
 from drake_teleop.resources import scenarios_dir
 from drake_teleop.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
@@ -38,6 +46,7 @@ from drake_teleop.slave.payload import Payload
 _CONTACT_STEP = 1.25e-4
 
 
+@settings
 @dataclass
 class Rates:
     """Sampling rates. The paper: sensor 8 kHz, hand above 2 kHz, joint control 10 kHz."""
@@ -49,6 +58,7 @@ class Rates:
     log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "log")
 
 
+@settings
 @dataclass
 class Simulation:
     """How long, and with which integrator.
@@ -66,12 +76,15 @@ class Simulation:
     )
     max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
     accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "of error-controlled integrators")
-    seed: int = plain(0, "of everything random; the same seed gives the same log")
+    seed: int = quantity(
+        0, "1", 0, 2**32 - 1, "of everything random; the same seed gives the same log"
+    )
     end_with_task: bool = plain(
         False, "end the run within 20 ms when the operator has done its task or given up"
     )
 
 
+@settings
 @dataclass
 class Master:
     """Where the device starts, and its friction."""
@@ -82,6 +95,7 @@ class Master:
     friction: JointFriction = field(default_factory=JointFriction)
 
 
+@settings
 @dataclass
 class Slave:
     """Where the tool starts: S points down at this position; and what it holds."""
@@ -90,6 +104,7 @@ class Slave:
     payload: Payload = field(default_factory=Payload)
 
 
+@settings
 @dataclass
 class Scenario:
     """One complete setup of the station of the paper's Fig. 4."""
@@ -153,6 +168,19 @@ class Scenario:
         _check_channel(self, where)
 
 
+def check_scenario(scenario: Any) -> None:
+    """Checks that it is a scenario, and every value of it.
+
+    Raises:
+        DrakeTeleopError: as `Scenario.check`, or for something else, such as a scenario's name.
+    """
+    remedy = "load one: LoadScenario(name)"
+    if isinstance(scenario, (str, Path)):
+        remedy = f"write LoadScenario({str(scenario)!r})"
+    expect(Scenario, scenario, "scenario", remedy)
+    scenario.check()
+
+
 def ScenarioNames() -> list[str]:
     """The names of the scenarios that are shipped."""
     return sorted(path.stem for path in scenarios_dir().glob("*.yaml"))
@@ -176,6 +204,7 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
     Raises:
         DrakeTeleopError: if there is no such scenario, or it is not YAML.
     """
+    expect((str, Path), name_or_path, "scenario")
     path = scenarios_dir() / f"{name_or_path}.yaml"
     if str(name_or_path) not in ScenarioNames():
         path = Path(name_or_path)
@@ -208,11 +237,21 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
 
     >>> replace(Scenario(), force_scaling__sigma=0.5).force_scaling.sigma
     0.5
+
+    Raises:
+        DrakeTeleopError: if there is no such block or field; values are checked by `Scenario.check`
+            and by all that takes a scenario.
     """
+    expect(Scenario, scenario, "scenario")
     for name, value in changes.items():
         block, _, inner = name.partition("__")
+        check_name(Scenario, block, f"scenario:{block}")
         if inner:
-            value = dataclasses.replace(getattr(scenario, block), **{inner: value})
+            config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
+            if config is None:
+                raise DrakeTeleopError(f"there is no {block} to change", where=place)
+            check_name(type(config), inner, place)
+            value = dataclasses.replace(config, **{inner: value})
         scenario = dataclasses.replace(scenario, **{block: value})  # type: ignore[arg-type]
     return scenario
 

@@ -11,7 +11,9 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Diagram
 
+from drake_teleop.errors import expect
 from drake_teleop.operator.decision import DONE
+from drake_teleop.quantities import check_ranges
 from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.scenario import Simulation
 from drake_teleop.signals import LOG, SIGNALS
@@ -45,8 +47,13 @@ def simulate(
         when they are asked for.
 
     Raises:
-        DrakeTeleopError: if a joint of the slave leaves its range, or the folder holds other files.
+        DrakeTeleopError: if an argument cannot be used, a joint of the slave leaves its range, or
+            the folder holds other files.
     """
+    expect(Diagram, diagram, "diagram", "make one: MakeTeleopStation(scenario)")
+    expect(Simulation, simulation, "simulation", "pass scenario.simulation")
+    check_ranges(simulation, "simulation")
+    expect((str, Path, type(None)), log, "log", "give a folder")
     simulator = MakeSimulator(diagram, simulation)
     end = simulation.settle + simulation.duration
     on_disk = None if log is None else _LogOnDisk(Path(log), simulator, simulation.settle)

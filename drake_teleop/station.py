@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
+from drake_teleop.errors import expect
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.scenario import Scenario
+from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sides.channel import MakeChannel
 from drake_teleop.sides.master import MakeMasterSide
 from drake_teleop.sides.ports import record, wire
@@ -41,8 +42,8 @@ def MakeTeleopStation(
     Args:
         scenario: what the station is made of.
         load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, as an identification
-            found it. It may be left out if sigma = gamma, which needs no estimate, and if the
-            estimator learns in the loop.
+            found it. It may be left out if the estimator learns in the loop, and if sigma = gamma,
+            which needs no estimate; then the station has no `contact_wrench_S`.
         load_covariance: (16, 16) of the estimate, with which a load that is to be watched
             (`load_estimator.watch`) need not be learnt first. Of a method that allows for noise in
             the motion ("total"): that of plain least squares is too small.
@@ -55,7 +56,10 @@ def MakeTeleopStation(
         DrakeTeleopError: for a value that cannot be right, as for the sides, or for a side of
             one's own without a port that is needed.
     """
-    scenario.check()
+    check_scenario(scenario)
+    for name, side in (("master", master), ("slave", slave)):
+        if side is not None:
+            expect(System, side, name, "docs/station.md lists the ports that each side has")
     builder = DiagramBuilder()
     if slave is None:
         slave = MakeSlaveSide(
@@ -98,7 +102,8 @@ def MakeTeleopStation(
 
 def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
     """Builds the slave alone, on an excitation trajectory: see `MakeSlaveOnTrajectory`."""
-    scenario.check()
+    check_scenario(scenario)
+    expect(FourierTrajectory, trajectory, "trajectory")
     builder = DiagramBuilder()
     slave = builder.AddNamedSystem("slave_side", MakeSlaveOnTrajectory(scenario, trajectory))
     return record(builder, "identification_station", (slave,), scenario.rates.log_hz)

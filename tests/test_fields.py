@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import ast
+import copy
+import dataclasses
+import pickle
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+import drake_teleop
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fields import FieldInfo, fields_of
 from drake_teleop.operator.operator import OperatorConfig
 from drake_teleop.operator.task import KINDS
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.scaling.force_scaling import ForceScalingConfig
-from drake_teleop.scenario import Scenario, Simulation
+from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.studies.design import Factor, Study
 
 
@@ -57,3 +64,46 @@ def test_an_instance_tells_its_own_defaults() -> None:
     charged = named(PassivityConfig, "charged_tdpa").default
     plain = named(PassivityConfig, "tdpa").default
     assert named(plain, "drag").default == [0.0, 0.0] != named(charged, "drag").default
+
+
+def test_a_misspelt_field_is_refused_with_the_one_that_is_meant() -> None:
+    scenario = Scenario()
+    with pytest.raises(DrakeTeleopError, match=r"ForceScalingConfig\.sgima: .* mean 'sigma'"):
+        scenario.force_scaling.sgima = 0.5
+    with pytest.raises(DrakeTeleopError, match="mean 'force_scaling'"):
+        scenario.force_scalling = ForceScalingConfig()
+    with pytest.raises(DrakeTeleopError, match=r"scenario:force_scaling\.sgima: .* 'sigma'"):
+        replace(scenario, force_scaling__sgima=0.5)
+    with pytest.raises(DrakeTeleopError, match=r"scenario:simulaton: .* mean 'simulation'"):
+        replace(scenario, simulaton__seed=1)
+    with pytest.raises(DrakeTeleopError, match="there is no slot to change"):
+        replace(scenario, slot__depth=0.03)
+    assert scenario == Scenario()
+
+
+def test_all_settings_refuse_them() -> None:
+    """A dataclass that can be changed is one of settings; a new one may not be forgotten."""
+    forgotten = []
+    for path in Path(drake_teleop.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                marks = [ast.unparse(mark) for mark in node.decorator_list]
+                if "dataclass" in marks and marks != ["settings", "dataclass"]:
+                    forgotten.append(node.name)
+    assert forgotten == []
+
+
+def test_settings_are_copied_stored_and_changed_as_ever() -> None:
+    scenario = LoadScenario("contact_transition")
+    for other in (copy.deepcopy(scenario), pickle.loads(pickle.dumps(scenario))):
+        assert other == scenario
+        other.force_scaling.sigma = 0.25
+        other.simulation = dataclasses.replace(other.simulation, seed=3)
+        assert other == replace(scenario, force_scaling__sigma=0.25, simulation__seed=3)
+
+
+def test_help_tells_units_ranges_and_meanings() -> None:
+    text = Simulation.__doc__ or ""
+    assert text.startswith("How long, and with which integrator.")
+    assert "    duration: logged time (0.001 to 36000 s; default 1)" in text.splitlines()
+    assert "(runge_kutta3, runge_kutta2," in " ".join(text.split())

@@ -84,7 +84,7 @@ def test_fresh_identifies_anew_and_keeps_that(identifications):
     [
         {"slave__payload": dataclasses.replace(Scenario().slave.payload, mass=1e-13)},
         {"slave__position": [0.55, 0.0, np.nextafter(0.45, 1)]},
-        {"slave__position": np.array([0.55, 0.0, np.nextafter(0.45, 1)])},
+        {"slave__position": [0.55, 0.0, float(np.nextafter(0.45, 1))]},
         {"wrist_sensor__ideal": True},
         {"motion_estimation__source": "encoders"},
         {"joint_control__position_bandwidth_hz": 12.5},

@@ -12,6 +12,7 @@ from pydrake.geometry import Meshcat, MeshcatParams
 
 from drake_teleop import film, replay
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identification import true_load
 from drake_teleop.replay import ReplayScene, replay_command, write_replay, write_scenario
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, replace
@@ -30,7 +31,7 @@ def scenario() -> Scenario:
 
 @pytest.fixture(scope="module")
 def result(scenario) -> SimulationResult:
-    station = MakeTeleopStation(scenario, load_estimate=np.zeros(16))
+    station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     return simulate(station, scenario.simulation)
 
 

@@ -13,6 +13,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from drake_teleop.channel.channel import Channel
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.identification import true_load
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.operator.operator import OperatorConfig, Sine, intent_at
 from drake_teleop.operator.task import Touch
@@ -215,7 +216,7 @@ def test_a_channel_of_two_wires_is_left_out_of_the_station():
     far = replace(Scenario(), channel=Channel(delay=0.01))
     assert not MakeTeleopStation(Scenario()).HasSubsystemNamed("channel")
     assert MakeTeleopStation(far).HasSubsystemNamed("channel")
-    station = MakeTeleopStation(seen, load_estimate=np.zeros(16), noise_floor=floor())
+    station = MakeTeleopStation(seen, load_estimate=true_load(seen), noise_floor=floor())
     assert station.HasSubsystemNamed("channel") and station.HasOutputPort("contact_at_hand")
 
 

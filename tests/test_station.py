@@ -15,6 +15,7 @@ from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.identification import identify_load
 from drake_teleop.load.compensation import scaled_wrench
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -117,12 +118,14 @@ def test_the_wrist_wrench_is_the_reaction_force_of_the_sensors_joint(slave, touc
 )
 def test_samples_between_the_steps_are_those_of_short_steps(name, most):
     """The 8 kHz samples in steps of 500 us (in contact, less) against a run in steps of 40 us."""
-    scenario = replace(LoadScenario(name), wrist_sensor__ideal=True, simulation__duration=0.4)
-    tight = replace(scenario, simulation__accuracy=1e-9, simulation__max_step=4e-5)
-    result, reference = (
-        simulate(MakeTeleopStation(s, load_estimate=np.zeros(16)), s.simulation)
-        for s in (scenario, tight)
+    scenario = replace(
+        LoadScenario(name),
+        wrist_sensor__ideal=True,
+        simulation__duration=0.4,
+        force_scaling__sigma=1.0,  # the hand feels the tool: no load need be known
     )
+    tight = replace(scenario, simulation__accuracy=1e-9, simulation__max_step=4e-5)
+    result, reference = (simulate(MakeTeleopStation(s), s.simulation) for s in (scenario, tight))
     off = np.abs(result["measured_wrench_S"] - reference["measured_wrench_S"])[:, :3].max()
     # The log shows the sample 125 us before its instant, inside a step.
     assert off < most
@@ -407,6 +410,35 @@ def test_eliminating_a_load_that_nobody_identified_is_refused():
         MakeTeleopStation(replace(Scenario(), force_scaling__sigma=0.0))
     MakeTeleopStation(replace(Scenario(), force_scaling__sigma=0.0, load_estimator__enabled=True))
     MakeTeleopStation(Scenario())
+    seen = replace(Scenario(), contact_detection=ContactDetectionConfig())
+    with pytest.raises(DrakeTeleopError, match=r"detected, but the load is not known"):
+        MakeTeleopStation(seen)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1.0])
+def test_a_load_that_was_never_learnt_is_refused(sigma):
+    """Everything would be contact: the weight and inertia of the tool, 96 N."""
+    scenario = replace(Scenario(), force_scaling__sigma=sigma)
+    offsets_alone = np.repeat([1.0, 0.0], [6, 10])
+    with pytest.raises(DrakeTeleopError, match=r"load_estimate: .* never learnt; identify it"):
+        MakeTeleopStation(scenario, load_estimate=offsets_alone)
+    # Of which a learning estimator may begin.
+    learning = replace(scenario, load_estimator__enabled=True)
+    MakeTeleopStation(learning, load_estimate=offsets_alone)
+
+
+def test_a_station_that_knows_no_load_does_not_call_anything_contact():
+    unknown, learning = Scenario(), replace(Scenario(), load_estimator__enabled=True)
+    for scenario, told in ((unknown, False), (learning, True)):
+        station = MakeTeleopStation(scenario)
+        assert station.HasOutputPort("scaled_wrench_S")
+        assert station.HasOutputPort("contact_wrench_S") == told
+        assert station.HasOutputPort("load_estimate") == told
+
+
+def test_identifying_without_learning_is_refused_at_once():
+    with pytest.raises(DrakeTeleopError, match=r"load_estimator\.enabled: .*call identified_load"):
+        identify_load(LoadScenario("contact_transition"))
 
 
 def test_leaving_the_joints_range_ends_the_simulation_with_a_clear_message(slave):

@@ -24,6 +24,7 @@ from drake_teleop._compiled import njit
 from drake_teleop.channel import network
 from drake_teleop.channel.network import PRESETS, NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.passivity import methods
 from drake_teleop.passivity.memory import LIMIT, MEMORY, Slots
@@ -51,6 +52,7 @@ from drake_teleop.quantities import choice, plain, quantity
 _NETWORKS = ("custom", *PRESETS)
 
 
+@settings
 @dataclass
 class Channel(NetworkConfig):
     """The network between master and slave; its own fields are those of `custom`."""

@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.noise import random_bits
 from drake_teleop.passivity.packet import POSE, VELOCITY, WRENCH, arrived, moved_into
 from drake_teleop.quantities import check_ranges, choice, plain, quantity
@@ -54,6 +55,7 @@ _ZERO, _EXTRAPOLATE = 1, 2
 _TRACE_STEP = 1e-3  # [s], as fine as a mean needs
 
 
+@settings
 @dataclass
 class NetworkConfig:
     """One direction of a network; the default is ideal: packet k arrives at step k."""

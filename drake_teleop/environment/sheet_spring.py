@@ -15,12 +15,14 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, PrismaticSpring
 
 from drake_teleop.environment.environment import Environment, Stand
+from drake_teleop.fields import settings
 from drake_teleop.quantities import quantity
 from drake_teleop.resources import models_dir
 
 _BENCH = 0.15  # from the lower face of the model's bench to the leaf [m]
 
 
+@settings
 @dataclass
 class SheetSpring(Environment):
     """Where the leaf is and what it is made of. Lengths in m, SI throughout."""

@@ -31,6 +31,7 @@ from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
 
 from drake_teleop.environment.environment import Environment, Stand
+from drake_teleop.fields import settings
 from drake_teleop.quantities import quantity
 
 #: The peg's balls [m]: their radius, and z_S of their centres. The first is that of tool.sdf; where
@@ -43,6 +44,7 @@ _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 0.55])  # the peg is seen through th
 _BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
 
 
+@settings
 @dataclass
 class Slot(Environment):
     """Where the slot is, its shape, and how the balls of the peg touch it."""

@@ -12,6 +12,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop._compiled import njit
+from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.load.compensation import scaled_wrench_into
 from drake_teleop.load.contact.detection import ContactDetector, flag_update
@@ -29,6 +30,7 @@ from drake_teleop.quantities import choice, quantity
 from drake_teleop.slave.arm import ArmModel, acceleration_into
 
 
+@settings
 @dataclass
 class ContactDetectionConfig:
     """How contact is noticed; a scenario without this block has no detector."""

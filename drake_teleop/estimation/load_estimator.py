@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.online.change import change_parameters
 from drake_teleop.load.online.methods import METHODS
@@ -36,6 +37,7 @@ from drake_teleop.quantities import choice, plain, quantity
 _CHECK = 16
 
 
+@settings
 @dataclass
 class LoadEstimatorConfig:
     """Recursive estimation with offsets, Eqs. (7)-(8)."""

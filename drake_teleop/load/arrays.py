@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+import reprlib
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -68,6 +69,31 @@ def checked_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list
         for table in tables.values()
     ]
     return leading, rows
+
+
+def number(name: str, value: Any) -> float:
+    """`value` as a float, which may be NaN; raises DrakeTeleopError unless it is one."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise DrakeTeleopError(
+            f"expected a number, found {reprlib.repr(value)}", where=name
+        ) from None
+
+
+def learnt(name: str, phi: Array) -> Array:
+    """`phi` (10,), unless it is zero throughout: the load of an estimator that never learnt.
+
+    Raises:
+        DrakeTeleopError: then; every wrench would be taken for contact.
+    """
+    if not phi.any():
+        raise DrakeTeleopError(
+            "is zero throughout, so this load was never learnt",
+            where=name,
+            remedy="identify it first: identify_load for a scenario, identify_log for a log",
+        )
+    return phi
 
 
 def positive(name: str, value: ArrayLike, *shape: int) -> Array:

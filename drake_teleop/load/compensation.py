@@ -16,14 +16,12 @@ All in the sensor frame S about its origin So; wrenches [f; tau] [N, N m], motio
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked, checked_rows
+from drake_teleop.load.arrays import Array, checked, checked_rows, number
 from drake_teleop.load.regressor import non_contact_wrench_into
 
 
@@ -190,12 +188,12 @@ def scales_from_eta(eta: float) -> tuple[float, float, float]:
     Raises:
         DrakeTeleopError: if eta is not within [0, 1].
     """
-    if not 0.0 <= eta <= 1.0:
+    if not 0.0 <= number("eta", eta) <= 1.0:
         raise DrakeTeleopError(f"{eta:g} is outside 0 to 1", where="eta")
     return 0.0, float(eta), 1.0
 
 
 def _scale(name: str, value: float) -> float:
-    if not (math.isfinite(value) and value >= 0.0):
+    if not 0.0 <= number(name, value) < np.inf:
         raise DrakeTeleopError(f"{value} is not a finite number >= 0", where=name)
     return float(value)

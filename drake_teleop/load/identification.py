@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked
+from drake_teleop.errors import DrakeTeleopError, expect
+from drake_teleop.load.arrays import Array, checked, learnt
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
 
 VERDICTS = ("identified", "weakly", "not", "prior")
@@ -84,6 +84,11 @@ class Identification:
     samples: int
     degrees_of_freedom: Array = field(default_factory=lambda: np.full(16, np.inf))
     prior_dominated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(16, dtype=bool))
+
+    def __post_init__(self) -> None:
+        """Raises DrakeTeleopError for a phi or offsets of another shape, or a load never learnt."""
+        learnt("phi", checked("phi", self.phi, 10))
+        checked("offsets", self.offsets, 6)
 
     @property
     def mass(self) -> float:
@@ -151,8 +156,10 @@ class Identification:
 
         Raises:
             DrakeTeleopError: naming file and field, if the file is missing, is no JSON, or a field
-                is missing, unknown, of the wrong shape or type, not finite, or at odds with phi.
+                is missing, unknown, of the wrong shape or type, not finite, or at odds with phi,
+                or the load was never learnt.
         """
+        expect((str, Path), path, "load")
         document = _read_json(path)
         known = {*cls.__dataclass_fields__, "mass", "com", "inertia_com", "physically_consistent"}
         known |= {"verdicts"}
@@ -171,7 +178,7 @@ class Identification:
         if (name := "prior_dominated") in document:
             optional[name] = _read_flags(f"{path}:{name}", document[name])
         result = cls(
-            phi=numbers("phi", 10),
+            phi=learnt(f"{path}:phi", numbers("phi", 10)),
             offsets=numbers("offsets", 6),
             covariance=_read_covariance(f"{path}:covariance", document["covariance"]),
             identifiable=_read_flags(f"{path}:identifiable", document["identifiable"]),

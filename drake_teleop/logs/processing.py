@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.batch.methods import DEFAULT_METHOD, identify_batch
+from drake_teleop.load.arrays import checked, number
+from drake_teleop.load.batch.methods import DEFAULT_METHOD, check_method, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta
 from drake_teleop.load.gripper import identified_object
@@ -119,6 +120,7 @@ def identify_log(
         DrakeTeleopError: if the log cannot be used, the method is unknown, or the result would be
             worthless, see `drake_teleop.logs.check.conventions.question_fit`.
     """
+    check_method(method)
     log = read_log(path, bandwidth_hz=cutoff_hz)
     delay_s, source = _delay(log, cutoff_hz, delay)
     log = undelayed(log, delay_s)
@@ -337,7 +339,7 @@ def _delay(
     if log.static:
         return 0.0, "static"
     if not isinstance(delay, str):
-        return float(delay), "given"
+        return float(checked("delay", number("delay", delay))), "given"
     if delay != "auto":
         raise DrakeTeleopError(
             f"{delay!r} is neither seconds nor auto", where="delay", remedy="give a number or auto"
@@ -367,7 +369,7 @@ def _scales(
 ) -> dict[str, float]:
     """The three scales of `scaled_wrench`; without a gripper (`split`) the load is all object."""
     for name, value in (("sigma", sigma), ("sigma_object", sigma_object)):
-        if value is not None and value < 0:
+        if value is not None and number(name, value) < 0:
             raise DrakeTeleopError(
                 f"{name} is {value:g}", where=name, remedy="give a number of at least 0"
             )

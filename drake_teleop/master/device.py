@@ -9,6 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.master.phantom import (
     FRICTION_SPEED,
@@ -27,6 +28,7 @@ _LARGEST_PERIOD = 1e-3  # s, slower than any haptic device
 _LARGEST_FRICTION_STEP = 2.0
 
 
+@settings
 @dataclass
 class JointFriction:
     """Friction of the six joints: coulomb * tanh(velocity / 0.01 rad/s) + viscous * velocity."""

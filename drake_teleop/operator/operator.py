@@ -24,6 +24,7 @@ from pydrake.systems.framework import (
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.operator import decision
 from drake_teleop.operator import perception as feeling
@@ -63,6 +64,7 @@ GRIPS = {
 }
 
 
+@settings
 @dataclass
 class MinimumJerk:
     """A move by an offset on the minimum-jerk profile 10 u^3 - 15 u^4 + 6 u^5."""
@@ -75,6 +77,7 @@ class MinimumJerk:
     )
 
 
+@settings
 @dataclass
 class Sine:
     """An oscillation that fades in and out on minimum-jerk ramps, so that it is C2 throughout.
@@ -93,17 +96,14 @@ class Sine:
     )
 
 
+@settings
 @dataclass
 class OperatorConfig:
     """How the hand holds the stylus and what it wants to do with it."""
 
     grip: str = choice("medium", tuple(GRIPS), "stiffness, damping and mass of the hand")
-    intent: list[MinimumJerk | Sine] = plain(
-        [], "moves and oscillations relative to the start pose; they may overlap, and add up"
-    )
-    task: Reach | Touch | Press | Insert | None = plain(
-        None, "what the operator does by eye and by feel, on top of the intent; null: nothing"
-    )
+    intent: list[MinimumJerk | Sine] = plain([], "moves relative to the start pose; they add up")
+    task: Reach | Touch | Press | Insert | None = plain(None, "by eye and feel, beside the intent")
     perception: Perception = field(default_factory=Perception)
     movement: Movement = field(default_factory=Movement)
 

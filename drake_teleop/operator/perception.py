@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.load.arrays import checked, checked_rows
 from drake_teleop.quantities import quantity
 
@@ -55,6 +56,7 @@ EXCESS, THRESHOLD, NOTICED, PERCEIVED = 0, 3, 4, 5
 """Places in what `perceive_into` writes, and its size."""
 
 
+@settings
 @dataclass
 class Perception:
     """What a human sees and feels, how exactly and how late; see docs/operator.md."""

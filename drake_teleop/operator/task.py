@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.quantities import quantity
 
 
@@ -26,6 +27,7 @@ class _Task:
         return math.hypot(*self.translation)
 
 
+@settings
 @dataclass
 class Reach(_Task):
     """Brings the tool's tip into a sphere in free space and keeps it there (Fitts)."""
@@ -34,6 +36,7 @@ class Reach(_Task):
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "time in the target")
 
 
+@settings
 @dataclass
 class Touch(_Task):
     """Approaches a surface at the target, notices contact, and stops."""
@@ -42,6 +45,7 @@ class Touch(_Task):
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest after the stop")
 
 
+@settings
 @dataclass
 class Press(_Task):
     """Approaches a surface at the target and presses on it with a set force for a while."""
@@ -52,6 +56,7 @@ class Press(_Task):
     hold: float = quantity(1.0, "s", 0.0, 60.0, "how long")
 
 
+@settings
 @dataclass
 class Insert(_Task):
     """Puts the tool down into a slot whose mouth is the target, and pushes it to the floor."""
@@ -68,6 +73,7 @@ REACH, TOUCH, PRESS, INSERT = range(4)
 KINDS = (Reach, Touch, Press, Insert)
 
 
+@settings
 @dataclass
 class Movement:
     """How the operator moves; see docs/operator.md."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
+from drake_teleop.fields import settings
 from drake_teleop.passivity import none
 from drake_teleop.passivity.memory import HELD, MOTION_SCALE, own_parameters
 from drake_teleop.passivity.packet import limit
@@ -20,6 +21,7 @@ from drake_teleop.quantities import quantity
 _OWN_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
 
 
+@settings
 @dataclass
 class ForceLimitConfig:
     """Parameters of the local force limit."""

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
+from drake_teleop.fields import settings
 from drake_teleop.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -49,6 +50,7 @@ _SLAVE, _HAND = _places.number(), _places.number()
 _DIFFERENCE = own_memory().vector(6)
 
 
+@settings
 @dataclass
 class FourChannelConfig:
     """Parameters of the four-channel architecture."""

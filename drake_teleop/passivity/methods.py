@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.passivity import none
 from drake_teleop.passivity.force_limit import ForceLimitConfig
 from drake_teleop.passivity.four_channel import FourChannelConfig
@@ -47,6 +48,7 @@ from drake_teleop.passivity.wave import WaveConfig
 from drake_teleop.quantities import choice, quantity
 
 
+@settings
 @dataclass
 class Methods:
     """The methods and the parameters of each: a line here enters one, by its field's name.
@@ -92,6 +94,7 @@ class _Common:
     )
 
 
+@settings
 @dataclass
 class PassivityConfig(Methods, _Common):
     """Which method keeps the station passive, and the parameters of each.

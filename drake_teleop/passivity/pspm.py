@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
+from drake_teleop.fields import settings
 from drake_teleop.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -65,6 +66,7 @@ _places = own_memory()
 _OFFSET, _WANTED = _places.vector(6), _places.vector(6)
 
 
+@settings
 @dataclass
 class PspmConfig:
     """Parameters of the passive set-position modulation."""

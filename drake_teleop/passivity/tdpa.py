@@ -46,6 +46,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
+from drake_teleop.fields import settings
 from drake_teleop.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -109,6 +110,7 @@ _WITHHELD, _FILTERED = _places.vector(6), _places.vector(6)
 _CONTACT, _ONSET = _places.vector(2), _places.vector(2)
 
 
+@settings
 @dataclass
 class TdpaConfig:
     """Parameters of the time-domain passivity approach."""

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
+from drake_teleop.fields import settings
 from drake_teleop.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -70,6 +71,7 @@ _places = own_memory()
 _SPRING, _BRAKE = _places.vector(6), _places.vector(6)
 
 
+@settings
 @dataclass
 class TwoLayerConfig:
     """Parameters of the energy tanks."""

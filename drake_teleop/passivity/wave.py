@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
+from drake_teleop.fields import settings
 from drake_teleop.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -70,6 +71,7 @@ _PLAYED, _INTEGRAL, _WAVE = _places.vector(6), _places.vector(6), _places.vector
 _SILENT, _DRIFT = _places.number(), _places.vector(6)
 
 
+@settings
 @dataclass
 class WaveConfig:
     """Parameters of the wave variables."""

@@ -10,10 +10,10 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 
-import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.identification import true_load
 from drake_teleop.pages.progress import Progress
 from drake_teleop.scenario import Scenario, Simulation
 from drake_teleop.simulation import MakeSimulator, advance
@@ -40,8 +40,8 @@ def MakeBarePlant(scenario: Scenario) -> Simulator:
 
 def MakeMovingStation(scenario: Scenario) -> Simulator:
     """The station of a scenario, past its settling time."""
-    # What the estimate says costs nothing, so none is made.
-    station = MakeTeleopStation(scenario, load_estimate=np.zeros(16))
+    # What the estimate says costs nothing, so it is the truth.
+    station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
     advance(simulator, scenario.simulation.settle)

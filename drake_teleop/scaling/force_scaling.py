@@ -9,6 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.compensation import scaled_wrench_into, scales_from_eta
 from drake_teleop.load.regressor import non_contact_wrench_into
@@ -28,6 +29,7 @@ from drake_teleop.slave.arm import ArmModel, forward_kinematics
 _ELIMINATION = np.array([0.0, 0.0, 1.0])
 
 
+@settings
 @dataclass
 class ForceScalingConfig:
     """sigma, gamma, eta of the paper and the scale from slave to master."""

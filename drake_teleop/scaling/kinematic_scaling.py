@@ -13,11 +13,13 @@ from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop._compiled import njit
+from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.quantities import quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, normalized, rotate
 
 
+@settings
 @dataclass
 class KinematicScalingConfig:
     """How the master's motion is scaled, and how the master's base lies in the world."""

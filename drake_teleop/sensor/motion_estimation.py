@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.load.sample import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
@@ -82,6 +83,7 @@ _PER_JOINT = 5 + 2 * _SECTIONS
 _GRAVITY = 22
 
 
+@settings
 @dataclass
 class MotionEstimationConfig:
     """From what the motion of the sensor is estimated."""

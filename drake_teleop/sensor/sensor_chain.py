@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
 from drake_teleop.quantities import choice, plain, quantity
 from drake_teleop.vectors import apply, cross, cross_matrix, nine, plus_cross, three
@@ -51,6 +52,7 @@ _SECTIONS = 2  # second-order sections of the fourth-order low-pass
 _ROTATION_ERROR = 1e-6
 
 
+@settings
 @dataclass
 class WristSensorConfig:
     """A force/torque sensor with accelerometers; the defaults are the paper's, `jr3_85m35a3`."""

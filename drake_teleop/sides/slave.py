@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, expect
 from drake_teleop.estimation.contact_detection import ContactDetection
 from drake_teleop.estimation.load_estimator import LoadEstimator
+from drake_teleop.load.arrays import checked, learnt
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.scaling.force_scaling import ForceScaling
@@ -52,8 +53,9 @@ def MakeSlaveSide(
         - pose_slave: (7,) X_WS, actual, of the last sample's joint angles (over a network)
         - saturated: (1,) 1 while the wrench is not to be trusted; a signal too
         - contact: (1,) 1 in contact; a signal too (with contact detection)
-        - the parts of a sample (`sample_parts`), load_estimate, slave_state, joint_torque,
-          joint_command, ik_status, scaled_wrench_S, contact_wrench_S: signals
+        - the parts of a sample (`sample_parts`), slave_state, joint_torque, joint_command,
+          ik_status, scaled_wrench_S: signals
+        - load_estimate, contact_wrench_S (if the load is known or learnt): signals
         - load_state (if the load is watched), true_contact_wrench_W (with something to touch),
           sheet_state (with a sheet spring): signals
         - sample, scaled_and_contact_S: several of these side by side, for the log
@@ -66,6 +68,8 @@ def MakeSlaveSide(
             something only if the load is known while it is not, or detection without its floor.
     """
     _check_load_is_known(scenario, load_estimate)
+    if load_covariance is not None:
+        checked("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
     body = _add_body(builder, scenario, load_estimate, load_covariance)
     arm = body.slave.arm
@@ -87,8 +91,9 @@ def MakeSlaveSide(
     estimate = body.load_estimator.GetOutputPort("load_estimate")
     builder.Connect(body.sample["sample"], force_scaling.GetInputPort("sample"))
     builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
-    scaled = ("scaled_wrench_S", "contact_wrench_S", "scaled_and_contact_S")
-    export(builder, force_scaling, "wrench_B", *scaled)
+    export(builder, force_scaling, "wrench_B", "scaled_wrench_S")
+    if _is_known(scenario, load_estimate):
+        export(builder, force_scaling, "contact_wrench_S", "scaled_and_contact_S")
 
     if not scenario.is_direct:
         kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))
@@ -102,6 +107,7 @@ def MakeSlaveSide(
                 where="contact_detection",
                 remedy="pass the noise_floor of identify_load, as load_estimate",
             )
+        expect(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
         detection = builder.AddNamedSystem(
             "contact_detection",
             ContactDetection(
@@ -212,7 +218,8 @@ def _add_body(
     # Only when it learns or watches: at 8 kHz even a wire that nobody reads costs time.
     if scenario.load_estimator.enabled or scenario.load_estimator.watch:
         builder.Connect(sample["sample"], estimator.GetInputPort("sample"))
-    export(builder, estimator, "load_estimate")
+    if _is_known(scenario, load_estimate):
+        export(builder, estimator, "load_estimate")
     if scenario.load_estimator.watch:
         export(builder, estimator, "load_state")
 
@@ -235,11 +242,26 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputP
 
 
 def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
+    if estimate is not None:
+        estimate = checked("load_estimate", estimate, 16)
+        if not scenario.load_estimator.enabled:
+            learnt("load_estimate", estimate[6:])
     sigma_gripper, sigma_object, gamma = scenario.force_scaling.scales()
     needed = not sigma_gripper == sigma_object == gamma
-    if needed and estimate is None and not scenario.load_estimator.enabled:
+    if needed and not _is_known(scenario, estimate):
         raise DrakeTeleopError(
             "sigma and gamma differ, but the load is not known",
             where="load_estimate",
             remedy="pass the estimate of identify_load, or set load_estimator.enabled",
         )
+    if scenario.contact_detection is not None and not _is_known(scenario, estimate):
+        raise DrakeTeleopError(
+            "contact is to be detected, but the load is not known",
+            where="load_estimate",
+            remedy="pass the estimate of identify_load, as its noise_floor",
+        )
+
+
+def _is_known(scenario: Scenario, estimate: Array | None) -> bool:
+    """Whether there is a load estimate, or will be one; without it nobody can tell contact."""
+    return estimate is not None or scenario.load_estimator.enabled

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop._compiled import njit
+from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.quantities import quantity
 from drake_teleop.slave.arm import ArmModel, inverse_dynamics
 
 
+@settings
 @dataclass
 class JointControlConfig:
     """Bandwidths of the two loops; the closed loop is about as fast as the position loop."""

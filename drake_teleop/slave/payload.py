@@ -8,11 +8,13 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, SpatialInertia, WeldJoint
 
+from drake_teleop.fields import settings
 from drake_teleop.quantities import quantity
 
 _STEEL = 7850.0  # kg/m^3
 
 
+@settings
 @dataclass
 class Payload:
     """A ball of steel, welded to the tool: without shape, so that it touches nothing.

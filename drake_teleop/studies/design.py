@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fields import settings
 from drake_teleop.quantities import check_ranges, choice, plain, quantity
 from drake_teleop.studies.measures import MEASURES, default_measures
 
@@ -22,6 +23,7 @@ Values: TypeAlias = dict[str, Value]
 _CANDIDATES = 1024
 
 
+@settings
 @dataclass
 class Factor:
     """A field of the scenario that the study varies: over a list of what it takes, or a range."""
@@ -86,6 +88,7 @@ class Factor:
             raise DrakeTeleopError("a value stands there twice", where=where)
 
 
+@settings
 @dataclass
 class Study:
     """What a study varies, by which design, and what it measures."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -252,6 +253,7 @@ def hole(document):
         (put("phi", [1.0] * 9), r"json:phi: has shape \(9,\) instead of \(10,\)"),
         (put("phi", [float("nan")] * 10), "json:phi: is not finite"),
         (put("phi", None), "json:phi: "),
+        (put("phi", [0.0] * 10), "json:phi: .* never learnt"),
         (put("offsets", ["a"] * 6), "json:offsets: holds no numbers"),
         (put("covariance", [[1.0] * 16] * 15), "json:covariance: is not a"),
         (put("covariance", [[1.0] * 16] * 15 + [[1.0]]), "json:covariance: is not a"),
@@ -273,6 +275,14 @@ def test_spoilt_file(tmp_path, spoil, message):
     path.write_text(json.dumps(document))
     with pytest.raises(DrakeTeleopError, match=message):
         Identification.load(path)
+
+
+def test_a_load_that_was_never_learnt_is_none():
+    found = identify(record(99)[0], *record(99)[1])
+    with pytest.raises(DrakeTeleopError, match=r"phi: .* never learnt"):
+        replace(found, phi=np.zeros(10))
+    with pytest.raises(DrakeTeleopError, match=r"offsets: has shape \(10,\)"):
+        replace(found, offsets=np.zeros(10))
 
 
 def test_no_file(tmp_path):

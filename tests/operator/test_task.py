@@ -8,7 +8,7 @@ import pytest
 from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import slave_arm
+from drake_teleop.identification import true_load
 from drake_teleop.master.device import JointFriction
 from drake_teleop.noise import random_normal
 from drake_teleop.operator import decision
@@ -33,7 +33,7 @@ FAST = {
 def run(name: str, **changes):
     """The scenario, with a load that is known."""
     scenario = replace(LoadScenario(name), **(FAST | changes))
-    estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+    estimate = true_load(scenario)
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     result = simulate(station, scenario.simulation)
     return result, task_measures(result, scenario)
@@ -199,7 +199,7 @@ def test_a_human_notices_the_papers_contact_and_nothing_before():
     scenario = LoadScenario("contact_transition")
     changes = FAST | {"simulation__settle": 0.0, "simulation__duration": 1.7}
     scenario = replace(scenario, **changes)
-    estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
+    estimate = true_load(scenario)
     result = simulate(MakeTeleopStation(scenario, load_estimate=estimate), scenario.simulation)
     hand, velocity = result["hand_wrench_E"][:, :3], result["twist_master"][:, :3]
     mass = scenario.operator.hand.mass

@@ -191,6 +191,12 @@ METHODS = {
 DEFAULT_METHOD = "consistent"
 
 
+def check_method(method: str) -> None:
+    """Raises DrakeTeleopError unless it is one of `METHODS`."""
+    if not isinstance(method, str) or method not in METHODS:
+        raise DrakeTeleopError(f"{method!r} is not one of {sorted(METHODS)}", where="method")
+
+
 def identify_batch(
     wrench: ArrayLike,
     s: ArrayLike,
@@ -224,8 +230,7 @@ def identify_batch(
         DrakeTeleopError: for an unknown method, arrays of another shape, numbers that are not
             finite, fewer than 3 samples, or a wrench that is zero throughout.
     """
-    if method not in METHODS:
-        raise DrakeTeleopError(f"{method!r} is not one of {sorted(METHODS)}", where="method")
+    check_method(method)
     if method != "consistent" and (prior, ellipsoid) != (None, None):
         raise DrakeTeleopError(
             f"{method!r} takes no prior and no ellipsoid", where="method", remedy="use consistent"

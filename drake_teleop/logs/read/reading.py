@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, expect
+from drake_teleop.load.arrays import number
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW,
     angular_motion,
@@ -64,6 +65,11 @@ def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
     Raises:
         DrakeTeleopError: naming file and field and what to do, if the log cannot be used.
     """
+    expect((str, Path), path, "log", "give the file's name")
+    if bandwidth_hz is not None and not number("bandwidth_hz", bandwidth_hz) > 0.0:
+        raise DrakeTeleopError(
+            f"{bandwidth_hz:g} Hz leave nothing", where="bandwidth_hz", remedy="give more, or None"
+        )
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):
         return _Reader(load_description(path), str(path), bandwidth_hz).log()

@@ -1,0 +1,119 @@
+"""Wrong types and shapes from Python are one DrakeTeleopError, as they are from YAML."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import drake_teleop as dt
+from drake_teleop.identification import true_load
+from drake_teleop.scenario import replace
+from drake_teleop.simulation import simulate
+
+N3, N6, N10 = np.ones((4, 3)), np.ones((4, 6)), np.ones(10)
+NAME: Any = "free_motion_force"
+HALF: Any = "half"
+LOADED: Any = {"load_estimate": np.ones(16)}
+
+
+def scaled(**scales: Any) -> Any:
+    kept = {"sigma_gripper": 0.0, "sigma_object": 0.0, "gamma": 1.0}
+    return dt.scaled_wrench(N6, np.zeros(6), N3, N3, N3, N10, N10, **kept | scales)
+
+
+def with_value(path: str, value: object) -> Callable[[], Any]:
+    return lambda: replace(dt.Scenario(), **{path: value}).check()
+
+
+#: By what is wrong: the call, and where the message says that it is.
+WRONG: dict[str, tuple[Callable[[], Any], str]] = {
+    # A word, a list, a tuple, an array, a flag where another kind belongs, as from YAML.
+    "a word for a number": (with_value("force_scaling__sigma", "half"), "force_scaling.sigma"),
+    "a numeral": (with_value("force_scaling__sigma", "0.5"), "force_scaling.sigma"),
+    "a list for a number": (with_value("force_scaling__eta", [0.5]), "force_scaling.eta"),
+    "None for a number": (with_value("force_scaling__gamma", None), "force_scaling.gamma"),
+    "a flag for a number": (with_value("simulation__duration", True), "simulation.duration"),
+    "an array": (with_value("slave__position", np.ones(3)), "slave.position"),
+    "a number for a vector": (with_value("slave__position", 0.4), "slave.position"),
+    "a word in a vector": (with_value("slave__position", [0.5, "x", 0.4]), "slave.position[1]"),
+    "a short vector": (with_value("slave__position", [0.5, 0.4]), "slave.position"),
+    "a number for a flag": (with_value("wrist_sensor__ideal", 1), "wrist_sensor.ideal"),
+    "a fraction for a seed": (with_value("simulation__seed", 0.5), "simulation.seed"),
+    "a negative seed": (with_value("simulation__seed", -1), "simulation.seed"),
+    "a number for a word": (with_value("operator__grip", 3), "operator.grip"),
+    "a word for a block": (with_value("force_scaling", "half"), "force_scaling"),
+    "a wrong block": (with_value("operator__task", dt.Scenario()), "operator.task"),
+    "a word in a list of blocks": (with_value("operator__intent", ["up"]), "operator.intent[0]"),
+    # A name, or nothing, where a scenario belongs.
+    "MakeTeleopStation": (lambda: dt.MakeTeleopStation(NAME), "scenario"),
+    "MakeIdentificationStation": (lambda: dt.MakeIdentificationStation(NAME, NAME), "scenario"),
+    "identify_load": (lambda: dt.identify_load(NAME), "scenario"),
+    "run_scenario": (lambda: dt.run_scenario(NAME), "scenario"),
+    "run_scenario of a path": (lambda: dt.run_scenario(Path("mine.yaml")), "scenario"),  # type: ignore[arg-type]
+    "replace": (lambda: replace(NAME, simulation__seed=1), "scenario"),
+    "LoadScenario": (lambda: dt.LoadScenario(dt.Scenario()), "scenario"),  # type: ignore[arg-type]
+    "simulate": (lambda: simulate(NAME, NAME), "diagram"),
+    # Loads and arrays.
+    "a load of length 10": (lambda: station(load_estimate=N10), "load_estimate"),
+    "a load in words": (lambda: station(load_estimate="heavy"), "load_estimate"),
+    "a result for a load": (lambda: station(load_estimate=object()), "load_estimate"),
+    "a load that is NaN": (lambda: station(load_estimate=np.full(16, np.nan)), "load_estimate"),
+    "a covariance": (lambda: station(load_covariance=N10, **LOADED), "load_covariance"),
+    "a side": (lambda: station(master=NAME), "master"),
+    "a trajectory": (lambda: identified(NAME), "trajectory"),
+    "regressor": (lambda: dt.regressor(N3, N6, N3), "omega"),
+    "non_contact_wrench": (lambda: dt.non_contact_wrench(N3, N3, N3, np.ones(16)), "phi"),
+    "contact_wrench": (lambda: dt.contact_wrench(N6, HALF, N3, N3, N3, N10), "offsets"),
+    "scaled_wrench": (lambda: scaled(gamma=HALF), "gamma"),
+    "a scale of None": (lambda: scaled(sigma_object=None), "sigma_object"),
+    "identify": (lambda: dt.identify(N3, N3, N3, N3), "wrench"),
+    # Logs.
+    "read_log": (lambda: dt.read_log(7), "log"),  # type: ignore[arg-type]
+    "a filter": (lambda: dt.read_log("log.csv", bandwidth_hz=HALF), "bandwidth_hz"),
+    "a method": (lambda: dt.identify_log("log.csv", method=7), "method"),  # type: ignore[arg-type]
+    "a load's file": (lambda: dt.eliminate_log("log.csv", 7), "load"),  # type: ignore[arg-type]
+    "Identification": (lambda: dt.Identification.load(7), "load"),  # type: ignore[arg-type]
+    "a result": (lambda: dt.SimulationResult.read_parquet(7), "result"),  # type: ignore[arg-type]
+    "signals": (lambda: dt.SimulationResult([0.0], {"a": [1.0]}, []), "signals"),
+}  # fmt: skip
+
+
+def station(**arguments: Any) -> Any:
+    return dt.MakeTeleopStation(dt.Scenario(), **arguments)
+
+
+def identified(trajectory: Any) -> Any:
+    return dt.identify_load(dt.LoadScenario("identification"), trajectory=trajectory)
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_is_wrong_is_one_line_that_says_where(what: str) -> None:
+    call, place = WRONG[what]
+    with pytest.raises(dt.DrakeTeleopError) as caught:
+        call()
+    where = str(caught.value).split(": ")[0]
+    assert where.removeprefix("scenario:") == place
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+
+
+def test_every_public_function_is_tried() -> None:
+    """A function that is new in the package's list is missing here until it is tried as well."""
+    functions = [name for name in dt.__all__ if callable(getattr(dt, name))]
+    with open(__file__, encoding="utf-8") as file:
+        text = file.read()
+    untried = [name for name in functions if f"dt.{name}(" not in text]
+    assert sorted(untried) == ["DrakeTeleopError", "Identification", "ScenarioNames", "simulate"]
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    replace(
+        dt.Scenario(),
+        force_scaling__sigma=np.float32(0.5),
+        simulation__seed=np.int64(3),
+        slave__position=[np.float64(0.5), 0, 0.45],
+    ).check()
+    station(load_estimate=list(true_load(dt.Scenario())))
