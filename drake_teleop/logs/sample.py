@@ -131,7 +131,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
 
 
 def _truth() -> dict[str, Any]:
-    """Names, units and signs of identification.json, and of the contacts of `eliminate`."""
+    """Names, units and signs of identification.json, and of the contacts of `detect`."""
     return {
         "mass": MASS,
         "com": COM,
@@ -140,15 +140,17 @@ def _truth() -> dict[str, Any]:
         "offsets": OFFSETS[0],
         "offsets_touched": OFFSETS[1],
         "delay_s": POSE_DELAY_S,
-        "contacts": [
-            {
-                "start_s": touch.start_s,
-                "stop_s": touch.stop_s,
-                "peak_N": np.linalg.norm(touch.push_W),
-            }
-            for touch in TOUCHES
-        ],
+        "contacts": [_contact(touch) for touch in TOUCHES],
     }
+
+
+def _contact(touch: Touch) -> dict[str, Any]:
+    """As `detect` has it: times, largest force, and where it pushes then, in S."""
+    middle = np.array([(touch.start_s + touch.stop_s) / 2])
+    R_WS = _motion(1).at(middle)[3][0]
+    peak = np.linalg.norm(touch.push_W)
+    push = R_WS.T @ touch.push_W / peak
+    return {"start_s": touch.start_s, "stop_s": touch.stop_s, "peak_N": peak, "push": push}
 
 
 def _print(out: Path) -> None:

@@ -78,6 +78,7 @@ def test_what_is_left_is_the_touches():
     assert len(found) == len(truth)
     for contact, touch in zip(found, truth, strict=True):
         assert contact["peak_N"] == pytest.approx(touch["peak_N"], rel=0.03)
+        assert contact["push"] == pytest.approx(touch["push"], abs=0.03)
         assert contact["start_s"] == pytest.approx(touch["start_s"], abs=0.015)
         assert contact["stop_s"] == pytest.approx(touch["stop_s"], abs=0.06)
 
