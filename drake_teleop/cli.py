@@ -20,6 +20,9 @@ def cli() -> None:
 
     Every command with --out writes its figures by name into DIR/summary.json. A command whose input
     cannot be used exits with status 2 and one error line.
+
+    The Tab key completes commands, options, names and files in bash (zsh, fish: likewise) after
+    eval "$(_DRAKE_TELEOP_COMPLETE=bash_source drake-teleop)"
     """
 
 
@@ -43,7 +46,7 @@ def reproduce(out: Path, seed: int | None, quiet: bool) -> int:
 
 
 @cli.command()
-@click.argument("scenario")
+@click.argument("scenario", type=option.SCENARIO)
 @option.out("run")
 @option.seed
 @click.option("--fresh", is_flag=True, help="Identify the load anew, also if it is in the cache.")
@@ -61,7 +64,7 @@ def run(scenario: str, out: Path, seed: int | None, fresh: bool, quiet: bool) ->
 
 
 @cli.command("scenario")
-@click.argument("name", required=False)
+@click.argument("name", type=option.SCENARIO, required=False)
 def print_scenario(name: str | None) -> None:
     """Print a scenario with every field, to start from.
 
@@ -302,7 +305,7 @@ def sample_log(seed: int, out: Path, quiet: bool) -> None:
 
 
 @cli.command()
-@click.argument("scenario")
+@click.argument("scenario", type=option.SCENARIO)
 @click.option(
     "--direction",
     type=click.Choice(["x", "y", "z"]),
@@ -358,7 +361,7 @@ def compare_passivity(
 
 
 @cli.command()
-@click.argument("study", type=option.PATH)
+@click.argument("study", type=option.STUDY)
 @click.option(
     "--jobs", type=option.Whole(min=1), help="Processes at once.  [default: one for each core]"
 )
@@ -407,7 +410,7 @@ def scaling_study(
 
 
 @cli.command()
-@click.argument("scenario", default="identification")
+@click.argument("scenario", type=option.SCENARIO, default="identification")
 @click.option("--model", type=option.PATH, help="Another arm: URDF, SDF, MJCF or .dmd.yaml.")
 @click.option("--sensor-frame", metavar="NAME", help="Its frame or link with the sensor.")
 @click.option(

@@ -8,8 +8,29 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.shell_completion import CompletionItem
+
+from drake_teleop.resources import scenarios_dir, studies_dir
+
+
+class Shipped(click.Path):
+    """What is shipped by name, or a file; a shell that is asked to completes both."""
+
+    def __init__(self, folder: Path, path_type: type) -> None:
+        super().__init__(path_type=path_type)
+        self._folder = folder
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        names = sorted(path.stem for path in self._folder.glob("*.yaml"))
+        fitting = [CompletionItem(name) for name in names if name.startswith(incomplete)]
+        return fitting + super().shell_complete(ctx, param, incomplete)
+
 
 PATH = click.Path(path_type=Path)
+SCENARIO = Shipped(scenarios_dir(), str)
+STUDY = Shipped(studies_dir(), Path)
 
 
 def _check_range(

@@ -43,7 +43,7 @@ Array = NDArray[np.float64]
 _DESIGN_SEED = 0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LoadIdentification:
     """What an identification run gives.
 
@@ -64,6 +64,9 @@ class LoadIdentification:
     kappa_w10: float
     real_time_factor: float
     method: str
+
+    def __repr__(self) -> str:
+        return repr(self.identification)
 
     @property
     def identification(self) -> Identification:

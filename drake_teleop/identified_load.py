@@ -42,7 +42,7 @@ LARGEST_NUMBER = 2000
 _LIBRARIES = ("drake", "numpy", "scipy", "numba")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class IdentifiedLoad:
     """What an identification before a run found.
 
@@ -55,6 +55,9 @@ class IdentifiedLoad:
     identification: Identification
     noise_floor: NoiseFloor | None
     from_cache: bool
+
+    def __repr__(self) -> str:
+        return repr(self.identification)
 
     @property
     def estimate(self) -> NDArray[np.float64]:

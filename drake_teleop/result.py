@@ -16,6 +16,7 @@ import numpy as np
 from drake_teleop.errors import DrakeTeleopError, expect
 
 if TYPE_CHECKING:
+    import pandas as pd
     import polars as pl
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike, NDArray
@@ -74,7 +75,8 @@ class Signal:
 class SimulationResult:
     """Sampled signals of one simulation, on one time base.
 
-    ``result["measured_wrench_S"]`` is an (N, k) array; ``name in result``, ``len(result)`` and
+    ``result["measured_wrench_S"]`` is an (N, k) array; a column of the data frame, by its own name,
+    is an (N,) one: ``result["measured_wrench_S.f_x"]``, ``result["t"]``. ``len(result)`` and
     iteration speak of the signals' names. Arrays are read-only.
 
     Args:
@@ -132,14 +134,26 @@ class SimulationResult:
         }
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
+        if name == "t":
+            return self._t
+        if (found := self._column(name)) is not None:
+            return self._values[found[0]][:, found[1]]
         try:
             return self._values[name]
         except KeyError:
-            near = difflib.get_close_matches(str(name), self.signals, n=3) or self.signals
+            names = self._ipython_key_completions_()
+            near = difflib.get_close_matches(str(name), names, n=3) or self.signals
             raise KeyError(f"no signal {name!r}; there are {', '.join(near)}") from None
 
+    def _column(self, name: object) -> tuple[str, int] | None:
+        """Of a column of the data frame, its signal and the number of its component."""
+        signal = str(name).partition(".")[0]
+        if signal not in self._specs or name not in self._specs[signal].columns:
+            return None
+        return signal, self._specs[signal].columns.index(str(name))
+
     def __contains__(self, name: object) -> bool:
-        return name in self._values
+        return name == "t" or name in self._specs or self._column(name) is not None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._specs)
@@ -148,7 +162,23 @@ class SimulationResult:
         return len(self._specs)
 
     def _ipython_key_completions_(self) -> list[str]:
-        return list(self._specs)
+        columns = (column for spec in self.specs for column in spec.columns)
+        return ["t", *self._specs, *columns]
+
+    def to_pandas(self) -> pd.DataFrame:
+        """`to_dataframe` as pandas has it, which comes with the extra `notebook`.
+
+        Raises:
+            DrakeTeleopError: if pandas is not installed.
+        """
+        try:
+            return self.to_dataframe().to_pandas()
+        except ModuleNotFoundError as error:
+            raise DrakeTeleopError(
+                f"{error.name or 'a library'} is not installed",
+                where="to_pandas",
+                remedy="install the extra that has it: pip install 'drake_teleop[notebook]'",
+            ) from None
 
     def to_dataframe(self) -> pl.DataFrame:
         """One row per sample: ``t``, then a column ``signal.component`` for every component."""
@@ -265,7 +295,8 @@ class SimulationResult:
         """Draws signals over time, one subplot for each signal and unit.
 
         Args:
-            names: the signals; all of them if none is named.
+            names: the signals, or columns such as "contact_wrench_S.f_z"; all signals if none is
+                named.
             contact: (N,) booleans; the time in contact is shaded.
 
         Raises:
@@ -292,7 +323,10 @@ class SimulationResult:
 
     def _panels(self, name: str) -> list[tuple[str, str, list[int]]]:
         """The subplots of a signal: its components, neighbours of the same unit together."""
-        if name not in self:
+        if (found := self._column(name)) is not None:
+            signal, index = found
+            return [(signal, self._specs[signal].units[index], [index])]
+        if name not in self._specs:
             self[name]  # a KeyError with a suggestion
         units = self._specs[name].units
         groups = groupby(range(len(units)), key=lambda index: units[index])

@@ -52,6 +52,22 @@ def test_help_imports_nothing_heavy(arguments):
     assert not HEAVY & set(modules)
 
 
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [("run con", "contact_transition"), ("scenario id", "ideal_sensor"), ("analyze pr", "press"),
+     ("excite fre", "free_motion_torque"), ("study scaling_p", "scaling_press"),
+     ("run --fr", "--fresh")],
+)  # fmt: skip
+def test_the_shell_completes_names_and_options(capsys, monkeypatch, words, expected):
+    monkeypatch.setenv("_DRAKE_TELEOP_COMPLETE", "bash_complete")
+    monkeypatch.setenv("COMP_WORDS", f"drake-teleop {words}")
+    monkeypatch.setenv("COMP_CWORD", "2")
+    _, out, _ = run_main(capsys)
+    assert f"plain,{expected}" in out.splitlines()
+    if not words.split()[1].startswith("-"):
+        assert f"file,{words.split()[1]}" in out.splitlines()
+
+
 def test_no_command_shows_the_help(capsys):
     status, _, _ = run_main(capsys)
     assert status == 2

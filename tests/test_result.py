@@ -45,6 +45,46 @@ def test_signals_are_found_by_name_and_know_their_units():
     }  # fmt: skip
 
 
+def test_a_column_of_the_data_frame_is_found_by_its_name(tmp_path):
+    result = make_result()
+    result.write_parquet(tmp_path / "log.parquet")
+    for each in (result, SimulationResult.scan_parquet(tmp_path / "log.parquet")):
+        for column in each.to_dataframe().columns:
+            assert column in each
+            np.testing.assert_array_equal(each[column], result.to_dataframe()[column].to_numpy())
+    assert result["measured_wrench_S.tau_x"].shape == (50,)
+    assert "measured_wrench_S.g_x" not in result and "t.t" not in result
+    with pytest.raises(KeyError, match=r"measured_wrench_S\.tau_x"):
+        result["measured_wrench_S.taux"]
+
+
+def test_a_notebook_completes_signals_and_columns():
+    offered = make_result()._ipython_key_completions_()
+    assert {"t", "sigma", "measured_wrench_S", "measured_wrench_S.tau_x"} <= set(offered)
+    assert all(name in make_result() for name in offered)
+
+
+def test_pandas_has_the_same_table():
+    result = make_result()
+    table = result.to_pandas()
+    assert list(table.columns) == result.to_dataframe().columns
+    np.testing.assert_array_equal(table["sigma.sigma"], result["sigma.sigma"])
+
+
+def test_without_pandas_the_extra_is_named(monkeypatch):
+    def missing(self):
+        raise ModuleNotFoundError("No module named 'pandas'", name="pandas")
+
+    monkeypatch.setattr(pl.DataFrame, "to_pandas", missing)
+    with pytest.raises(DrakeTeleopError, match=r"pandas is not installed; .*\[notebook\]"):
+        make_result().to_pandas()
+
+
+def test_a_column_can_be_drawn():
+    (axes,) = make_result().plot("measured_wrench_S.tau_x").axes
+    assert (axes.get_ylabel(), len(axes.lines)) == ("N m", 1)
+
+
 def test_one_component_may_be_given_flat():
     result = SimulationResult([0.0, 1.0], {"sigma": [0.5, 0.7]}, [SPECS[-1]])
     np.testing.assert_array_equal(result["sigma"], [[0.5], [0.7]])

@@ -16,6 +16,7 @@ estimator gives numbers for the rest too. Two steps decide what `Identification.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ _WEAK, _SMALLEST_SIZE, _GRAVITY = 0.5, 0.03, 9.81
 _OPTIONAL = {"degrees_of_freedom", "prior_dominated", "verdicts"}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Identification:
     """An identified load; what identification.json holds.
 
@@ -125,6 +126,27 @@ class Identification:
         share = self.standard_deviations / natural_scale(self.phi)
         rest = np.where(self.prior_dominated, "prior", np.where(share <= _WEAK, "weakly", "not"))
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
+
+    def __repr__(self) -> str:
+        """Eight lines; +- is the largest standard deviation, of the centre for this mass."""
+        deviations, named = self.standard_deviations, zip(PARAMETERS, self.verdicts, strict=True)
+        mass, com, inertia = mass_com_inertia(self.phi)
+        inertia = np.where(self.identifiable[10:], inertia[np.triu_indices(3)], np.nan)
+        force, torque = (np.sqrt(np.mean(part**2)) for part in np.split(self.residual_rms, 2))
+        unknown = [f"{name} {verdict}" for name, verdict in named if verdict != "identified"]
+        known = ", ".join([f"{16 - len(unknown)} of 16 parameters identified", *unknown])
+        return "\n".join(
+            (
+                f"{self.method}, {self.samples} samples: {known}",
+                f"  mass              {_numbers([mass], deviations[6:7])} kg",
+                f"  centre of mass    {_numbers(com, deviations[7:10] / abs(mass))} m",
+                f"  inertia xx yy zz  {_numbers(inertia[[0, 3, 5]])} kg m^2, about that centre",
+                f"  inertia xy xz yz  {_numbers(inertia[[1, 2, 4]])} kg m^2",
+                f"  offset of force   {_numbers(self.offsets[:3], deviations[:3])} N",
+                f"  offset of torque  {_numbers(self.offsets[3:], deviations[3:6])} N m",
+                f"  residual, rms     {force:.3g} N, {torque:.3g} N m",
+            )
+        )
 
     def save(self, path: str | Path) -> None:
         """Writes identification.json."""
@@ -209,6 +231,15 @@ class Identification:
             "inertia_com": inertia.tolist(),
             "physically_consistent": self.physically_consistent,
         }
+
+
+def _numbers(values: Sequence[float] | Array, deviations: Array | None = None) -> str:
+    """Numbers side by side, "?" for NaN, and the largest of their standard deviations."""
+    text = ", ".join("?" if np.isnan(value) else f"{value:.4g}" for value in values)
+    text = text if len(values) == 1 else f"[{text}]"
+    if deviations is None:
+        return text
+    return f"{text} +- {deviations.max():.1g}" if np.isfinite(deviations).all() else f"{text} +- ?"
 
 
 def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:

@@ -31,7 +31,7 @@ from drake_teleop.logs.read.reading import read_log
 _FEWEST_TO_TARE = 10
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class IdentifiedLog:
     """A log and what was identified from it.
 
@@ -54,6 +54,9 @@ class IdentifiedLog:
     base: BaseParameters
     findings: tuple[Finding, ...] = ()
     loads: tuple[Segment, ...] = ()
+
+    def __repr__(self) -> str:
+        return repr(self.identification)
 
 
 @dataclass(frozen=True)

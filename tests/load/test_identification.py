@@ -285,6 +285,25 @@ def test_a_load_that_was_never_learnt_is_none():
         replace(found, offsets=np.zeros(10))
 
 
+def test_a_load_is_printed_in_eight_lines_with_units():
+    lines = str(identify(record(99)[0], *record(99)[1])).splitlines()
+    assert len(lines) == 8
+    assert lines[0] == "batch least squares, 99 samples: 16 of 16 parameters identified"
+    for line, unit in zip(
+        lines[1:], ["kg", "m", "kg m^2", "kg m^2", "N", "N m", "N m"], strict=True
+    ):
+        assert unit in line.split("  ")[-1]
+    assert lines[1].startswith(f"  mass              {TOOL[0]:.4g} +- ")
+
+
+def test_what_is_not_identified_is_not_printed_as_a_number():
+    """Poses at rest tell nothing of the inertia."""
+    s = static_poses()
+    text = str(identify(non_contact_wrench(s, REST, REST, TOOL), s, REST, REST))
+    assert "10 of 16 parameters identified, I_xx not, I_xy not" in text
+    assert "[?, ?, ?] kg m^2" in text and "+- ?" not in text
+
+
 def test_no_file(tmp_path):
     with pytest.raises(DrakeTeleopError, match=r"absent\.json: cannot be read"):
         Identification.load(tmp_path / "absent.json")
