@@ -25,18 +25,18 @@ contact_noticed_ms          with contact_detection: how long after the beginning
 false_contacts              how often the detector began to notice a contact that there was not
 success, task_time_s, ...   with a task, see `drake_teleop.task_measures`; null for
                             what did not happen
+failure                     with a task: why it failed, in words; null if it did not
 peak_force_to_master_N      largest force that the device displayed
 joint_speed_use             largest share of a joint's speed limit; likewise joint_torque_use
 mass_error_percent          of the estimate at the end; likewise com_error_mm
 real_time_factor            simulated over elapsed time, this machine, compilation included
-warnings                    what was beyond the reach of sensor, arm or leaf, and when
+warnings                    what was not as it should be, and when, see `drake_teleop.run_warnings`
 =========================== =====================================================================
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,10 +59,10 @@ from drake_teleop.pages.progress import Stage, progress_bars, silent
 from drake_teleop.pages.style import contact_spans
 from drake_teleop.replay import write_replay, write_scenario
 from drake_teleop.result import SimulationResult, remove_log
+from drake_teleop.run_warnings import run_warnings
 from drake_teleop.scenario import LoadScenario, Scenario, check_scenario, replace
-from drake_teleop.slave.inverse_kinematics import IkStatus
 from drake_teleop.station import MakeTeleopStation
-from drake_teleop.task_measures import task_measures
+from drake_teleop.task_measures import task_failure, task_measures
 
 Array = NDArray[np.float64]
 
@@ -241,7 +241,8 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     if run.scenario.operator.task is not None:
         figures = task_measures(result, run.scenario)
         summary |= {name: None if np.isnan(x) else x for name, x in figures.items()}
-    return summary | {"warnings": list(_warnings(run, summary))}
+        summary["failure"] = task_failure(result, run.scenario) or None
+    return summary | {"warnings": run_warnings(result, run.scenario, arm)}
 
 
 def overview(result: SimulationResult) -> Figure:
@@ -252,32 +253,6 @@ def overview(result: SimulationResult) -> Figure:
     figure = result.plot(*wanted, contact=in_contact(result))
     figure.align_ylabels()
     return figure
-
-
-def _warnings(run: ScenarioRun, summary: dict[str, Any]) -> Iterator[str]:
-    result, sheet = run.result, run.scenario.sheet_spring
-    yield from _since("the wrist sensor saturates", result, result["saturated"])
-    if "ik_status" in result:
-        for status in list(IkStatus)[1:]:
-            happened = result["ik_status"] == status
-            yield from _since(f"inverse kinematics: {status.name}", result, happened)
-    for name, words in (("joint_speed_use", "speed"), ("joint_torque_use", "torque")):
-        if summary[name] >= 1:
-            yield f"a joint of the slave reaches {summary[name]:.0%} of its largest {words}"
-    if sheet is not None:
-        limit = sheet.largest_small_deflection
-        yield from _since(
-            f"the leaf bends by more than {1e3 * limit:.0f} mm, where its model is no longer good",
-            result,
-            np.abs(result["sheet_state"][:, :1]) > limit,
-        )
-
-
-def _since(what: str, result: SimulationResult, happened: NDArray[Any]) -> Iterator[str]:
-    """A warning with the time since when, if (N, 1) `happened` is ever true."""
-    if np.any(happened):
-        first = result.t[np.argmax(happened)]
-        yield f"{what} from {first:.3f} s on, for {np.mean(happened != 0):.1%} of the time"
 
 
 def _detection_figures(
@@ -355,6 +330,8 @@ def _print(summary: dict[str, Any], out: Path) -> None:
             slave, hand = (summary[f"contact_{at}_ms"][k] for at in ("noticed", "at_hand"))
             noticed = f", noticed after {_ms(slave)}, at the hand after {_ms(hand)}"
         console.print(f"contact from {start:.4f} to {stop:.4f} s{noticed}", highlight=False)
+    if summary.get("failure"):
+        console.print(f"[bold red]the task failed:[/] {summary['failure']}", highlight=False)
     for warning in summary["warnings"]:
         console.print(f"[bold yellow]warning:[/] {warning}", highlight=False)
     console.print(

@@ -15,7 +15,8 @@ press_error_N                root mean square error of the force while it was he
 
 All of them are of the time from the task's start until it was done or given up, or the log's end.
 Of a task that failed, also where the operator believes that it is done, there are only the success
-and what was noticed; the others are nan, for little effort in vain is no merit.
+and what was noticed; the others are nan, for little effort in vain is no merit. Why it failed is
+said by `task_failure`.
 """
 
 from __future__ import annotations
@@ -24,19 +25,35 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.operator.decision import DONE, FELT, PHASE, WAITING
-from drake_teleop.operator.task import Insert, Press, Task, Touch
+from drake_teleop.operator.decision import (
+    DONE,
+    FEELING,
+    FELT,
+    MOVING,
+    PHASE,
+    PRESSING,
+    SEEKING,
+    STOPPING,
+    WAITING,
+)
+from drake_teleop.operator.task import Insert, Press, Reach, Task, Touch
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario
 from drake_teleop.slave.arm import forward_kinematics
-from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant
+from drake_teleop.slave.plant import R_WS_HOME, NominalSlave
 
 Array = NDArray[np.float64]
 
 _ON_THE_FLOOR = 2e-3  # m
+_DOING = {
+    MOVING: "on its way to the target",
+    FEELING: "on its careful way to contact",
+    STOPPING: "at rest after contact",
+    PRESSING: "pressing",
+    SEEKING: "seeking the way into the slot",
+}
 
 TASK_MEASURES = (
     "success",
@@ -68,12 +85,10 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
             where="operator.task",
             remedy="give the operator a task: !Reach, !Touch, !Press or !Insert",
         )
-    state = result["task_state"]
-    t, outcome = result.t, state[:, DONE]
-    ended = int(np.argmax(outcome != 0.0)) if outcome.any() else len(t) - 1
+    state, t, ended = result["task_state"], result.t, _ended(result)
     begun = int(np.argmax(state[:, PHASE] != WAITING))
     span = slice(begun, ended + 1)
-    done = outcome[ended] > 0.0
+    done = state[ended, DONE] > 0.0
     force = contact_force(result)
     held = _held(t, force, task, ended) if done and isinstance(task, Press) else np.empty(0)
     wanted = _wanted_force(task)
@@ -82,7 +97,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     noticed, touching = state[span, FELT] > 0.0, force[span] > 0.0
     # The log may begin later than the task.
     taken = float(t[ended]) + scenario.simulation.settle - task.t_start
-    success = done and _truly(result, scenario, task, ended, force, held)
+    success = done and not _wrong(result, scenario, task, ended)
     done_well = {
         "task_time_s": taken,
         "contact_force_overshoot_N": max(float(force[span].max()) - wanted, 0.0),
@@ -98,6 +113,47 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
         "false_notices": float(_false_notices(touching, noticed)),
     }
     return {name: figures[name] for name in TASK_MEASURES}
+
+
+def task_failure(result: SimulationResult, scenario: Scenario) -> str:
+    """Why the task failed: out of time, given up, or not as believed; "" if it did not.
+
+    Times are those of the log.
+
+    Args:
+        result, scenario: as for `task_measures`; the scenario has a task.
+    """
+    task, state, ended = scenario.operator.task, result["task_state"], _ended(result)
+    assert task is not None
+    at, outcome = float(result.t[ended]), state[ended, DONE]
+    if outcome > 0.0:
+        wrong = _wrong(result, scenario, task, ended)
+        return f"the operator believed at {at:.2f} s that it was done, but {wrong}" if wrong else ""
+    phase = int(state[ended if outcome == 0.0 else max(ended - 1, 0), PHASE])
+    if phase == WAITING:
+        return f"the task begins at {task.t_start:g} s, when the simulation has ended"
+    taken = at + scenario.simulation.settle - task.t_start
+    found = f"{_DOING[phase]}, {_force_and_place(result, scenario, task, ended)}"
+    if outcome == 0.0:
+        return (
+            f"the simulation ended after {taken:.2f} s of the task, while the operator was {found};"
+            " set a longer simulation.duration"
+        )
+    if taken >= task.timeout:
+        return (
+            f"the operator gave up at {at:.2f} s, after the {task.timeout:g} s of its timeout,"
+            f" while {found}; set a longer operator.task.timeout, or see what held it up"
+        )
+    return (
+        f"the operator gave up at {at:.2f} s, for it saw the tool far beyond the surface and felt"
+        f" nothing, {_force_and_place(result, scenario, task, ended)}"
+    )
+
+
+def _ended(result: SimulationResult) -> int:
+    """The sample at which the operator has done its task or given up, or the last one."""
+    outcome = result["task_state"][:, DONE]
+    return int(np.argmax(outcome != 0.0)) if outcome.any() else len(outcome) - 1
 
 
 def _wanted_force(task: Task) -> float:
@@ -132,18 +188,42 @@ def _held(t: Array, force: Array, task: Press, ended: int) -> Array:
     return force[: ended + 1][t[: ended + 1] >= t[ended] - task.hold]
 
 
-def _truly(
-    result: SimulationResult, scenario: Scenario, task: Task, ended: int, force: Array, held: Array
-) -> bool:
+def _wrong(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
+    """What is not as the operator believes when it believes that it is done; "" if nothing is."""
+    force = contact_force(result)
     if isinstance(task, Press):
-        return bool(abs(held.mean() - task.force) <= task.tolerance)
+        held = float(_held(result.t, force, task, ended).mean())
+        if abs(held - task.force) <= task.tolerance:
+            return ""
+        return f"the tool pressed with {held:.1f} N, not {task.force:g} ± {task.tolerance:g} N"
+    if isinstance(task, Touch) and force[ended] > 0.0:
+        return ""
+    off = _tip_from_target(result, scenario, task, ended)
+    if isinstance(task, Insert):
+        above = off[2] + task.depth
+        return "" if above <= _ON_THE_FLOOR else f"the tip is {1e3 * above:.1f} mm above the floor"
+    away = float(np.linalg.norm(off))
     if isinstance(task, Touch):
-        return bool(force[ended] > 0.0)
-    slave = AddSlavePlant(DiagramBuilder(), scenario.slave.position, None)
+        return f"the tool touches nothing, the tip {1e3 * away:.1f} mm from the target"
+    if away <= task.width / 2:
+        return ""
+    return f"the tip is {1e3 * away:.1f} mm from the target, not {500 * task.width:g} mm"
+
+
+def _force_and_place(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
+    away = 1e3 * np.linalg.norm(_tip_from_target(result, scenario, task, ended))
+    place = f"the tip {away:.1f} mm from the target"
+    if isinstance(task, Reach):
+        return place
+    wanted = f" instead of {_wanted_force(task):g} N" if _wanted_force(task) else ""
+    return f"{place}, {contact_force(result)[ended]:.1f} N at the tool{wanted}"
+
+
+def _tip_from_target(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> Array:
+    """(3,) from the target to the tool's tip, in W [m]."""
+    slave = NominalSlave(scenario.slave.payload)
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(slave.arm.table, result["slave_state"][ended, :6], R_WS, p_WS)
     start = np.array(scenario.slave.position) + R_WS_HOME.matrix() @ slave.tip
-    off = p_WS + R_WS @ slave.tip - start - np.array(task.translation)
-    if isinstance(task, Insert):
-        return bool(off[2] <= _ON_THE_FLOOR - task.depth)
-    return bool(np.linalg.norm(off) <= task.width / 2)
+    off: Array = p_WS + R_WS @ slave.tip - start - np.array(task.translation)
+    return off

@@ -153,6 +153,11 @@ def poses_of_S(plant: MultibodyPlant, angles: np.ndarray) -> tuple[np.ndarray, n
     return R_WS, np.array([pose.translation() for pose in poses])
 
 
+def poses_now(recorded: Recorded) -> tuple[np.ndarray, np.ndarray]:
+    """R_WS and p_WS where the arm is in each row, younger than in the sample of that row."""
+    return poses_of_S(recorded.plant, recorded.log["slave_state"][:, :6])
+
+
 def rotations(pose: np.ndarray) -> np.ndarray:
     """(N, 3, 3) of poses (N, 7)."""
     return Rotation.from_quat(pose[..., [1, 2, 3, 0]]).as_matrix()
@@ -543,7 +548,8 @@ def test_four_channels_add_force_to_motion_at_both_ends(over_a_network, slave):
     recorded, config = over_a_network["four_channel"], PassivityConfig(method="four_channel")
     log, own = recorded.log, config.four_channel
     p, R = log["pose_command"][:, 4:], rotations(log["pose_command"])
-    speed, slaves = steps(R, p) / PERIOD, steps(recorded.R_WS, recorded.p_WS) / PERIOD
+    R_now, p_now = poses_now(recorded)
+    speed, slaves = steps(R, p) / PERIOD, steps(R_now, p_now) / PERIOD
     # The slave's servo is told to yield to the hand's force as a spring would. Its stiffness in
     # the slave's units becomes one in power units by the force's scale over the motion's.
     hand = in_power_units(log["hand_wrench_E"])
@@ -564,7 +570,7 @@ def test_four_channels_add_force_to_motion_at_both_ends(over_a_network, slave):
         assert np.abs(hand[sent, group] / K).max() > 1e-4
     # The hand feels the slave's wrench, and a spring and damper to where the slave was.
     heard = now - TO_HAND
-    apart = (recorded.p_WS[heard] - p[now], turn(recorded.R_WS[heard] @ R[now].transpose(0, 2, 1)))
+    apart = (p_now[heard] - p[now], turn(R_now[heard] @ R[now].transpose(0, 2, 1)))
     wrench = in_power_units(wanted_at_the_hand(recorded, slave))[heard]
     for g, scale in ((0, TRANSLATION), (1, ROTATION)):
         group = slice(3 * g, 3 * g + 3)
@@ -600,10 +606,10 @@ def test_the_hands_port_counts_the_work_of_the_device(assembled_over_a_network):
 
 
 def test_the_slaves_port_counts_the_work_of_the_scaled_wrench(assembled_over_a_network, slave):
-    """In the master's power units, at the arm's own motion."""
+    """In the master's power units, at the arm's own motion, which is not that of the sample."""
     recorded = assembled_over_a_network
     wrench = in_power_units(wanted_at_the_hand(recorded, slave))
-    moved = steps(recorded.R_WS, recorded.p_WS)
+    moved = steps(*poses_now(recorded))
     for g in (0, 1):
         group = slice(3 * g, 3 * g + 3)
         put_in = np.cumsum(np.sum(wrench[:-1, group] * moved[1:, group], axis=1))

@@ -153,7 +153,7 @@ def test_a_pose_out_of_reach_is_reported_with_its_time(quick):
         "far", "kinematic_scaling: {translation_scale: 30}\nslave: {position: [0.6, 0, 0.6]}"
     )
     assert any(
-        warning.startswith("inverse kinematics: ") and " s on, for " in warning
+        warning.startswith("inverse kinematics: ") and " from 0." in warning and " to 0." in warning
         for warning in summary["warnings"]
     )
 

@@ -7,24 +7,35 @@ import math
 import numpy as np
 import pytest
 
-from drake_teleop.operator.decision import MOVING, OVER, STATE
+from drake_teleop.identification import slave_arm
+from drake_teleop.operator.decision import FEELING, MOVING, OVER, PRESSING, SEEKING, STATE, WAITING
 from drake_teleop.operator.operator import OperatorConfig
-from drake_teleop.operator.task import Press, Touch
+from drake_teleop.operator.task import Insert, Press, Reach, Touch
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.signals import SIGNALS
-from drake_teleop.task_measures import TASK_MEASURES, task_measures
+from drake_teleop.slave.plant import home_position
+from drake_teleop.task_measures import TASK_MEASURES, task_failure, task_measures
 
 T = np.arange(0.0, 4.0 + 1e-9, 1e-3)
 START, END, CONTACT, NOTICED = 0.5, 3.0, 1.5, 1.75  # s, in the log
 SETTLE = 0.25
+HOME = home_position(slave_arm(Scenario()), Scenario().slave.position)
 
 
-def measures(task, *, done: float = 1.0, force: float = 6.0, early: bool = False):
-    """A hand of 2 N that goes to and fro at 0.1 m/s, and a contact from CONTACT on."""
+def measures(task, **log):
+    return task_measures(*run(task, **log))
+
+
+def run(task, *, done: float = 1.0, force: float = 6.0, early: bool = False, phase: int = MOVING):
+    """A hand of 2 N that goes to and fro at 0.1 m/s, and a contact from CONTACT on.
+
+    The tool stays where it was at the start.
+    """
     state = np.zeros((len(T), STATE))
-    state[T >= START, 0] = MOVING
-    state[T >= END, :2] = OVER, done
+    state[T >= START, 0] = phase
+    if done:
+        state[T >= END, :2] = OVER, done
     state[T >= NOTICED, 2] = 1.0
     if early:
         state[(T >= 1.0) & (T < 1.2), 2] = 1.0
@@ -37,10 +48,11 @@ def measures(task, *, done: float = 1.0, force: float = 6.0, early: bool = False
         "hand_wrench_E": hand,
         "twist_master": twist,
         "true_contact_wrench_W": contact,
+        "slave_state": np.tile([*HOME, *np.zeros(6)], (len(T), 1)),
     }
     result = SimulationResult(T, signals, [SIGNALS[name] for name in signals])
     operator = OperatorConfig(task=task)
-    return task_measures(result, replace(Scenario(), operator=operator, simulation__settle=SETTLE))
+    return result, replace(Scenario(), operator=operator, simulation__settle=SETTLE)
 
 
 def test_of_a_touch():
@@ -80,3 +92,47 @@ def test_of_a_task_that_was_given_up():
     found = measures(Touch(), done=-1.0, force=0.0)
     assert found["success"] == 0.0
     assert math.isnan(found["task_time_s"]) and math.isnan(found["detection_time_s"])
+
+
+AT = {"t_start": START + SETTLE}
+FAR = "the tip 100.0 mm from the target"
+FAILURES = {
+    # Its operator is content, the truth is not.
+    "at 3.00 s that it was done, but the tool pressed with 6.0 N, not 5 ± 0.5 N": (
+        Press(force=5.0, tolerance=0.5),
+        {},
+    ),
+    f"but the tool touches nothing, {FAR}": (Touch(), {"force": 0.0}),
+    "but the tip is 100.0 mm from the target, not 5 mm": (Reach(), {}),
+    "but the tip is 140.0 mm above the floor": (Insert(), {}),
+    # It gives up.
+    f"at 3.00 s, after the 2.5 s of its timeout, while pressing, {FAR}, 6.0 N at the tool instead"
+    " of 8 N": (Press(**AT, timeout=2.5), {"done": -1.0, "phase": PRESSING}),
+    f"at 3.00 s, for it saw the tool far beyond the surface and felt nothing, {FAR}, 0.0 N": (
+        Touch(**AT),
+        {"done": -1.0, "phase": FEELING, "force": 0.0},
+    ),
+    # The log ends before.
+    f"after 3.50 s of the task, while the operator was seeking the way into the slot, {FAR}": (
+        Insert(**AT),
+        {"done": 0.0, "phase": SEEKING},
+    ),
+    f"on its way to the target, {FAR}; set a longer": (Reach(**AT), {"done": 0.0}),
+    "begins at 7 s, when the simulation has ended": (
+        Reach(t_start=7.0),
+        {"done": 0.0, "phase": WAITING},
+    ),
+}
+
+
+@pytest.mark.parametrize("said", FAILURES)
+def test_a_task_that_failed_says_why(said):
+    task, log = FAILURES[said]
+    result, scenario = run(task, **log)
+    assert said in task_failure(result, scenario)
+    assert task_measures(result, scenario)["success"] == 0.0
+
+
+def test_a_task_that_was_done_says_nothing():
+    for task in (Touch(), Press(force=5.0, tolerance=2.0), Reach(translation=[0, 0, 0])):
+        assert task_failure(*run(task)) == ""

@@ -176,6 +176,14 @@ def mean_delay(config: NetworkConfig) -> float:
     return float(used.mean()) if used.size else config.playout
 
 
+def longest_delay(config: NetworkConfig) -> float:
+    """How long a packet that is not lost has been on its way at most, when it is used [s]."""
+    longest = config.delay * (1 + _TAILS[config.distribution] * config.jitter)
+    if config.trace is not None:
+        longest = float(_read_trace(Path(config.trace), _TRACE_STEP).max()) * _TRACE_STEP
+    return max(longest, config.playout)
+
+
 def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
     """(N,) delays in steps, for packets sent one a period; -1 where the packet is lost."""
     # The reader of tables is not needed by those who have no trace, and takes its time to start.

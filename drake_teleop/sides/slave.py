@@ -50,7 +50,7 @@ def MakeSlaveSide(
         - pose_command: (7,) X_WS that it shall follow
         output_ports:
         - wrench_B: (6,) F_E_B, what the hand should feel, in the master's base [N, N m]
-        - pose_slave: (7,) X_WS, actual, of the last sample's joint angles (over a network)
+        - pose_slave: (7,) X_WS, actual, of the joint angles now (over a network)
         - saturated: (1,) 1 while the wrench is not to be trusted; a signal too
         - contact: (1,) 1 in contact; a signal too (with contact detection)
         - the parts of a sample (`sample_parts`), slave_state, joint_torque, joint_command,
@@ -97,7 +97,8 @@ def MakeSlaveSide(
 
     if not scenario.is_direct:
         kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))
-        builder.Connect(body.sample["joint_position"], kinematics.GetInputPort("joint_position"))
+        state = body.slave.plant.get_state_output_port(body.slave.instance)
+        builder.Connect(state, kinematics.GetInputPort("slave_state"))
         export(builder, kinematics, "pose_slave")
 
     if scenario.contact_detection is not None:

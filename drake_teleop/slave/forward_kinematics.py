@@ -1,4 +1,9 @@
-"""The slave's pose, from its joint angles as the encoders read them."""
+"""The slave's pose, from the joint angles that its control goes by.
+
+Not from those in the wrist sensor's sample, which are as old as the latest part of it, such as the
+acceleration through a filter or a slow line: what a passivity method counts as work of the servo
+would be larger by the pull of so much lag.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +35,7 @@ class ForwardKinematics(LeafSystem):
 
         name: ForwardKinematics
         input_ports:
-        - joint_position: (n,) [rad]
+        - slave_state: [q; v] of the arm [rad, rad/s]
         output_ports:
         - pose_slave: (7,) X_WS
 
@@ -43,9 +48,10 @@ class ForwardKinematics(LeafSystem):
     def __init__(self, arm: ArmModel) -> None:
         super().__init__()
         self._arm = arm.table
-        self._q = self.DeclareVectorInputPort("joint_position", arm.num_joints)
-        inputs = {self._q.ticket()}
+        self._n = arm.num_joints
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
+        inputs = {self._state.ticket()}
         self.DeclareVectorOutputPort("pose_slave", 7, weak_callback(self._calc), inputs)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        pose_into(self._arm, self._q.Eval(context), output.get_mutable_value())
+        pose_into(self._arm, self._state.Eval(context)[: self._n], output.get_mutable_value())

@@ -1,0 +1,274 @@
+"""What was not as it should be in a run, and when, from its recorded signals.
+
+============== =================================================================================
+saturated      the wrist sensor says so
+unreachable    the inverse kinematics say so
+clipped        a joint asks for its largest speed, or its motor gives its largest torque; the device
+               displays its largest force or torque
+leaf           it bends further than its model goes
+safe state     an end of the channel has heard nothing for longer than `channel.timeout`
+behind         the command that leaves the channel, or a joint, is not within the range of what it
+               was asked for within the time that delay and bandwidth explain
+hunting        the hand or a joint goes to and fro, while what it was asked for does not
+============== =================================================================================
+
+The first four are said however short they were, the others if they last for longer than 0.2 s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.channel.network import longest_delay
+from drake_teleop.master.phantom import FORCE_LIMIT, WRIST_TORQUE_LIMIT, jacobian_into
+from drake_teleop.pages.style import contact_spans
+from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import Scenario
+from drake_teleop.slave.arm import ArmModel
+from drake_teleop.slave.inverse_kinematics import IkStatus
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Spans = list[tuple[float, float]]
+
+LASTING = 0.2
+"""What is over sooner [s] may be a movement's own."""
+# What comes again sooner than this has not been away [s].
+_GAP = 0.05
+# As good as at a limit, which is reached by a product that rounds.
+_AT_LIMIT = 1 - 1e-9
+# How far behind is behind: command [m], its turn [rad], joint [rad], 3 mm at a reach of 1 m.
+_FAR, _TURNED, _JOINT_FAR = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
+# To and fro by more than this is hunting: hand [m], joint [rad].
+_HAND_SWING, _JOINT_SWING = 5e-4, np.deg2rad(0.1)
+# So many turns make it hunting, each within this time of the one before [s]; and so near to a turn
+# of the command a turn is that one's.
+_TURNS, _SLOWEST, _NEAR = 4, 0.5, 0.25
+# After so many time constants of the position loop a command has been met to 0.3 %.
+_TIME_CONSTANTS = 6.0
+# More times than this are counted, not listed.
+_LISTED = 3
+
+
+def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
+    """One sentence for each thing of the table above that happened, with its times.
+
+    Args:
+        result: of a run; what was not recorded is not looked at.
+        scenario: that was run.
+        arm: the slave's, with its limits.
+    """
+    return [
+        f"{what} {_when(spans)}"
+        for found in (_limits(result, scenario, arm), _channel(result, scenario),
+                      _joints(result, scenario), _hand(result))
+        for what, spans in found
+        if spans
+    ]  # fmt: skip
+
+
+def spans_of(t: Array, happened: Flags, least: float = 0.0) -> Spans:
+    """From when to when something was so, if for at least so long; short gaps are closed.
+
+    Args:
+        t: (N,) [s].
+        happened: (N,).
+        least: [s].
+    """
+    spans: Spans = []
+    for start, stop in contact_spans(t, happened):
+        if spans and start - spans[-1][1] < _GAP:
+            start = spans.pop()[0]
+        spans.append((start, stop))
+    return [(start, stop) for start, stop in spans if stop - start >= least]
+
+
+def behind(t: Array, command: Array, actual: Array, window: float) -> Array:
+    """(N,) how far the actual motion is from all that was commanded within the last time `window`.
+
+    A delay gives what was commanded earlier, and a loop that does not overshoot a weighted mean of
+    it: both are in the range of those commands. What is outside it is explained by neither.
+
+    Args:
+        t: (N,) [s], evenly.
+        command, actual: (N, k) in one unit.
+        window: [s].
+    """
+    rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
+    above = actual - _largest_of_last(command, rows)
+    below = -_largest_of_last(-command, rows) - actual
+    return np.linalg.norm(np.maximum(np.maximum(above, below), 0.0), axis=1)
+
+
+def turns(x: Array, swing: float) -> NDArray[np.intp]:
+    """Where a signal turns: its extremes, each further than `swing` from the one before.
+
+    Args:
+        x: (N,).
+        swing: in its unit.
+    """
+    slope = np.diff(x)
+    near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
+    found: list[int] = []
+    high = low = 0
+    rising = 0  # unknown, until it has gone far enough from its start
+    for k in [*near, len(x) - 1]:
+        high, low = (k if x[k] > x[high] else high), (k if x[k] < x[low] else low)
+        if rising >= 0 and x[high] - x[k] > swing:
+            found += [high] if rising else []
+            rising, high, low = -1, k, k
+        elif rising <= 0 and x[k] - x[low] > swing:
+            found += [low] if rising else []
+            rising, high, low = 1, k, k
+    return np.array(found, dtype=np.intp)
+
+
+def hunts(t: Array, command: Array, actual: Array, swing: float) -> Flags:
+    """(N,) whether the actual motion goes to and fro while the commanded one does not.
+
+    Four turns or more, each within 0.5 s of the one before. A turn within 0.25 s of one of the
+    command is its answer; but only one for each.
+
+    Args:
+        t: (N,) [s].
+        command, actual: (N, k) in one unit; a turn of any component of the command counts.
+        swing: in that unit.
+    """
+    asked = np.sort(np.concatenate([t[turns(x, swing)] for x in command.T]))
+    hunting = np.zeros(len(t), dtype=bool)
+    for x in actual.T:
+        mine = turns(x, swing)
+        for time in asked:
+            if len(mine) and abs(t[mine] - time).min() < _NEAR:
+                mine = np.delete(mine, abs(t[mine] - time).argmin())
+        for chain in np.split(mine, np.flatnonzero(np.diff(t[mine]) > _SLOWEST) + 1):
+            if len(chain) >= _TURNS:
+                hunting[chain[0] : chain[-1] + 1] = True
+    return hunting
+
+
+def _limits(
+    result: SimulationResult, scenario: Scenario, arm: ArmModel
+) -> Iterator[tuple[str, Spans]]:
+    t = result.t
+    yield "the wrist sensor saturates", spans_of(t, result["saturated"][:, 0] > 0)
+    if "ik_status" in result:
+        for status in list(IkStatus)[1:]:
+            happened = result["ik_status"][:, 0] == status
+            yield f"inverse kinematics: {status.name}", spans_of(t, happened)
+    asked = 2 * np.pi * scenario.joint_control.position_bandwidth_hz * _joint_error(result)
+    for what, values, limit in (
+        ("speed", asked, arm.velocity_limit),
+        ("torque", result["joint_torque"], arm.effort_limit),
+    ):
+        clipped = np.abs(values) >= _AT_LIMIT * limit
+        for joint in np.flatnonzero(clipped.any(axis=0)):
+            yield f"joint {joint + 1} is at its largest {what}", spans_of(t, clipped[:, joint])
+    if "force_to_master" in result:
+        shown = result["force_to_master"]
+        full = np.linalg.norm(shown[:, :3], axis=1) >= _AT_LIMIT * FORCE_LIMIT
+        full |= _full_torque(shown[:, 3:], result["master_state"])
+        yield "the device displays the most that it can", spans_of(t, full, LASTING)
+    if scenario.sheet_spring is not None and "sheet_state" in result:
+        bent = scenario.sheet_spring.largest_small_deflection
+        yield (
+            f"the leaf bends by more than {1e3 * bent:.0f} mm, where its model is no longer good,",
+            spans_of(t, np.abs(result["sheet_state"][:, 0]) > bent),
+        )
+
+
+def _channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
+    if "ports" not in result:
+        return
+    t, timeout = result.t, scenario.channel.timeout
+    for column, end, other in ((-2, "master", "slave"), (-1, "slave", "master")):
+        silent = result["ports"][:, column] > timeout
+        yield (
+            f"the {end}'s end is in its safe state, as nothing comes from the {other},",
+            spans_of(t, silent, LASTING),
+        )
+    # An end that hears nothing goes by the last packet until `timeout`.
+    window = longest_delay(scenario.channel.lines()[0]) + timeout
+    sent, received = result["pose_command"], result["pose_received"]
+    far = behind(t, sent[:, 4:], received[:, 4:], window)
+    # Twice the part of a quaternion that a small turn changes is the turn's angle.
+    sent_turn, turn = (2 * q[:, :4] * np.sign(q[:, :4] @ sent[0, :4])[:, np.newaxis]
+                       for q in (sent, received))  # fmt: skip
+    turned = behind(t, sent_turn, turn, window)
+    by = f"{scenario.passivity.method}, network {scenario.channel.network}"
+    for values, least, unit, scale in (
+        (far, _FAR, "mm", 1e3),
+        (turned, _TURNED, "degrees", 180 / np.pi),
+    ):
+        spans = spans_of(t, values > least, LASTING)
+        yield (
+            f"the channel ({by}) holds the slave's command back: up to"
+            f" {scale * _largest_in(t, values, spans):.1f} {unit} more than its delay explains,",
+            spans,
+        )
+
+
+def _joints(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
+    if "joint_command" not in result:
+        return
+    t, command = result.t, result["joint_command"]
+    actual = result["slave_state"][:, : command.shape[1]]
+    control = scenario.joint_control
+    slowest = min(control.position_bandwidth_hz, control.velocity_bandwidth_hz)
+    window = _TIME_CONSTANTS / (2 * np.pi * slowest) + 1 / scenario.rates.joint_control_hz
+    for k in range(command.shape[1]):
+        far = behind(t, command[:, [k]], actual[:, [k]], window)
+        spans = spans_of(t, far > _JOINT_FAR, LASTING)
+        degrees = np.rad2deg(_largest_in(t, far, spans))
+        yield f"joint {k + 1} is up to {degrees:.1f} degrees behind its command", spans
+    hunting = hunts(t, command, actual, _JOINT_SWING)
+    yield "the slave hunts: it goes to and fro uncommanded", spans_of(t, hunting, LASTING)
+
+
+def _hand(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+    if "intent" in result and "pose_master" in result:
+        wanted, actual = result["intent"][:, 4:], result["pose_master"][:, 4:]
+        hunting = hunts(result.t, wanted, actual, _HAND_SWING)
+        yield "the hand hunts: it is shaken to and fro", spans_of(result.t, hunting, LASTING)
+
+
+def _joint_error(result: SimulationResult) -> Array:
+    if "joint_command" not in result:
+        return np.zeros((len(result.t), 1))
+    command = result["joint_command"]
+    return command - result["slave_state"][:, : command.shape[1]]
+
+
+def _full_torque(torque: Array, master_state: Array) -> Flags:
+    """(N,) whether a wrist motor of the device gives its largest torque."""
+    full, J = np.zeros(len(torque), dtype=bool), np.empty((6, 6))
+    # A motor's torque is the component about its axis: no larger than the torque.
+    for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= _AT_LIMIT * WRIST_TORQUE_LIMIT.min()):
+        jacobian_into.py_func(master_state[k, :6], J)  # seldom: not worth compiling
+        full[k] = (np.abs(torque[k] @ J[3:, 3:]) >= _AT_LIMIT * WRIST_TORQUE_LIMIT).any()
+    return full
+
+
+def _largest_of_last(x: Array, rows: int) -> Array:
+    """(N, k) the largest of the last so many rows, by doubling."""
+    largest, done = x.copy(), 1
+    while done < min(rows, len(x)):
+        step = min(done, rows - done)
+        largest[step:] = np.maximum(largest[step:], largest[:-step])
+        done += step
+    return largest
+
+
+def _largest_in(t: Array, values: Array, spans: Spans) -> float:
+    return max((float(values[(t >= a) & (t <= b)].max()) for a, b in spans), default=0.0)
+
+
+def _when(spans: Spans) -> str:
+    listed = [f"from {start:.3f} to {stop:.3f} s" for start, stop in spans[:_LISTED]]
+    more = len(spans) - _LISTED
+    if more > 0:
+        listed.append(f"{more} more time{'s' if more > 1 else ''}")
+    return " and ".join([", ".join(listed[:-1]), listed[-1]] if len(listed) > 1 else listed)

@@ -1,0 +1,203 @@
+"""Warnings of a run: what is planted in its signals is said with its times, and nothing else is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.channel.channel import Channel
+from drake_teleop.channel.network import NetworkConfig, longest_delay
+from drake_teleop.identification import slave_arm
+from drake_teleop.master.phantom import FORCE_LIMIT, HOME, WRIST_TORQUE_LIMIT, jacobian_into
+from drake_teleop.operator.operator import MinimumJerk, OperatorConfig
+from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.result import SimulationResult
+from drake_teleop.run_warnings import behind, hunts, run_warnings, spans_of, turns
+from drake_teleop.scenario import Scenario, Simulation, replace
+from drake_teleop.sensor.sensor_chain import PRESETS
+from drake_teleop.signals import SIGNALS
+from drake_teleop.simulation import simulate
+from drake_teleop.station import MakeTeleopStation
+
+T = np.arange(3001) / 1000
+ARM = slave_arm(Scenario())
+OVER_NETWORK = replace(
+    Scenario(), channel=Channel(network="internet"), passivity=PassivityConfig(method="two_layer")
+)
+LATE = 0.05  # s, of the recorded channel, a mean of "internet"
+
+
+def smooth(t):
+    """From 0 to 1 within 0.8 s from 0.5 s on, as hands go."""
+    u = np.clip((t - 0.5) / 0.8, 0.0, 1.0)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def during(start: float, stop: float):
+    return (start - 1e-9 < T) & (stop + 1e-9 > T)
+
+
+def recorded(**changed):
+    """A run over a network in which all is well: a movement of 7 cm, by joint 2 of 0.2 rad."""
+
+    def pose(z):
+        return np.column_stack([np.ones_like(T), *np.zeros((5, len(T))), z])
+
+    def joints(angle):
+        return np.column_stack([np.zeros_like(T), angle, *np.zeros((4, len(T)))])
+
+    signals = {
+        "saturated": np.zeros((len(T), 1)),
+        "slave_state": np.column_stack([joints(0.2 * smooth(T - LATE - 0.016)), joints(0 * T)]),
+        "joint_torque": joints(np.full_like(T, 20.0)),
+        "intent": pose(-0.07 * smooth(T)),
+        "master_state": np.tile([*HOME, *np.zeros(6)], (len(T), 1)),
+        "pose_master": pose(-0.07 * smooth(T - 0.02)),
+        "pose_command": pose(-0.07 * smooth(T)),
+        "joint_command": joints(0.2 * smooth(T - LATE)),
+        "ik_status": np.zeros((len(T), 1)),
+        "force_to_master": np.zeros((len(T), 6)),
+        "pose_received": pose(-0.07 * smooth(T - LATE)),
+        "ports": np.zeros((len(T), 6)),
+    }
+    for name, (column, change) in changed.items():
+        signals[name] = signals[name].copy()
+        signals[name][:, column] += change
+    order = [name for name in SIGNALS if name in signals]
+    return SimulationResult(T, signals, [SIGNALS[name] for name in order])
+
+
+PLANTED = [
+    ("saturated", (0, during(1.0, 1.1)), "the wrist sensor saturates from 1.000 to 1.100 s"),
+    ("ik_status", (0, 3.0 * during(1, 2)), "OUT_OF_REACH from 1.000 to 2.000 s"),
+    ("joint_torque", (4, 1e4 * during(2.5, 2.6)), "joint 5 is at its largest torque"),
+    ("joint_command", (0, 0.2 * during(2.0, 2.1)), "joint 1 is at its largest speed"),
+    ("force_to_master", (2, FORCE_LIMIT * during(1, 2)), "most that it can from 1.000"),
+    ("ports", (4, 0.15 * during(1, 2)), "master's end is in its safe state, as nothing comes from"
+     " the slave, from 1.000 to 2.000 s"),
+    ("ports", (5, np.where(during(1, 2), np.inf, 0)), "slave's end is in its safe state"),
+    # It stays 4 cm behind: more than is explained from 0.5 s + half of the movement + delay on.
+    ("pose_received", (6, 0.04 * smooth(T)), "the channel (two_layer, network internet) holds"
+     " the slave's command back: up to 40.0 mm more than its delay explains, from 0.9"),
+    ("pose_received", (3, 0.1 * during(2, 2.5)), "11.5 degrees more"),
+    ("slave_state", (5, 0.01 * during(1, 1.5)), "joint 6 is up to 0.6 degrees behind"),
+    ("slave_state", (3, 0.004 * np.sin(40 * T) * during(1, 2)), "the slave hunts"),
+    ("pose_master", (5, 0.002 * np.sin(15 * T) * during(1, 3)), "the hand hunts"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "change", "said"), PLANTED, ids=[said for *_, said in PLANTED])
+def test_what_is_planted_is_said_and_nothing_else(name, change, said):
+    (warning,) = run_warnings(recorded(**{name: change}), OVER_NETWORK, ARM)
+    assert said in warning
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("force_to_master", (2, FORCE_LIMIT * during(1.0, 1.15))),
+        ("ports", (5, 0.15 * during(1.0, 1.15))),
+        ("pose_received", (6, 0.04 * during(1.6, 1.75))),
+        ("slave_state", (5, 0.01 * during(1.0, 1.15))),
+        # An answer that rings twice, and a tremble that nobody sees.
+        ("pose_master", (5, 0.003 * np.exp(-8 * (T - 1)) * np.sin(25 * (T - 1)) * (T > 1))),
+        ("slave_state", (3, 0.0008 * np.sin(40 * T) * during(1, 2))),
+    ],
+    ids=["display", "silence", "channel", "joint", "ringing", "tremble"],
+)
+def test_what_is_over_soon_or_small_is_not_said(name, change):
+    assert run_warnings(recorded(**{name: change}), OVER_NETWORK, ARM) == []
+
+
+def test_a_run_that_went_well_has_no_warnings():
+    assert run_warnings(recorded(), OVER_NETWORK, ARM) == []
+
+
+def test_a_wrist_motor_at_its_limit_is_found_with_the_axes_of_the_device():
+    J = np.empty((6, 6))
+    jacobian_into.py_func(np.array(HOME), J)
+    about = 3 + int(np.argmax(np.abs(J[3:, 5])))  # the last axis, the weakest motor's
+    assert abs(J[about, 5]) == pytest.approx(1.0)
+    full = WRIST_TORQUE_LIMIT[2] * during(1, 2)
+    (warning,) = run_warnings(recorded(force_to_master=(about, full)), OVER_NETWORK, ARM)
+    assert "the device displays the most that it can from 1.000" in warning
+    assert run_warnings(recorded(force_to_master=(about, 0.99 * full)), OVER_NETWORK, ARM) == []
+
+
+def test_spans_close_gaps_and_leave_out_what_is_short():
+    happened = during(0.5, 0.6) | during(0.62, 1.0) | during(2.0, 2.1)
+    assert spans_of(T, happened) == [(0.5, 1.0), (2.0, 2.1)]
+    assert spans_of(T, happened, 0.2) == [(0.5, 1.0)]
+    assert spans_of(T, 0 * T > 1) == []
+
+
+def test_many_times_are_counted():
+    happened = np.sin(2 * np.pi * 2 * T) > 1e-9
+    (warning,) = run_warnings(recorded(saturated=(0, happened)), OVER_NETWORK, ARM)
+    assert warning.count("from") == 3
+    assert warning.endswith(" and 3 more times")
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.1, 0.3])
+def test_behind_is_what_neither_delay_nor_a_low_pass_explains(delay):
+    command = np.column_stack([np.sin(5 * T), np.cos(3 * T)])
+    late = np.column_stack([np.sin(5 * (T - delay)), np.cos(3 * (T - delay))])
+    late[delay > T] = command[0]
+    assert behind(T, command, late, 0.3 + 1e-9).max() < 1e-9
+    slow = command.copy()
+    for k in range(1, len(T)):
+        slow[k] = slow[k - 1] + 0.001 / 0.05 * (command[k - 1] - slow[k - 1])
+    assert behind(T, command, slow, 0.3).max() < 2 * np.exp(-6)
+    step = np.where(T > 1.0 + 1e-9, 1.0, 0.0)[:, np.newaxis] * [3.0, 4.0]
+    found = behind(T, step, 0 * step, 0.2)
+    np.testing.assert_allclose(found, np.where(T > 1.2 + 1e-9, 5.0, 0.0))
+
+
+def test_turns_are_extremes_that_go_far_enough():
+    x = np.sin(2 * np.pi * T) + 0.01 * np.sin(2 * np.pi * 50 * T)
+    np.testing.assert_allclose(T[turns(x, 0.1)], np.arange(6) / 2 + 0.25, atol=0.02)
+    assert len(turns(x, 0.005)) > 50
+    assert len(turns(np.zeros(10), 0.1)) == len(turns(T, 0.1)) == 0
+
+
+def test_who_follows_to_and_fro_does_not_hunt():
+    command = 0.066 * np.sin(2 * np.pi * 2.63 * T)[:, np.newaxis]
+    follows = 0.06 * np.sin(2 * np.pi * 2.63 * (T - 0.06))[:, np.newaxis]
+    assert not hunts(T, command, follows, 5e-4).any()
+    assert hunts(T, 0 * command, follows, 5e-4).mean() > 0.8
+    slow = 0.066 * np.sin(2 * np.pi * 0.5 * T)[:, np.newaxis]
+    shaken = slow.copy()
+    shaken[during(1, 2), 0] += 0.003 * np.sin(2 * np.pi * 20 * T[during(1, 2)])
+    found = T[hunts(T, slow, shaken, 5e-4)]
+    assert 0.95 < found[0] < 1.05
+    assert 1.95 < found[-1] < 2.05
+
+
+def test_the_longest_delay_is_that_of_the_latest_packet(tmp_path):
+    assert longest_delay(NetworkConfig(delay=0.1, jitter=0.5, distribution="gamma")) == 0.4
+    assert longest_delay(NetworkConfig(delay=0.1, playout=0.2)) == 0.2
+    (tmp_path / "trace.csv").write_text("time,delay\n0,0.02\n1,0.07\n2,\n")
+    found = longest_delay(NetworkConfig(trace=str(tmp_path / "trace.csv")))
+    assert found == pytest.approx(0.07)
+
+
+@pytest.mark.slow
+def test_the_slave_follows_however_late_the_wrist_sensor_is():
+    """The accelerations of this sensor are 6 ms late, and with them its sample.
+
+    Energy that was counted with joint angles of that time emptied the tank of the slave: it came
+    4 cm behind, and without a word.
+    """
+    move = MinimumJerk(t_start=0.5, duration=0.8, translation=[0.0, 0.0, -0.07])
+    scenario = replace(
+        OVER_NETWORK,
+        simulation=Simulation(duration=1.1, settle=0.0),
+        operator=OperatorConfig(intent=[move]),
+        wrist_sensor=PRESETS["ati_gamma_imu"],
+        force_scaling__sigma=1.0,  # so that it need not know its load
+    )
+    result = simulate(MakeTeleopStation(scenario), scenario.simulation)
+    assert run_warnings(result, scenario, slave_arm(scenario)) == []
+    sent, received = result["pose_command"][:, 6], result["pose_received"][:, 6]
+    assert sent[-1] < 0.42  # it moves
+    assert abs(received[-1] - np.interp(result.t[-1] - LATE, result.t, sent)) < 2e-3
