@@ -46,7 +46,7 @@ from drake_teleop.identification import (
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.operator.operator import OperatorConfig, Sine
-from drake_teleop.pages.progress import progress_bars
+from drake_teleop.pages.progress import show_progress
 from drake_teleop.result import SimulationResult
 from drake_teleop.run import in_contact
 from drake_teleop.scenario import LoadScenario, Scenario, replace
@@ -230,7 +230,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2, help="for the free motion")
     parser.add_argument("--json", type=Path, help="write the figures here")
     given = parser.parse_args()
-    with progress_bars(quiet=False) as stage:
+    with show_progress(True) as stage:
         figures: dict[str, Any] = {"papers_contact": papers_contact(stage("The paper's contact"))}
         figures["arrivals"] = arrivals(stage("Networks"))
         if given.minutes > 0.0:

@@ -28,7 +28,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.methods import METHODS
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.one_thread import one_blas_thread
-from drake_teleop.pages.progress import Progress, Stage, silent
+from drake_teleop.pages.progress import Progress, Stage, show_progress
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, Simulation, check_scenario, replace
 from drake_teleop.sensor.motion_estimation import estimated_motion_std
@@ -132,7 +132,7 @@ def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
 
 def identify_load(
     scenario: Scenario,
-    stage: Stage = silent,
+    progress: bool | Stage = True,
     *,
     trajectory: FourierTrajectory | None = None,
     log: Path | None = None,
@@ -142,7 +142,7 @@ def identify_load(
     Args:
         scenario: whose load estimator learns: the shipped "identification", or that with the slave
             and the sensor of another one (`identification_scenario`).
-        stage: where progress is shown.
+        progress: whether bars are shown, or where: see `pages/progress.py`.
         trajectory: to run, of the scenario's duration; a new one is designed if there is none.
         log: as `simulate` has it.
 
@@ -160,13 +160,16 @@ def identify_load(
         )
     if trajectory is not None:
         expect(FourierTrajectory, trajectory, "trajectory")
-    robot = RobotFromScenario(scenario)
-    if trajectory is None:
-        trajectory = _designed(robot, scenario.simulation.duration, stage)
-    else:
-        _check_given(robot, trajectory, scenario.simulation.duration)
-    station = MakeIdentificationStation(scenario, trajectory)
-    result, factor = timed(station, scenario.simulation, stage("Identify the load"), log)
+    robot, simulation = RobotFromScenario(scenario), scenario.simulation
+    with show_progress(progress) as stage:
+        if trajectory is None:
+            trajectory = excite(
+                robot, period=simulation.duration, seed=_DESIGN_SEED, progress=stage
+            ).trajectory
+        else:
+            _check_given(robot, trajectory, simulation.duration)
+        station = MakeIdentificationStation(scenario, trajectory)
+        result, factor = timed(station, simulation, stage("Identify the load"), log)
     usable = result["saturated"][:, 0] == 0
     wrench, s, omega, alpha = (signal[usable] for signal in sensor_samples(result))
     with one_blas_thread():
@@ -207,15 +210,6 @@ def batch_identification(
     )
     found = identify_batch(wrench, s, omega, alpha, method="total", noise=noise)
     return found.identification
-
-
-def _designed(robot: Robot, period: float, stage: Stage) -> FourierTrajectory:
-    progress = stage("Design the excitation trajectory")
-    found = excite(
-        robot, period=period, seed=_DESIGN_SEED, designing=lambda done, best: progress(0.5 * done)
-    )
-    progress(1.0)
-    return found.trajectory
 
 
 def _check_given(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:

@@ -30,7 +30,7 @@ from drake_teleop._version import __version__
 from drake_teleop.identification import identification_scenario, identify_load, slave_arm
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.identification import Identification
-from drake_teleop.pages.progress import Stage, silent
+from drake_teleop.pages.progress import Stage
 from drake_teleop.resources import models_dir
 from drake_teleop.scenario import Scenario, check_scenario
 
@@ -67,7 +67,7 @@ class IdentifiedLoad:
 
 def identified_load(
     scenario: Scenario,
-    stage: Stage = silent,
+    progress: bool | Stage = True,
     *,
     fresh: bool = False,
     folder: Path | None = None,
@@ -76,7 +76,7 @@ def identified_load(
 
     Args:
         scenario: that is to be run.
-        stage: where progress is shown.
+        progress: as for `identify_load`.
         fresh: whether to identify anew although it was kept.
         folder: of the files, instead of the user's.
 
@@ -91,7 +91,7 @@ def identified_load(
     path = (folder or cache_folder()) / f"load-{_key(before, detects)}.npz"
     if not fresh and (kept := _read(path)) is not None:
         return kept
-    found = identify_load(before, stage)
+    found = identify_load(before, progress)
     floor = found.noise_floor(slave_arm(scenario)) if detects else None
     load = IdentifiedLoad(found.identification, floor, from_cache=False)
     with suppress(OSError):  # a full or write-protected disk: it is identified again next time

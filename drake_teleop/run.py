@@ -55,7 +55,7 @@ from drake_teleop.identified_load import identified_load
 from drake_teleop.load.arrays import learnt
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
-from drake_teleop.pages.progress import Stage, progress_bars, silent
+from drake_teleop.pages.progress import Stage, show_progress
 from drake_teleop.pages.style import contact_spans
 from drake_teleop.replay import write_replay, write_scenario
 from drake_teleop.result import SimulationResult, remove_log
@@ -97,6 +97,7 @@ def run_command(
     seed: int | None = None,
     fresh: bool = False,
     quiet: bool = False,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Runs one scenario.
 
@@ -111,6 +112,7 @@ def run_command(
         seed: instead of the scenario's.
         fresh: whether to identify the load anew although it was kept.
         quiet: no progress bars and no table.
+        progress: False for no progress bars alone.
 
     Returns:
         The summary.
@@ -129,7 +131,7 @@ def run_command(
     out.mkdir(parents=True, exist_ok=True)
     write_scenario(out / "scenario.yaml", setup)
     try:
-        with progress_bars(quiet) as stage:
+        with show_progress(progress and not quiet) as stage:
             run = run_scenario(setup, stage, log, fresh=fresh)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(_kept(log)) from interrupt
@@ -148,19 +150,18 @@ def run_command(
 
 def run_scenario(
     scenario: Scenario,
-    stage: Stage = silent,
+    progress: bool | Stage = True,
     log: Path | None = None,
     *,
     fresh: bool = False,
-    loads: Path | None = None,
 ) -> ScenarioRun:
     """Runs a scenario by the rule at the top of this module.
 
     Args:
         scenario: what to run.
-        stage: where progress is shown.
+        progress: whether bars are shown, or where: see `pages/progress.py`.
         log: as `simulate` has it.
-        fresh, loads: `fresh` and `folder` of `identified_load`.
+        fresh: as for `identified_load`.
 
     Raises:
         DrakeTeleopError: if the scenario cannot be used or a joint leaves its range.
@@ -168,17 +169,18 @@ def run_scenario(
     check_scenario(scenario)
     learns = scenario.load_estimator.enabled
     if learns and not scenario.operator.intent and scenario.operator.task is None:
-        found = identify_load(scenario, stage, log=log)
+        found = identify_load(scenario, progress, log=log)
         return ScenarioRun(
             scenario, found.result, found.identification, _LEARNT, found.real_time_factor
         )
     identification, estimate, floor, source = None, None, None, _LEARNT
-    if not learns:
-        load = identified_load(scenario, stage, fresh=fresh, folder=loads)
-        identification, estimate, floor = load.identification, load.estimate, load.noise_floor
-        source = "cache" if load.from_cache else "identified before the run"
-    station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
-    result, factor = timed(station, scenario.simulation, stage("Run the scenario"), log)
+    with show_progress(progress) as stage:
+        if not learns:
+            load = identified_load(scenario, stage, fresh=fresh)
+            identification, estimate, floor = load.identification, load.estimate, load.noise_floor
+            source = "cache" if load.from_cache else "identified before the run"
+        station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
+        result, factor = timed(station, scenario.simulation, stage("Run the scenario"), log)
     return ScenarioRun(scenario, result, identification, source, factor)
 
 

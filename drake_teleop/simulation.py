@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.errors import expect
 from drake_teleop.operator.decision import DONE
+from drake_teleop.pages.progress import Progress, show_progress
 from drake_teleop.quantities import check_ranges
 from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.scenario import Simulation
@@ -28,7 +28,7 @@ def simulate(
     diagram: Diagram,
     simulation: Simulation,
     *,
-    progress: Callable[[float], None] | None = None,
+    progress: bool | Progress = True,
     log: str | Path | None = None,
 ) -> SimulationResult:
     """Runs a station through its settling time and its duration.
@@ -36,7 +36,8 @@ def simulate(
     Args:
         diagram: a station, as `MakeTeleopStation` makes it.
         simulation: duration, settling time, integrator and seed.
-        progress: called with the fraction done, 0 to 1.
+        progress: whether a bar is shown if it takes longer than a second; or what is called with
+            the fraction done, 0 to 1.
         log: a folder that the log goes to while the station runs, in parts of some seconds
             (`SimulationResult.scan_parquet`): a long run then needs no more memory than a short
             one. What was recorded before Ctrl-C or an error is in it, and all but the last part
@@ -54,6 +55,9 @@ def simulate(
     expect(Simulation, simulation, "simulation", "pass scenario.simulation")
     check_ranges(simulation, "simulation")
     expect((str, Path, type(None)), log, "log", "give a folder")
+    if isinstance(progress, bool):
+        with show_progress(progress, after=1.0) as stage:
+            return simulate(diagram, simulation, progress=stage("Simulate"), log=log)
     simulator = MakeSimulator(diagram, simulation)
     end = simulation.settle + simulation.duration
     on_disk = None if log is None else _LogOnDisk(Path(log), simulator, simulation.settle)
@@ -67,8 +71,7 @@ def simulate(
             if on_disk is not None and on_disk.waiting() >= _PART_ROWS:
                 on_disk.take()
             over = simulation.end_with_task and _task_is_over(simulator)
-            if progress is not None:
-                progress(1.0 if over else time / end)
+            progress(1.0 if over else time / end)
             if over:
                 break
     finally:

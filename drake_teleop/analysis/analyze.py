@@ -24,7 +24,7 @@ maps         list: x, y, stable (share of the map), boundary (places)
 measured     in free motion, by multi-sine in the nonlinear simulation: frequency_Hz, felt_re,
              felt_im, coherence, greatest_error and greatest_error_deg against the linearisation
              (hand's mass included); null if free motion is unstable
-verdict      sentences
+verdict      list of short sentences
 ============ ==================================================================================
 """
 
@@ -62,7 +62,7 @@ from drake_teleop.analysis.verdict import verdict
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import slave_arm
 from drake_teleop.operator.operator import GRIPS
-from drake_teleop.pages.progress import Stage, progress_bars
+from drake_teleop.pages.progress import Stage, show_progress
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 
@@ -71,7 +71,12 @@ _PRESSED = 5e-3  # m, how deep the hand presses into the leaf
 
 
 def analyze_command(
-    scenario: str, out: Path, *, direction: str = "z", quiet: bool = False
+    scenario: str | Path,
+    out: Path,
+    *,
+    direction: str = "z",
+    quiet: bool = False,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Analyses a scenario; writes summary.json, report.html and its pictures.
 
@@ -80,6 +85,7 @@ def analyze_command(
         out: the folder.
         direction: x, y or z of the world.
         quiet: no progress bars and no tables.
+        progress: False for no progress bars alone.
 
     Returns:
         The summary, see the top of this module.
@@ -89,9 +95,8 @@ def analyze_command(
     """
     setup = LoadScenario(scenario)
     out.mkdir(parents=True, exist_ok=True)  # before the work: a bad path costs no time
-    with progress_bars(quiet) as stage:
-        summary, curves = analyze(setup, direction, stage)
-    summary = {"scenario": scenario, **summary}
+    summary, curves = analyze(setup, direction, progress and not quiet)
+    summary = {"scenario": str(scenario), **summary}
     (out / "summary.json").write_text(
         json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8"
     )
@@ -101,14 +106,26 @@ def analyze_command(
     return summary
 
 
-def analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str, Any], Curves]:
+def analyze(
+    scenario: Scenario, direction: str = "z", progress: bool | Stage = True
+) -> tuple[dict[str, Any], Curves]:
     """The figures of a scenario along x, y or z of the world, and its curves.
 
     A method of passivity in the channel is not linear: then the station is analysed without it.
 
+    Args:
+        scenario: of the station.
+        direction: x, y or z.
+        progress: whether bars are shown, or where: see `pages/progress.py`.
+
     Raises:
         DrakeTeleopError: see `analyze_command`.
     """
+    with show_progress(progress) as stage:
+        return _analyze(scenario, direction, stage)
+
+
+def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str, Any], Curves]:
     method = scenario.passivity.method
     linear = replace(scenario, passivity=PassivityConfig())
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])

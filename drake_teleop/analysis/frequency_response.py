@@ -195,7 +195,7 @@ def measure_frequency_response(
         rates__log_hz=rate,
     )
     diagram = MakeTeleopStation(drawing, load_estimate=load_estimate)
-    result = simulate(diagram, drawing.simulation)
+    result = simulate(diagram, drawing.simulation, progress=False)
     multiples = excitation.multiples()
     spectra: dict[str, Complex] = {
         name: np.fft.rfft(signal[: steps * excitation.periods].reshape(-1, steps))[:, multiples]

@@ -299,6 +299,7 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     """Margins and verdict on the terminal."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     console = Console()
@@ -306,10 +307,10 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     for heading in ("Grip", "Wall", "Stable"):
         table.add_column(heading)
     for heading in ("Gain", "Phase", "More round trip [ms]"):
-        table.add_column(heading, justify="right")
+        table.add_column(escape(heading), justify="right")  # [ms] is no markup
     for row in summary["margins"]:
         table.add_row(*margin_cells(row, summary["delay_s"]))
     console.print(table)
     for sentence in summary["verdict"]:
-        console.print(sentence, highlight=False, markup=False)
+        console.print(f"- {sentence}", highlight=False, markup=False)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

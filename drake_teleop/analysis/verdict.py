@@ -8,76 +8,85 @@ import numpy as np
 
 
 def verdict(figures: dict[str, Any]) -> list[str]:
-    """The figures in words."""
+    """The figures in words: short sentences, each of which can be read alone."""
     said = []
     if figures["method"] != "none":
-        said.append(
-            f"The method {figures['method']} is not linear: what follows is the station without it."
-        )
-    for point in figures["diagram"]:
-        pace, hertz = point["decay_1_per_s"], point["frequency_Hz"]
-        if pace is None:
-            stable = "stable" if point["stable"] else "unstable"
-            said.append(f"In the state '{point['point']}' one axis of the station is {stable}.")
-            continue
-        motion = f"at {hertz:.3g} Hz" if hertz > 0.01 else "without oscillation"
-        said.append(
-            f"In the state '{point['point']}', with the {figures['grip']} grip, the Diagram is "
-            + (
-                f"stable: what dies last halves every {1e3 * np.log(2) / pace:.3g} ms, {motion}."
-                if point["stable"]
-                else f"unstable: it doubles every {-1e3 * np.log(2) / pace:.3g} ms, {motion}."
-            )
-        )
-    said += [
-        _bears(row, figures["delay_s"])
-        for row in figures["margins"]
-        if row["grip"] == figures["grip"] and row["wall_N_per_m"] == figures["wall_N_per_m"]
-    ]
+        said += [
+            f"The method {figures['method']} is not linear.",
+            "All that follows is about the station without it.",
+        ]
+    said += [_rest(point, figures["grip"]) for point in figures["diagram"]]
+    for row in figures["margins"]:
+        if row["grip"] == figures["grip"] and row["wall_N_per_m"] == figures["wall_N_per_m"]:
+            said += _bears(row, figures["delay_s"])
     worst = max(figures["two_port"]["sampled"].values())
     if worst > 0.1:
-        said.append(
-            f"Along {figures['direction']} the station is not one axis: its two-port differs by up "
-            f"to {100 * worst:.2g} % below 30 Hz, because a push turns hand and tool. Margins and "
-            "maps, which are those of one axis, are rough there."
-        )
-    bounded = figures["bounded"]
-    each = ", ".join(f"{grip} {_stiffness(K)}" for grip, K in bounded["each"].items())
-    said.append(
-        f"Walls are stable up to a stiffness that depends on the hand: {each}; for every hand "
-        f"between the lightest and the firmest grip {_stiffness(bounded['grips'])}."
-    )
-    absolute = figures["absolute"]
-    if absolute["absolutely_stable"]:
-        said.append("It is absolutely stable: no passive hand and environment make it oscillate.")
-    else:
-        lacking = absolute["lacking_damping_Ns_per_m"]
-        remedy = "no amount of" if lacking is None else f"{lacking:.3g} N s/m more"
-        said.append(
-            "It is not absolutely stable, as position-force stations behind a servo hardly ever "
-            f"are: some passive hand and environment would oscillate; {remedy} damping of the "
-            "device would prevent it. For hands and walls that there are, the limits above count."
-        )
-    free, wall = figures["transparency"]["free"], figures["transparency"]["wall"]
-    felt, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]
-    said.append(
-        f"In free motion the hand feels {1e3 * free['felt']['mass']:.3g} g, where device and "
-        f"σ = {figures['axis']['sigma']:g} make {1e3 * free['ideal']['mass']:.3g} g; of the wall "
-        f"it feels {felt:.3g} N/m of {ideal:.3g} N/m. A human could not tell the wall from the "
-        f"ideal one up to {wall['unnoticed_to_Hz']:.2g} Hz; the slave follows up to "
-        f"{figures['transparency']['tracking_bandwidth_Hz']:.3g} Hz."
-    )
-    return said
+        said += [
+            f"Along {figures['direction']} it is not one axis: a push turns hand and tool.",
+            f"Its two-port differs from one axis by up to {100 * worst:.2g} % below 30 Hz.",
+            "Margins and maps are those of one axis, and rough here.",
+        ]
+    return said + _walls(figures) + _transparency(figures)
 
 
-def _bears(row: dict[str, Any], delay: float) -> str:
+def _rest(point: dict[str, Any], grip: str) -> str:
+    pace, hertz = point["decay_1_per_s"], point["frequency_Hz"]
+    if pace is None:
+        stable = "stable" if point["stable"] else "unstable"
+        return f"In the state '{point['point']}' one axis of the station is {stable}."
+    state = f"In the state '{point['point']}', {grip} grip, it is"
+    motion = f"at {hertz:.3g} Hz" if hertz > 0.01 else "without oscillation"
+    if point["stable"]:
+        return f"{state} stable: motion halves every {1e3 * np.log(2) / pace:.3g} ms, {motion}."
+    return f"{state} unstable: it doubles every {-1e3 * np.log(2) / pace:.3g} ms, {motion}."
+
+
+def _bears(row: dict[str, Any], delay: float) -> list[str]:
     wall = f"a wall of {_stiffness(row['wall_N_per_m'])}"
     if not row["stable"]:
-        return f"Before {wall} it is unstable with that grip."
+        return [f"Before {wall} it is unstable with that grip."]
     spare = None if row["round_trip_s"] is None else row["round_trip_s"] - 2 * delay
-    longest = "any delay" if spare is None else f"{1e3 * spare:.3g} ms more round trip"
+    longest = "any round trip" if spare is None else f"{1e3 * spare:.3g} ms more round trip"
     more = "any gain" if row["gain"] is None else f"{row['gain']:.3g} times its gain"
-    return f"Before {wall} it bears {longest}, and {more}."
+    return [f"Before {wall} it stays stable with {longest}, or with {more}."]
+
+
+def _walls(figures: dict[str, Any]) -> list[str]:
+    bounded, absolute = figures["bounded"], figures["absolute"]
+    each = ", ".join(f"{grip} {_stiffness(K)}" for grip, K in bounded["each"].items())
+    every = _stiffness(bounded["grips"])
+    said = [
+        f"The stiffest stable wall depends on the grip: {each}.",
+        f"For every hand from the lightest to the firmest grip it is {every}.",
+        "These limits are without Coulomb friction, which only takes energy.",
+    ]
+    if absolute["absolutely_stable"]:
+        return [
+            *said,
+            "It is absolutely stable: no passive hand and environment make it oscillate.",
+        ]
+    lacking = absolute["lacking_damping_Ns_per_m"]
+    remedy = "No damping" if lacking is None else f"{lacking:.3g} N s/m more damping"
+    return [
+        *said,
+        "It is not absolutely stable: with some passive hand and environment it would oscillate.",
+        f"{remedy} of the device would prevent that.",
+        "Position-force stations behind a servo hardly ever are absolutely stable.",
+        "For hands and walls that there are, the limits above count.",
+    ]
+
+
+def _transparency(figures: dict[str, Any]) -> list[str]:
+    free, wall = figures["transparency"]["free"], figures["transparency"]["wall"]
+    felt, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]
+    sigma = f"σ = {figures['axis']['sigma']:g}"
+    return [
+        f"In free motion the hand feels {1e3 * free['felt']['mass']:.3g} g.",
+        f"With device and {sigma} alone it would be {1e3 * free['ideal']['mass']:.3g} g.",
+        f"Of a wall that should be {ideal:.3g} N/m the hand feels {felt:.3g} N/m.",
+        f"A human could not tell it from the ideal one up to {wall['unnoticed_to_Hz']:.2g} Hz.",
+        f"The slave follows up to {figures['transparency']['tracking_bandwidth_Hz']:.3g} Hz.",
+    ]
 
 
 def _stiffness(value: float | None) -> str:

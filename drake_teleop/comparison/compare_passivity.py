@@ -43,7 +43,7 @@ from drake_teleop.comparison.delayed_contact import (
 from drake_teleop.comparison.one_dof import Figures, OneDof, figures, run_one_dof
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import identification_scenario, identify_load
-from drake_teleop.pages.progress import Stage, progress_bars
+from drake_teleop.pages.progress import Stage, show_progress
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
@@ -69,6 +69,7 @@ def compare_command(
     seed: int = 0,
     jobs: int = -1,
     quiet: bool = False,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Compares the methods; writes summary.json, runs.parquet, report.html and its pictures.
 
@@ -79,6 +80,7 @@ def compare_command(
         seed: of sensor and networks.
         jobs: processes at once; -1: one for each core.
         quiet: no progress bars and no tables.
+        progress: False for no progress bars alone.
 
     Returns:
         The summary, see the top of this module.
@@ -89,7 +91,7 @@ def compare_command(
     _check("network", networks, tuple(PRESETS))
     _check("method", methods, METHODS)
     out.mkdir(parents=True, exist_ok=True)  # before the work: a bad path costs no time
-    with progress_bars(quiet) as stage:
+    with show_progress(progress and not quiet) as stage:
         limits = _one_dof_study(methods, seed, jobs, stage)
         runs, traces = _station_study(networks, methods, seed, jobs, stage)
         covering = _covering_study(stage)
@@ -144,7 +146,8 @@ def station_run(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
     )
     try:
-        result = simulate(MakeTeleopStation(setup, load_estimate=estimate), setup.simulation)
+        station = MakeTeleopStation(setup, load_estimate=estimate)
+        result = simulate(station, setup.simulation, progress=False)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     found = dataclasses.asdict(station_figures(result, setup, task))

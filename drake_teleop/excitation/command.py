@@ -33,7 +33,7 @@ from drake_teleop.excitation.excite import Excitation, excite, sensor_motion
 from drake_teleop.excitation.motion_film import write_motion_film
 from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.pages.progress import Stage, progress_bars
+from drake_teleop.pages.progress import show_progress
 from drake_teleop.pages.style import BLACK, BLUE, COLOURS, GREY, Picture, house_style
 from drake_teleop.scenario import LoadScenario
 
@@ -68,6 +68,7 @@ def excite_command(
     seconds: float | None = None,
     seed: int = 0,
     quiet: bool = False,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Designs, checks and writes an excitation trajectory; see the top of this module.
 
@@ -79,6 +80,7 @@ def excite_command(
         package_paths, acceleration, payload: see `RobotFromModel`.
         criterion, period, harmonics, seconds, seed: see `excite`.
         quiet: no progress bars and no tables.
+        progress: False for no progress bars alone.
 
     Returns:
         The summary.
@@ -87,7 +89,7 @@ def excite_command(
         DrakeTeleopError: if the input cannot be used, or nothing respects all limits.
     """
     setup = LoadScenario(scenario)
-    with progress_bars(quiet) as stage:
+    with show_progress(progress and not quiet) as stage:
         opened = stage("Read the robot")
         if model is None:
             _refuse(sensor_frame, package_paths, acceleration, payload)
@@ -110,7 +112,15 @@ def excite_command(
                 payload=payload,
             )
         opened(1.0)
-        found = _design(robot, stage, criterion, period, harmonics, seconds, seed)
+        found = excite(
+            robot,
+            criterion=criterion,
+            period=period,
+            harmonics=harmonics,
+            seed=seed,
+            seconds=seconds,
+            progress=stage,
+        )
     summary = summarise(found) | {"seed": seed}
     out.mkdir(parents=True, exist_ok=True)
     table(found).write_csv(out / "trajectory.csv")
@@ -129,35 +139,6 @@ def _refuse(*options: object) -> None:
     for name, value in zip(names, options, strict=True):
         if value not in (None, ()):
             raise DrakeTeleopError("needs --model", where=name)
-
-
-def _design(
-    robot: Robot,
-    stage: Stage,
-    criterion: str,
-    period: float,
-    harmonics: int,
-    seconds: float | None,
-    seed: int,
-) -> Excitation:
-    designing = stage("Design")
-    checking = stage("Check at 1 kHz")
-
-    def show(done: float, best: float) -> None:
-        designing(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
-
-    found = excite(
-        robot,
-        criterion=criterion,
-        period=period,
-        harmonics=harmonics,
-        seed=seed,
-        seconds=seconds,
-        designing=show,
-        checking=checking,
-    )
-    show(1.0, found.values[criterion])
-    return found
 
 
 def summarise(found: Excitation) -> dict[str, Any]:

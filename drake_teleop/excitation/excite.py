@@ -24,6 +24,7 @@ from drake_teleop.excitation.prediction import predicted_deviations
 from drake_teleop.excitation.problem import Task
 from drake_teleop.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.pages.progress import Stage, show_progress
 
 Array = NDArray[np.float64]
 
@@ -64,8 +65,7 @@ def excite(
     seed: int = 0,
     starts: int = 4,
     seconds: float | None = None,
-    designing: Callable[[float, float], None] = lambda done, best: None,
-    checking: Callable[[float], None] = lambda done: None,
+    progress: bool | Stage = True,
 ) -> Excitation:
     """Designs an excitation trajectory and checks it.
 
@@ -75,7 +75,7 @@ def excite(
         period: of the trajectory [s].
         harmonics: N of Eq. (9), at least 2.
         seed, starts, seconds: see `design`.
-        designing, checking: progress, see `design` and `check`.
+        progress: whether bars are shown, or where: see `pages/progress.py`.
 
     Raises:
         DrakeTeleopError: if nothing was found that respects all limits.
@@ -88,8 +88,15 @@ def excite(
         period,
         harmonics,
     )
-    found = design(task, seed=seed, starts=starts, seconds=seconds, progress=designing)
-    trajectory, uses = best_checked(robot, found, checking)
+    with show_progress(progress) as stage:
+        told, checking = stage("Design the trajectory"), stage("Check it at 1 kHz")
+
+        def designing(done: float, best: float) -> None:
+            told(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
+
+        found = design(task, seed=seed, starts=starts, seconds=seconds, progress=designing)
+        designing(1.0, min((iterate.value for iterate in found), default=np.inf))
+        trajectory, uses = best_checked(robot, found, checking)
     best = accumulate((iterate.value for iterate in found), min)
     return Excitation(
         robot,

@@ -1,7 +1,8 @@
-"""Progress bars, one for each named stage of a command."""
+"""Progress bars, one for each named stage of a command or of a call in Python."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeAlias
@@ -18,25 +19,63 @@ def silent(name: str) -> Progress:
 
 
 @contextmanager
-def progress_bars(quiet: bool) -> Iterator[Stage]:
-    """Bars on the terminal for as long as the context lasts; nothing at all if `quiet`."""
-    if quiet:
-        yield silent
-        return
-    from rich import progress as rich_progress
+def show_progress(progress: bool | Stage, *, after: float = 0.0) -> Iterator[Stage]:
+    """Bars on the terminal or in the notebook for as long as the context lasts.
 
-    columns = (
+    There are none if the output goes to a file.
+
+    Args:
+        progress: whether to show them; or what a caller has from here, and goes on showing.
+        after: how long something takes before it has a bar [s].
+    """
+    if callable(progress):
+        yield progress
+    elif not progress or not _somebody_looks():
+        yield silent
+    else:
+        yield from _bars(after)
+
+
+def _somebody_looks() -> bool:
+    from rich import get_console
+
+    console = get_console()
+    return console.is_terminal or console.is_jupyter
+
+
+def _bars(after: float) -> Iterator[Stage]:
+    from rich import progress as rich_progress
+    from rich.errors import LiveError
+
+    bars = rich_progress.Progress(
         rich_progress.TextColumn("{task.description:34s}"),
         rich_progress.BarColumn(),
         rich_progress.TaskProgressColumn(),
         rich_progress.TimeElapsedColumn(),
     )
-    with rich_progress.Progress(*columns) as bars:
+    opened, shown = time.monotonic(), False
 
-        def stage(name: str) -> Progress:
-            task = bars.add_task(name, total=1.0)
-            return lambda fraction, words="": bars.update(
-                task, completed=fraction, description=f"{name} {words}"
-            )
+    def show() -> None:
+        nonlocal shown
+        if not shown and time.monotonic() - opened >= after:
+            shown = True
+            try:
+                bars.start()
+            except LiveError:  # older rich: bars of somebody else are being shown, and go on
+                bars.disable = True
 
+    def stage(name: str) -> Progress:
+        task = bars.add_task(name, total=1.0)
+        show()
+
+        def update(fraction: float, words: str = "") -> None:
+            bars.update(task, completed=fraction, description=f"{name} {words}")
+            show()
+
+        return update
+
+    try:
         yield stage
+    finally:
+        if shown:
+            bars.stop()

@@ -42,7 +42,7 @@ from drake_teleop.identification import (
     slave_arm,
 )
 from drake_teleop.load.compensation import scaled_wrench
-from drake_teleop.pages.progress import Progress, Stage, progress_bars
+from drake_teleop.pages.progress import Progress, Stage, show_progress
 from drake_teleop.replay import write_replay, write_scenario
 from drake_teleop.reproduction.figures import contact_figure, scaling_figure
 from drake_teleop.reproduction.reaction import eliminated_reaction
@@ -106,7 +106,9 @@ class ContactMotion:
     threshold: float
 
 
-def reproduce_command(out: Path, *, seed: int | None = None, quiet: bool = False) -> Figures:
+def reproduce_command(
+    out: Path, *, seed: int | None = None, quiet: bool = False, progress: bool = True
+) -> Figures:
     """Repeats the paper's experiments and writes what they show into `out`.
 
     summary.json, table.md (the paper against this run), fig6.png, fig7.png, fig8.png, replay.html,
@@ -116,13 +118,14 @@ def reproduce_command(out: Path, *, seed: int | None = None, quiet: bool = False
         out: the folder.
         seed: of all noise; 0 if left out.
         quiet: no progress bars and no table.
+        progress: False for no progress bars alone.
 
     Returns:
         The summary: an object of figures for free_force, free_torque, contact, identification and
         speed.
     """
     seed = seed or 0
-    with progress_bars(quiet) as stage:
+    with show_progress(progress and not quiet) as stage:
         # Each run has noise of its own.
         force, torque, contact = (
             _at_the_hands_rate(LoadScenario(name), seed + k)

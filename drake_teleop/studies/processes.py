@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from drake_teleop.errors import DrakeTeleopError
@@ -23,7 +24,20 @@ from drake_teleop.studies.store import Store
 Chunk: TypeAlias = list[dict[str, Any]]
 """Rows that go to a process together and come back with their measures."""
 Run: TypeAlias = Callable[[Chunk], Chunk]
-Processes: TypeAlias = Callable[[Run, Sequence[Chunk]], Iterator[Chunk]]
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Where chunks are run.
+
+    Attributes:
+        count: of the processes.
+        rows_of: gives the rows of chunks, in the order in which they are done.
+    """
+
+    count: int
+    rows_of: Callable[[Run, Sequence[Chunk]], Iterator[Chunk]]
+
 
 DIED = "the run has ended its process"
 _LOOK = 0.5  # how often a process looks whether the study's is still there [s]
@@ -31,7 +45,7 @@ _LOOK = 0.5  # how often a process looks whether the study's is still there [s]
 
 @contextmanager
 def processes(store: Store, jobs: int, cluster: str | None) -> Iterator[Processes]:
-    """A function that has chunks run and gives their rows, in the order in which they are done.
+    """Processes, for as long as the context lasts.
 
     Args:
         store: of the study, for the marks.
@@ -43,10 +57,16 @@ def processes(store: Store, jobs: int, cluster: str | None) -> Iterator[Processe
             processes end before they begin.
     """
     if cluster is None:
-        yield lambda run, chunks: _on_this_machine(run, chunks, store, jobs)
+        from joblib import effective_n_jobs
+
+        yield Processes(
+            effective_n_jobs(jobs),
+            lambda run, chunks: _on_this_machine(run, chunks, store, jobs),
+        )
         return
     with _client(cluster, jobs) as client:
-        yield lambda run, chunks: _on_a_cluster(run, chunks, client)
+        workers = sum(client.nthreads().values())
+        yield Processes(workers, lambda run, chunks: _on_a_cluster(run, chunks, client))
 
 
 def _on_this_machine(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:

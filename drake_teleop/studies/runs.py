@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from drake_teleop._version import __version__
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.one_thread import one_blas_thread
-from drake_teleop.pages.progress import Progress, progress_bars
+from drake_teleop.pages.progress import Progress, show_progress
 from drake_teleop.studies.design import Study, Values
 from drake_teleop.studies.processes import Chunk, processes
 from drake_teleop.studies.store import Store, open_store
@@ -30,9 +31,13 @@ Work: TypeAlias = Callable[[Values, int], dict[str, float]]
 """The measures of one run, from its factors' values and its seed."""
 
 # A part of the store: what a kill costs, and what is handed to a process at once. Small next to
-# the study, so that at its end no process waits long for another.
+# the study, so that at its end no process waits long for another; the first ones are of one run,
+# so that soon there is something to see, and to judge by how long the study will take.
 _LARGEST_CHUNK = 8
 _CHUNKS = 512
+_SINGLE = 64
+# So many of the last runs say how long the others will take.
+_RECENT = 16
 
 
 def run_study(
@@ -43,7 +48,7 @@ def run_study(
     *,
     jobs: int = -1,
     cluster: str | None = None,
-    quiet: bool = True,
+    progress: bool = True,
 ) -> pl.DataFrame:
     """Runs what the folder does not hold yet of a study.
 
@@ -52,7 +57,7 @@ def run_study(
         out: the folder.
         work: one run; it goes to other processes, so it can be pickled.
         basis: what its results depend on beside the study, for JSON.
-        jobs, cluster, quiet: as for `study_command`.
+        jobs, cluster, progress: as for `study_command`.
 
     Returns:
         All rows, sorted by run.
@@ -65,19 +70,20 @@ def run_study(
     first_rows = study.rows(points)
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
     identity = dataclasses.asdict(study) | basis | {"design_sha256": digest, "version": __version__}
+    identity |= {"single_runs": _SINGLE}  # a chunk is known by its first run alone
     schema = _schema(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
     with open_store(out, identity) as store:
-        told = _Told(study.size() * study.repeats)
+        told = Told(study.size() * study.repeats)
         try:
-            with progress_bars(quiet) as stage, processes(store, jobs, cluster) as rows_of:
-                told.start(stage("Study"))
+            with show_progress(progress) as stage, processes(store, jobs, cluster) as workers:
+                told.start(stage("Study"), workers.count)
                 new = points
                 while new:
                     chunks = _chunks(study.rows(new, len(points) - len(new)), store, told)
-                    for found in rows_of(run, chunks):
+                    for found in workers.rows_of(run, chunks):
                         _keep(store, found, schema)
-                        told.more(len(found))
+                        told.more(found)
                     new = study.next_points(points, _objective(study, store, len(points)))
                     points += new
         except KeyboardInterrupt as interrupt:
@@ -86,10 +92,11 @@ def run_study(
         return store.read()
 
 
-def _chunks(rows: Chunk, store: Store, told: _Told) -> list[Chunk]:
+def _chunks(rows: Chunk, store: Store, told: Told) -> list[Chunk]:
     """The chunks of some runs that the store does not hold yet."""
     size = min(max(len(rows) // _CHUNKS, 1), _LARGEST_CHUNK)
-    chunks = [rows[first : first + size] for first in range(0, len(rows), size)]
+    chunks = [[row] for row in rows[:_SINGLE]]
+    chunks += [rows[first : first + size] for first in range(_SINGLE, len(rows), size)]
     finished = store.finished()
     left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
     told.found(len(rows) - sum(map(len, left)))
@@ -108,26 +115,38 @@ def _objective(study: Study, store: Store, points: int) -> Array:
     return means[study.objective].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
-class _Told:
+class Told:
     """Tells the progress bar how many runs are done, and how long the others will take."""
 
     def __init__(self, total: int) -> None:
-        self.total, self.done, self._new = total, 0, 0
+        self.total, self.done = total, 0
+        self._recent: deque[float] = deque(maxlen=_RECENT)
 
-    def start(self, progress: Progress) -> None:
-        self._progress, self._start = progress, time.monotonic()
+    def start(self, progress: Progress, processes: int) -> None:
+        """Begins, with so many runs at once."""
+        self._progress, self._processes = progress, processes
 
     def found(self, runs: int) -> None:
         """Runs that were done before."""
         self.done += runs
-        self._progress(self.done / self.total, f"{self.done}/{self.total}")
+        self._tell()
 
-    def more(self, runs: int) -> None:
-        """Runs that were done now."""
-        self.done, self._new = self.done + runs, self._new + runs
-        seconds = (time.monotonic() - self._start) / self._new * (self.total - self.done)
-        eta = f"{self.done}/{self.total}, {_duration(seconds)} left"
-        self._progress(self.done / self.total, eta)
+    def more(self, rows: Chunk) -> None:
+        """Runs that were done now, with the "seconds" that each took.
+
+        The first ones identify loads, the others need not: the last ones count.
+        """
+        self.done += len(rows)
+        # One that ended its process does not say.
+        self._recent.extend(row["seconds"] for row in rows if "seconds" in row)
+        self._tell()
+
+    def _tell(self) -> None:
+        left, words = self.total - self.done, "the first runs begin"
+        if self._recent:
+            at_once = min(self._processes, left) or 1
+            words = f"about {_duration(float(np.median(self._recent)) * left / at_once)} left"
+        self._progress(self.done / self.total, f"{self.done}/{self.total}, {words}")
 
 
 def _duration(seconds: float) -> str:
@@ -142,6 +161,7 @@ def _run_chunk(
     found = []
     with one_blas_thread():
         for row in rows:
+            start = time.monotonic()
             values = {name: row[name] for name in names}
             try:
                 measures: dict[str, Any] = work(values, row["seed"])
@@ -149,7 +169,8 @@ def _run_chunk(
                 measures = {"error": str(error)}
             except Exception as error:  # whatever it is, the other runs go on
                 measures = {"error": " ".join(f"{type(error).__name__}: {error}".split())}
-            found.append(row | measures)
+            # Not for the table: no two sessions would have the same bytes.
+            found.append(row | measures | {"seconds": time.monotonic() - start})
     return found
 
 

@@ -31,6 +31,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -66,12 +68,14 @@ class Answer:
         merit: (s, g) of each sigma and gamma, 1 at the reference; nan where too many runs fail.
         low, high: (s, g) its 95 % interval.
         best: (s, g) in what part of the draws a point is the best.
+        failures: (s, g) what part of the runs fails, in the task in which most do.
     """
 
     merit: Array
     low: Array
     high: Array
     best: Array
+    failures: Array
 
 
 def scaling_study_command(
@@ -81,12 +85,13 @@ def scaling_study_command(
     cluster: str | None = None,
     repeats: int | None = None,
     quiet: bool = False,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Runs the studies, or what is left of them, and answers.
 
     Args:
         out: the folder.
-        jobs, cluster, quiet: as for `study_command`.
+        jobs, cluster, quiet, progress: as for `study_command`.
         repeats: of each point, instead of the studies' own.
 
     Returns:
@@ -99,7 +104,7 @@ def scaling_study_command(
     for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT):
         study_command(
             name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
-            loads=out / "loads",
+            progress=progress,
         )  # fmt: skip
         rows[name] = pl.read_parquet(out / name / "runs.parquet").sort("run")
     tables = {task: _tables(rows[f"scaling_{task}"], task) for task in TASKS}
@@ -139,18 +144,19 @@ def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> An
         if names
     ]
     merits = np.mean(parts, axis=0)
-    usable = np.all([t["success"].mean(axis=-1) >= 1 - _FAILURES for t in tables.values()], axis=0)
+    failures = np.max([1 - t["success"].mean(axis=-1) for t in tables.values()], axis=0)
+    usable = failures <= _FAILURES
     # Seeds at which the reference failed say nothing alone.
     known = np.isfinite(merits[:, usable]).all(axis=1)
     merits[:, ~usable] = np.nan
     drawn, best = merits[1:][known[1:]], np.zeros(usable.size)
     if not (usable.any() and known[0] and len(drawn)):
         nothing = np.full(usable.shape, np.nan)
-        return Answer(nothing, nothing, nothing, best.reshape(usable.shape))
+        return Answer(nothing, nothing, nothing, best.reshape(usable.shape), failures)
     flat = np.where(usable, drawn, np.inf).reshape(len(drawn), -1)
     best = np.bincount(flat.argmin(axis=1), minlength=usable.size) / len(drawn)
     low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
-    return Answer(merits[0], low, high, best.reshape(usable.shape))
+    return Answer(merits[0], low, high, best.reshape(usable.shape), failures)
 
 
 def _relative(table: Array, weights: Array) -> Array:
@@ -270,27 +276,48 @@ def criteria_picture(
 
 
 def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list[float]) -> Figure:
-    """The merit over sigma and gamma for each way of counting; in the cells, how often the best."""
+    """The merit over sigma and gamma for each way of counting, all in the same colours.
+
+    In the cells stand the merit and how often a point is the best, or how many runs fail.
+    """
+    known = np.concatenate([found.merit[np.isfinite(found.merit)] for found in answers.values()])
+    farthest = np.abs(np.log2(known)).max(initial=0.01)
+    # As far from 1 below as above, in ratios; the cell of a point that is no choice is grey.
+    ends = 2.0**-farthest, 2.0**farthest
+    scale = LogNorm(*ends)
+    colours = colormaps["RdBu_r"].with_extremes(bad="#dddddd")
     with house_style():
-        figure = Picture(figsize=(11.0, 3.2))
-        for axes, (way, found) in zip(figure.subplots(1, len(WAYS)), answers.items(), strict=True):
-            drawn = axes.imshow(found.merit, origin="lower", aspect="auto", cmap="viridis_r")
+        figure = Picture(figsize=(10.0, 7.6))
+        grid = figure.subplots(2, 2)
+        for axes, (way, found) in zip(grid.ravel(), answers.items(), strict=True):
+            drawn = axes.imshow(
+                found.merit, origin="lower", aspect="auto", cmap=colours, norm=scale
+            )
             axes.grid(False)
-            axes.set_xticks(range(len(gammas)), [f"{gamma:g}" for gamma in gammas], fontsize=8)
+            axes.set_xticks(range(len(gammas)), [f"{gamma:g}" for gamma in gammas])
             axes.set_yticks(range(len(sigmas)), [f"{sigma:g}" for sigma in sigmas])
             axes.set_xlabel("$\\gamma$")
             axes.set_ylabel("$\\sigma$")
             axes.set_title(f"counts: {way}")
-            for i, j in np.argwhere(found.best >= 0.005):
-                box = {"facecolor": "white", "alpha": 0.75, "lw": 0, "pad": 1}
-                axes.text(
-                    j, i, f"{found.best[i, j]:.0%}", ha="center", va="center", fontsize=7, bbox=box
-                )
-            figure.colorbar(drawn, ax=axes)
-        figure.suptitle(
-            "Merit (below 1: better than feeling all); how often the best", x=0.01, ha="left"
-        )
+            for i, j in np.ndindex(found.merit.shape):
+                # White on what is dark.
+                dark = abs(scale(found.merit[i, j]) - 0.5) > 0.3
+                axes.text(j, i, _cell(found, i, j), color="white" if dark else "black",
+                          ha="center", va="center", fontsize=7.5)  # fmt: skip
+        bar = figure.colorbar(drawn, ax=grid, label="merit; below 1 is better than feeling all")
+        ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
+        bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks], minor=False)
+        bar.minorticks_off()
+        figure.suptitle("Merit, and how often a point is the best; grey: too many runs fail",
+                        x=0.01, ha="left")  # fmt: skip
     return figure
+
+
+def _cell(found: Answer, i: int, j: int) -> str:
+    if not np.isfinite(found.merit[i, j]):
+        return f"{found.failures[i, j]:.0%} fail"
+    best = f"\nbest: {found.best[i, j]:.0%}" if found.best[i, j] >= 0.005 else ""
+    return f"{found.merit[i, j]:.2f}{best}"
 
 
 def _print(summary: dict[str, Any], out: Path) -> None:

@@ -13,7 +13,7 @@ A study file::
 
 A factor of one value sets a field for all runs; beside numbers there are words, flags (true, false)
 and vectors. Every run follows the rule of `drake-teleop run`; runs with the same slave, sensor and
-seed share one identification of the load, which the folder keeps. An adaptive design looks for the
+seed share one identification of the load (`identified_load.py`). An adaptive design looks for the
 point whose `objective` is smallest, in batches that follow from the rows of those before.
 
 The folder holds
@@ -53,7 +53,6 @@ from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.quantities import check_ranges, check_structure
 from drake_teleop.resources import studies_dir
-from drake_teleop.result import SimulationResult
 from drake_teleop.run import run_scenario
 from drake_teleop.scenario import ReadScenario, Scenario, ScenarioFromData, ScenarioNames
 from drake_teleop.studies.design import Factor, Study, Values
@@ -77,14 +76,12 @@ class StationWork:
         where: the file's name for messages.
         measures: by name.
         threshold: force [N] of time_above_force_s.
-        loads: folder of the loads that were identified, for all processes that see it.
     """
 
     data: Any
     where: str
     measures: Sequence[str]
     threshold: float
-    loads: Path
 
     def scenario(self, values: Values, seed: int) -> Scenario:
         """The scenario of one run."""
@@ -94,12 +91,8 @@ class StationWork:
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
         """The measures of one run."""
         scenario = self.scenario(values, seed)
-        return measured(self._simulated(scenario), scenario, self.measures, self.threshold)
-
-    def _simulated(self, scenario: Scenario) -> SimulationResult:
-        """`run_scenario`, which identifies a load only once in a study."""
-        elsewhere = not self.loads.parent.is_dir()  # on another machine of a cluster
-        return run_scenario(scenario, loads=None if elsewhere else self.loads).result
+        result = run_scenario(scenario, progress=False).result
+        return measured(result, scenario, self.measures, self.threshold)
 
 
 def study_command(
@@ -109,8 +102,8 @@ def study_command(
     jobs: int = -1,
     cluster: str | None = None,
     quiet: bool = False,
+    progress: bool = True,
     repeats: int | None = None,
-    loads: Path | None = None,
 ) -> dict[str, Any]:
     """Runs a study, or what is left of it.
 
@@ -120,8 +113,8 @@ def study_command(
         jobs: processes at once on this machine; -1: one for each core.
         cluster: address of a Dask scheduler instead, or "local" for one of this machine's own.
         quiet: no progress bar and no table.
+        progress: False for no progress bar alone.
         repeats: instead of the file's.
-        loads: folder of the loads that were identified, if studies share them.
 
     Returns:
         The summary, see the top of this module.
@@ -136,9 +129,9 @@ def study_command(
     for index, factor in enumerate(study.factors):
         _check_values(factor, f"{path}:factors[{index}]")
     study.repeats = repeats or study.repeats
-    loads = loads or out / "loads"
-    work = StationWork(data, where, tuple(study.measures), study.force_threshold, loads)
-    rows = run_study(study, out, work, {"data": data}, jobs=jobs, cluster=cluster, quiet=quiet)
+    work = StationWork(data, where, tuple(study.measures), study.force_threshold)
+    shown = progress and not quiet
+    rows = run_study(study, out, work, {"data": data}, jobs=jobs, cluster=cluster, progress=shown)
     summary = _summary(study, rows)
     text = json.dumps(summary, indent=2, allow_nan=False)
     (out / "summary.json").write_text(text + "\n", encoding="utf-8")

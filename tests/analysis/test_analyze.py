@@ -9,11 +9,11 @@ import pytest
 from drake_teleop.analysis import analyze
 from drake_teleop.analysis import figures as of_summary
 from drake_teleop.analysis.maps import stability_map
+from drake_teleop.analysis.report import print_tables
 from drake_teleop.analysis.task_direction import task_direction
 from drake_teleop.analysis.verdict import verdict
 from drake_teleop.cli import main
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.pages.progress import silent
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 
 PICTURES = ("bode", "nyquist", "passive", "widths", "maps")
@@ -88,15 +88,26 @@ def test_what_is_said_of_stability_is_one_story(run):
 
 
 @pytest.mark.slow
+def test_the_terminal_has_units_and_a_list(run, capsys):
+    print_tables(run[0], run[1])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "[ms]" in printed
+    for sentence in run[0]["verdict"]:
+        assert f"- {sentence}" in printed
+
+
+@pytest.mark.slow
 def test_the_verdict_follows_the_figures(run):
     summary, _ = run
     assert summary["verdict"] == verdict(summary)
+    for sentence in summary["verdict"]:
+        assert len(sentence) <= 100 and sentence.endswith(".") and ". " not in sentence
     other = summary | {"absolute": summary["absolute"] | {"absolutely_stable": True}}
     assert any("stable: no passive" in sentence for sentence in verdict(other))
 
 
 def figures(scenario: Scenario, direction: str = "z"):
-    return analyze.analyze(scenario, direction, silent)[0]
+    return analyze.analyze(scenario, direction)[0]
 
 
 @pytest.mark.slow

@@ -11,7 +11,13 @@ import pytest
 from drake_teleop.resources import studies_dir
 from drake_teleop.scenario import ScenarioNames
 from drake_teleop.studies import scaling_study
-from drake_teleop.studies.scaling_study import TASKS, answer, scaling_study_command
+from drake_teleop.studies.scaling_study import (
+    TASKS,
+    WAYS,
+    answer,
+    choice_picture,
+    scaling_study_command,
+)
 from drake_teleop.studies.study import LoadStudy
 
 STUDIES = sorted(path.stem for path in studies_dir().glob("*.yaml"))
@@ -67,6 +73,23 @@ def test_a_reference_that_fails_leaves_the_seeds_at_which_it_does_not(failing, b
     found = answer(rows, ("effort",))
     assert np.isfinite(found.low).sum() == np.isfinite(found.merit).sum() == 29 * best
     assert found.best.sum() == pytest.approx(best)
+
+
+def test_the_picture_of_the_choice_has_one_scale_and_no_empty_cell():
+    failing = tables()
+    failing["press"]["success"][:2, 0, :3] = 0.0  # three of twenty
+    answers = {way: answer(failing, criteria) for way, criteria in WAYS.items()}
+    sigmas, gammas = [0, 0.1, 0.25, 0.5, 1], [0.25, 0.5, 1, 2, 4, 8]
+    figure = choice_picture(answers, sigmas, gammas)
+    images = [image for axes in figure.axes for image in axes.images]
+    assert len(images) == len(WAYS)
+    assert len({image.norm for image in images}) == 1
+    for axes, found in zip(figure.axes, answers.values(), strict=False):
+        words = {text.get_position(): text.get_text() for text in axes.texts}
+        assert len(words) == found.merit.size
+        assert words[0, 0] == words[0, 1] == "15% fail"
+        assert words[2, 4].startswith("1.00")  # the reference
+        assert np.isfinite(axes.images[0].norm([0.1, 1.0, 10.0])).all()
 
 
 def test_more_seeds_make_surer():

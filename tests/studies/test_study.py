@@ -24,7 +24,7 @@ from drake_teleop.signals import SIGNALS
 from drake_teleop.studies import study as studies
 from drake_teleop.studies.design import Factor, Study
 from drake_teleop.studies.measures import default_measures, measured
-from drake_teleop.studies.runs import run_study
+from drake_teleop.studies.runs import Told, run_study
 from drake_teleop.studies.store import open_store
 from drake_teleop.studies.study import LoadStudy, study_command
 
@@ -471,9 +471,9 @@ def test_measures_of_a_known_motion():
     )
 
 
-def test_a_preset_brings_its_values(files):
+def test_a_preset_brings_its_values():
     """A factor acts as if it stood in the file: a preset is more than its name."""
-    work = studies.StationWork({}, "x", (), 1.0, files / "loads")
+    work = studies.StationWork({}, "x", (), 1.0)
     ideal = work.scenario({"wrist_sensor.preset": "ideal"}, 3)
     assert ideal.simulation.seed == 3
     assert ideal.wrist_sensor != work.scenario({}, 3).wrist_sensor
@@ -534,3 +534,37 @@ def test_a_run_has_one_thread_of_blas_so_that_its_bytes_are_the_same_in_any_proc
         rows = run_study(study, tmp_path, threads, {}, jobs=1)
         assert threads({}, 0) == {"hand_work_J": 2.0}
     assert rows["hand_work_J"].to_list() == [1.0, 1.0]
+
+
+def test_the_time_that_is_left_follows_from_the_last_runs():
+    """The first two identify a load; each of the others takes two seconds, four at once."""
+    shown = []
+    told = Told(100)
+    told.start(lambda fraction, words="": shown.append((fraction, words)), 4)
+    told.found(20)
+    assert shown == [(0.2, "20/100, the first runs begin")]
+    told.more([{"seconds": 9.0}] * 2)
+    assert shown[-1] == (0.22, "22/100, about 0:02:56 left")
+    for _ in range(18):
+        told.more([{"seconds": 2.0}])
+    told.more([{"error": "the run has ended its process"}])
+    assert shown[-1] == (0.41, "41/100, about 0:00:30 left")
+    told.more([{"seconds": 2.0}] * 59)
+    assert shown[-1] == (1.0, "100/100, about 0:00:00 left")
+
+
+def test_rows_of_a_large_study_come_one_by_one_at_first(tmp_path):
+    """A chunk of eight runs would be the first thing to be seen of it."""
+    factor = Factor("a.b", low=0.0, high=1.0, levels=1000)
+    study = Study(factors=[factor], repeats=5, measures=["hand_work_J"])
+    sizes = []
+
+    def work(values, seed):
+        if len(sizes) == 20:
+            raise KeyboardInterrupt
+        sizes.append(len(list((tmp_path / "runs.parquet").iterdir())))
+        return {"hand_work_J": values["a.b"]}
+
+    with pytest.raises(KeyboardInterrupt, match="keeps 20 of 5000 runs"):
+        run_study(study, tmp_path, work, {}, jobs=1)
+    assert sizes == list(range(20))

@@ -1,0 +1,83 @@
+"""Bars are shown to whom looks, unless one argument says no, and only of what takes its time."""
+
+from __future__ import annotations
+
+import inspect
+import io
+
+import numpy as np
+import pytest
+import rich
+from rich.console import Console
+
+from drake_teleop import identify_load, run_scenario, simulate
+from drake_teleop.analysis.analyze import analyze, analyze_command
+from drake_teleop.comparison.compare_passivity import compare_command
+from drake_teleop.excitation.command import excite_command
+from drake_teleop.excitation.excite import excite
+from drake_teleop.identified_load import identified_load
+from drake_teleop.pages.progress import show_progress, silent
+from drake_teleop.reproduction.reproduce import reproduce_command
+from drake_teleop.run import run_command
+from drake_teleop.studies.runs import run_study
+from drake_teleop.studies.scaling_study import scaling_study_command
+from drake_teleop.studies.study import study_command
+
+SLOW = [
+    *(identify_load, identified_load, run_scenario, simulate, analyze, excite, run_study),
+    *(run_command, study_command, scaling_study_command, analyze_command, compare_command),
+    *(excite_command, reproduce_command),
+]
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """What a terminal would show."""
+    written = io.StringIO()
+    monkeypatch.setattr(rich, "_console", Console(file=written, force_terminal=True, width=100))
+    return written
+
+
+@pytest.mark.parametrize("function", SLOW, ids=lambda function: function.__name__)
+def test_what_takes_long_shows_it_unless_progress_is_false(function):
+    assert inspect.signature(function).parameters["progress"].default is True
+    assert "progress" in (function.__doc__ or "") or function is run_study
+
+
+def shown(progress, **options) -> None:
+    with show_progress(progress, **options) as stage:
+        told = stage("Counting sheep")
+        for fraction in np.linspace(0, 1, 5):
+            told(fraction, f"{fraction:.2f}")
+
+
+def test_a_terminal_shows_each_stage(terminal):
+    shown(True)
+    text = terminal.getvalue()
+    assert "Counting sheep" in text and "100%" in text
+
+
+def test_nothing_is_shown_if_nobody_looks_or_wants_it(terminal, monkeypatch):
+    shown(False)
+    shown(silent)
+    shown(True, after=3600.0)  # done before
+    file = io.StringIO()
+    monkeypatch.setattr(rich, "_console", Console(file=file, force_terminal=False))
+    shown(True)
+    assert terminal.getvalue() == file.getvalue() == ""
+
+
+def test_a_callers_stages_go_on_in_what_it_calls(terminal):
+    with show_progress(True) as stage, show_progress(stage) as same:
+        assert same is stage
+    calls = []
+    shown(lambda name: lambda fraction, words="": calls.append((name, fraction)))
+    assert calls[-1] == ("Counting sheep", 1.0) and len(calls) == 5
+
+
+def test_bars_within_bars_are_no_error(terminal):
+    with show_progress(True) as stage:
+        stage("Outside")(0.5)
+        shown(True)
+    assert "Outside" in terminal.getvalue()
+    shown(True)
