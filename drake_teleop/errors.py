@@ -33,6 +33,6 @@ def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = 
     """
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
-        wanted = " or ".join(one.__name__ for one in kinds)
+        wanted = " or ".join("None" if one is type(None) else one.__name__ for one in kinds)
         found = reprlib.repr(value)
         raise DrakeTeleopError(f"expected {wanted}, found {found}", where=where, remedy=remedy)

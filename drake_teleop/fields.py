@@ -6,14 +6,12 @@ Help texts, references and schemas are made from it, so that each says what the 
 from __future__ import annotations
 
 import dataclasses
-import types
-import typing
 from dataclasses import dataclass
 from inspect import cleandoc
 from textwrap import TextWrapper
 from typing import Any, TypeVar
 
-from drake_teleop.quantities import KINDS, check_name
+from drake_teleop.quantities import KINDS, check_name, kind_of
 
 _Class = TypeVar("_Class", bound=type)
 
@@ -100,7 +98,8 @@ def fields_of(config: Any) -> list[FieldInfo]:
 
 
 def _info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
-    lists, items, optional = _unfold(entry.type)
+    hint: Any = entry.type
+    lists, items, optional = kind_of(hint)
     blocks = tuple(item for item in items if item not in KINDS)
     known = entry.metadata
     return FieldInfo(
@@ -117,18 +116,6 @@ def _info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
         blocks=blocks,
         meaning=known.get("doc") or _first_line(blocks[0]),
     )
-
-
-def _unfold(hint: Any) -> tuple[int, tuple[Any, ...], bool]:
-    """list[A | B] | None as (1, (A, B), True)."""
-    if typing.get_origin(hint) is list:
-        lists, items, _ = _unfold(typing.get_args(hint)[0])
-        return lists + 1, items, False
-    if typing.get_origin(hint) not in (typing.Union, types.UnionType):
-        return 0, (hint,), False
-    options = tuple(option for option in typing.get_args(hint) if option is not type(None))
-    lists, items, _ = _unfold(options[0]) if len(options) == 1 else (0, options, False)
-    return lists, items, len(options) < len(typing.get_args(hint))
 
 
 def _default(entry: dataclasses.Field[Any]) -> Any:

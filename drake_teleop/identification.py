@@ -102,6 +102,7 @@ class LoadIdentification:
 
 def slave_arm(scenario: Scenario) -> ArmModel:
     """The arm of a scenario's slave, with tool and payload as its load."""
+    check_scenario(scenario)
     return NominalSlave(scenario.slave.payload).arm
 
 
@@ -116,6 +117,7 @@ def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
     If contact is to be detected, it is logged at the rate at which that is done: the noise floor
     tells how alike samples are that follow each other.
     """
+    check_scenario(scenario)
     rates = scenario.rates
     if scenario.contact_detection is not None:
         rates = dataclasses.replace(rates, log_hz=rates.estimator_hz)

@@ -15,7 +15,7 @@ import reprlib
 import types
 import typing
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from drake_teleop.errors import DrakeTeleopError
 
@@ -69,13 +69,13 @@ def check_structure(schema: type, data: Any, where: str) -> None:
             where=where,
             remedy=f"the fields are {', '.join(_names(schema))}",
         )
-    hints = _hints(schema)
+    kinds = _kinds(schema)
     for key, value in data.items():
         if key == "_tag":
             continue
         place = _inside(where, key)
         check_name(schema, key, place)
-        _check_kind(hints[key], value, place, from_file=True)
+        _check_kind(kinds[key], value, place, from_file=True)
 
 
 def check_name(schema: type, name: Any, where: str) -> None:
@@ -94,10 +94,10 @@ def check_ranges(config: Any, where: str) -> None:
         DrakeTeleopError: naming the field, its unit and the range, for a value that is of another
             kind, outside, not finite, of the wrong length or not among the choices.
     """
-    hints = _hints(config.__class__)
+    kinds = _kinds(config.__class__)
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), _inside(where, field.name)
-        _check_kind(hints[field.name], value, place, from_file=False)
+        _check_kind(kinds[field.name], value, place, from_file=False)
         if "choices" in field.metadata:
             if value not in field.metadata["choices"]:
                 allowed = ", ".join(field.metadata["choices"])
@@ -134,50 +134,73 @@ def _inside(where: str, name: Any) -> str:
 
 
 @functools.cache
-def _hints(schema: type) -> dict[str, Any]:
-    return typing.get_type_hints(schema)
+def _kinds(schema: type) -> dict[str, Kind]:
+    return {name: kind_of(hint) for name, hint in typing.get_type_hints(schema).items()}
 
 
 def _names(schema: type) -> list[str]:
     return [field.name for field in dataclasses.fields(schema)]
 
 
-def _check_kind(hint: Any, value: Any, place: str, *, from_file: bool) -> None:
+class Kind(NamedTuple):
+    """What the type of a field says: `list[A | B] | None` is (1, (A, B), True)."""
+
+    lists: int
+    items: tuple[Any, ...]
+    optional: bool
+
+
+@functools.cache
+def kind_of(hint: Any) -> Kind:
+    """The type of a field, taken apart."""
+    if typing.get_origin(hint) is list:
+        inner = kind_of(typing.get_args(hint)[0])
+        return Kind(inner.lists + 1, inner.items, False)
+    if typing.get_origin(hint) not in (typing.Union, types.UnionType):
+        return Kind(0, (hint,), False)
+    options = tuple(option for option in typing.get_args(hint) if option is not type(None))
+    inner = kind_of(options[0]) if len(options) == 1 else Kind(0, options, False)
+    return inner._replace(optional=len(options) < len(typing.get_args(hint)))
+
+
+def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
     """Descends into lists; refuses words where numbers are wanted, and the like.
 
     Args:
-        hint: the type of the field.
+        kind: of the field.
         value: what stands there.
         place: for the message.
         from_file: whether it is what a YAML parser made of a file. Then blocks are mappings, which
             are descended into, and a number may be a word still, such as 1e-3.
     """
-    origin = typing.get_origin(hint)
-    options = typing.get_args(hint) if origin in (typing.Union, types.UnionType) else (hint,)
-    if value is None and type(None) in options:
+    first = kind.items[0]
+    if value is None and kind.optional:
         return
-    options = tuple(option for option in options if option is not type(None))
-    classes = (option for option in options if isinstance(option, type))
-    variants = {option.__name__: option for option in classes if dataclasses.is_dataclass(option)}
-    if variants and not from_file:
-        if not isinstance(value, tuple(variants.values())):
-            raise _unexpected(" or ".join(variants), value, place)
-    elif variants:
-        tag = value.get("_tag", "").lstrip("!") if isinstance(value, dict) else ""
-        if tag and tag not in variants:
-            raise DrakeTeleopError(
-                f"'!{tag}' is not known", where=place, remedy=f"use one of !{', !'.join(variants)}"
-            )
-        check_structure(variants.get(tag) or next(iter(variants.values())), value, place)
-    elif typing.get_origin(options[0]) is list:
+    if kind.lists:
         if not isinstance(value, list):
             raise _unexpected("a list", value, place, "write it in brackets: [...]")
+        inner = Kind(kind.lists - 1, kind.items, False)
         for index, item in enumerate(value):
-            inner = typing.get_args(options[0])[0]
             _check_kind(inner, item, f"{place}[{index}]", from_file=from_file)
-    elif not _is_of(options[0], value, from_file=from_file):
-        remedy = "write the number alone; its unit is in the field's name or documentation"
-        raise _unexpected(KINDS[options[0]], value, place, remedy if options[0] is float else "")
+    elif first in KINDS:
+        if not _is_of(first, value, from_file=from_file):
+            remedy = "write the number alone; its unit is in the field's name or documentation"
+            raise _unexpected(KINDS[first], value, place, remedy if first is float else "")
+    elif from_file:
+        check_structure(_block(kind.items, value, place), value, place)
+    elif not isinstance(value, kind.items):
+        raise _unexpected(" or ".join(block.__name__ for block in kind.items), value, place)
+
+
+def _block(blocks: tuple[type, ...], value: Any, place: str) -> type:
+    """The one that the tag of a mapping tells; the first if it has none."""
+    names = [block.__name__ for block in blocks]
+    tag = value.get("_tag", "").lstrip("!") if isinstance(value, dict) else ""
+    if tag and tag not in names:
+        raise DrakeTeleopError(
+            f"'!{tag}' is not known", where=place, remedy=f"use one of !{', !'.join(names)}"
+        )
+    return blocks[names.index(tag) if tag else 0]
 
 
 def _is_of(kind: type, value: Any, *, from_file: bool) -> bool:

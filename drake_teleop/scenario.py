@@ -248,8 +248,8 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
         check_name(Scenario, block, f"scenario:{block}")
         if inner:
             config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
-            if config is None:
-                raise DrakeTeleopError(f"there is no {block} to change", where=place)
+            if config is None or isinstance(config, str):
+                raise DrakeTeleopError(f"there is no block {block} to change", where=place)
             check_name(type(config), inner, place)
             value = dataclasses.replace(config, **{inner: value})
         scenario = dataclasses.replace(scenario, **{block: value})  # type: ignore[arg-type]

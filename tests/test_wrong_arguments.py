@@ -10,9 +10,17 @@ import numpy as np
 import pytest
 
 import drake_teleop as dt
+from drake_teleop.analysis.linearization import linearize, linearize_station
+from drake_teleop.excitation.robot import RobotFromScenario
 from drake_teleop.identification import true_load
+from drake_teleop.identified_load import identified_load
+from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.scenario import replace
+from drake_teleop.sides.channel import MakeChannel
+from drake_teleop.sides.master import MakeMasterSide
+from drake_teleop.sides.slave import MakeSlaveSide
 from drake_teleop.simulation import simulate
+from drake_teleop.studies.study import LoadStudy
 
 N3, N6, N10 = np.ones((4, 3)), np.ones((4, 6)), np.ones(10)
 NAME: Any = "free_motion_force"
@@ -57,6 +65,15 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "replace": (lambda: replace(NAME, simulation__seed=1), "scenario"),
     "LoadScenario": (lambda: dt.LoadScenario(dt.Scenario()), "scenario"),  # type: ignore[arg-type]
     "simulate": (lambda: simulate(NAME, NAME), "diagram"),
+    "MakeMasterSide": (lambda: MakeMasterSide(NAME), "scenario"),
+    "MakeChannel": (lambda: MakeChannel(NAME), "scenario"),
+    "MakeSlaveSide": (lambda: MakeSlaveSide(NAME), "scenario"),
+    "identified_load": (lambda: identified_load(NAME), "scenario"),
+    "RobotFromScenario": (lambda: RobotFromScenario(NAME), "scenario"),
+    "linearize": (lambda: linearize(NAME), "scenario"),
+    "linearize_station": (lambda: linearize_station(NAME), "scenario"),
+    "LoadStudy": (lambda: LoadStudy(dt.Scenario()), "study"),  # type: ignore[arg-type]
+    "a block that is none": (lambda: replace(dt.Scenario(), description__x=1), "description.x"),
     # Loads and arrays.
     "a load of length 10": (lambda: station(load_estimate=N10), "load_estimate"),
     "a load in words": (lambda: station(load_estimate="heavy"), "load_estimate"),
@@ -71,6 +88,8 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "scaled_wrench": (lambda: scaled(gamma=HALF), "gamma"),
     "a scale of None": (lambda: scaled(sigma_object=None), "sigma_object"),
     "identify": (lambda: dt.identify(N3, N3, N3, N3), "wrench"),
+    "a delay": (lambda: dt.identify(N6, N3, N3, N3, delay_s=HALF), "delay_s"),
+    "noise": (lambda: identify_batch(N6, N3, N3, N3, noise=HALF), "noise"),
     # Logs.
     "read_log": (lambda: dt.read_log(7), "log"),  # type: ignore[arg-type]
     "a filter": (lambda: dt.read_log("log.csv", bandwidth_hz=HALF), "bandwidth_hz"),

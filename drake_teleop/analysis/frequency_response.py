@@ -25,7 +25,7 @@ from drake_teleop.analysis.task_direction import TaskDirection
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.operator.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import Scenario, replace
+from drake_teleop.scenario import Scenario, check_scenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import ArmModel, jacobian
 from drake_teleop.slave.plant import AddSlavePlant
@@ -178,6 +178,7 @@ def measure_frequency_response(
         DrakeTeleopError: if a period is not a whole number of steps of the hand, or as for
             `MakeTeleopStation`.
     """
+    check_scenario(scenario)
     rate = scenario.rates.hand_hz
     steps = round(excitation.period * rate)
     if abs(steps - excitation.period * rate) > 1e-6:

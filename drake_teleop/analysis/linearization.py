@@ -42,10 +42,11 @@ from drake_teleop.analysis.two_port import two_port
 from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.point_contact import FRICTION
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import checked
 from drake_teleop.master import phantom
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
-from drake_teleop.scenario import Scenario, replace
+from drake_teleop.scenario import Scenario, check_scenario, replace
 from drake_teleop.sensor.sensor_chain import without
 from drake_teleop.simulation import MakeSimulator
 from drake_teleop.slave.arm import jacobian
@@ -256,7 +257,9 @@ def linearize(
         DrakeTeleopError: if the rates have no common period that a cut can be made at, or if the
             slave does not come to rest.
     """
+    check_scenario(scenario)
     if load_estimate is not None:
+        load_estimate = checked("load_estimate", load_estimate, 16)
         # The sensor has no offset here, so there is none to subtract.
         load_estimate = np.concatenate([np.zeros(6), load_estimate[6:]])
     period = _Period(scenario, load_estimate)
@@ -289,6 +292,7 @@ def linearize_station(
         DrakeTeleopError: as `linearize`, or if a method of passivity is in the channel, which is
             not linear.
     """
+    check_scenario(scenario)
     if scenario.passivity.method != "none":
         raise DrakeTeleopError(
             f"'{scenario.passivity.method}' is not linear",

@@ -20,8 +20,9 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.analysis.one_axis import OneAxis
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import checked
 from drake_teleop.master import phantom
-from drake_teleop.scenario import Scenario
+from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.slave.arm import ArmModel, forward_kinematics, inverse_dynamics, jacobian
 from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
 from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, home_position
@@ -87,7 +88,8 @@ def task_direction(
         DrakeTeleopError: for a direction of length zero, a pose out of reach, or gripper and object
             that are scaled differently.
     """
-    n_W = np.asarray(direction, dtype=float)
+    check_scenario(scenario)
+    n_W = checked("direction", direction, 3)
     if not np.linalg.norm(n_W) > 0.0:
         raise DrakeTeleopError("a direction of length zero", where="direction")
     sigma, sigma_object, gamma = scenario.force_scaling.scales()
@@ -100,7 +102,7 @@ def task_direction(
     n_W = n_W / np.linalg.norm(n_W)
     scaling, hand = scenario.kinematic_scaling, scenario.operator.hand
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
-    moved_B = np.asarray(displacement, dtype=float)
+    moved_B = checked("displacement", displacement, 3)
     hand_B = np.concatenate([R_WB.T @ n_W, np.zeros(3)])
     device_mass, device_damping = _device(scenario, moved_B, hand_B)
     slave = scenario.slave

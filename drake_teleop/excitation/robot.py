@@ -26,7 +26,7 @@ from drake_teleop.excitation.prediction import SensorNoise, sensor_noise
 from drake_teleop.excitation.scene import CLEARANCE, Parse, Scene
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.scenario import Scenario
+from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.slave.arm import ArmModel
@@ -93,6 +93,7 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     Raises:
         DrakeTeleopError: if the arm cannot reach the scenario's start.
     """
+    check_scenario(scenario)
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         instance, tool = ParseSlave(plant)

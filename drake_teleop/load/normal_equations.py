@@ -43,7 +43,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked, checked_rows, positive
+from drake_teleop.load.arrays import Array, checked, checked_rows, number, positive
 from drake_teleop.load.identification import METHODS, Identification, worth_stating
 from drake_teleop.load.regressor import regressor_into
 
@@ -132,7 +132,7 @@ class NormalEquations:
             covariance=covariance,
             identifiable=worth_stating(np.sqrt(np.diag(covariance)), theta[6:]),
             condition_number=condition_number,
-            delay_s=float(delay_s),
+            delay_s=number("delay_s", delay_s),
             residual_rms=np.sqrt(self.residual_squares(theta) / self.samples),
             method=METHODS[0],
             samples=self.samples,

@@ -8,7 +8,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
 from drake_teleop.channel.channel import TeleopChannel
-from drake_teleop.scenario import Scenario
+from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sides.ports import export
 from drake_teleop.slave.plant import R_WS_HOME
 
@@ -34,6 +34,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         - contact_at_hand: signal (with contact detection)
         - pose_received, ports: signals (over a network)
     """
+    check_scenario(scenario)
     builder = DiagramBuilder()
     if scenario.is_direct:
         wires = [("pose_command", "pose_to_slave", 7), ("wrench_B", "wrench_to_master", 6)]

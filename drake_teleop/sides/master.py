@@ -14,7 +14,7 @@ from drake_teleop.master.phantom import inverse_kinematics
 from drake_teleop.operator.decision import Training
 from drake_teleop.operator.operator import Operator
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
-from drake_teleop.scenario import Scenario
+from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sides.ports import export
 from drake_teleop.slave.plant import R_WS_HOME, NominalSlave
 
@@ -44,6 +44,7 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
     Raises:
         DrakeTeleopError: for a value that cannot be right.
     """
+    check_scenario(scenario)
     hand, scaling = scenario.operator.hand, scenario.kinematic_scaling
     start_B = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     start_W = np.array([*R_WS_HOME.ToQuaternion().wxyz(), *scenario.slave.position])

@@ -16,7 +16,7 @@ from drake_teleop.load.arrays import checked, learnt
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.scaling.force_scaling import ForceScaling
-from drake_teleop.scenario import Scenario
+from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.sensor.wrist_sensor import AddWristSensor
 from drake_teleop.sides.ports import export
@@ -67,6 +67,7 @@ def MakeSlaveSide(
         DrakeTeleopError: for a value that cannot be right, a start out of reach, scales that mean
             something only if the load is known while it is not, or detection without its floor.
     """
+    check_scenario(scenario)
     _check_load_is_known(scenario, load_estimate)
     if load_covariance is not None:
         checked("load_covariance", load_covariance, 16, 16)

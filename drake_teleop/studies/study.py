@@ -50,7 +50,7 @@ import yaml
 from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, expect
 from drake_teleop.quantities import check_ranges, check_structure
 from drake_teleop.resources import studies_dir
 from drake_teleop.run import run_scenario
@@ -148,6 +148,7 @@ def study_file(name_or_path: str | Path) -> Path:
     Raises:
         DrakeTeleopError: if there is neither.
     """
+    expect((str, Path), name_or_path, "study")
     shipped = studies_dir() / f"{name_or_path}.yaml"
     path = shipped if shipped.is_file() else Path(name_or_path)
     if not path.is_file():

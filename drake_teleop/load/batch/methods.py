@@ -41,7 +41,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, expect
 from drake_teleop.load.arrays import Array, checked_rows
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
 from drake_teleop.load.batch.covariance import (
@@ -231,6 +231,7 @@ def identify_batch(
             finite, fewer than 3 samples, or a wrench that is zero throughout.
     """
     check_method(method)
+    expect((Noise, type(None)), noise, "noise")
     if method != "consistent" and (prior, ellipsoid) != (None, None):
         raise DrakeTeleopError(
             f"{method!r} takes no prior and no ellipsoid", where="method", remedy="use consistent"
