@@ -9,7 +9,8 @@ leaf           it bends further than its model goes
 safe state     an end of the channel has heard nothing for longer than `channel.timeout`
 behind         the command that leaves the channel, or a joint, is not within the range of what it
                was asked for within the time that delay and bandwidth explain
-hunting        the hand or a joint goes to and fro, while what it was asked for does not
+hunting        the hand, the command that leaves the channel or a joint goes to and fro, while what
+               it was asked for does not
 ============== =================================================================================
 
 The first four are said however short they were, the others if they last for longer than 0.2 s.
@@ -42,11 +43,12 @@ _GAP = 0.05
 _AT_LIMIT = 1 - 1e-9
 # How far behind is behind: command [m], its turn [rad], joint [rad], 3 mm at a reach of 1 m.
 _FAR, _TURNED, _JOINT_FAR = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
-# To and fro by more than this is hunting: hand [m], joint [rad].
-_HAND_SWING, _JOINT_SWING = 5e-4, np.deg2rad(0.1)
-# So many turns make it hunting, each within this time of the one before [s]; and so near to a turn
-# of the command a turn is that one's.
-_TURNS, _SLOWEST, _NEAR = 4, 0.5, 0.25
+# To and fro by more than this is hunting: hand and command [m], their turn [rad], joint [rad].
+_SWING, _TURN_SWING, _JOINT_SWING = 5e-4, np.deg2rad(0.5), np.deg2rad(0.1)
+NEAR = 0.25
+"""So near to a turn of the command [s] a turn is that one's."""
+# So many turns make it hunting, each within this time of the one before [s].
+_TURNS, _SLOWEST = 4, 0.5
 # After so many time constants of the position loop a command has been met to 0.3 %.
 _TIME_CONSTANTS = 6.0
 # More times than this are counted, not listed.
@@ -126,23 +128,24 @@ def turns(x: Array, swing: float) -> NDArray[np.intp]:
     return np.array(found, dtype=np.intp)
 
 
-def hunts(t: Array, command: Array, actual: Array, swing: float) -> Flags:
+def hunts(t: Array, command: Array, actual: Array, swing: float, near: float = NEAR) -> Flags:
     """(N,) whether the actual motion goes to and fro while the commanded one does not.
 
-    Four turns or more, each within 0.5 s of the one before. A turn within 0.25 s of one of the
-    command is its answer; but only one for each.
+    Four turns or more, each within 0.5 s of the one before. A turn that is near one of the command
+    is its answer; but only one for each.
 
     Args:
         t: (N,) [s].
         command, actual: (N, k) in one unit; a turn of any component of the command counts.
         swing: in that unit.
+        near: [s].
     """
     asked = np.sort(np.concatenate([t[turns(x, swing)] for x in command.T]))
     hunting = np.zeros(len(t), dtype=bool)
     for x in actual.T:
         mine = turns(x, swing)
         for time in asked:
-            if len(mine) and abs(t[mine] - time).min() < _NEAR:
+            if len(mine) and abs(t[mine] - time).min() < near:
                 mine = np.delete(mine, abs(t[mine] - time).argmin())
         for chain in np.split(mine, np.flatnonzero(np.diff(t[mine]) > _SLOWEST) + 1):
             if len(chain) >= _TURNS:
@@ -194,10 +197,7 @@ def _channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str
     window = longest_delay(scenario.channel.lines()[0]) + timeout
     sent, received = result["pose_command"], result["pose_received"]
     far = behind(t, sent[:, 4:], received[:, 4:], window)
-    # Twice the part of a quaternion that a small turn changes is the turn's angle.
-    sent_turn, turn = (2 * q[:, :4] * np.sign(q[:, :4] @ sent[0, :4])[:, np.newaxis]
-                       for q in (sent, received))  # fmt: skip
-    turned = behind(t, sent_turn, turn, window)
+    turned = behind(t, _turned(sent, sent), _turned(received, sent), window)
     by = f"{scenario.passivity.method}, network {scenario.channel.network}"
     for values, least, unit, scale in (
         (far, _FAR, "mm", 1e3),
@@ -209,6 +209,8 @@ def _channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str
             f" {scale * _largest_in(t, values, spans):.1f} {unit} more than its delay explains,",
             spans,
         )
+    hunting = _sways(t, sent, received, NEAR + window)
+    yield f"the channel ({by}) lets the slave hunt, to and fro", spans_of(t, hunting, LASTING)
 
 
 def _joints(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
@@ -230,9 +232,24 @@ def _joints(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str,
 
 def _hand(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
     if "intent" in result and "pose_master" in result:
-        wanted, actual = result["intent"][:, 4:], result["pose_master"][:, 4:]
-        hunting = hunts(result.t, wanted, actual, _HAND_SWING)
+        hunting = _sways(result.t, result["intent"], result["pose_master"], NEAR)
         yield "the hand hunts: it is shaken to and fro", spans_of(result.t, hunting, LASTING)
+
+
+def _sways(t: Array, command: Array, actual: Array, near: float) -> Flags:
+    """(N,) whether a pose (N, 7) hunts, by its place or its orientation."""
+    turned, wanted = (_turned(pose, command) for pose in (actual, command))
+    swaying = hunts(t, command[:, 4:], actual[:, 4:], _SWING, near)
+    return swaying | hunts(t, wanted, turned, _TURN_SWING, near)
+
+
+def _turned(pose: Array, reference: Array) -> Array:
+    """(N, 4) of which a small change is as large as the turn [rad]: twice the quaternion.
+
+    Its sign is that of the first pose of the reference.
+    """
+    q: Array = pose[:, :4]
+    return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
 
 
 def _joint_error(result: SimulationResult) -> Array:
@@ -267,7 +284,10 @@ def _largest_in(t: Array, values: Array, spans: Spans) -> float:
 
 
 def _when(spans: Spans) -> str:
-    listed = [f"from {start:.3f} to {stop:.3f} s" for start, stop in spans[:_LISTED]]
+    listed = [
+        f"from {start:.3f} to {stop:.3f} s" if stop > start else f"at {start:.3f} s"
+        for start, stop in spans[:_LISTED]
+    ]
     more = len(spans) - _LISTED
     if more > 0:
         listed.append(f"{more} more time{'s' if more > 1 else ''}")

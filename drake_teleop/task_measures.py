@@ -195,7 +195,7 @@ def _wrong(result: SimulationResult, scenario: Scenario, task: Task, ended: int)
         held = float(_held(result.t, force, task, ended).mean())
         if abs(held - task.force) <= task.tolerance:
             return ""
-        return f"the tool pressed with {held:.1f} N, not {task.force:g} ± {task.tolerance:g} N"
+        return f"the tool pressed with {held:.2f} N, not {task.force:g} ± {task.tolerance:g} N"
     if isinstance(task, Touch) and force[ended] > 0.0:
         return ""
     off = _tip_from_target(result, scenario, task, ended)

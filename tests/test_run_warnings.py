@@ -69,6 +69,7 @@ def recorded(**changed):
 
 PLANTED = [
     ("saturated", (0, during(1.0, 1.1)), "the wrist sensor saturates from 1.000 to 1.100 s"),
+    ("saturated", (0, during(1.0, 1.0)), "the wrist sensor saturates at 1.000 s"),
     ("ik_status", (0, 3.0 * during(1, 2)), "OUT_OF_REACH from 1.000 to 2.000 s"),
     ("joint_torque", (4, 1e4 * during(2.5, 2.6)), "joint 5 is at its largest torque"),
     ("joint_command", (0, 0.2 * during(2.0, 2.1)), "joint 1 is at its largest speed"),
@@ -83,6 +84,9 @@ PLANTED = [
     ("slave_state", (5, 0.01 * during(1, 1.5)), "joint 6 is up to 0.6 degrees behind"),
     ("slave_state", (3, 0.004 * np.sin(40 * T) * during(1, 2)), "the slave hunts"),
     ("pose_master", (5, 0.002 * np.sin(15 * T) * during(1, 3)), "the hand hunts"),
+    ("pose_master", (1, 0.005 * np.sin(190 * T) * during(2, 3)), "the hand hunts: it is shaken to"
+     " and fro from 2.0"),
+    ("pose_received", (2, 0.005 * np.sin(40 * T) * during(2, 3)), "lets the slave hunt"),
 ]  # fmt: skip
 
 
