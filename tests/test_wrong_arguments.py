@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from drake_teleop.studies.study import LoadStudy
 N3, N6, N10 = np.ones((4, 3)), np.ones((4, 6)), np.ones(10)
 NAME: Any = "free_motion_force"
 HALF: Any = "half"
+FOUND: Any = SimpleNamespace(estimate=np.ones(16))  # such as identify_load gives
 LOADED: Any = {"load_estimate": np.ones(16)}
 
 
@@ -78,6 +80,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "a load of length 10": (lambda: station(load_estimate=N10), "load_estimate"),
     "a load in words": (lambda: station(load_estimate="heavy"), "load_estimate"),
     "a result for a load": (lambda: station(load_estimate=object()), "load_estimate"),
+    "all that was identified": (lambda: station(load_estimate=FOUND), "load_estimate"),
     "a load that is NaN": (lambda: station(load_estimate=np.full(16, np.nan)), "load_estimate"),
     "a covariance": (lambda: station(load_covariance=N10, **LOADED), "load_covariance"),
     "a side": (lambda: station(master=NAME), "master"),
@@ -85,6 +88,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "regressor": (lambda: dt.regressor(N3, N6, N3), "omega"),
     "non_contact_wrench": (lambda: dt.non_contact_wrench(N3, N3, N3, np.ones(16)), "phi"),
     "contact_wrench": (lambda: dt.contact_wrench(N6, HALF, N3, N3, N3, N10), "offsets"),
+    "its load": (lambda: dt.contact_wrench(N6, np.zeros(6), N3, N3, N3, N3), "phi"),
     "scaled_wrench": (lambda: scaled(gamma=HALF), "gamma"),
     "a scale of None": (lambda: scaled(sigma_object=None), "sigma_object"),
     "identify": (lambda: dt.identify(N3, N3, N3, N3), "wrench"),

@@ -110,7 +110,7 @@ def contact_wrench(
         s,
         omega,
         alpha,
-        phi,
+        checked("phi", phi, 10),
         np.zeros(10),
         sigma_gripper=0.0,
         sigma_object=0.0,

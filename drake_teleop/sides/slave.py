@@ -244,6 +244,12 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputP
 
 
 def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
+    if hasattr(estimate, "estimate"):
+        raise DrakeTeleopError(
+            f"expected 16 numbers, found {type(estimate).__name__}",
+            where="load_estimate",
+            remedy="pass its .estimate",
+        )
     if estimate is not None:
         estimate = checked("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
