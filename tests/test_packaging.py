@@ -28,7 +28,7 @@ assert models_dir() == home / "models" and scenarios_dir() == home / "scenarios"
 assert files("drake_teleop.reproduction").joinpath("report.html.j2").is_file()
 for name in drake_teleop.ScenarioNames():
     scenario = drake_teleop.LoadScenario(name)
-    station = drake_teleop.MakeTeleopStation(scenario, load_estimate=[0.0] * 16)
+    station = drake_teleop.MakeTeleopStation(scenario, load_estimate=[1.0] * 16)
     print(station.get_name(), name)
 """
 
