@@ -178,6 +178,7 @@ def identify(
     metavar="SECONDS",
     help="With --causal: an untouched start that the offsets are of.  [default: the load file's]",
 )
+@option.free
 @option.out("eliminate")
 @option.cutoff
 @option.delay
@@ -192,6 +193,7 @@ def eliminate(
     eta: float | None,
     causal: str | None,
     causal_tare_s: float | None,
+    free: Path | None,
     out: Path,
     cutoff_hz: float,
     delay: float | str,
@@ -215,6 +217,7 @@ def eliminate(
         eta=eta,
         causal=causal,
         causal_tare_s=causal_tare_s,
+        free=free,
         cutoff_hz=cutoff_hz,
         delay=delay,
         quiet=quiet,
@@ -228,12 +231,7 @@ def eliminate(
     type=option.PATH,
     help="The identification.json of the load.  [default: identified from LOG itself]",
 )
-@click.option(
-    "--free",
-    type=option.PATH,
-    metavar="LOG",
-    help="Free motion with this load, which sets the threshold.  [default: what is quiet in LOG]",
-)
+@option.free
 @click.option(
     "--statistic",
     type=click.Choice(["level", "cusum", "glr"]),

@@ -119,6 +119,15 @@ gripper = click.option(
 )
 
 
+free = click.option(
+    "--free",
+    type=PATH,
+    metavar="LOG",
+    help="Free motion with this load, which sets the threshold of contact."
+    "  [default: what is quiet in LOG]",
+)
+
+
 class Names(click.ParamType):
     """Names with commas between them."""
 

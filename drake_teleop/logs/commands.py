@@ -107,6 +107,7 @@ def eliminate_command(
     eta: float | None = None,
     causal: str | None = None,
     causal_tare_s: float | None = None,
+    free: Path | None = None,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     quiet: bool = False,
@@ -131,6 +132,7 @@ def eliminate_command(
         eta=eta,
         causal=causal,
         causal_tare_s=causal_tare_s,
+        free=free,
         cutoff_hz=cutoff_hz,
         delay=delay,
     )
@@ -141,6 +143,7 @@ def eliminate_command(
         "sigma_object": sigma_object,
         "gamma": gamma,
         "eta": eta,
+        "free": None if free is None else str(free),
         "tare": found.offsets - load_file.offsets,
         "tare_fraction": found.tare_fraction,
     }
@@ -154,6 +157,10 @@ def eliminate_command(
             "less than half of the record agrees on the sensor's offsets: if it is in contact most"
             " of the time, the contact wrench may be off by a constant"
         )
+    if found.detection is not None:
+        summary["notes"] += found.detection.notes
+    elif not found.log.static:
+        summary["notes"].append(f"{len(found.log)} samples are too few to tell contact from noise")
     summary = plain(summary | rms_figures(found) | contact_figures(found, causal_tare_s))
     from drake_teleop.logs.pictures import draw_elimination
 

@@ -6,8 +6,8 @@ forces in N, torques in N m, frame S:
 ====================== ==========================================================================
 load                   the identification's file; null if it was identified from the log itself
 free                   the log of free motion that floor and threshold are of; null for the parts
-                       of the log itself in which nothing stands out
-                       (`drake_teleop.logs.contact.in_contact`)
+                       of the log itself in which nothing stands out, see
+                       `drake_teleop.logs.contact`
 free_s                 how much free motion that was
 statistic, threshold   see `drake_teleop.load.contact.statistics`
 noise                  [f; tau], standard deviation at rest
@@ -26,65 +26,32 @@ contacts               list of start_s, stop_s, peak_N, peak_Nm; and at the peak
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.contact.detection import ContactDetector
-from drake_teleop.load.contact.noise_floor import (
-    MARGIN,
-    STATISTICS,
-    NoiseFloor,
-    finite_covariance,
-    statistic_index,
-)
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
-from drake_teleop.load.contact.statistics import statistics
-from drake_teleop.load.contact.wrench_axis import wrench_axis
+from drake_teleop.load.contact.noise_floor import STATISTICS
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.contact import contacts_of
+from drake_teleop.logs.contact import FEWEST, Detection, contacts_of
 from drake_teleop.logs.figures import common_figures, plain, write_summary
 from drake_teleop.logs.printing import print_results
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
-from drake_teleop.logs.read.alignment import low_pass
-
-# Where the orientation is not known, gravity is what is slower than this in the specific force.
-_GRAVITY_HZ = 0.5
 
 
 @dataclass(frozen=True)
-class DetectedLog:
+class DetectedLog(Detection):
     """A log and where it is in contact, N samples.
 
     Args:
         eliminated: the log without its non-contact wrench.
-        floor: of the free motion.
-        statistic: one of `STATISTICS`.
-        threshold: of it.
-        statistics: (N, 3); 0 at the ends, which are not judged.
-        touched: (N,) contact, with hysteresis.
-        free_s: length of the free motion [s].
-        force_threshold: a quarter above the largest |F_c| of the free motion [N].
+        others: as of `Detection`.
     """
 
-    eliminated: EliminatedLog
-    floor: NoiseFloor
-    statistic: str
-    threshold: float
-    statistics: NDArray[np.float64]
-    touched: NDArray[np.bool_]
-    free_s: float
-    force_threshold: float
-
-    @property
-    def above(self) -> NDArray[np.bool_]:
-        """(N,) where the statistic reaches the threshold."""
-        return self.statistics[:, STATISTICS.index(self.statistic)] >= self.threshold
+    eliminated: EliminatedLog = field(kw_only=True)
 
 
 def detect_log(
@@ -119,66 +86,18 @@ def detect_log(
         load = identify_log(path, cutoff_hz=cutoff_hz, delay=delay).identification
     elif not isinstance(load, Identification):
         load = Identification.load(load)
-    found = eliminate_log(path, load, cutoff_hz=cutoff_hz, delay=delay)
-    calm = found
-    if free is not None:
-        calm = eliminate_log(free, load, cutoff_hz=cutoff_hz, delay=delay)
-    for log in (found.log, calm.log):
-        if log.static:
-            raise DrakeTeleopError("holds poses at rest, which have no contact", where=log.source)
-    statistic_index(statistic)  # refused here, if it is none
-    inner = _judged(calm, cutoff_hz)
-    quiet = ~calm.touched[inner] if free is None else slice(None)
-    train = _Samples(*(x[inner][quiet] for x in _samples(calm, cutoff_hz)))
-    # What was held fades by e within a period of the low-pass.
-    fade = math.exp(-calm.log.dt * cutoff_hz)
-    covariance = finite_covariance(found.phi, load.covariance, tared=True)
-    floor = fit_noise_floor(*train, covariance, fade=fade)
-    threshold = floor.threshold(statistic)
-
-    inner = _judged(found, cutoff_hz)
-    rows = _Samples(*(x[inner] for x in _samples(found, cutoff_hz)))
-    hold = round(1.0 / (cutoff_hz * found.log.dt))
-    detector = ContactDetector(floor, threshold, statistic=statistic, hold=hold)
-    values, touched = np.zeros((len(found.log), 3)), np.zeros(len(found.log), bool)
-    values[inner], touched[inner] = statistics(floor, *rows), detector.detect(*rows)
-    return DetectedLog(
-        eliminated=found,
-        floor=floor,
-        statistic=statistic,
-        threshold=threshold,
-        statistics=values,
-        touched=touched,
-        free_s=len(train.contact) * calm.log.dt,
-        force_threshold=MARGIN * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
+    found = eliminate_log(
+        path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
     )
-
-
-def _judged(found: EliminatedLog, cutoff_hz: float) -> slice:
-    """All but a period of the low-pass at both ends, where it passes the noise as it is."""
-    ends = max(1, round(1.0 / (cutoff_hz * found.log.dt)))
-    return slice(ends, len(found.log) - ends)
-
-
-class _Samples(NamedTuple):
-    """What the detectors take, N samples each."""
-
-    contact: NDArray[np.float64]
-    s: NDArray[np.float64]
-    omega: NDArray[np.float64]
-    alpha: NDArray[np.float64]
-    acceleration: NDArray[np.float64]
-
-
-def _samples(found: EliminatedLog, cutoff_hz: float) -> _Samples:
-    """Contact wrench and motion after the low-pass."""
-    log = found.log
-    s, omega, alpha = (low_pass(x, log.dt, cutoff_hz) for x in log.motion)
-    if log.gravity is not None:
-        gravity = low_pass(log.gravity, log.dt, cutoff_hz)
-    else:
-        gravity = -low_pass(log.specific_force, log.dt, _GRAVITY_HZ)
-    return _Samples(found.contact, s, omega, alpha, s + gravity)
+    if found.log.static:
+        raise DrakeTeleopError("holds poses at rest, which have no contact", where=found.log.source)
+    if found.detection is None:
+        raise DrakeTeleopError(
+            f"{len(found.log)} samples are too few to tell contact from noise",
+            where=found.log.source,
+            remedy=f"give a record of more than {FEWEST} samples",
+        )
+    return DetectedLog(**vars(found.detection), eliminated=found)
 
 
 def detect_command(
@@ -213,8 +132,9 @@ def detect_command(
         "in_contact": found.touched.mean(),
         "force_threshold": found.force_threshold,
         "above_force_threshold": _above_force(eliminated, found.force_threshold),
-        "contacts": _contacts(found),
+        "contacts": contacts_of(eliminated.log.t, eliminated.contact, found.touched),
     }
+    summary["notes"] += found.notes
     summary = plain(summary)
     out.mkdir(parents=True, exist_ok=True)
     _write_table(found, out / "detection.parquet")
@@ -235,28 +155,6 @@ def _above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
         name: None if wrench is None else (np.linalg.norm(wrench[:, :3], axis=1) > threshold).mean()
         for name, wrench in wrenches.items()
     }
-
-
-def _contacts(found: DetectedLog) -> list[dict[str, Any]]:
-    t, wrench = found.eliminated.log.t, found.eliminated.contact
-    rows = []
-    for touch in contacts_of(t, wrench, found.touched):
-        inside = np.flatnonzero((t >= touch.start_s) & (t <= touch.stop_s))
-        peak = inside[np.argmax(np.linalg.norm(wrench[inside, :3], axis=1))]
-        direction, point, _ = wrench_axis(wrench[peak])
-        known = bool(np.isfinite(direction).all())
-        rows.append(
-            {
-                "start_s": touch.start_s,
-                "stop_s": touch.stop_s,
-                "peak_N": touch.peak_force,
-                "peak_Nm": touch.peak_torque,
-                # Eq. (13) is what the sensor exerts on the load.
-                "push": -direction if known else None,
-                "point_m": point if known else None,
-            }
-        )
-    return rows
 
 
 def _write_table(found: DetectedLog, path: Path) -> None:

@@ -63,9 +63,12 @@ residual_peak             largest |F_c|
 raw_torque_rms ...        the same four of the torque
 raw_rms_per_channel ...   the same four of each channel [f; tau]
 noise_floor               [f; tau], standard deviation of the contact wrench where it is quiet
-contacts                  list of start_s, stop_s, peak_N, peak_Nm: from where a channel exceeds 5.5
-                          noise floors until all are below 4; null for static poses
-in_contact                share of the samples in `contacts`; null for static poses
+free                      the log of free motion that the threshold is of; null for what is quiet
+                          in the record itself, see `drake_teleop.logs.contact`
+threshold                 of contact, in standard deviations; null, as the next two, for static
+                          poses and for records that are too short to tell
+contacts                  as of `drake_teleop.logs.detection`: the same detector with the same times
+in_contact                share of the samples in `contacts`
 causal                    null, or, if --causal was given: mode, lag_s (by how much the output is
                           late, or would be without prediction), offsets, tare_s (length of the
                           start that they are of; null if of the load file), residual_rms,
@@ -182,21 +185,14 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
     """Noise floor and contacts, and what `--causal` adds."""
     figures: dict[str, Any] = {
         "noise_floor": found.noise_floor,
+        "threshold": None,
         "contacts": None,
         "in_contact": None,
         "causal": None,
     }
-    if not found.log.static:
-        touches = contacts_of(found.log.t, found.contact, found.touched)
-        figures["contacts"] = [
-            {
-                "start_s": touch.start_s,
-                "stop_s": touch.stop_s,
-                "peak_N": touch.peak_force,
-                "peak_Nm": touch.peak_torque,
-            }
-            for touch in touches
-        ]
+    if found.detection is not None:
+        figures["threshold"] = found.detection.threshold
+        figures["contacts"] = contacts_of(found.log.t, found.contact, found.touched)
         figures["in_contact"] = found.touched.mean()
     if found.causal is not None:
         late = found.causal.contact

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from drake_teleop.load.arrays import checked, number
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, check_method, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta
+from drake_teleop.load.contact.noise_floor import finite_covariance, statistic_index
 from drake_teleop.load.gripper import identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -22,7 +24,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
 from drake_teleop.logs.check.conventions import check_log, question_fit
 from drake_teleop.logs.check.finding import Finding
-from drake_teleop.logs.contact import in_contact, noise_floor
+from drake_teleop.logs.contact import Detection, detect_contact, noise_floor, samples_of
 from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import estimate_delay
@@ -77,8 +79,9 @@ class EliminatedLog:
         scaled: (N, 6) gamma F_c + sigma V phi.
         gravity_only: (N, 6) wrench without offsets and static weight, or None if the orientation
             is not known.
-        noise_floor: (6,) of `contact`, see `drake_teleop.logs.contact`.
-        touched: (N,) where `contact` says that something is touched; nowhere in static poses.
+        noise_floor: (6,) of `contact`, one for all motions.
+        detection: where something is touched, see `drake_teleop.logs.contact`; None for static
+            poses and for records too short to tell.
         causal: the same wrenches as a loop would have had them, or None if not asked for.
         findings: suspected errors of the log's description; only looked for if the load hardly
             explains the wrench in half of the record.
@@ -97,9 +100,15 @@ class EliminatedLog:
     scaled: NDArray[np.float64]
     gravity_only: NDArray[np.float64] | None
     noise_floor: NDArray[np.float64]
-    touched: NDArray[np.bool_]
     causal: CausalWrench | None
+    detection: Detection | None = None
     findings: tuple[Finding, ...] = ()
+
+    @property
+    def touched(self) -> NDArray[np.bool_]:
+        """(N,) where something is touched; nowhere without a `detection`."""
+        none = np.zeros(len(self.contact), bool)
+        return none if self.detection is None else self.detection.touched
 
 
 def identify_log(
@@ -168,6 +177,8 @@ def eliminate_log(
     tare: bool = True,
     causal: str | None = None,
     causal_tare_s: float | None = None,
+    free: str | Path | None = None,
+    statistic: str = "level",
 ) -> EliminatedLog:
     """Removes (or scales) the non-contact wrench of a known load in a log.
 
@@ -193,13 +204,66 @@ def eliminate_log(
         causal_tare_s: length of the start of the record, with nothing touched, that the offsets of
             the causal wrench are taken from [s]; None takes those of `load`. Either way they come
             from the past alone.
+        free: log of free motion with the same load, which says what is no contact; None: what is
+            quiet in the record itself.
+        statistic: that contact is told by, one of
+            `drake_teleop.load.contact.noise_floor.STATISTICS`.
 
     Raises:
-        DrakeTeleopError: if the log or a load file cannot be used, eta is given together with
-            another scale, sigma_object without a gripper, or causal for static poses.
+        DrakeTeleopError: if a log or a load file cannot be used, eta is given together with
+            another scale, sigma_object without a gripper, causal or free for static poses, or
+            another statistic.
     """
     identification = load if isinstance(load, Identification) else Identification.load(load)
     scales = _scales(sigma, sigma_object, gamma, eta, gripper is not None)
+    statistic_index(statistic)  # refused here, if it is none
+    # One load without a gripper is all object.
+    phi_gripper = np.zeros(10)
+    if gripper is not None:
+        alone = gripper if isinstance(gripper, Identification) else Identification.load(gripper)
+        identified_object(identification, alone)  # An error for exchanged files.
+        phi_gripper = usable_phi(alone)[0]
+    eliminated = partial(
+        _eliminated,
+        identification=identification,
+        phi_gripper=phi_gripper,
+        scales=scales,
+        cutoff_hz=cutoff_hz,
+        delay=delay,
+        tare=tare,
+    )
+    found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s)
+    calm = None if free is None else eliminated(free)
+    if calm is not None and (found.log.static or calm.log.static):
+        source = (calm if calm.log.static else found).log.source
+        raise DrakeTeleopError("holds poses at rest, which have no contact", where=source)
+    if found.log.static:
+        return found
+    detection = detect_contact(
+        samples_of(found.log, found.contact, cutoff_hz),
+        found.log.dt,
+        cutoff_hz,
+        finite_covariance(found.phi, identification.covariance, tared=tare),
+        identification.residual_rms,
+        free=None if calm is None else (samples_of(calm.log, calm.contact, cutoff_hz), calm.log.dt),
+        statistic=statistic,
+    )
+    return replace(found, detection=detection)
+
+
+def _eliminated(
+    path: str | Path,
+    identification: Identification,
+    phi_gripper: NDArray[np.float64],
+    scales: dict[str, float],
+    *,
+    cutoff_hz: float | None,
+    delay: str | float,
+    tare: bool,
+    causal: str | None = None,
+    causal_tare_s: float | None = None,
+) -> EliminatedLog:
+    """`eliminate_log` without its detection of contact."""
     log = read_log(path, bandwidth_hz=cutoff_hz)
     if causal is None and causal_tare_s is not None:
         raise DrakeTeleopError(
@@ -210,12 +274,6 @@ def eliminate_log(
             "poses at rest have no order in time", where="causal", remedy="leave it out"
         )
     phi, point_mass = usable_phi(identification)
-    # One load without a gripper is all object.
-    phi_gripper = np.zeros(10)
-    if gripper is not None:
-        alone = gripper if isinstance(gripper, Identification) else Identification.load(gripper)
-        identified_object(identification, alone)  # An error for exchanged files.
-        phi_gripper = usable_phi(alone)[0]
     phi_object = phi - phi_gripper
     delay_s, source = _delay(log, cutoff_hz, delay, phi)
     if source == "undetermined":
@@ -255,9 +313,6 @@ def eliminate_log(
         )
         late = replace(late, offsets=before, contact=late.contact[known], scaled=late.scaled[known])
     contact = smooth(contact)
-    floor, touched = noise_floor(contact), np.zeros(len(contact), bool)
-    if not log.static:
-        touched = in_contact(contact, floor, _hold(log.dt, cutoff_hz))
     return EliminatedLog(
         log=log.only(known),
         phi=phi,
@@ -271,8 +326,7 @@ def eliminate_log(
         contact=contact,
         scaled=smooth(scaled),
         gravity_only=gravity_only,
-        noise_floor=floor,
-        touched=touched,
+        noise_floor=noise_floor(contact),
         causal=late,
         findings=_suspected(Path(path), log.wrench - offsets, contact),
     )
@@ -360,11 +414,6 @@ def _suspected(
         return ()
     found = check_log(path).findings
     return tuple(finding for finding in found if finding.name not in ("lag", "payload"))
-
-
-def _hold(dt: float, cutoff_hz: float | None) -> int:
-    """Samples of quiet that end a contact: a period of the low-pass, within which it may swing."""
-    return 0 if cutoff_hz is None else round(1.0 / (cutoff_hz * dt))
 
 
 def _scales(

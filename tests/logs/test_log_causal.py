@@ -1,15 +1,12 @@
-"""The contact wrench from the past alone, its noise floor, and the contacts in it."""
+"""The contact wrench from the past alone."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.causal import causal_low_pass, causal_wrenches, filter_lag
-from drake_teleop.logs.contact import contacts_of, in_contact, noise_floor
-from drake_teleop.logs.read.alignment import low_pass
 
 DT, CUTOFF = 1e-3, 30.0
 
@@ -66,60 +63,3 @@ def test_what_cannot_be_asked_for() -> None:
         causal_wrenches(x, x, DT, cutoff_hz=None, delay_s=0.0, mode="soon")
     same = causal_wrenches(x, x, DT, cutoff_hz=None, delay_s=0.0, mode="delayed")
     assert same.lag_s == 0.0
-
-
-STD = np.array([0.2, 0.3, 0.4, 0.02, 0.03, 0.04])
-
-
-def quiet(seed: int, n: int = 6000) -> np.ndarray:
-    return STD * np.random.default_rng(seed).normal(size=(n, 6))
-
-
-def test_the_noise_floor_is_that_of_the_quiet_part() -> None:
-    contact = quiet(1)
-    np.testing.assert_allclose(noise_floor(contact), STD, rtol=0.05)
-    contact[3500:] += 5.0 + 3 * np.sin(np.linspace(0, 9, 2500))[:, None]
-    np.testing.assert_allclose(noise_floor(contact), STD, rtol=0.05)
-    assert (noise_floor(np.zeros((100, 6))) == np.repeat([1e-3, 1e-4], 3)).all()
-
-
-def test_contacts_have_their_times_and_peaks_and_noise_has_none() -> None:
-    contact = quiet(2)
-    t = 10 + DT * np.arange(len(contact))
-    floor = noise_floor(contact)
-    assert not in_contact(contact, floor, 33).any()
-    force = np.zeros(len(t))
-    force[1000:1300] = 12.0 * np.sin(np.linspace(0, 2 * np.pi, 300))  # changes its sign
-    force[4000:4001] = 40.0
-    contact[:, 2] += force
-    found = contacts_of(t, contact, in_contact(contact, floor, 33))
-    assert len(found) == 2
-    assert found[0].start_s == pytest.approx(11.0, abs=0.02)
-    assert found[0].stop_s == pytest.approx(11.3, abs=0.02)
-    assert found[0].peak_force == pytest.approx(12.0, abs=1.5)
-    assert found[0].peak_torque < 0.3
-    assert found[1].start_s == found[1].stop_s == pytest.approx(14.0)
-
-
-@pytest.mark.parametrize("memory", [0.0, 0.2])
-def test_noise_is_a_contact_less_than_once_an_hour(memory: float) -> None:
-    """An hour in records of a minute, each with its own noise floor."""
-    rate, n = 200.0, 12_000
-    rng, count = np.random.default_rng(7), 0
-    decay = np.exp(-1 / (rate * memory)) if memory else 0.0
-    for _ in range(60):
-        noise = lfilter([1.0], [1.0, -decay], rng.normal(size=(n + 400, 6)), axis=0)[400:]
-        contact = low_pass(STD * noise, 1 / rate, 30.0)
-        contact = contact - contact.mean(axis=0)
-        count += len(
-            contacts_of(np.arange(n) / rate, contact, in_contact(contact, noise_floor(contact), 7))
-        )
-    assert count <= 1
-
-
-def test_hysteresis_lasts_until_the_lower_threshold() -> None:
-    contact = np.zeros((300, 6))
-    contact[:, 0] = np.concatenate([np.full(50, 5.0), [6.0], np.full(149, 5.0), np.full(100, 3.0)])
-    touched = in_contact(contact, np.ones(6), 10)
-    assert np.flatnonzero(touched).tolist() == list(range(50, 200))
-    assert not in_contact(contact[:50], np.ones(6), 10).any()

@@ -356,9 +356,10 @@ def test_ntnu_records_without_their_non_contact_force(
     assert summary["residual_rms"] <= residual
     assert summary["gravity_only_rms"] == pytest.approx(gravity_only, abs=0.02)
     assert np.abs(summary["tare"][:3]).max() < 0.5
-    # The hammer taps four times in the second record.
+    # A hammer taps the robot four times in the second record, which touches nothing either. One of
+    # the taps shakes it more than the rest of the record lets expect.
     assert [round(c["start_s"], 1) for c in summary["contacts"]] == (
-        [0.8, 2.3, 3.3, 4.2] if record == "2-vibrations" else []
+        [4.2] if record == "2-vibrations" else []
     )
 
     own = identify_command(log, tmp_path / "own", quiet=True)

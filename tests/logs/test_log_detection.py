@@ -16,7 +16,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.detection import detect_command, detect_log
-from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 
 TOOL = phi_from_mass_com_inertia(1.5, [0.01, -0.02, 0.1], np.diag([0.01, 0.009, 0.004]))
@@ -72,6 +72,36 @@ def test_free_motion_of_the_log_itself_and_its_own_load(tmp_path: Path) -> None:
     assert touch["start_s"] == pytest.approx(5.0, abs=0.05)
     assert summary["free"] is None
     assert summary["load"] is None
+
+
+def test_detect_and_eliminate_report_the_same_contacts_as_with_free_motion(tmp_path: Path) -> None:
+    """A push of 20 N that rises slowly, for a third of the record."""
+    free = log_with_push(tmp_path / "free.parquet", np.zeros(3), 1)
+    load = tmp_path / "identification.json"
+    identify_log(free, delay=0.0).identification.save(load)
+    log = log_with_push(tmp_path / "log.parquet", np.zeros(3), 2)
+    table = pl.read_parquet(log)
+    t = table["t"].to_numpy()
+    rise = np.where((t > 4.0) & (t < 6.7), np.sin(np.pi * (t - 4.0) / 2.7) ** 2, 0.0)
+    table.with_columns(f_y=pl.col("f_y") - 20.0 * rise).write_parquet(log)
+    known, own = (detect_log(log, load, free=calm, delay=0.0) for calm in (free, None))
+    for found, calm in ((known, free), (own, None)):
+        other = eliminate_log(log, load, free=calm, delay=0.0)
+        assert other.detection is not None
+        assert other.detection.threshold == found.threshold
+        np.testing.assert_array_equal(other.touched, found.touched)
+    assert own.threshold < 1.6 / 1.25 * 1.1 * known.threshold
+    start, start_known = (t[np.argmax(found.touched)] for found in (own, known))
+    assert start == pytest.approx(start_known, abs=0.03)
+    assert 4.0 < start < 4.12
+    out = tmp_path / "out"
+    arguments = ["eliminate", str(log), "--load", str(load), "--free", str(free), "--delay", "0"]
+    result = CliRunner().invoke(cli, [*arguments, "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["free"] == str(free)
+    assert summary["threshold"] == known.threshold
+    assert [c["start_s"] for c in summary["contacts"]] == [start_known]
 
 
 def test_poses_and_unknown_statistics_are_refused(ntnu: Path, tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from drake_teleop.load.contact.statistics import statistics
 
 # A noise floor below this counts as this [N, N m]: as in `logs.contact`.
 _RESOLUTION = np.repeat([1e-3, 1e-4], 3)
-_FITS, _HIGHEST_RHO, _NARROWEST, _RARE = 20, 0.999, 0.1, 1e-3
+_FITS, _SETTLED = 20, 1e-4
+_HIGHEST_RHO, _NARROWEST, _RARE = 0.999, 0.1, 1e-3
 
 
 def fit_noise_floor(
@@ -59,15 +60,18 @@ def fit_noise_floor(
     for unit, out in zip(np.eye(2), held, strict=True):
         growth = np.tile(unit, (6, 1))
         write_sigmas(*rows[1:], np.zeros(6), np.zeros((16, 16)), growth, fade, out)
-    found = np.empty((6, 3))
+    found = np.zeros((6, 3))
     for c in range(6):
         square, given = rows[0][:, c] ** 2, known[:, c] ** 2
         terms = np.stack([np.ones(len(square)), *held[:, :, c] ** 2], axis=1)
         variance = np.full(len(square), max(float(square.mean()), _RESOLUTION[c] ** 2))
         for _ in range(_FITS):
+            before = found[c].copy()
             found[c] = nnls(terms / variance[:, None], (square - given) / variance)[0]
             found[c, 0] = max(found[c, 0], _RESOLUTION[c] ** 2)
             variance = terms @ found[c] + given
+            if np.allclose(found[c], before, rtol=_SETTLED, atol=0.0):
+                break
     floor = NoiseFloor(
         np.sqrt(found[:, 0]), P, np.sqrt(found[:, 1:]), np.eye(6), np.zeros(6), fade=fade
     )

@@ -57,8 +57,10 @@ from drake_teleop.load.contact.noise_floor import (
 SLACK = 1.0
 """Of the cumulative sum [standard deviations]. Half of the shift to be noticed is best in white
 noise; this much lets lasting errors of the load pass (benchmarks/contact_detection.py)."""
-LEAVE = 0.7 * 6.2
-"""Level below which contact may end; normal noise reaches 6.2 once in a million samples."""
+RARE = 6.2
+"""Level that normal noise reaches once in a million samples."""
+LEAVE = 0.7 * RARE
+"""Level below which contact may end."""
 
 
 @njit(cache=True)
