@@ -69,7 +69,7 @@ def force(x, y, word, seed):
 
 
 def test_a_factor_that_does_nothing_shows_nothing():
-    """Plain means of its three cells differ by 2.3 N here, because x and y differ in them."""
+    """Plain means of its three cells differ by 2.2 N here, because x and y differ in them."""
     study = sobol(32, repeats=2, seed=104)
     rows = made_up(study, force)
     plain = rows.group_by("a.w").agg(pl.col("hand_work_J").mean())["hand_work_J"].to_numpy()
