@@ -45,7 +45,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
-    """The mean of each measure at each level of each factor.
+    """The mean of each measure at each level of each factor; dotted, that of all levels.
 
     Bars are intervals of the level's difference from the mean of all, which is what a factor does.
     """
@@ -70,6 +70,7 @@ def _levels(axes: Axes, found: effects.MainEffect) -> None:
     place = np.arange(len(found.names))
     bars = np.nan_to_num(found.effect_half)
     axes.errorbar(place, found.mean, bars, color=BLUE, marker="o", ms=3.5, capsize=3)
+    axes.axhline(found.mean[0] - found.effect[0], color=GREY, lw=0.8, ls=":")
     axes.set_xticks(place, found.names)
     axes.set_xlim(-0.4, len(place) - 0.6)
     if np.isnan(found.mean).all():

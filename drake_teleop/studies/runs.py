@@ -28,7 +28,14 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Work: TypeAlias = Callable[[Values, int], dict[str, float]]
-"""The measures of one run, from its factors' values and its seed."""
+"""The measures of one run, from its factors' values and its seed.
+
+Beside them it may give `ONCE`.
+"""
+
+ONCE = "seconds_once"
+"""How long a run took for what most others need not repeat, such as an identification [s]."""
+_SECONDS = "seconds"
 
 # A part of the store: what a kill costs, and what is handed to a process at once. Small next to
 # the study, so that at its end no process waits long for another; the first ones are of one run,
@@ -119,7 +126,7 @@ class Told:
     """Tells the progress bar how many runs are done, and how long the others will take."""
 
     def __init__(self, total: int) -> None:
-        self.total, self.done = total, 0
+        self.total, self.done, self._told = total, 0, 0
         self._recent: deque[float] = deque(maxlen=_RECENT)
 
     def start(self, progress: Progress, processes: int) -> None:
@@ -132,13 +139,17 @@ class Told:
         self._tell()
 
     def more(self, rows: Chunk) -> None:
-        """Runs that were done now, with the "seconds" that each took.
+        """Runs that were done now, with the time that each took.
 
-        The first ones identify loads, the others need not: the last ones count.
+        The last ones count. Of the first ones that does not which is done once; if it is done
+        again and again, the later ones tell.
         """
         self.done += len(rows)
-        # One that ended its process does not say.
-        self._recent.extend(row["seconds"] for row in rows if "seconds" in row)
+        for row in rows:
+            if _SECONDS in row:  # one that ended its process does not say
+                first = self._told < _RECENT
+                self._recent.append(row[_SECONDS] - (row.get(ONCE, 0.0) if first else 0.0))
+                self._told += 1
         self._tell()
 
     def _tell(self) -> None:
@@ -170,7 +181,7 @@ def _run_chunk(
             except Exception as error:  # whatever it is, the other runs go on
                 measures = {"error": " ".join(f"{type(error).__name__}: {error}".split())}
             # Not for the table: no two sessions would have the same bytes.
-            found.append(row | measures | {"seconds": time.monotonic() - start})
+            found.append(row | measures | {_SECONDS: time.monotonic() - start})
     return found
 
 

@@ -24,7 +24,7 @@ from drake_teleop.signals import SIGNALS
 from drake_teleop.studies import study as studies
 from drake_teleop.studies.design import Factor, Study
 from drake_teleop.studies.measures import default_measures, measured
-from drake_teleop.studies.runs import Told, run_study
+from drake_teleop.studies.runs import ONCE, Told, run_study
 from drake_teleop.studies.store import open_store
 from drake_teleop.studies.study import LoadStudy, study_command
 
@@ -537,20 +537,30 @@ def test_a_run_has_one_thread_of_blas_so_that_its_bytes_are_the_same_in_any_proc
 
 
 def test_the_time_that_is_left_follows_from_the_last_runs():
-    """The first two identify a load; each of the others takes two seconds, four at once."""
+    """Runs take two seconds, four at once; the first two identify a load, too."""
     shown = []
     told = Told(100)
     told.start(lambda fraction, words="": shown.append((fraction, words)), 4)
     told.found(20)
     assert shown == [(0.2, "20/100, the first runs begin")]
-    told.more([{"seconds": 9.0}] * 2)
-    assert shown[-1] == (0.22, "22/100, about 0:02:56 left")
+    told.more([{"seconds": 9.0, ONCE: 7.0}] * 2)
+    assert shown[-1] == (0.22, "22/100, about 0:00:39 left")
     for _ in range(18):
         told.more([{"seconds": 2.0}])
     told.more([{"error": "the run has ended its process"}])
     assert shown[-1] == (0.41, "41/100, about 0:00:30 left")
     told.more([{"seconds": 2.0}] * 59)
     assert shown[-1] == (1.0, "100/100, about 0:00:00 left")
+
+
+def test_loads_that_every_run_identifies_are_counted_in_the_end():
+    shown = []
+    told = Told(100)
+    told.start(lambda fraction, words="": shown.append(words), 1)
+    for _ in range(40):
+        told.more([{"seconds": 9.0, ONCE: 7.0}])
+    assert shown[0] == "1/100, about 0:03:18 left"
+    assert shown[-1] == "40/100, about 0:09:00 left"
 
 
 def test_rows_of_a_large_study_come_one_by_one_at_first(tmp_path):
