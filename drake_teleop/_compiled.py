@@ -38,9 +38,10 @@ def njit(**options: Any) -> Callable[[Any], Any]:
     """As `numba.njit`; with `cache=True` the compiled code is kept as described above."""
 
     def compiled(function: FunctionType) -> Any:
-        dispatcher = numba.njit(**options)(function)
+        dispatcher = numba.njit(**options | {"cache": False})(function)
         if options.get("cache") and isinstance(dispatcher, Dispatcher):
-            dispatcher._cache = _Cache(function, dispatcher)
+            with suppress(RuntimeError):  # no folder can be written: each process compiles anew
+                dispatcher._cache = _Cache(function, dispatcher)
         return dispatcher
 
     return compiled
@@ -75,9 +76,13 @@ class _Files:
     def save(self, key: Any, code: Any) -> None:
         path = self._path(key)
         unfinished = path.with_suffix(f".{uuid4().hex}")
-        unfinished.write_bytes(dumps((key, code)))
-        os.replace(unfinished, path)
-        self._discard(keep=self._name + fingerprint(self._dispatcher))
+        try:
+            unfinished.write_bytes(dumps((key, code)))
+            os.replace(unfinished, path)
+            self._discard(keep=self._name + fingerprint(self._dispatcher))
+        except OSError:  # a full disk: it is compiled again next time
+            with suppress(OSError):
+                unfinished.unlink(missing_ok=True)
 
     def flush(self) -> None:
         self._discard()

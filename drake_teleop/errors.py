@@ -5,6 +5,9 @@ from __future__ import annotations
 import reprlib
 from typing import Any
 
+LONGEST_LINE = 300
+"""Characters of a line that the command line says about an error."""
+
 
 class DrakeTeleopError(ValueError):
     """Input that cannot be used. Its message is one line: what is wrong, where, and the remedy.
@@ -22,7 +25,16 @@ class DrakeTeleopError(ValueError):
         text = f"{where}: {what}" if where else what
         if remedy:
             text = f"{text}; {remedy}"
-        super().__init__(" ".join(text.split()))
+        super().__init__(one_line(text, LONGEST_LINE - len("error: ")))
+
+
+def one_line(text: str, longest: int = LONGEST_LINE) -> str:
+    """The text in one line: without what a terminal would obey, and with its middle cut out."""
+    text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+    if len(text) <= longest:
+        return text
+    end = longest // 3
+    return f"{text[: longest - end - 5]} ... {text[-end:]}"
 
 
 def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = "") -> None:
@@ -36,3 +48,8 @@ def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = 
         wanted = " or ".join("None" if one is type(None) else one.__name__ for one in kinds)
         found = reprlib.repr(value)
         raise DrakeTeleopError(f"expected {wanted}, found {found}", where=where, remedy=remedy)
+
+
+def inside(where: str, name: Any) -> str:
+    """The place of a field inside a place: `file:field`, then `file:field.inner`."""
+    return f"{where}.{name}" if ":" in where else f"{where}:{name}"

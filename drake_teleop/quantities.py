@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
-import math
 import numbers
 import reprlib
 import types
@@ -17,7 +16,7 @@ import typing
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, inside
 
 KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
 """What a field that is no block may hold, in words."""
@@ -65,7 +64,7 @@ def check_structure(schema: type, data: Any, where: str) -> None:
     """
     if not isinstance(data, dict):
         raise DrakeTeleopError(
-            f"expected a mapping of fields, found {data!r}",
+            f"expected a mapping of fields, found {_in_short(data)}",
             where=where,
             remedy=f"the fields are {', '.join(_names(schema))}",
         )
@@ -73,7 +72,7 @@ def check_structure(schema: type, data: Any, where: str) -> None:
     for key, value in data.items():
         if key == "_tag":
             continue
-        place = _inside(where, key)
+        place = inside(where, key)
         check_name(schema, key, place)
         _check_kind(kinds[key], value, place, from_file=True)
 
@@ -96,7 +95,7 @@ def check_ranges(config: Any, where: str) -> None:
     """
     kinds = _kinds(config.__class__)
     for field in dataclasses.fields(config):
-        value, place = getattr(config, field.name), _inside(where, field.name)
+        value, place = getattr(config, field.name), inside(where, field.name)
         _check_kind(kinds[field.name], value, place, from_file=False)
         if "choices" in field.metadata:
             if value not in field.metadata["choices"]:
@@ -121,16 +120,21 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
     low, high = metadata["low"], metadata["high"]
     unit = "" if metadata["unit"] == "1" else f" {metadata['unit']}"
     for number in values:
-        if not math.isfinite(number) or not low <= number <= high:
+        if not low <= number <= high:  # nor if it is no number
             raise DrakeTeleopError(
-                f"{number:g}{unit} is outside {low:g} to {high:g}{unit}",
+                f"{_in_short(number)}{unit} is outside {_in_short(low)} to {_in_short(high)}{unit}",
                 where=place,
                 remedy=f"check the value and its unit ({metadata['doc']})",
             )
 
 
-def _inside(where: str, name: Any) -> str:
-    return f"{where}.{name}" if ":" in where else f"{where}:{name}"
+def _in_short(value: Any) -> str:
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        return reprlib.repr(value)
+    # Of a seed all digits, of a longer integer the first and the last.
+    return reprlib.repr(int(value)) if isinstance(value, numbers.Integral) else f"{value:g}"
 
 
 @functools.cache
@@ -195,7 +199,7 @@ def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
 def _block(blocks: tuple[type, ...], value: Any, place: str) -> type:
     """The one that the tag of a mapping tells; the first if it has none."""
     names = [block.__name__ for block in blocks]
-    tag = value.get("_tag", "").lstrip("!") if isinstance(value, dict) else ""
+    tag = str(value.get("_tag", "")).lstrip("!") if isinstance(value, dict) else ""
     if tag and tag not in names:
         raise DrakeTeleopError(
             f"'!{tag}' is not known", where=place, remedy=f"use one of !{', !'.join(names)}"
@@ -216,7 +220,7 @@ def _is_of(kind: type, value: Any, *, from_file: bool) -> bool:
 def _can_be_read_as_number(value: Any) -> bool:
     try:
         float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return False
     return True
 

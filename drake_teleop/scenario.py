@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
+from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import NetworkConfig
@@ -41,6 +40,7 @@ from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.sensor.sensor_chain import WristSensorConfig, preset_of
 from drake_teleop.slave.joint_control import JointControlConfig
 from drake_teleop.slave.payload import Payload
+from drake_teleop.texts import read_yaml
 
 #: What fixed steps need in contact [s]: ball on leaf vibrate at up to 700 Hz.
 _CONTACT_STEP = 1.25e-4
@@ -202,7 +202,7 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
     """What stands in the file of a scenario, not checked, and the file's name for messages.
 
     Raises:
-        DrakeTeleopError: if there is no such scenario, or it is not YAML.
+        DrakeTeleopError: if there is no such scenario, or as `read_yaml`.
     """
     expect((str, Path), name_or_path, "scenario")
     path = scenarios_dir() / f"{name_or_path}.yaml"
@@ -213,10 +213,7 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
             f"there is no scenario '{name_or_path}'",
             remedy=f"give a YAML file or one of {', '.join(ScenarioNames())}",
         )
-    try:
-        return yaml_load(data=path.read_text()), str(path)
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise DrakeTeleopError(f"is not YAML ({error})", where=str(path)) from None
+    return read_yaml(path, tagged=True), str(path)
 
 
 def ScenarioFromData(data: Any, where: str) -> Scenario:

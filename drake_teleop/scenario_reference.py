@@ -34,6 +34,8 @@ from the code (`python docs/make_reference.py`).
 
 - `drake-teleop scenario press > mine.yaml` writes the shipped scenario `press` with every field,
   its range and its meaning, as a starting point; `drake-teleop run mine.yaml` runs it.
+- Files are read as YAML 1.2: `1e-3` is a number, `yes` and `1:30` are words. A field that stands
+  there twice, or that nothing reads, is an error, and so is `010`.
 - [scenario.schema.json](scenario.schema.json) is the JSON schema: an editor that knows it (for
   instance by a first line `# yaml-language-server: $schema=scenario.schema.json`) completes and
   checks the fields. Such an editor has to be told of tags like `!Touch`, which say what kind of

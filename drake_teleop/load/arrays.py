@@ -28,7 +28,7 @@ def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> 
     wanted = f"({wanted},)" if len(shape) == 1 and not leading else f"({wanted})"
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DrakeTeleopError(
             f"holds no numbers ({error})", where=name, remedy=f"give an array of shape {wanted}"
         ) from error
@@ -75,7 +75,7 @@ def number(name: str, value: Any) -> float:
     """`value` as a float, which may be NaN; raises DrakeTeleopError unless it is one."""
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise DrakeTeleopError(
             f"expected a number, found {reprlib.repr(value)}", where=name
         ) from None

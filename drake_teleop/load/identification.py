@@ -190,6 +190,8 @@ class Identification:
             raise DrakeTeleopError(what, where=f"{path}:{name}")
 
         def numbers(name: str, *shape: int) -> Array:
+            if not _holds_numbers(document[name]):
+                raise DrakeTeleopError("holds no numbers", where=f"{path}:{name}")
             return checked(f"{path}:{name}", document[name], *shape)
 
         if not isinstance(document["method"], str):
@@ -216,8 +218,12 @@ class Identification:
                 "does not follow from phi, covariance and flags", where=f"{path}:verdicts"
             )
         for name, value in result._derived().items():
-            stated = numbers(name, *np.shape(value))
-            if not np.allclose(stated, value, rtol=1e-6, atol=1e-9):
+            if isinstance(value, bool):
+                follows = document[name] is value
+            else:
+                stated = numbers(name, *np.shape(value))
+                follows = np.allclose(stated, value, rtol=1e-6, atol=1e-9)
+            if not follows:
                 raise DrakeTeleopError(
                     "does not follow from phi", where=f"{path}:{name}", remedy="edit phi"
                 )
@@ -265,17 +271,23 @@ def natural_scale(phi: Array) -> Array:
 
 
 def _read_json(path: str | Path) -> dict[str, Any]:
-    try:
-        document = json.loads(Path(path).read_text())
-    except OSError as error:
+    from drake_teleop.texts import read_json  # PyYAML takes its time to start
+
+    if not Path(path).exists():
         raise DrakeTeleopError(
-            f"cannot be read ({error.strerror})", where=str(path), remedy="run `identify` first"
-        ) from error
-    except ValueError as error:
-        raise DrakeTeleopError(f"is not JSON ({error})", where=str(path)) from error
+            "cannot be read (no such file)", where=str(path), remedy="run `identify` first"
+        )
+    document = read_json(path)
     if not isinstance(document, dict):
         raise DrakeTeleopError("holds no JSON object", where=str(path))
     return document
+
+
+def _holds_numbers(value: Any) -> bool:
+    """Of JSON: numpy would take "1" and true for 1."""
+    if isinstance(value, list):
+        return all(map(_holds_numbers, value))
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _read_covariance(where: str, value: Any) -> Array:

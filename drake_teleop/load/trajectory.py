@@ -13,6 +13,8 @@ from drake_teleop.errors import DrakeTeleopError
 
 Array: TypeAlias = NDArray[np.float64]
 
+_FIELDS, _OF_JOINT = {"frequency", "joints"}, {"q0", "rho", "delta"}
+
 
 @dataclass(frozen=True)
 class FourierTrajectory:
@@ -90,11 +92,18 @@ class FourierTrajectory:
         Raises:
             DrakeTeleopError: naming file and field, if that cannot be a trajectory.
         """
-        import yaml
+        from drake_teleop.texts import read_yaml
 
+        data = read_yaml(path)
         try:
-            data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
             joints = list(data["joints"].values())
+            for fields, known in [(data, _FIELDS), *((joint, _OF_JOINT) for joint in joints)]:
+                if unknown := sorted(fields.keys() - known):
+                    raise DrakeTeleopError(
+                        f"there is no field '{unknown[0]}'",
+                        where=str(path),
+                        remedy=f"the fields are {', '.join(sorted(known))}",
+                    )
             q0, rho, delta = (
                 np.array([joint[name] for joint in joints], dtype=float)
                 for name in ("q0", "rho", "delta")
@@ -102,7 +111,9 @@ class FourierTrajectory:
             frequency = float(data["frequency"])
         except KeyError as error:
             raise DrakeTeleopError(f"{error} is missing", where=str(path)) from None
-        except (yaml.YAMLError, UnicodeDecodeError, AttributeError, TypeError, ValueError) as error:
+        except DrakeTeleopError:
+            raise
+        except (AttributeError, TypeError, ValueError) as error:
             raise DrakeTeleopError(f"is not a trajectory ({error})", where=str(path)) from None
         shapes_fit = q0.ndim == 1 and rho.ndim == 2 and rho.shape == delta.shape
         numbers = np.concatenate([q0.ravel(), rho.ravel(), delta.ravel(), [frequency]])

@@ -47,9 +47,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydrake.common.yaml import yaml_dump, yaml_load, yaml_load_typed
+from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
 from drake_teleop.errors import DrakeTeleopError, expect
 from drake_teleop.quantities import check_ranges, check_structure
@@ -61,6 +60,7 @@ from drake_teleop.studies.effects import effects
 from drake_teleop.studies.measures import measured
 from drake_teleop.studies.pictures import write_pictures
 from drake_teleop.studies.runs import ONCE, run_study
+from drake_teleop.texts import read_yaml
 
 if TYPE_CHECKING:
     import polars as pl
@@ -174,13 +174,9 @@ def LoadStudy(path: str | Path) -> Study:
         DrakeTeleopError: naming file and field of what is wrong.
     """
     path = study_file(path)
-    try:
-        text = Path(path).read_text()
-        data = yaml_load(data=text)
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise DrakeTeleopError(f"is not YAML ({error})", where=str(path)) from None
+    data = read_yaml(path)
     check_structure(Study, data, str(path))
-    study = yaml_load_typed(schema=Study, data=text, defaults=Study())
+    study = yaml_load_typed(schema=Study, data=yaml_dump(data), defaults=Study())
     study.check(str(path))
     return study
 

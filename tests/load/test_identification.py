@@ -312,7 +312,7 @@ def test_no_file(tmp_path):
         with pytest.raises(DrakeTeleopError, match=rf"bad\.json: {message}"):
             Identification.load(tmp_path / "bad.json")
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(DrakeTeleopError, match=r"binary\.json: is not JSON"):
+    with pytest.raises(DrakeTeleopError, match=r"binary\.json: is no text"):
         Identification.load(tmp_path / "binary.json")
 
 

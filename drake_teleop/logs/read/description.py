@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import (
     BaseModel,
@@ -32,6 +31,7 @@ from pydantic import (
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
+from drake_teleop.texts import read_yaml
 
 STANDARD_GRAVITY = 9.80665
 ROTATION_TOLERANCE = 0.01
@@ -90,7 +90,8 @@ def _gravity(value: Any) -> Any:
 
 
 Column = str | int
-Vector = Annotated[tuple[float, float, float], Field(strict=False)]
+Number = Annotated[float, Field(strict=True)]  # neither true nor "1"
+Vector = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 Rotation = tuple[Vector, Vector, Vector]
 _GRAVITY_SCHEMA = {
     "anyOf": [
@@ -113,9 +114,9 @@ class Time(_Strict):
 
     column: Column | None = None
     unit: Literal["s", "ms", "us", "ns"] = "s"
-    rate: float | None = Field(default=None, gt=0, description="Hz, if there is no column")
-    offset: float = Field(default=0.0, description="s, added to the stream's clock")
-    scale: float = Field(
+    rate: Number | None = Field(default=None, gt=0, description="Hz, if there is no column")
+    offset: Number = Field(default=0.0, description="s, added to the stream's clock")
+    scale: Number = Field(
         default=1.0, gt=0, description="of the time since the first row, for a clock that drifts"
     )
 
@@ -357,14 +358,9 @@ def load_description(path: str | Path) -> Description:
         DrakeTeleopError: naming file and field, if it is absent, no YAML, or does not fit.
     """
     path = Path(path)
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DrakeTeleopError("no such file", where=str(path), remedy="check the path") from error
-    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise DrakeTeleopError(
-            f"is not YAML: {error}", where=str(path), remedy="see docs/logs.md for an example"
-        ) from error
+    if not path.exists():
+        raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
+    data = read_yaml(path)
     if not isinstance(data, dict):
         raise DrakeTeleopError(
             "holds no fields", where=str(path), remedy="see docs/logs.md for an example"
@@ -388,10 +384,13 @@ def _resolved(description: Description, folder: Path) -> Description:
 def _explained(error: ValidationError, path: Path) -> DrakeTeleopError:
     # A misspelt field is also a missing one: name what stands there first.
     first = min(error.errors(), key=lambda entry: entry["type"] == "missing")
-    location = [part for part in first["loc"] if _is_field(part)]
+    *outer, last = first["loc"] or ("",)
+    unknown = first["type"] == "extra_forbidden"
+    location = [part for part in outer if _is_field(part)]
+    location += [last] if unknown or _is_field(last) else []
     where = f"{path}:{'.'.join(map(str, location))}" if location else str(path)
     remedy = "see docs/logs.md for the fields and their units"
-    if first["type"] == "extra_forbidden":
+    if unknown:
         known = list(_fields_at(location[:-1]))
         near = difflib.get_close_matches(str(location[-1]), known, n=1)
         what = f"unknown field {location[-1]!r}"

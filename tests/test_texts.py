@@ -1,0 +1,184 @@
+"""YAML and JSON from people: one line with file and field for what could be read in two ways."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError, one_line
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.logs.read.description import load_description
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.studies.study import LoadStudy
+from drake_teleop.texts import read_json, read_yaml
+
+ALIASES = "a: &a [1, 1]\n" + "\n".join(
+    f"{to}: &{to} [{', '.join([f'*{of}'] * 20)}]" for of, to in zip("abcd", "bcde", strict=True)
+)
+ALL_READERS = {
+    "a field twice": ("channel: {}\nchannel: {}", ":channel: stands there twice (line 2)"),
+    "an inner field twice": ("a: {b: {c: 1, c: 2}}", ":a.b.c: stands there twice"),
+    "a number for a name": ("3: 1", "a field's name is a word, not '3'"),
+    "a flag for a name": ("true: 1", "a field's name is a word, not 'true'"),
+    "a list for a name": ("[1, 2]: 1", "a field's name is a word"),
+    "octal": ("simulation: {duration: 010}", ":simulation.duration: '010' may be octal"),
+    "400 digits": (f"a: {'9' * 400}", ":a: an integer of 400 digits is too long"),
+    "an open end": ("[" * 2000, "nested too deeply"),
+    "brackets": ("a: " + "[" * 2000 + "]" * 2000, "nested too deeply"),
+    "braces": ("{a: " * 2000 + "1" + "}" * 2000, "nested too deeply"),
+    "its own alias": ("a: &a [*a]", "nested too deeply"),
+    "aliases of aliases": (ALIASES, "there are more than 50000 values"),
+    "the name of a tag": ("operator: {task: {_tag: 3}}", ":operator.task._tag: there is no such"),
+    "code": ("a: !!python/object/apply:os.system [ls]", ":a: a list takes no tag"),
+    "bytes": ("a: !!binary aGk=", ":a: 'aGk=' with the tag 'binary' means nothing"),
+    "a word that is called a number": ("a: !!int x", ":a: 'x' with the tag 'int' means nothing"),
+    "two documents": ("--- 1\n--- 2", "is not YAML (line 2"),
+    "a character of control": ("a: \x00", "is not YAML"),
+    "another encoding": ("a: \xff", "is no text in UTF-8"),
+}
+
+
+def message(read, path, text: str) -> str:
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(DrakeTeleopError) as caught:
+        read(path)
+    line = str(caught.value)
+    assert line.startswith(str(path))
+    assert len(line) <= LONGEST_LINE and len(line.splitlines()) == 1
+    return line
+
+
+@pytest.mark.parametrize(
+    "read", [LoadScenario, LoadStudy, load_description, FourierTrajectory.load]
+)
+@pytest.mark.parametrize("name", ALL_READERS)
+def test_what_no_yaml_file_may_hold(read, name, tmp_path):
+    text, expected = ALL_READERS[name]
+    assert expected in message(read, tmp_path / "x.yaml", text)
+
+
+@pytest.mark.parametrize(
+    "read", [LoadScenario, LoadStudy, load_description, FourierTrajectory.load]
+)
+def test_an_empty_file(read, tmp_path):
+    message(read, tmp_path / "x.yaml", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("_hidden: 1", ":_hidden: there is no such field"),
+        ("<<: {seed: 1}", ":<<: there is no such field"),
+        ("simulation: {duration: 1:30}", ":simulation.duration: expected a number, found '1:30'"),
+        ("simulation: {duration: 0x10}", ":simulation.duration: expected a number"),
+        ("simulation: {duration: 2001-01-01}", ":simulation.duration: expected a number"),
+        ("simulation: {duration: 1e400}", ":simulation.duration: inf s is outside"),
+        ("simulation: {seed: -1}", ":simulation.seed: -1 is outside 0 to 4294967295;"),
+        ("simulation: {seed: 5000000000}", ":simulation.seed: 5000000000 is outside"),
+        ("simulation: {seed: true}", ":simulation.seed: expected a whole number, found True"),
+        ("wrist_sensor: {ideal: yes}", ":wrist_sensor.ideal: expected true or false, found 'yes'"),
+        ("operator: {task: !Press [1]}", ":operator.task: a list takes no tag '!Press'"),
+        ("", "found nothing"),
+        ("true", "found True"),
+        (f"wrist_sensor: {{preset: {'x' * 5000}}}", ":wrist_sensor.preset: 'xxx"),
+        (f"operator: {'x' * 5000}", ":operator: expected a mapping"),
+    ],
+)
+def test_what_a_scenario_does_not_hold(text, expected, tmp_path):
+    assert expected in message(LoadScenario, tmp_path / "x.yaml", text)
+
+
+STREAM = "wrench: {{file: w.csv, time: {}, force: {{columns: [a]}}, torque: {{columns: [b]}}}}\n{}"
+
+
+@pytest.mark.parametrize(
+    ("time", "more", "expected"),
+    [
+        ("{rate: true}", "", ":wrench.time.rate: "),
+        ("{rate: '100'}", "", ":wrench.time.rate: "),
+        ("{rate: 1:30}", "", ":wrench.time.rate: "),
+        ("{rate: 100, my field: 1}", "", ":wrench.time.my field: unknown field"),
+        ("{rate: 100}", "_x: 1", ":_x: unknown field"),
+        ("{rate: 100}", "gravity: true", ":gravity: "),
+    ],
+)
+def test_what_a_description_does_not_hold(time, more, expected, tmp_path):
+    path = tmp_path / "x.yaml"
+    assert expected in message(load_description, path, STREAM.format(time, more))
+
+
+def test_a_trajectory_has_no_other_fields(tmp_path):
+    path, joint = tmp_path / "x.yaml", "{q0: 0, rho: [1], delta: [1]%s}"
+    path.write_text(f"frequency: 1\njoints: {{a: {joint % ''}}}")
+    assert FourierTrajectory.load(path).period == 1.0
+    text = f"frequency: 1\njoints: {{a: {joint % ', phase: 1'}}}"
+    assert "there is no field 'phase'" in message(FourierTrajectory.load, path, text)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[" * 2000, "nested too deeply"),
+        ('{"phi": ' * 2000, "nested too deeply"),
+        ('{"phi": 1, "phi": 2}', ":phi: stands there twice"),
+        ("", "is not JSON (line 1"),
+        ("\xff", "is no text in UTF-8"),
+    ],
+)
+def test_what_no_load_file_may_hold(text, expected, tmp_path):
+    assert expected in message(Identification.load, tmp_path / "x.json", text)
+
+
+@pytest.mark.parametrize("value", ['"1"', "true", "9" * 400])
+def test_what_is_no_number_in_a_load_file(value, tmp_path, identified):
+    path = tmp_path / "x.json"
+    identified.save(path)
+    text = path.read_text()
+    changed = text.replace('"condition_number": 4.0', f'"condition_number": {value}')
+    assert changed != text
+    assert ":condition_number: " in message(Identification.load, path, changed)
+
+
+@pytest.fixture
+def identified():
+    ones = [1.0] * 16
+    return Identification(
+        phi=np.array([1.0, 0.1, 0.1, 0.1, 0.2, 0.0, 0.0, 0.2, 0.0, 0.2]),
+        offsets=np.zeros(6),
+        covariance=np.diag(ones),
+        identifiable=np.zeros(16, bool),
+        condition_number=4.0,
+        delay_s=0.0,
+        residual_rms=np.zeros(6),
+        method="batch least squares",
+        samples=100,
+    )
+
+
+def test_scalars_are_those_of_yaml_1_2(tmp_path):
+    path = tmp_path / "x.yaml"
+    path.write_text(
+        "[0, -3, 1e-3, .5, 5., -.inf, ~, null, true, FALSE, no, 1:30, '010', 1_000, 0o7, '', 0.010]"
+    )
+    words = ["no", "1:30", "010", "1_000", "0o7", ""]
+    expected = [0, -3, 1e-3, 0.5, 5.0, -float("inf"), None, None, True, False, *words, 0.01]
+    assert read_yaml(path) == expected
+    assert [type(x) for x in read_yaml(path)] == [type(x) for x in expected]
+
+
+def test_text_may_begin_with_the_mark_of_utf8(tmp_path):
+    path = tmp_path / "x"
+    path.write_bytes(b"\xef\xbb\xbf[1]")
+    assert read_yaml(path) == read_json(path) == [1]
+
+
+def test_numbers_of_python_beyond_all_floats():
+    with pytest.raises(DrakeTeleopError, match=r"simulation\.duration: 9999.* is outside"):
+        replace(Scenario(), simulation__duration=10**400 - 1).check()
+
+
+def test_a_line_keeps_its_beginning_and_its_end():
+    line = one_line("begin\n" + "x" * 1000 + " \x1b[31m end")
+    assert len(line) == LONGEST_LINE
+    assert line.startswith("begin x") and line.endswith("x ?[31m end")
