@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+import warnings
 from pathlib import Path
+from typing import Any
 
 import click
 
 from drake_teleop import cli_options as option
 from drake_teleop._version import __version__
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, one_line
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -148,19 +151,19 @@ def identify(
 @option.gripper
 @click.option(
     "--sigma",
-    type=option.Number(min=0),
+    type=option.Number(0, 100),
     default=0.0,
     show_default=True,
     help="Scale of the non-contact wrench; of the gripper's, if there is one.",
 )
 @click.option(
     "--sigma-object",
-    type=option.Number(min=0),
+    type=option.Number(0, 100),
     help="Scale of the object's non-contact wrench, with --gripper.  [default: sigma]",
 )
 @click.option(
     "--gamma",
-    type=option.Number(),
+    type=option.Number(-100, 100),
     default=1.0,
     show_default=True,
     help="Scale of the contact wrench.",
@@ -174,7 +177,7 @@ def identify(
 @click.option(
     "--causal-tare",
     "causal_tare_s",
-    type=option.Number(min=0, min_open=True),
+    type=option.Number(0, 36000, min_open=True),
     metavar="SECONDS",
     help="With --causal: an untouched start that the offsets are of.  [default: the load file's]",
 )
@@ -288,7 +291,7 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
 
 
 @cli.command("sample-log")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@option.seed_0
 @option.out("sample-log")
 @option.quiet
 def sample_log(seed: int, out: Path, quiet: bool) -> None:
@@ -327,11 +330,9 @@ def analyze(scenario: str, direction: str, out: Path, quiet: bool) -> None:
 @cli.command("compare-passivity")
 @click.option("--networks", type=option.Names(), help="Presets.  [default: lan to lunar]")
 @click.option("--methods", type=option.Names(), help="Methods.  [default: all]")
-@click.option(
-    "--jobs", type=option.Whole(min=1), help="Processes at once.  [default: one for each core]"
-)
+@option.jobs
 @option.out("compare-passivity")
-@click.option("--seed", type=option.Whole(min=0), default=0, show_default=True)
+@option.seed_0
 @option.quiet
 def compare_passivity(
     networks: tuple[str, ...] | None,
@@ -360,9 +361,7 @@ def compare_passivity(
 
 @cli.command()
 @click.argument("study", type=option.STUDY)
-@click.option(
-    "--jobs", type=option.Whole(min=1), help="Processes at once.  [default: one for each core]"
-)
+@option.jobs
 @click.option(
     "--cluster",
     metavar="ADDRESS",
@@ -383,15 +382,13 @@ def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: 
 
 
 @cli.command("scaling-study")
-@click.option(
-    "--jobs", type=option.Whole(min=1), help="Processes at once.  [default: one for each core]"
-)
+@option.jobs
 @click.option(
     "--cluster",
     metavar="ADDRESS",
     help="Of a Dask scheduler, which has the processes; or local, for one on this machine.",
 )
-@click.option("--repeats", type=option.Whole(min=1), help="Seeds of each point.  [default: 12]")
+@click.option("--repeats", type=option.Whole(1, 10**6), help="Seeds of each point.  [default: 12]")
 @option.out("scaling-study")
 @option.quiet
 def scaling_study(
@@ -427,7 +424,7 @@ def scaling_study(
 )
 @click.option(
     "--payload",
-    type=option.Number(min=0, min_open=True),
+    type=option.Number(0, 1e4, min_open=True),
     metavar="KG",
     help="Its heaviest load.  [default: what the model holds beyond the sensor, and 30 %]",
 )
@@ -445,11 +442,11 @@ def scaling_study(
 @click.option(
     "--time",
     "seconds",
-    type=option.Number(min=0, min_open=True),
+    type=option.Number(0, 1e6, min_open=True),
     metavar="SECONDS",
     help="CPU time of the optimiser.  [default: four starts, the same on every machine]",
 )
-@click.option("--seed", type=option.Whole(min=0), default=0, show_default=True)
+@option.seed_0
 @option.out("excite")
 @option.quiet
 def excite(
@@ -498,24 +495,33 @@ def main(arguments: list[str] | None = None) -> None:
     Also 1, if `reproduce` finds a number that is not as accepted.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        status = cli.main(arguments, prog_name="drake-teleop", standalone_mode=False)
-    except click.exceptions.NoArgsIsHelpError as error:
-        click.echo(error.format_message())
-        status = 2
-    except click.ClickException as error:
-        status = _fail(error.format_message())
-    except DrakeTeleopError as error:
-        status = _fail(str(error))
-    except (click.Abort, KeyboardInterrupt) as interrupt:
-        # click makes an Abort of a KeyboardInterrupt; what was kept is told by its cause.
-        click.echo(f"interrupted: {interrupt.__cause__ or ''}".removesuffix(": "), err=True)
-        status = 130
-    except OSError as error:
-        status = _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    with warnings.catch_warnings():
+        if not sys.warnoptions:  # they are for those who write programs
+            warnings.simplefilter("ignore")
+            os.environ["PYTHONWARNINGS"] = "ignore"  # of the processes of a study
+        status = _run(arguments)
     sys.exit(status if isinstance(status, int) else 0)
 
 
+def _run(arguments: list[str] | None) -> Any:
+    """What the command returns, or the exit status of what it ended with."""
+    try:
+        return cli.main(arguments, prog_name="drake-teleop", standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
+        return 2
+    except click.ClickException as error:
+        return _fail(error.format_message())
+    except DrakeTeleopError as error:
+        return _fail(str(error))
+    except (click.Abort, KeyboardInterrupt) as interrupt:
+        # click makes an Abort of a KeyboardInterrupt; what was kept is told by its cause.
+        click.echo(f"interrupted: {interrupt.__cause__ or ''}".removesuffix(": "), err=True)
+        return 130
+    except OSError as error:
+        return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+
+
 def _fail(message: str) -> int:
-    click.echo(f"error: {' '.join(message.split())}", err=True)
+    click.echo(one_line(f"error: {message}"), err=True)
     return 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
+from drake_teleop.quantities import in_short
 from drake_teleop.resources import scenarios_dir, studies_dir
 
 
@@ -42,12 +44,11 @@ def _check_range(
     """Refuses what is outside, in words: click's own would be `x>=0`."""
     low, high = kind.min, kind.max
     if high is not None and not (low or 0) <= number <= high:
-        kind.fail(f"{number:g} is outside {low or 0:g} to {high:g}", param, ctx)
-    if low is not None and (number < low or (kind.min_open and number == low)):
-        text = (
-            f"{number:g} is not above {low:g}" if kind.min_open else f"{number:g} is below {low:g}"
-        )
+        text = f"{in_short(number)} is outside {in_short(low or 0)} to {in_short(high)}"
         kind.fail(text, param, ctx)
+    if low is not None and (number < low or (kind.min_open and number == low)):
+        relation = "not above" if kind.min_open else "below"
+        kind.fail(f"{in_short(number)} is {relation} {in_short(low)}", param, ctx)
 
 
 class Number(click.FloatRange):
@@ -84,21 +85,51 @@ class Delay(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str:
-        return "auto" if value == "auto" else Number().convert(value, param, ctx)
+        return "auto" if value == "auto" else Number(-10, 10).convert(value, param, ctx)
 
 
 def out(command: str) -> Callable[[Any], Any]:
-    """`--out DIR`, by default out/COMMAND."""
-    default = Path("out") / command
-    return click.option("--out", type=PATH, default=default, show_default=True, metavar="DIR")
+    """`--out DIR`, by default out/COMMAND. A command that fails leaves no empty folder there."""
+    return click.option(
+        "--out",
+        type=PATH,
+        default=Path("out") / command,
+        show_default=True,
+        metavar="DIR",
+        callback=_not_left_empty,
+    )
 
 
-seed = click.option("--seed", type=Whole(min=0), help="Instead of the scenario's seed.")
+def _not_left_empty(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
+    new = [each for each in (folder, *folder.parents) if not os.path.exists(each)]
+    if new:
+        ctx.call_on_close(lambda: _remove_empty(new))
+    return folder
+
+
+def _remove_empty(new: list[Path]) -> None:
+    """Removes the folders as far as there is nothing in them but empty folders; innermost first."""
+    inner = sorted(new[0].rglob("*"), reverse=True)
+    for folder in (*inner, *new):
+        if folder.is_symlink() or not folder.is_dir():
+            return
+        try:
+            folder.rmdir()
+        except OSError:  # there is something in it
+            return
+
+
+_SEED = Whole(0, 2**32 - 1)
+seed = click.option("--seed", type=_SEED, help="Instead of the scenario's seed.")
+seed_0 = click.option("--seed", type=_SEED, default=0, show_default=True)
+jobs = click.option(
+    "--jobs", type=Whole(1, 4096), help="Processes at once.  [default: one for each core]"
+)
 quiet = click.option("--quiet", is_flag=True, help="No progress bars, no tables.")
 cutoff = click.option(
     "--cutoff",
     "cutoff_hz",
-    type=Number(min=0, min_open=True),
+    type=Number(0, 1e5, min_open=True),
     default=30.0,
     show_default=True,
     metavar="HZ",
@@ -151,5 +182,5 @@ class PositiveNumbers(click.ParamType):
     ) -> tuple[float, ...]:
         if isinstance(value, tuple):
             return value
-        number = Number(min=0, min_open=True)
+        number = Number(0, 1e5, min_open=True)
         return tuple(number.convert(part, param, ctx) for part in value.split(","))

@@ -50,6 +50,16 @@ def plain(default: Any, doc: str) -> Any:
     return dataclasses.field(default=default, metadata={"doc": doc})
 
 
+def in_short(value: Any) -> str:
+    """A value for a message: six digits of a float, of the rest what is short."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        return reprlib.repr(value)
+    # Of a seed all digits, of a longer integer the first and the last.
+    return reprlib.repr(int(value)) if isinstance(value, numbers.Integral) else f"{value:g}"
+
+
 def check_structure(schema: type, data: Any, where: str) -> None:
     """Checks parsed YAML against a dataclass before it is loaded.
 
@@ -64,7 +74,7 @@ def check_structure(schema: type, data: Any, where: str) -> None:
     """
     if not isinstance(data, dict):
         raise DrakeTeleopError(
-            f"expected a mapping of fields, found {_in_short(data)}",
+            f"expected a mapping of fields, found {in_short(data)}",
             where=where,
             remedy=f"the fields are {', '.join(_names(schema))}",
         )
@@ -122,19 +132,10 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
     for number in values:
         if not low <= number <= high:  # nor if it is no number
             raise DrakeTeleopError(
-                f"{_in_short(number)}{unit} is outside {_in_short(low)} to {_in_short(high)}{unit}",
+                f"{in_short(number)}{unit} is outside {in_short(low)} to {in_short(high)}{unit}",
                 where=place,
                 remedy=f"check the value and its unit ({metadata['doc']})",
             )
-
-
-def _in_short(value: Any) -> str:
-    if value is None:
-        return "nothing"
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
-        return reprlib.repr(value)
-    # Of a seed all digits, of a longer integer the first and the last.
-    return reprlib.repr(int(value)) if isinstance(value, numbers.Integral) else f"{value:g}"
 
 
 @functools.cache

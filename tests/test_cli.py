@@ -5,12 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 import types
+import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numba.core.errors import NumbaWarning
 
 from drake_teleop import cli
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
 
 HEAVY = {"numpy", "scipy", "numba", "polars", "matplotlib", "pydrake", "jinja2", "pydantic", "yaml"}
 
@@ -117,11 +120,64 @@ def test_wrong_usage_is_one_error_line_and_status_2(capsys, arguments):
         ("--harmonics", "21", "21 is outside 2 to 20"),
         ("--period", "1000", "1000 is outside 0.5 to 600"),
         ("--time", "0", "0 is not above 0"),
-        ("--seed", "-3", "-3 is below 0"),
+        ("--seed", "-3", "-3 is outside 0 to 4294967295"),
+        ("--seed", "9" * 400, f"{'9' * 18}...{'9' * 19} is outside 0 to 4294967295"),
+        ("--payload", "1e300", "1e+300 is outside 0 to 10000"),
+        ("--acceleration", "1e300", "1e+300 is outside 0 to 100000"),
     ],
 )
 def test_a_range_is_said_in_words(capsys, option, number, says):
     assert run_main(capsys, "excite", option, number)[2].endswith(f"'{option}': {says}\n")
+
+
+@pytest.mark.parametrize(
+    ("option", "number", "says"),
+    [
+        ("--delay", "1e300", "1e+300 is outside -10 to 10"),
+        ("--sigma", "1e308", "1e+308 is outside 0 to 100"),
+        ("--sigma-object", "101", "101 is outside 0 to 100"),
+        ("--gamma", "-1e308", "-1e+308 is outside -100 to 100"),
+        ("--cutoff", "1e300", "1e+300 is outside 0 to 100000"),
+        ("--cutoff", "-1", "-1 is outside 0 to 100000"),
+        ("--causal-tare", "1e9", "1e+09 is outside 0 to 36000"),
+    ],
+)
+def test_no_option_takes_a_number_that_cannot_be(capsys, option, number, says):
+    err = run_main(capsys, "eliminate", "log.csv", "--load", "x.json", option, number)[2]
+    assert err.endswith(f"'{option}': {says}\n")
+
+
+@pytest.mark.parametrize("command", ["inspect", "run"])
+def test_a_command_that_fails_leaves_no_empty_folder(capsys, tmp_path, command):
+    there, out = tmp_path / "there", tmp_path / "new" / "inner"
+    there.mkdir()
+    for folder in (there, out):
+        status, _, err = run_main(capsys, command, str(tmp_path / "x.csv"), "--out", str(folder))
+        assert status == 2 and err.count("\n") == 1
+    assert there.is_dir() and not (tmp_path / "new").exists()
+
+
+def test_what_a_command_wrote_is_kept(capsys, tmp_path):
+    log = tmp_path / "x.csv"
+    log.write_text("a,b\n1,2\n")
+    assert run_main(capsys, "inspect", str(log), "--quiet", "--out", str(tmp_path / "new"))[0] == 0
+    assert (tmp_path / "new" / "summary.json").is_file()
+
+
+def test_an_error_line_has_an_end(capsys):
+    err = run_main(capsys, "run", "\x1b[31m" + "x" * 1000)[2]
+    assert len(err) <= LONGEST_LINE + len("\n") and err.isascii() and "\x1b" not in err
+
+
+def test_warnings_are_for_those_who_write_programs(capsys, monkeypatch, recwarn):
+    def names():
+        np.float64(1e308) * np.float64(10.0)
+        warnings.warn("slow", NumbaWarning, stacklevel=1)
+        return []
+
+    monkeypatch.setattr("drake_teleop.scenario.ScenarioNames", names)
+    assert run_main(capsys, "scenario") == (0, "", "")
+    assert not recwarn
 
 
 @pytest.mark.parametrize(
