@@ -114,7 +114,9 @@ class Figures:
             says nothing of how hard the slave presses.
         drift: of the slave against the master, 2 s after contact [m].
         free_force: felt in free motion, rms [N].
-        rise_delay: from half of the wall's force to half of the force felt [s].
+        rise_delay: from when the scaled force of the wall has reached half of the steady force
+            felt to when the force felt has, so not negative [s]; NaN where it had before, by a
+            drag that hides the rise, or where one of them never does.
         least_energy: the least that both ends together have put into the channel [J]; negative if
             it gave out more than it got.
     """
@@ -267,7 +269,7 @@ def figures_of(
         force_error=steady / goal - 1 if goal != 0 else float("nan"),
         drift=float(slave[after] - master[after]),
         free_force=float(np.sqrt(np.mean(felt[window(task.swing, task.swung)] ** 2))),
-        rise_delay=(_half(felt[start:], steady) - _half(pressed[start:], goal)) * dt,
+        rise_delay=_rise_delay(felt[start:], pressed[start:], steady) * dt,
         least_energy=float(energy.min()),
     )
 
@@ -280,10 +282,18 @@ def _hunting(x: NDArray[np.float64]) -> float:
     return float(np.ptp(x - np.polyval(np.polyfit(t, x, 2), t)))
 
 
-def _half(force: NDArray[np.float64], steady: float) -> float:
-    """Index at which the force first exceeds half of its steady value."""
-    beyond = np.abs(force) > 0.5 * abs(steady)
-    return float(np.argmax(beyond)) if beyond.any() else float("nan")
+def _rise_delay(felt: NDArray[np.float64], pressed: NDArray[np.float64], steady: float) -> float:
+    """Samples from `pressed` to `felt`, both beyond half of `steady`; NaN if that tells nothing.
+
+    One level for both: a method that shows half of the force would otherwise seem to show it before
+    it is there.
+    """
+    level, sign = 0.5 * abs(steady), np.sign(steady)
+    there, shown = pressed * sign > level, felt * sign > level
+    start = int(np.argmax(there))
+    if not there.any() or shown[max(start - 1, 0)] or not shown[start:].any():
+        return float("nan")
+    return float(np.argmax(shown[start:]))
 
 
 @njit(cache=True)

@@ -132,7 +132,7 @@ class Identification:
         deviations, named = self.standard_deviations, zip(PARAMETERS, self.verdicts, strict=True)
         mass, com, inertia = mass_com_inertia(self.phi)
         inertia = np.where(self.identifiable[10:], inertia[np.triu_indices(3)], np.nan)
-        force, torque = (np.sqrt(np.mean(part**2)) for part in np.split(self.residual_rms, 2))
+        force, torque = (np.linalg.norm(part) for part in np.split(self.residual_rms, 2))
         unknown = [f"{name} {verdict}" for name, verdict in named if verdict != "identified"]
         known = ", ".join([f"{16 - len(unknown)} of 16 parameters identified", *unknown])
         return "\n".join(
@@ -144,7 +144,7 @@ class Identification:
                 f"  inertia xy xz yz  {_numbers(inertia[[1, 2, 4]])} kg m^2",
                 f"  offset of force   {_numbers(self.offsets[:3], deviations[:3])} N",
                 f"  offset of torque  {_numbers(self.offsets[3:], deviations[3:6])} N m",
-                f"  residual, rms     {force:.3g} N, {torque:.3g} N m",
+                f"  residual, rms     {force:.3g} N of |F|, {torque:.3g} N m of |tau|",
             )
         )
 

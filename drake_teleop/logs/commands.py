@@ -65,6 +65,7 @@ def identify_command(
         "condition_number": result.condition_number,
         "residual_rms": result.residual_rms,
         "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
+        "residual_rms_torque": float(np.linalg.norm(result.residual_rms[3:])),
         "load_changes": [
             {
                 "t_s": found.log.t[after.start],

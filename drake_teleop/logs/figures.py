@@ -38,7 +38,7 @@ method                 of the fit, in words
 rejected               share of the samples that a robust fit took for disturbed and left out
 condition_number       of the regression
 residual_rms           [f; tau], after the fit
-residual_rms_force     of |F|
+residual_rms_force     of |F|; residual_rms_torque of |tau|
 load_changes           list of t_s, mass_before, mass_after: where the load changes in the record,
                        so that one load for all of it is wrong
 gripper                its file, if --gripper was given; otherwise this and the next are absent
@@ -71,8 +71,9 @@ contacts                  as of `drake_teleop.logs.detection`: the same detector
 in_contact                share of the samples in `contacts`
 causal                    null, or, if --causal was given: mode, lag_s (by how much the output is
                           late, or would be without prediction), offsets, tare_s (length of the
-                          start that they are of; null if of the load file), residual_rms,
-                          noise_floor as above, and difference_rms, of |F_causal - F_c|
+                          start that they are of; null if of the load file), residual_rms
+                          and residual_torque_rms, noise_floor as above, and difference_rms and
+                          difference_torque_rms, of |F_causal - F_c| and |tau_causal - tau_c|
 ========================= =======================================================================
 """
 
@@ -197,17 +198,18 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
     if found.causal is not None:
         late = found.causal.contact
 
-        def force_rms(wrench: NDArray[np.float64]) -> float:
-            return float(np.sqrt(np.mean(np.sum(wrench[:, :3] ** 2, axis=1))))
+        def rms(name: str, wrench: NDArray[np.float64]) -> dict[str, float]:
+            force, torque = np.sqrt(np.mean(wrench**2, axis=0).reshape(2, 3).sum(axis=1))
+            return {f"{name}_rms": float(force), f"{name}_torque_rms": float(torque)}
 
         figures["causal"] = {
             "mode": found.causal.mode,
             "lag_s": found.causal.lag_s,
             "tare_s": causal_tare_s,
             "offsets": found.causal.offsets,
-            "residual_rms": force_rms(late),
+            **rms("residual", late),
             "noise_floor": noise_floor(late),
-            "difference_rms": force_rms(late - found.contact),
+            **rms("difference", late - found.contact),
         }
     return figures
 

@@ -211,7 +211,10 @@ def draw_elimination(found: EliminatedLog) -> Figure:
         norms = [(n, np.linalg.norm(w[:, :3], axis=1), c) for n, w, c in curves]
         _draw(magnitude, t, norms, static)
         magnitude.set_ylim(bottom=0)
-        magnitude.set_title("$|F|$, rms in N: " + ", ".join(_rms_words(norms)))
+        torques = [(n, np.linalg.norm(w[:, 3:], axis=1), c) for n, w, c in curves]
+        magnitude.set_title(
+            f"$|F|$, rms in N: {_rms_words(norms)}\n$|\\tau|$, rms in N m: {_rms_words(torques)}"
+        )
         magnitude.set_ylabel("force [N]")
         shade_contact(magnitude, t, found.touched)
         axes = _channel_axes(below)
@@ -223,8 +226,8 @@ def draw_elimination(found: EliminatedLog) -> Figure:
     return figure
 
 
-def _rms_words(norms: Sequence[tuple[str, NDArray[np.float64], str]]) -> list[str]:
-    return [f"{name} {np.sqrt(np.mean(values**2)):.3g}" for name, values, _ in norms]
+def _rms_words(norms: Sequence[tuple[str, NDArray[np.float64], str]]) -> str:
+    return ", ".join(f"{name} {np.sqrt(np.mean(values**2)):.3g}" for name, values, _ in norms)
 
 
 def _channel_axes(figure: Any) -> list[Axes]:

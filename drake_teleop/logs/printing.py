@@ -29,6 +29,7 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
         _add_rows(table, rows, summary["object"]["identifiable"])
     figures = (
         f"residual {summary['residual_rms_force']:.4g} N rms of |F|,"
+        f" {summary['residual_rms_torque']:.4g} N m rms of |tau|,"
         f" condition number {summary['condition_number']:.3g}, {summary['samples']} samples"
     )
     if summary["rejected"] > 0:
@@ -75,7 +76,10 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
         force, torque = summary[f"{name}_rms"], summary[f"{name}_torque_rms"]
         if force is not None:
             table.add_row(label, f"{force:.4g}", f"{torque:.4g}")
-    figures = f"largest contact force {summary['residual_peak']:.4g} N"
+    figures = (
+        f"largest contact force {summary['residual_peak']:.4g} N,"
+        f" torque {summary['residual_torque_peak']:.4g} N m"
+    )
     contacts = summary["contacts"]
     if contacts:
         first = ", ".join(f"{c['start_s']:.3f}" for c in contacts[:5])
@@ -88,7 +92,8 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
         late = "late" if causal["mode"] == "delayed" else "made up for by prediction"
         figures += (
             f"\ncausal: {1e3 * causal['lag_s']:.1f} ms {late},"
-            f" rms of |F| {causal['residual_rms']:.4g} N"
+            f" rms of |F| {causal['residual_rms']:.4g} N,"
+            f" of |tau| {causal['residual_torque_rms']:.4g} N m"
         )
     print_results(table, figures, summary, out)
 

@@ -154,4 +154,9 @@ def _tiles(load: Identification) -> list[tuple[str, str, str]]:
             "N",
             "rms of the force that the load does not explain",
         ),
+        (
+            f"{np.linalg.norm(load.residual_rms[3:]):.3g}",
+            "N m",
+            "rms of the torque that it does not explain",
+        ),
     ]

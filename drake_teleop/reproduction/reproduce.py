@@ -222,6 +222,7 @@ def contact_figures(run: ContactMotion) -> Figures:
         "duration_s": float(np.count_nonzero(run.contact) * (t[1] - t[0])),
         "largest_deflection_mm": 1e3 * float(np.abs(run.touched["sheet_state"][:, 0]).max()),
         "free_residual_norm_max_N": float(_force(run.calculated_free).max()),
+        "free_residual_norm_max_Nm": _largest(run.calculated_free[:, 3:]),
     }
 
 

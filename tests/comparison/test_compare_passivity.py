@@ -10,6 +10,7 @@ import pytest
 from drake_teleop.channel.network import PRESETS
 from drake_teleop.comparison import compare_passivity as study
 from drake_teleop.comparison.one_dof import OneDof
+from drake_teleop.comparison.report import COLUMNS, cells
 from drake_teleop.errors import DrakeTeleopError
 
 
@@ -31,6 +32,7 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
         assert row["error"] is None
         assert abs(row["force_error"]) < 0.01
         assert abs(row["drift"]) < 0.5e-3
+        assert row["rise_delay"] >= 0.0
     limits = {row["method"]: row["longest_s"] for row in summary["one_dof"]}
     assert limits["none"] == 0.02 < limits["tdpa"]
     injected = {
@@ -42,6 +44,13 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
     assert pl.read_parquet(tmp_path / "runs.parquet").height == 2
     page = (tmp_path / "report.html").read_text()
     assert "round trip 1 ms" in page
+    # All columns are seen in a window of 1200 px, of which the page takes 944: a letter has about
+    # 8.5 px, and a column 11 px to its neighbour.
+    rows = [["charged_tdpa", "Stable", *(heading for _, heading, _, _ in COLUMNS)]]
+    rows += [["four_channel", "yes", *cells(row)] for row in summary["station"]]
+    words = [max(map(len, " ".join(column).split())) for column in zip(*rows, strict=True)]
+    assert page.split("</thead>")[0].count("<th") - 1 == len(words)  # <thead> is one of them
+    assert sum(8.5 * letters + 11 for letters in words) < 944
     for name in ("runs", "energy", "limits"):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
 

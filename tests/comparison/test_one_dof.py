@@ -13,7 +13,15 @@ from scipy.optimize import brentq
 from drake_teleop.analysis.delayed_loop import delay_margin, station_loop
 from drake_teleop.analysis.one_axis import Axis, OneAxis, servo_response
 from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import PERIOD, REFERENCE, OneDof, figures, run_one_dof
+from drake_teleop.comparison.one_dof import (
+    PERIOD,
+    REFERENCE,
+    OneDof,
+    Task,
+    figures,
+    figures_of,
+    run_one_dof,
+)
 from drake_teleop.operator.operator import GRIPS
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.slave.joint_control import JointControlConfig
@@ -179,3 +187,32 @@ def test_the_same_seed_gives_the_same_run():
     )
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 0
+
+
+@pytest.mark.parametrize(
+    ("share", "late", "drag", "expected"),
+    [
+        (1.0, 0.1, 0.0, 0.1),
+        # Half of the force, at once: not before it is there.
+        (0.5, 0.0, 0.0, 0.0),
+        # A drag hides the rise if it is as strong; a weaker one, on top, makes it 0.08 s sooner.
+        (1.0, 0.1, 0.8, math.nan),
+        (1.0, 0.1, 0.2, 0.02),
+        (1.0, 0.1, -0.8, 0.1),
+    ],
+)
+def test_the_force_felt_never_rises_before_that_of_the_wall(share, late, drag, expected):
+    task, t = Task(), np.arange(round(Task().end / PERIOD)) * PERIOD
+    middle = 0.5 * (task.press + task.pressed)
+
+    def wall(now):
+        return np.clip((now - middle) / 0.4, 0.0, 1.0)
+
+    pulled = np.where((t > task.press) & (t < middle + 0.25), drag, 0.0)
+    felt = np.minimum(wall(t - late), share) + (pulled if drag else 0.0)
+    still = np.zeros_like(t)
+    found = figures_of(
+        t=t, master=still, slave=still, felt=felt, pressed=wall(t), energy=still, task=task
+    )
+    assert found.rise_delay == pytest.approx(expected, abs=2 * PERIOD, nan_ok=True)
+    assert not found.rise_delay < 0.0
