@@ -308,8 +308,8 @@ def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list
         ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
         bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks], minor=False)
         bar.minorticks_off()
-        figure.suptitle("Merit, and how often a point is the best; grey: too many runs fail",
-                        x=0.01, ha="left")  # fmt: skip
+        words = "Merit, and how often a point is the best; grey: in some task too many runs fail"
+        figure.suptitle(words, x=0.01, ha="left")
     return figure
 
 
