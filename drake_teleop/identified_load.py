@@ -123,18 +123,8 @@ def _key(before: Scenario, detects: bool) -> str:
 
     computed_by = [f"{name} {version(name)}" for name in _LIBRARIES]
     computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCES]
-    what = (__version__, _text(before), detects, computed_by)
+    what = (__version__, before, detects, computed_by)
     return sha256(repr(what).encode()).hexdigest()
-
-
-def _text(value: Any) -> str:
-    """All that a value is made of; repr would round the numbers of arrays."""
-    if dataclasses.is_dataclass(value):
-        parts = (f"{f.name}={_text(getattr(value, f.name))}" for f in dataclasses.fields(value))
-        return f"{type(value).__qualname__}({', '.join(parts)})"
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return f"[{', '.join(_text(each) for each in value)}]"
-    return repr(value.item() if isinstance(value, np.generic) else value)
 
 
 def _write(path: Path, load: IdentifiedLoad) -> None:

@@ -118,14 +118,18 @@ def test_a_run_that_went_well_has_no_warnings():
 
 
 def test_a_wrist_motor_at_its_limit_is_found_with_the_axes_of_the_device():
-    J = np.empty((6, 6))
-    jacobian_into.py_func(np.array(HOME), J)
-    about = 3 + int(np.argmax(np.abs(J[3:, 5])))  # the last axis, the weakest motor's
-    assert abs(J[about, 5]) == pytest.approx(1.0)
-    full = WRIST_TORQUE_LIMIT[2] * during(1, 2)
-    (warning,) = run_warnings(recorded(force_to_master=(about, full)), OVER_NETWORK, ARM)
-    assert "the device displays the most that it can from 1.000" in warning
-    assert run_warnings(recorded(force_to_master=(about, 0.99 * full)), OVER_NETWORK, ARM) == []
+    q, J = np.array([0.3, 0.2, 0.4, -0.5, 0.6, 0.7]), np.empty((6, 6))
+    jacobian_into.py_func(q, J)
+    posture = (slice(0, 6), q - HOME)
+    about = J[3:, 5]  # the last axis, that of the weakest motor
+    for share, warnings in ((1.0, 1), (0.99, 0)):
+        torque = share * WRIST_TORQUE_LIMIT[2] * during(1, 2)[:, np.newaxis] * about
+        full = (slice(3, 6), torque)
+        found = run_warnings(
+            recorded(force_to_master=full, master_state=posture), OVER_NETWORK, ARM
+        )
+        assert len(found) == warnings
+        assert all("the device displays the most that it can from 1.000" in x for x in found)
 
 
 def test_spans_close_gaps_and_leave_out_what_is_short():
@@ -169,12 +173,13 @@ def test_who_follows_to_and_fro_does_not_hunt():
     follows = 0.06 * np.sin(2 * np.pi * 2.63 * (T - 0.06))[:, np.newaxis]
     assert not hunts(T, command, follows, 5e-4).any()
     assert hunts(T, 0 * command, follows, 5e-4).mean() > 0.8
-    slow = 0.066 * np.sin(2 * np.pi * 0.5 * T)[:, np.newaxis]
+    slow = 0.02 * np.sin(2 * np.pi * 2 * T)[:, np.newaxis]
     shaken = slow.copy()
     shaken[during(1, 2), 0] += 0.003 * np.sin(2 * np.pi * 20 * T[during(1, 2)])
     found = T[hunts(T, slow, shaken, 5e-4)]
-    assert 0.95 < found[0] < 1.05
-    assert 1.95 < found[-1] < 2.05
+    assert 0.95 < found[0] < 1.1
+    assert 1.9 < found[-1] < 2.05
+    assert len(found) > 800
 
 
 def test_the_longest_delay_is_that_of_the_latest_packet(tmp_path):
