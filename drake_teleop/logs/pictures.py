@@ -213,7 +213,8 @@ def draw_elimination(found: EliminatedLog) -> Figure:
         magnitude.set_ylim(bottom=0)
         torques = [(n, np.linalg.norm(w[:, 3:], axis=1), c) for n, w, c in curves]
         magnitude.set_title(
-            f"$|F|$, rms in N: {_rms_words(norms)}\n$|\\tau|$, rms in N m: {_rms_words(torques)}"
+            f"$|F|$, rms in N: {_rms_words(norms)}\n$|\\tau|$, rms in N m: {_rms_words(torques)}",
+            fontsize=8.5,
         )
         magnitude.set_ylabel("force [N]")
         shade_contact(magnitude, t, found.touched)

@@ -145,18 +145,14 @@ def _tiles(load: Identification) -> list[tuple[str, str, str]]:
         for c, known in zip(load.com, load.identifiable[7:10], strict=True)
     )
     count = int(load.identifiable[6:].sum())
+    force, torque = (np.linalg.norm(part) for part in np.split(load.residual_rms, 2))
     return [
         (mass, "kg", f"mass, ± {deviation:.2g} kg" if load.identifiable[6] else "mass"),
         (com, "mm", "centre of mass from the origin of S: x, y, z"),
         (f"{count} of 10", "", "parameters of the load are identified"),
         (
-            f"{np.linalg.norm(load.residual_rms[:3]):.3g}",
-            "N",
-            "rms of the force that the load does not explain",
-        ),
-        (
-            f"{np.linalg.norm(load.residual_rms[3:]):.3g}",
+            f"{force:.2g} N, {torque:.2g}",
             "N m",
-            "rms of the torque that it does not explain",
+            "rms of the force and of the torque that the load does not explain",
         ),
     ]

@@ -263,8 +263,11 @@ def _tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     return [
         (f"{s['free_force.peak_raw_N']:.0f}", "N", "on the sensor from moving the tool alone"),
-        (f"{s['free_force.residual_max_N']:.2f}", "N", "at most left of it after elimination"),
-        (f"{s['free_torque.residual_max_Nm']:.2f}", "N m", "at most left of the torque"),
+        (
+            f"{s['free_force.residual_max_N']:.2f} N, {s['free_torque.residual_max_Nm']:.2f}",
+            "N m",
+            "at most left of force and torque after elimination",
+        ),
         (f"{lag:.1f}", "ms", "from the touch to its detection"),
         (f"{s['identification.mass_error_percent']:.3f}", "%", "error of the identified mass"),
     ]

@@ -43,4 +43,4 @@ def test_the_torque_is_not_forgotten(tmp_path: Path, capsys: pytest.CaptureFixtu
         _, _, rest = printed.partition(words)
         assert re.match(r"[^;]*? N[ ,][^;]*? N m", rest), words
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "rms of the force that" in page and "rms of the torque that" in page
+    assert "rms of the force and of the torque that" in page
