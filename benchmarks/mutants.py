@@ -399,6 +399,9 @@ def _run(tree: Path, tests: list[str], found: Path) -> None:
     os.chdir(tree)
     sys.path[:1] = [str(tree)]
     os.environ["PYTHONPATH"] = str(tree)
+    # What was said to a pytest that this runs in: its plugins need not be found from here.
+    for name in ("PYTEST_ADDOPTS", "PYTEST_PLUGINS"):
+        os.environ.pop(name, None)
     options = [
         "-x",
         "-q",

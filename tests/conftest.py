@@ -19,10 +19,9 @@ settings.register_profile("drake_teleop", deadline=None, derandomize=True)
 settings.load_profile("drake_teleop")
 
 
-#: Half of the tests, with which the second of two workers begins: they compile little of what the
-#: first half does, so that the workers do not compile the same at the same time.
-SECOND_HALF = (
-    *("load", "logs"),  # in this order
+#: What compiles little of what the notebooks and the stations do, in the order in which it is run.
+COMPILE_LITTLE = (
+    *("load", "logs"),
     *("cli", "house", "malformed_input", "master", "passivity", "theory", "vectors"),
 )
 
@@ -35,14 +34,22 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["DRAKE_TELEOP_CACHE_DIR"] = folder.name
 
 
+@pytest.hookimpl(trylast=True)  # what is not run shall not count
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The notebooks first: what takes longest must not be what the other worker waits for."""
+    """The first worker begins with the notebooks, the second with what compiles little.
+
+    What takes longest must not be what the other one waits for at the end, and both shall not
+    compile the same at the same time. Two workers get one half of the list each.
+    """
 
     def place(item: pytest.Item) -> int:
         if item.path.name == "test_notebooks.py":
             return -2
         room = item.path.relative_to(Path(__file__).parent).parts[0]
         room = room.removeprefix("test_").removesuffix(".py")
-        return SECOND_HALF.index(room) if room in SECOND_HALF else -1
+        return COMPILE_LITTLE.index(room) if room in COMPILE_LITTLE else -1
 
-    items.sort(key=place)
+    much = sorted((item for item in items if place(item) < 0), key=place)
+    little = sorted((item for item in items if place(item) >= 0), key=place)
+    half = len(items) // 2
+    items[:] = [*much[:half], *little, *much[half:]]
