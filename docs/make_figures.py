@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import FancyBboxPatch
 from scipy.signal import welch
 
+from drake_teleop.excitation.command import excite_command
 from drake_teleop.logs.detection import detect_log
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.sample import sample_log_command
@@ -245,8 +246,8 @@ def log_figure(folder: Path) -> Picture:
     return figure
 
 
-def scene_picture(film: Path, target: Path) -> None:
-    """The film of the contact at the instant at which the tool bends the leaf most."""
+def film_picture(film: Path, time: float, target: Path) -> None:
+    """A film at one of its times [s]."""
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
         print(f"{target} stays as it is: there is no Chromium")
@@ -255,7 +256,7 @@ def scene_picture(film: Path, target: Path) -> None:
     drawing = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
     subprocess.run(
         [chromium, *options, *drawing, "--virtual-time-budget=4000", f"--screenshot={target}",
-         f"{film.resolve().as_uri()}#0.24"],
+         f"{film.resolve().as_uri()}#{time:g}"],
         check=True, capture_output=True, timeout=300,
     )  # fmt: skip
 
@@ -270,7 +271,10 @@ def main() -> None:
         log_figure(Path(folder) / "sample").savefig(FIGURES / "log.png")
         reproduce_command(Path(folder))
         shutil.copy(Path(folder) / "fig8.png", FIGURES / "result.png")
-        scene_picture(Path(folder) / "replay.html", FIGURES / "scene.png")
+        # When the tool bends the leaf most.
+        film_picture(Path(folder) / "replay.html", 0.24, FIGURES / "scene.png")
+        excite_command("identification", Path(folder) / "excite", quiet=True)
+        film_picture(Path(folder) / "excite" / "excitation.html", 1.0, FIGURES / "excitation.png")
 
 
 if __name__ == "__main__":

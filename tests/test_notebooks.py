@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import nbformat
 import pytest
 from nbclient import NotebookClient
 
-NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = ROOT / "notebooks"
 
 #: What must hold once a notebook has run, in its own variables.
 CHECKS = {
@@ -103,3 +105,14 @@ def test_it_is_committed_without_outputs(name):
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert all(not cell.outputs and cell.execution_count is None for cell in code)
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_its_page_is_of_this_notebook(name):
+    page = (ROOT / "docs" / "notebooks" / f"{name}.md").read_text(encoding="utf-8")
+    for cell in nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4).cells:
+        # Links differ; a cell that was changed wants docs/render_notebooks.py.
+        assert cell.cell_type != "code" or cell.source.strip() in page
+    shown = re.findall(r"\]\(([^):]+\.png)\)", page)
+    assert shown
+    assert [picture for picture in shown if not (ROOT / "docs/notebooks" / picture).exists()] == []

@@ -101,7 +101,7 @@ def ParseModel(
             for index in plant.GetFrameIndices(instance)
         ]
         # Drake's own, of joints.
-        frames = [name for name in frames if not name.endswith("_parent")]
+        frames = [name for name in frames if not name.endswith(("_parent", "_child", "__model__"))]
         raise DrakeTeleopError(
             f"{len(having) or 'no'} frames are named {sensor_frame!r}",
             where=str(path),
