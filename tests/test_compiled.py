@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import drake_teleop
+from drake_teleop import _compiled, vectors
 
 # `inner` reads a constant of another file, a module's function, one that comes after it, and
 # one that becomes part of its caller.
@@ -218,3 +219,17 @@ def test_two_first_runs_side_by_side_leave_the_right_code(tmp_path):
         "print(double(3), double(1.5), sum(double.stats.cache_misses.values()))",
     )
     assert later.communicate()[0] == "6 3.0 0\n"
+
+
+def test_where_no_folder_can_be_written_nothing_is_kept(monkeypatch):
+    def nowhere(*_):
+        raise RuntimeError("cannot cache function: no locator available")
+
+    monkeypatch.setattr(_compiled.FunctionCache, "__init__", nowhere)
+    assert _compiled.njit(cache=True)(vectors.cross)._cache.cache_path is None
+
+
+def test_a_full_disk_costs_nothing_but_time(tmp_path):
+    files = _compiled._Files(tmp_path / "absent", _compiled.njit()(vectors.cross))
+    files.save("key", "code")
+    assert files.load("key") is None

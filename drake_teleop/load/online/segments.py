@@ -131,8 +131,10 @@ def _noise(sums: Array, wrench: Array) -> Array:
         Z = sums[i + _NOISE_WINDOW] - sums[i]
         Z = Z / Z[0, 0]
         # The plain fit first, then weighted by what it left.
-        std = np.sqrt(np.mean(wrench**2, axis=0)) + np.finfo(float).tiny
+        std = np.sqrt(np.mean(wrench**2, axis=0))
         floor = _ROUNDING * np.repeat([np.linalg.norm(std[:3]), np.linalg.norm(std[3:])], 3)
+        floor = np.where(floor > 0.0, floor, 1.0)
+        std = np.maximum(std, floor)  # a channel may say nothing at all
         for _ in range(2):
             theta = _fit(*normal_equations(Z, np.diag(std**-2.0)))
             left = np.diag(residual_covariance(Z, theta))

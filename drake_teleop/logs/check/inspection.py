@@ -40,7 +40,7 @@ from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topic
 from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import shortest_gap
 from drake_teleop.logs.read.description import Description, load_description
-from drake_teleop.logs.read.tables import FORMATS, Table, read_table
+from drake_teleop.logs.read.tables import Table, read_table
 
 BANDWIDTH = 30.0
 """Gaps are those that matter below this frequency [Hz]."""
@@ -95,7 +95,10 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
             topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
             for topic in topics
         }
-    elif log.suffix.lower() in FORMATS:
+    elif log.suffix.lower() in (".yaml", ".yml"):
+        description = load_description(log)
+        tables = {}
+    else:
         table = read_table(log)
         try:
             description = describe_canonical(log, table)
@@ -110,9 +113,6 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
         if description is None:
             draft = draft_description(table, out)
             summary["kind"] = "unknown"
-    else:
-        description = load_description(log)
-        tables = {}
     if description is None:
         summary["draft"] = str(out / "draft.yaml")
         (out / "draft.yaml").write_text(draft, encoding="utf-8")

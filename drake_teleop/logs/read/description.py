@@ -26,6 +26,7 @@ from pydantic import (
     Field,
     ValidationError,
     WithJsonSchema,
+    field_validator,
     model_validator,
 )
 
@@ -34,6 +35,7 @@ from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
 from drake_teleop.texts import read_yaml
 
 STANDARD_GRAVITY = 9.80665
+_LARGEST_GRAVITY = 100.0
 ROTATION_TOLERANCE = 0.01
 
 UNITS = {
@@ -90,6 +92,8 @@ def _gravity(value: Any) -> Any:
 
 
 Column = str | int
+
+
 Number = Annotated[float, Field(strict=True)]  # neither true nor "1"
 Vector = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 Rotation = tuple[Vector, Vector, Vector]
@@ -107,6 +111,14 @@ Place = Annotated[Vector | Literal["auto"], BeforeValidator(_place)]
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _in_reach(cls, value: Any) -> Any:
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, (int, float)) and 1e12 < abs(number) < np.inf:
+                raise ValueError(f"{number:g} is beyond 1e12")
+        return value
 
 
 class Time(_Strict):
@@ -308,6 +320,8 @@ class Description(_Strict):
 
     @model_validator(mode="after")
     def _complete(self) -> Description:
+        if np.abs(self.gravity).max() > _LARGEST_GRAVITY:
+            raise ValueError(f"gravity is beyond {_LARGEST_GRAVITY:g} m/s^2")
         if self.static is not None:
             if self.wrench or self.imu or self.pose:
                 raise ValueError("static poses stand alone: remove wrench, imu and pose")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ from drake_teleop.logs.read.rotations import (
     rotation_error,
     rotation_matrices,
 )
-from drake_teleop.logs.read.streams import Stream, in_S, on_clock, turned_wrench
+from drake_teleop.logs.read.streams import LARGEST, Stream, in_S, on_clock, turned_wrench
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 
 MINIMUM_SAMPLES = 16
@@ -166,14 +167,23 @@ class _Reader:
         self, name: str, stream: Wrench | Static, table: Table, rows: int
     ) -> NDArray[np.float64]:
         both = [
-            table.numbers(quantity.columns, 3, f"{self._source}:{name}.{field}.columns", rows)
-            * (stream.sign * self._description.scale(quantity.unit))
+            self._vectors(name, field, quantity, table, rows, stream.sign)
             for field, quantity in (("force", stream.force), ("torque", stream.torque))
         ]
         if isinstance(stream.frame, tuple):
             R = np.array(stream.frame)
             both = [vectors @ R.T for vectors in both]
         return np.hstack(both)
+
+    def _vectors(
+        self, name: str, field: str, quantity: Any, table: Table, rows: int, sign: float = 1.0
+    ) -> NDArray[np.float64]:
+        """(rows, 3) of a stream's field in SI, in the axes of the file, of a size that can be."""
+        where = f"{self._source}:{name}.{field}.columns"
+        values = table.numbers(quantity.columns, 3, where, rows) - getattr(quantity, "bias", 0.0)
+        values = values * (sign * self._description.scale(quantity.unit))
+        table.check_size(values, *LARGEST[field], where)
+        return values
 
     def _pose(self, stream: Pose) -> Stream:
         table = self._table(stream)
@@ -187,11 +197,8 @@ class _Reader:
         R_WS = nearest_rotation(resample(t, raw_t, raw_R))
         acceleration = np.zeros(3)
         if stream.position is not None:
-            where = f"{self._source}:pose.position.columns"
-            position = table.numbers(stream.position.columns, 3, where, clock.total)
-            position = resample(t, raw_t, position[clock.rows]) * self._description.scale(
-                stream.position.unit
-            )
+            position = self._vectors("pose", "position", stream.position, table, clock.total)
+            position = resample(t, raw_t, position[clock.rows])
             acceleration = smooth_derivatives(position, dt, self._bandwidth_hz)[2]
         return Stream(
             "pose",
@@ -212,11 +219,8 @@ class _Reader:
             quantity = getattr(stream, field)
             if quantity is None:
                 return None
-            where = f"{self._source}:imu.{field}.columns"
-            values = table.numbers(quantity.columns, 3, where, clock.total)
-            unbiased = values[clock.rows] - quantity.bias
-            scaled = resample(t, raw_t, unbiased) * (sign * self._description.scale(quantity.unit))
-            return self._to_S("imu", stream.frame, scaled, t, pose)
+            values = self._vectors("imu", field, quantity, table, clock.total, sign)
+            return self._to_S("imu", stream.frame, resample(t, raw_t, values[clock.rows]), t, pose)
 
         s = vectors("specific_force", stream.sign)
         omega, alpha = vectors("angular_velocity"), vectors("angular_acceleration")
@@ -268,10 +272,7 @@ class _Reader:
         table = self._table(stream)
         wrench = self._forces("static", stream, table, table.rows)
         if stream.gravity is not None:
-            where = f"{self._source}:static.gravity.columns"
-            gravity = table.numbers(stream.gravity.columns, 3, where, table.rows)
-            scale = self._description.scale(stream.gravity.unit)
-            gravity = (gravity - stream.gravity.bias) * scale
+            gravity = self._vectors("static", "gravity", stream.gravity, table, table.rows)
             R_SW = None
         else:
             assert stream.orientation is not None

@@ -9,6 +9,17 @@ from numpy.typing import NDArray
 
 from drake_teleop.logs.read.alignment import low_pass, resample, spacing
 
+LARGEST = {
+    "force": (1e6, "N"),
+    "torque": (1e6, "N m"),
+    "specific_force": (1e6, "m/s^2"),
+    "gravity": (1e6, "m/s^2"),
+    "angular_velocity": (1e6, "rad/s"),
+    "angular_acceleration": (1e9, "rad/s^2"),
+    "position": (1e9, "m"),
+}
+"""What no log holds, not even in wrong units within reach: those are told by what they explain."""
+
 
 @dataclass(frozen=True)
 class Stream:

@@ -6,6 +6,8 @@ Topics of bags become the same kind of table in `drake_teleop.logs.read.bags`.
 from __future__ import annotations
 
 import difflib
+import math
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
     import polars as pl
 
 FORMATS = (".csv", ".parquet", ".npz")
+LARGEST = 1e25
+"""Numbers beyond are none that were measured, in whatever unit: nanoseconds since 1970 are 2e18."""
 
 
 @dataclass(frozen=True)
@@ -91,10 +95,36 @@ class Table:
         name = str(name)
         if name not in self.columns:
             return self._column(name, where)
-        column = self.columns[name]
-        return _as_numbers(column, lambda row, cell: self._bad(name, row, cell)).reshape(
-            len(column), -1
-        )
+        numbers = self._numbers(name)
+        self.check_size(numbers, LARGEST, "", f"{self.path}:{name}")
+        return numbers
+
+    def check_size(
+        self, values: NDArray[np.float64], largest: float, unit: str, where: str
+    ) -> None:
+        """Refuses what cannot have been measured, and would be beyond all floats when squared.
+
+        Args:
+            values: (N, k), a row for each of the table's.
+            largest: size of a value, in the unit.
+            unit: for the message.
+            where: the field, for the message.
+
+        Raises:
+            DrakeTeleopError: naming the first row with a number that is larger, but not infinite.
+        """
+        if not values.size or (values.min() >= -largest and values.max() <= largest):
+            return
+        bad = ((np.abs(values) > largest) & np.isfinite(values)).any(axis=1)
+        if bad.any():
+            first = int(np.argmax(bad))
+            worst = values[first][np.argmax(np.abs(values[first]))]
+            raise DrakeTeleopError(
+                f"{worst:g} {unit}".rstrip() + f" in row {first + self.first_row} of"
+                f" {self.path.name} is outside {-largest:g} to {largest:g}",
+                where=where,
+                remedy="check the column and its unit, or delete the row",
+            )
 
     def _column(self, name: str, where: str) -> NDArray[np.float64]:
         if name not in self.columns:
@@ -111,8 +141,8 @@ class Table:
                 where=where,
                 remedy=f"{hint} {_listed(near or list(self.columns))}",
             )
-        numbers = _as_numbers(self.columns[name], lambda row, cell: self._bad(name, row, cell))
-        bad = ~np.isfinite(numbers).reshape(len(numbers), -1).all(axis=1)
+        numbers = self.raw(name, where)
+        bad = ~np.isfinite(numbers).all(axis=1)
         if bad.any():
             first = int(np.argmax(bad))
             raise DrakeTeleopError(
@@ -121,7 +151,12 @@ class Table:
                 where=f"{self.path}:{name}",
                 remedy="cut the log before it or repair the rows",
             )
-        return numbers.reshape(len(numbers), -1)
+        return numbers
+
+    def _numbers(self, name: str) -> NDArray[np.float64]:
+        column = self.columns[name]
+        numbers = _as_numbers(column, lambda row, cell: self._bad(name, row, cell))
+        return numbers.reshape(len(column), math.prod(numbers.shape[1:]))
 
     def _bad(self, name: str, row: int, cell: object) -> DrakeTeleopError:
         return DrakeTeleopError(
@@ -152,7 +187,7 @@ def read_table(path: Path, *, header: bool = True) -> Table:
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     try:
         table = _read_npz(path) if path.suffix.lower() == ".npz" else _read_frame(path, header)
-    except (OSError, ValueError) as error:
+    except Exception as error:  # what a damaged file leads to, zipfile, numpy, polars do not say
         raise _unreadable(path, error) from error
     if not table.columns or not all(len(c) for c in table.columns.values()):
         raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
@@ -163,18 +198,17 @@ def _read_frame(path: Path, header: bool) -> Table:
     import polars as pl
 
     is_csv = path.suffix.lower() == ".csv"
-    try:
-        if is_csv:
-            frame = pl.read_csv(path, has_header=header, infer_schema_length=None)
-            names = [name.strip() if header else str(i) for i, name in enumerate(frame.columns)]
-            found = [_frame_column(series) for series in frame.get_columns()]
-        else:
-            # One column at a time: the whole table would be in memory twice.
-            names = list(pl.read_parquet_schema(path))
-            found = [_frame_column(pl.read_parquet(path, columns=[n]).to_series()) for n in names]
-    except pl.exceptions.PolarsError as error:
-        raise _unreadable(path, error) from error
+    if is_csv:
+        frame = pl.read_csv(path, has_header=header, infer_schema_length=None)
+        names = [name if header else str(i) for i, name in enumerate(frame.columns)]
+        found = [_frame_column(series) for series in frame.get_columns()]
+    else:
+        # One column at a time: the whole table would be in memory twice.
+        names = list(pl.read_parquet_schema(path))
+        found = [_frame_column(pl.read_parquet(path, columns=[n]).to_series()) for n in names]
     columns = {name.strip(): column for name, column in zip(names, found, strict=True)}
+    if len(columns) < len(names):
+        raise ValueError("two of its columns have names that differ in spaces alone")
     return Table(path, columns, first_row=2 if is_csv and header else 1)
 
 
@@ -186,8 +220,13 @@ def _frame_column(series: pl.Series) -> NDArray:
 
 
 def _read_npz(path: Path) -> Table:
+    if not zipfile.is_zipfile(path):
+        raise ValueError("it is no archive of arrays, or not all of one; numpy.savez writes them")
     with np.load(path, allow_pickle=False) as archive:
-        return Table(path, {key: archive[key] for key in archive.files if archive[key].ndim})
+        columns = {key: archive[key] for key in archive.files}
+    return Table(
+        path, {key: x for key, x in columns.items() if isinstance(x, np.ndarray) and x.ndim}
+    )
 
 
 def _as_numbers(
@@ -195,6 +234,8 @@ def _as_numbers(
 ) -> NDArray[np.float64]:
     if column.dtype.kind in "fiu":
         return column.astype(float, copy=False)
+    if column.dtype.kind == "c" and len(column):  # float() would drop half of it
+        raise bad(0, column[0])
     numbers = np.empty(len(column))
     for row, cell in enumerate(column):
         try:
@@ -206,7 +247,7 @@ def _as_numbers(
 
 def _unreadable(path: Path, error: Exception) -> DrakeTeleopError:
     return DrakeTeleopError(
-        f"cannot be read: {str(error).splitlines()[0]}",
+        f"cannot be read: {(str(error).splitlines() or [type(error).__name__])[0]}",
         where=str(path),
         remedy=f"check that it is a valid {path.suffix} file",
     )

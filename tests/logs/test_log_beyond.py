@@ -1,0 +1,161 @@
+"""Damaged files, and numbers that no log holds: one line each, said once."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+
+import numpy as np
+import pytest
+from numpy.lib import format as npy
+
+from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.load.online.segments import segments
+from drake_teleop.logs.read.description import load_description
+from drake_teleop.logs.read.reading import read_log
+from drake_teleop.logs.read.tables import read_table
+
+COLUMNS = (
+    *("t", "f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z", "s_x", "s_y", "s_z"),
+    *("omega_x", "omega_y", "omega_z", "alpha_x", "alpha_y", "alpha_z"),
+)
+
+
+def archive(**members: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, **members)
+    return stream.getvalue()
+
+
+def zipped(content: bytes) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as file:
+        file.writestr("t.npy", content)
+    return stream.getvalue()
+
+
+def header(shape: tuple[int, ...]) -> bytes:
+    stream = io.BytesIO()
+    npy.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+def one_array() -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, np.zeros(3))
+    return stream.getvalue()
+
+
+WHOLE = archive(t=np.arange(100.0))
+AT = WHOLE.index(np.arange(100.0)[50:52].tobytes())
+DAMAGED = {
+    "the end is missing": (WHOLE[:-30], "not all of one"),
+    "the half is missing": (WHOLE[: len(WHOLE) // 2], "not all of one"),
+    "a wrong checksum": (WHOLE[:AT] + b"\x7f" + WHOLE[AT + 1 :], "Bad CRC"),
+    "one array": (one_array(), "no archive of arrays"),
+    "text": (b"t\n0\n1\n", "no archive of arrays"),
+    "nothing": (b"", "no archive of arrays"),
+    "objects": (archive(t=np.array([None, {}])), "Object arrays"),
+    "73 TiB": (zipped(header((10**13,))), "cannot be read"),
+    "no header": (zipped(b"\x93NUMPY\x01\x00\x10\x00{'descr': nonsens"), "cannot be read"),
+    "no array": (zipped(b""), "holds no rows"),
+}
+
+
+def message(call) -> str:
+    with pytest.raises(DrakeTeleopError) as caught:
+        call()
+    line = str(caught.value)
+    assert len(line) <= LONGEST_LINE
+    assert line.count("cannot be read") <= 1 and line.count("check ") <= 1
+    return line
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_damaged_archive(name, tmp_path):
+    content, expected = DAMAGED[name]
+    path = tmp_path / "x.npz"
+    path.write_bytes(content)
+    line = message(lambda: read_table(path))
+    assert line.startswith(f"{path}: ") and expected in line
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_an_archive_by_another_name(suffix, tmp_path):
+    path = tmp_path / f"x{suffix}"
+    path.write_bytes(WHOLE)
+    assert message(lambda: read_table(path)).startswith(f"{path}: cannot be read: ")
+
+
+def test_half_of_a_complex_number_is_not_dropped(tmp_path):
+    path = tmp_path / "x.npz"
+    path.write_bytes(archive(t=np.array([1.0 + 1.0j])))
+    table = read_table(path)
+    assert "is not a number" in message(lambda: table.numbers(["t"], 1, "x"))
+
+
+def test_no_column_is_dropped_for_its_name(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("a, a\n1,2\n")
+    assert "differ in spaces alone" in message(lambda: read_table(path))
+
+
+def log_file(folder, **changes: float):
+    t = np.arange(60) * 1e-3
+    table = np.column_stack([t, np.sin(np.outer(t, 2.0 + np.arange(15)))])
+    for name, value in changes.items():
+        table[17, COLUMNS.index(name)] = value
+    path = folder / "log.csv"
+    np.savetxt(path, table, delimiter=",", header=",".join(COLUMNS), comments="")
+    return path
+
+
+@pytest.mark.parametrize("name", ["t", "f_x", "tau_y", "s_z", "omega_x", "alpha_y"])
+@pytest.mark.parametrize("value", [1e300, -1e26])
+def test_what_is_beyond_all_units(name, value, tmp_path):
+    path = log_file(tmp_path, **{name: value})
+    line = message(lambda: read_log(path))
+    assert line.startswith(f"{path}:{name}: {value:g} in row 19 of log.csv is outside -1e+25 to")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("f_y", 2e6, "wrench.force.columns: 2e+06 N in row 19 of log.csv is outside -1e+06 to"),
+        ("tau_z", -2e6, "wrench.torque.columns: -2e+06 N m in row 19"),
+        ("s_x", 2e6, "imu.specific_force.columns: 2e+06 m/s^2 in row 19"),
+        ("omega_z", 2e6, "imu.angular_velocity.columns: 2e+06 rad/s in row 19"),
+        ("alpha_x", 2e9, "imu.angular_acceleration.columns: 2e+09 rad/s^2 in row 19"),
+    ],
+)
+def test_what_no_sensor_measures(name, value, expected, tmp_path):
+    path = log_file(tmp_path, **{name: value})
+    assert f"{path}:{expected}" in message(lambda: read_log(path))
+    assert len(read_log(log_file(tmp_path, **{name: value / 4}))) == 60
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ("gravity: 1e300", ":gravity: 1e+300 is beyond 1e12"),
+        ("gravity: [0, 0, -9810]", "gravity is beyond 100 m/s^2"),
+        ("wrench: {time: {rate: 100, offset: -1e13}}", ":wrench.time.offset: -1e+13 is beyond"),
+        ("imu: {position: [0, 1e300, 0]}", ":imu.position: 1e+300 is beyond 1e12"),
+    ],
+)
+def test_a_description_beyond_all_units(change, expected, tmp_path):
+    path = tmp_path / "x.yaml"
+    static = "static: {file: a.csv, force: {columns: [a]}, torque: {columns: [b]}, gravity:"
+    static += " {columns: [c]}}"
+    path.write_text(change if "wrench" in change or "imu" in change else f"{static}\n{change}")
+    assert expected in message(lambda: load_description(path))
+
+
+@pytest.mark.parametrize("dead", [slice(3, 4), slice(0, 1), slice(3, 6)])
+def test_a_channel_that_says_nothing_divides_by_nothing(dead):
+    t = np.arange(2000) * 2e-3
+    motion = np.sin(np.outer(t, 2.0 + np.arange(9)))
+    wrench = np.cos(np.outer(t, 3.0 + np.arange(6)))
+    wrench[:, dead] = 0.0
+    with np.errstate(all="raise", under="ignore"):
+        assert segments(wrench, *np.split(motion, 3, axis=1), 2e-3) == []
