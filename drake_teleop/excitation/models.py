@@ -84,6 +84,8 @@ def ParseModel(
             efforts = _efforts(root)
             text = ElementTree.tostring(root, encoding="unicode")
             instances = parser.AddModelsFromString(text, kind)
+    except DrakeTeleopError:
+        raise
     except (RuntimeError, ValueError) as error:
         reason = str(error).replace("<literal-string>", "")
         raise DrakeTeleopError(
