@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -20,7 +21,11 @@ from drake_teleop.task_measures import TASK_MEASURES, task_failure, task_measure
 T = np.arange(0.0, 4.0 + 1e-9, 1e-3)
 START, END, CONTACT, NOTICED = 0.5, 3.0, 1.5, 1.75  # s, in the log
 SETTLE = 0.25
-HOME = home_position(slave_arm(Scenario()), Scenario().slave.position)
+
+
+@functools.cache  # what it compiles is not for each worker to compile while it collects
+def home():
+    return home_position(slave_arm(Scenario()), Scenario().slave.position)
 
 
 def measures(task, **log):
@@ -48,7 +53,7 @@ def run(task, *, done: float = 1.0, force: float = 6.0, early: bool = False, pha
         "hand_wrench_E": hand,
         "twist_master": twist,
         "true_contact_wrench_W": contact,
-        "slave_state": np.tile([*HOME, *np.zeros(6)], (len(T), 1)),
+        "slave_state": np.tile([*home(), *np.zeros(6)], (len(T), 1)),
     }
     result = SimulationResult(T, signals, [SIGNALS[name] for name in signals])
     operator = OperatorConfig(task=task)

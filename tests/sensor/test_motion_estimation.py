@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -44,8 +45,7 @@ Array = NDArray[np.float64]
 
 T = 1 / 8000
 SOURCES = ("encoders", "accelerometer", "fused")
-ARM = AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm
-HOME = home_position(ARM, [0.55, 0.0, 0.45])
+ARM = AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None, np.zeros(6)).arm
 JR3 = PRESETS["jr3_85m35a3"]
 #: Nothing but its low-pass, and an accelerometer that is somewhere and looks somewhere else.
 QUIET = dataclasses.replace(
@@ -53,6 +53,11 @@ QUIET = dataclasses.replace(
     p_SoAo_S=[0.02, -0.03, 0.05],
     R_SA=[0.0, -1.0, 0.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0],
 )
+
+
+@functools.cache  # what it compiles is not for each worker to compile while it collects
+def home() -> Array:
+    return home_position(ARM, [0.55, 0.0, 0.45])
 
 
 def truth_of(motion, arm=ARM) -> Array:
@@ -95,8 +100,9 @@ def rms(rows: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(rows**2, axis=1))))
 
 
-def swinging(t: Array, frequencies=(1.3, 2.1, 0.7, 2.6, 1.9, 3.1), start=HOME, acceleration=5.0):
-    """Every joint on its own sine; exact derivatives."""
+def swinging(t: Array, frequencies=(1.3, 2.1, 0.7, 2.6, 1.9, 3.1), start=None, acceleration=5.0):
+    """Every joint on its own sine, about home or `start`; exact derivatives."""
+    start = home() if start is None else start
     w = 2 * np.pi * np.array(frequencies)
     phase = np.outer(t, w) + np.arange(len(w))
     amplitude = acceleration / w**2
@@ -112,7 +118,7 @@ def papers_motion(seconds: float):
     coarse = np.arange(0.0, seconds + 0.01, 0.004)
     x = np.clip(coarse / 0.6, 0.0, 1.0)
     height = 0.45 + 0.078 * x**3 * (10 - 15 * x + 6 * x**2) * np.sin(2 * np.pi * 2.63 * coarse)
-    path, q = [], HOME
+    path, q = [], home()
     for z in height:
         q, _ = nearest_branch(R_WS_HOME.matrix(), np.array([0.55, 0.0, z]), q, ARM.lower, ARM.upper)
         path.append(q)
@@ -394,7 +400,7 @@ def test_the_flag_stays_while_a_part_of_the_reading_waits():
     sensor = dataclasses.replace(QUIET, acceleration_latency=1e-3)
     constants, memory = motion_estimator(MotionEstimationConfig("fused"), sensor, 6, T)
     reading, sample, flags = np.zeros(19), np.zeros(22), []
-    reading[13:] = HOME
+    reading[13:] = home()
     for k in range(40):
         reading[12] = float(k == 20)
         estimate_into(constants, memory, ARM.table, reading, sample)
