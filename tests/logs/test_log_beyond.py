@@ -10,7 +10,10 @@ import pytest
 from numpy.lib import format as npy
 
 from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.load.batch.methods import identify_batch
+from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.online.segments import segments
+from drake_teleop.logs.check.inspection import inspect_command
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.tables import read_table
@@ -141,13 +144,15 @@ def test_what_no_sensor_measures(name, value, expected, tmp_path):
         ("gravity: [0, 0, -9810]", "gravity is beyond 100 m/s^2"),
         ("wrench: {time: {rate: 100, offset: -1e13}}", ":wrench.time.offset: -1e+13 is beyond"),
         ("imu: {position: [0, 1e300, 0]}", ":imu.position: 1e+300 is beyond 1e12"),
+        ("wrench: {time: {rate: 1e-300}}", ":wrench.time.rate: "),
+        ("pose: {time: {column: t, scale: 1e-300}}", ":pose.time.scale: "),
     ],
 )
 def test_a_description_beyond_all_units(change, expected, tmp_path):
     path = tmp_path / "x.yaml"
     static = "static: {file: a.csv, force: {columns: [a]}, torque: {columns: [b]}, gravity:"
     static += " {columns: [c]}}"
-    path.write_text(change if "wrench" in change or "imu" in change else f"{static}\n{change}")
+    path.write_text(f"{static}\n{change}" if "gravity" in change else change)
     assert expected in message(lambda: load_description(path))
 
 
@@ -159,3 +164,30 @@ def test_a_channel_that_says_nothing_divides_by_nothing(dead):
     wrench[:, dead] = 0.0
     with np.errstate(all="raise", under="ignore"):
         assert segments(wrench, *np.split(motion, 3, axis=1), 2e-3) == []
+
+
+def test_a_record_shorter_than_a_block_has_one_load():
+    assert segments(np.ones((9, 6)), *np.ones((3, 9, 3)), 1e-5) == []
+
+
+@pytest.mark.parametrize("rows", [2, 3])
+def test_a_record_that_is_too_short_to_be_thinned(rows, tmp_path):
+    path = tmp_path / "log.csv"
+    table = np.outer(np.arange(rows) * 1e-3, np.ones(len(COLUMNS)))
+    np.savetxt(path, table, delimiter=",", header=",".join(COLUMNS), comments="")
+    found = inspect_command(path, tmp_path / "out", quiet=True)["findings"]
+    assert any("too few" in finding["message"] for finding in found)
+
+
+def test_a_wrench_of_rounding_tells_no_mass():
+    motion = np.sin(np.outer(np.arange(100.0), 1.0 + np.arange(9)))
+    wrench = 1e-150 * np.cos(np.outer(np.arange(100.0), 1.0 + np.arange(6)))
+    line = message(lambda: identify_batch(wrench, *np.split(motion, 3, axis=1)))
+    assert "no mass can be told" in line
+
+
+def test_channels_far_below_what_is_known_of_the_load():
+    contact = np.tile([1e-5, 1e-5, 1e-5, 1e-5, 1e-6, 2e-7], (300, 1))
+    known = np.diag(np.repeat([1.0, 0.0], [6, 10]))
+    floor = fit_noise_floor(contact, *np.zeros((4, 300, 3)), known)
+    assert np.linalg.eigvalsh(floor.correlation)[0] > 0.0

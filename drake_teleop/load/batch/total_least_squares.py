@@ -47,6 +47,7 @@ from drake_teleop.load.batch.moments import (
 # At most so many weights, until theta changes by less; how near to a pole a root may be; and
 # standard deviations of noise that a signal must exceed.
 _ITERATIONS, _CONVERGED, _ROUNDING, _SIGNIFICANT = 10, 1e-8, 1e-12, 5.0
+_NOTHING = 1e-60  # N^2, N^2 m^2: mean squares whose inverse is beyond all use
 
 
 class NormalForm(NamedTuple):
@@ -91,7 +92,7 @@ def total_least_squares(
         DrakeTeleopError: for fewer than 3 samples, or if the wrench is zero throughout.
     """
     Z, Q = moments.mean, moments.noise_covariance(noise, wrench_noise)
-    if not Z[1:7, 1:7].any():
+    if np.diag(Z)[1:7].max() <= _NOTHING:
         raise DrakeTeleopError(
             "no mass can be told from this wrench",
             where="wrench",

@@ -77,7 +77,8 @@ def fit_noise_floor(
     )
     scaled = rows[0] / floor.sigma(*rows[1:])
     deviations = np.sqrt(np.mean(scaled**2, axis=0))
-    power = scaled.T @ scaled / len(scaled) / np.maximum(np.outer(deviations, deviations), 1e-12)
+    least = np.maximum(deviations, 1e-6)
+    power = scaled.T @ scaled / len(scaled) / np.outer(least, least)
     # A channel without noise of its own is still one of six.
     correlation = 0.999 * power + 0.001 * np.eye(6)
     np.fill_diagonal(correlation, 1.0)

@@ -86,6 +86,8 @@ def segments(
     _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     each = max(1, round(BLOCK / float(positive("period", period))))
     n = len(rows[0]) // each
+    if n == 0:
+        return []
     rows = [table[: n * each].reshape(n, each, -1).mean(axis=1) for table in rows]
     length = max(_FEWEST, -(-n // _BLOCKS))
     edges = np.append(np.arange(0, n - length + 1, length), n)

@@ -72,7 +72,8 @@ class LogData:
         else:
             t = self._tables[stream.source].raw(str(time.column), "time")[:, 0]
             rate = 1 / max(1e-12, float(np.median(np.diff(t))) * description.scale(time.unit))
-        return max(1, math.floor((rate / _RATE - 1) / 2) * 2 + 1)
+        rows = self._tables[stream.source].rows  # of which one at least shall be left
+        return max(1, min(rows, math.floor((rate / _RATE - 1) / 2) * 2 + 1))
 
     def _thin(self, stream: Any, thin: Table, k: int) -> None:
         """Means over k rows; of an orientation, which has no mean, the row in the middle."""

@@ -126,10 +126,15 @@ class Time(_Strict):
 
     column: Column | None = None
     unit: Literal["s", "ms", "us", "ns"] = "s"
-    rate: Number | None = Field(default=None, gt=0, description="Hz, if there is no column")
+    rate: Number | None = Field(
+        default=None, ge=1e-3, le=1e6, description="Hz, if there is no column"
+    )
     offset: Number = Field(default=0.0, description="s, added to the stream's clock")
     scale: Number = Field(
-        default=1.0, gt=0, description="of the time since the first row, for a clock that drifts"
+        default=1.0,
+        ge=0.5,
+        le=2,
+        description="of the time since the first row, for a clock that drifts",
     )
 
     @model_validator(mode="after")
