@@ -25,6 +25,14 @@ def test_the_python_example_runs(tmp_path, monkeypatch):
     assert Path("forces.png").stat().st_size > 10_000
 
 
+def test_it_is_short_and_begins_with_the_scene():
+    lines = README.splitlines()
+    assert len(lines) <= 150
+    (first, *others) = [number for number, line in enumerate(lines) if line.startswith("![")]
+    assert first < 10 and "scene.png" in lines[first]
+    assert len(others) >= 7
+
+
 def test_every_link_into_the_repository_leads_somewhere():
     targets = re.findall(r"\]\((?!https?:)([^)]+)\)", README)
     assert targets
