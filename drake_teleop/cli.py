@@ -163,7 +163,7 @@ def identify(
 )
 @click.option(
     "--gamma",
-    type=option.Number(-100, 100),
+    type=option.Number(0, 100),
     default=1.0,
     show_default=True,
     help="Scale of the contact wrench.",

@@ -136,7 +136,7 @@ def test_a_range_is_said_in_words(capsys, option, number, says):
         ("--delay", "1e300", "1e+300 is outside -10 to 10"),
         ("--sigma", "1e308", "1e+308 is outside 0 to 100"),
         ("--sigma-object", "101", "101 is outside 0 to 100"),
-        ("--gamma", "-1e308", "-1e+308 is outside -100 to 100"),
+        ("--gamma", "-1e308", "-1e+308 is outside 0 to 100"),
         ("--cutoff", "1e300", "1e+300 is outside 0 to 100000"),
         ("--cutoff", "-1", "-1 is outside 0 to 100000"),
         ("--causal-tare", "1e9", "1e+09 is outside 0 to 36000"),

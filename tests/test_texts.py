@@ -130,14 +130,22 @@ def test_what_no_load_file_may_hold(text, expected, tmp_path):
     assert expected in message(Identification.load, tmp_path / "x.json", text)
 
 
-@pytest.mark.parametrize("value", ['"1"', "true", "9" * 400])
-def test_what_is_no_number_in_a_load_file(value, tmp_path, identified):
+@pytest.mark.parametrize(
+    ("name", "old", "value"),
+    [
+        ("condition_number", "4.0", '"1"'),
+        ("condition_number", "4.0", "true"),
+        ("condition_number", "4.0", "9" * 400),
+        ("delay_s", "0.0", "1e300"),
+    ],
+)
+def test_what_is_no_number_in_a_load_file(name, old, value, tmp_path, identified):
     path = tmp_path / "x.json"
     identified.save(path)
     text = path.read_text()
-    changed = text.replace('"condition_number": 4.0', f'"condition_number": {value}')
+    changed = text.replace(f'"{name}": {old}', f'"{name}": {value}')
     assert changed != text
-    assert ":condition_number: " in message(Identification.load, path, changed)
+    assert f":{name}: " in message(Identification.load, path, changed)
 
 
 @pytest.fixture

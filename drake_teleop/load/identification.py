@@ -48,6 +48,7 @@ WORTH_STATING = 0.05
 """Standard deviation over natural scale up to which a parameter is identified."""
 # Worth stating: standard deviation over natural scale, smallest size of a load [m], gravity.
 _WEAK, _SMALLEST_SIZE, _GRAVITY = 0.5, 0.03, 9.81
+_LARGEST = 1e9  # of any value, in SI: beyond, its squares' squares are not far from infinity
 _OPTIONAL = {"degrees_of_freedom", "prior_dominated", "verdicts"}
 
 
@@ -189,10 +190,13 @@ class Identification:
             what = "is missing" if name in known else "is not a field of an identification"
             raise DrakeTeleopError(what, where=f"{path}:{name}")
 
-        def numbers(name: str, *shape: int) -> Array:
+        def numbers(name: str, *shape: int, largest: float = np.inf) -> Array:
             if not _holds_numbers(document[name]):
                 raise DrakeTeleopError("holds no numbers", where=f"{path}:{name}")
-            return checked(f"{path}:{name}", document[name], *shape)
+            array = checked(f"{path}:{name}", document[name], *shape)
+            if np.abs(array).max() > largest:
+                raise DrakeTeleopError(f"is beyond {largest:g}", where=f"{path}:{name}")
+            return array
 
         if not isinstance(document["method"], str):
             raise DrakeTeleopError("is no text", where=f"{path}:method")
@@ -202,13 +206,13 @@ class Identification:
         if (name := "prior_dominated") in document:
             optional[name] = _read_flags(f"{path}:{name}", document[name])
         result = cls(
-            phi=learnt(f"{path}:phi", numbers("phi", 10)),
-            offsets=numbers("offsets", 6),
+            phi=learnt(f"{path}:phi", numbers("phi", 10, largest=_LARGEST)),
+            offsets=numbers("offsets", 6, largest=_LARGEST),
             covariance=_read_covariance(f"{path}:covariance", document["covariance"]),
             identifiable=_read_flags(f"{path}:identifiable", document["identifiable"]),
             condition_number=float(numbers("condition_number")),
-            delay_s=float(numbers("delay_s")),
-            residual_rms=numbers("residual_rms", 6),
+            delay_s=float(numbers("delay_s", largest=_LARGEST)),
+            residual_rms=numbers("residual_rms", 6, largest=_LARGEST),
             method=document["method"],
             samples=int(numbers("samples")),
             **optional,

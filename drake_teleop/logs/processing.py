@@ -31,6 +31,7 @@ from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.reading import read_log
 
 _FEWEST_TO_TARE = 10
+_LARGEST_SCALE = 100.0  # as of `ForceScalingConfig`
 
 
 @dataclass(frozen=True, repr=False)
@@ -420,11 +421,9 @@ def _scales(
     sigma: float, sigma_object: float | None, gamma: float, eta: float | None, split: bool
 ) -> dict[str, float]:
     """The three scales of `scaled_wrench`; without a gripper (`split`) the load is all object."""
-    for name, value in (("sigma", sigma), ("sigma_object", sigma_object)):
-        if value is not None and number(name, value) < 0:
-            raise DrakeTeleopError(
-                f"{name} is {value:g}", where=name, remedy="give a number of at least 0"
-            )
+    for name, value in (("sigma", sigma), ("sigma_object", sigma_object), ("gamma", gamma)):
+        if value is not None and not 0.0 <= number(name, value) <= _LARGEST_SCALE:
+            raise DrakeTeleopError(f"{value:g} is outside 0 to {_LARGEST_SCALE:g}", where=name)
     if sigma_object is not None and not split:
         raise DrakeTeleopError(
             "sigma_object needs to know what is gripper and what is object",

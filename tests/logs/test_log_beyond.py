@@ -14,6 +14,7 @@ from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.online.segments import segments
 from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.tables import read_table
@@ -191,3 +192,25 @@ def test_channels_far_below_what_is_known_of_the_load():
     known = np.diag(np.repeat([1.0, 0.0], [6, 10]))
     floor = fit_noise_floor(contact, *np.zeros((4, 300, 3)), known)
     assert np.linalg.eigvalsh(floor.correlation)[0] > 0.0
+
+
+@pytest.mark.parametrize("delay", [1e300, -1e300, 5.0])
+def test_a_delay_beyond_the_record(delay, tmp_path):
+    line = message(lambda: identify_log(log_file(tmp_path), delay=delay))
+    assert f"a delay of {delay:g} s leaves 0 of 60 samples" in line
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("sigma", 1e308), ("sigma", np.nan), ("gamma", 1e308), ("gamma", -1.0)]
+)
+def test_scales_beyond_all_use(name, value, tmp_path):
+    path = log_file(tmp_path)
+    load = identify_log(path, delay=0.0).identification
+    line = message(lambda: eliminate_log(path, load, **{name: value}))
+    assert line == f"{name}: {value:g} is outside 0 to 100"
+
+
+@pytest.mark.parametrize("cutoff", [1e-300, np.nan])
+def test_a_low_pass_that_leaves_nothing(cutoff, tmp_path):
+    path = log_file(tmp_path)
+    assert "Hz leave nothing" in message(lambda: identify_log(path, cutoff_hz=cutoff))

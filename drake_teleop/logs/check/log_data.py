@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from drake_teleop.logs.read.bags import read_stream
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description, Time
-from drake_teleop.logs.read.reading import read_description
+from drake_teleop.logs.read.reading import MINIMUM_SAMPLES, read_description
 from drake_teleop.logs.read.tables import Table
 
 _RATE = 100.0
@@ -72,8 +72,9 @@ class LogData:
         else:
             t = self._tables[stream.source].raw(str(time.column), "time")[:, 0]
             rate = 1 / max(1e-12, float(np.median(np.diff(t))) * description.scale(time.unit))
-        rows = self._tables[stream.source].rows  # of which one at least shall be left
-        return max(1, min(rows, math.floor((rate / _RATE - 1) / 2) * 2 + 1))
+        # So that enough are left of a short record.
+        most = min(rate / _RATE, self._tables[stream.source].rows / MINIMUM_SAMPLES)
+        return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
     def _thin(self, stream: Any, thin: Table, k: int) -> None:
         """Means over k rows; of an orientation, which has no mean, the row in the middle."""

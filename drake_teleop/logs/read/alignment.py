@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log
 
+_FEWEST = 8
 _SMOOTHER_SAMPLES = 9
 _SMOOTHER_DEGREE = 5
 SMOOTHER_WINDOW = 1.8
@@ -198,11 +200,20 @@ def undelayed(log: Log, delay_s: float) -> Log:
         log: the log.
         delay_s: how far the motion lags behind the wrench [s]; negative if it leads. The samples
             whose motion is then unknown (one end of the record) are dropped.
+
+    Raises:
+        DrakeTeleopError: if hardly any samples are left.
     """
     if log.static or delay_s == 0:
         return log
     at = log.t + delay_s
     known = (at >= log.t[0]) & (at <= log.t[-1])
+    if known.sum() < _FEWEST:
+        raise DrakeTeleopError(
+            f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples",
+            where=log.source,
+            remedy="give a shorter one, or auto",
+        )
     s, omega, alpha = (resample(at[known], log.t, x) for x in log.motion)
     bridged = None
     if log.bridged is not None:

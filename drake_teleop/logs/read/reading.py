@@ -45,6 +45,7 @@ from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 
 MINIMUM_SAMPLES = 16
 MINIMUM_POSES = 3
+_LEAST_HZ = 1e-3
 
 
 def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
@@ -67,7 +68,7 @@ def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
         DrakeTeleopError: naming file and field and what to do, if the log cannot be used.
     """
     expect((str, Path), path, "log", "give the file's name")
-    if bandwidth_hz is not None and not number("bandwidth_hz", bandwidth_hz) > 0.0:
+    if bandwidth_hz is not None and not number("bandwidth_hz", bandwidth_hz) >= _LEAST_HZ:
         raise DrakeTeleopError(
             f"{bandwidth_hz:g} Hz leave nothing", where="bandwidth_hz", remedy="give more, or None"
         )
