@@ -281,14 +281,14 @@ class SimulationResult:
         part = min(path.glob(_PART_NAMES), default=path)
         try:
             text = pl.read_parquet_metadata(part)[_METADATA_KEY]
+            specs = [Signal(**entry) for entry in json.loads(text)]
             t = pl.read_parquet(path, columns=["t"])["t"].to_numpy()
-        except (OSError, KeyError, pl.exceptions.PolarsError) as error:
+        except Exception as error:  # what a damaged file leads to, polars does not say
             raise DrakeTeleopError(
                 "is not a simulation result",
                 where=str(path),
                 remedy="give what SimulationResult.write_parquet or drake-teleop run wrote",
             ) from error
-        specs = [Signal(**entry) for entry in json.loads(text)]
         return cls(t, _SignalsOnDisk(path, specs), specs)
 
     def plot(self, *names: str, contact: ArrayLike | None = None) -> Figure:

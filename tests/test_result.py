@@ -155,7 +155,12 @@ def test_same_data_same_bytes_other_data_other_bytes(tmp_path):
 def test_foreign_and_absent_files_are_one_clear_error(tmp_path):
     pl.DataFrame({"t": [0.0]}).write_parquet(tmp_path / "foreign.parquet")
     (tmp_path / "text.parquet").write_text("no table at all")
-    for name in ("foreign.parquet", "text.parquet", "absent.parquet"):
+    names = ["foreign.parquet", "text.parquet", "absent.parquet"]
+    for spoilt in ("{", "3", '[{"name": "x"}]', "[" * 2000):
+        names.append(f"{len(names)}.parquet")
+        metadata = {"drake_teleop.signals": spoilt}
+        pl.DataFrame({"t": [0.0]}).write_parquet(tmp_path / names[-1], metadata=metadata)
+    for name in names:
         with pytest.raises(DrakeTeleopError, match=f"{name}: is not a simulation result"):
             SimulationResult.read_parquet(tmp_path / name)
 
