@@ -42,7 +42,7 @@ from drake_teleop.comparison.delayed_contact import (
 )
 from drake_teleop.comparison.one_dof import Figures, OneDof, figures, run_one_dof
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import identification_scenario, identify_load
+from drake_teleop.identified_load import identified_load
 from drake_teleop.pages.progress import Stage, show_progress
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.scenario import LoadScenario, Scenario, replace
@@ -184,13 +184,13 @@ def _station_study(
     networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: Stage
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, NDArray[np.float64]]]]:
     base = replace(LoadScenario("contact_transition"), simulation__seed=seed, rates__log_hz=500.0)
-    found = identify_load(identification_scenario(base, seed + 1), stage)
+    estimate = identified_load(base, stage).estimate
     # The longest runs first, so that no process is left with one at the end.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
     cases = list(itertools.product(slowest, LEAVES, methods))
     results = _each(
         station_run,
-        [(base, method, network, leaf, found.estimate) for network, leaf, method in cases],
+        [(base, method, network, leaf, estimate) for network, leaf, method in cases],
         jobs,
         stage("The whole station"),
     )

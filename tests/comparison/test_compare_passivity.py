@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import polars as pl
@@ -9,9 +10,12 @@ import pytest
 
 from drake_teleop.channel.network import PRESETS
 from drake_teleop.comparison import compare_passivity as study
-from drake_teleop.comparison.one_dof import OneDof
+from drake_teleop.comparison import delayed_contact
+from drake_teleop.comparison.one_dof import OneDof, Task
 from drake_teleop.comparison.report import COLUMNS, cells
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identified_load import identified_load
+from drake_teleop.scenario import LoadScenario, Rates, replace
 
 
 @pytest.mark.slow
@@ -19,6 +23,16 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "WALLS", (5100.0,))
     monkeypatch.setattr(study, "IMPAIRMENTS", ((0.0, 0.0),))
     monkeypatch.setattr(study, "LEAVES", {"contact": study.LEAVES["contact"]})
+    monkeypatch.setattr(study, "ROUND_TRIPS", (0.01, 0.02, 0.03, 0.1))
+    monkeypatch.setattr(study, "_COVERED", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3))))
+    # As long as one swings, presses, holds and rests; at a study's rates, with the load that the
+    # runs of the shipped scenario have identified as well.
+    task = Task(press=2.6, pressed=3.6, release=5.1, released=6.1, end=7.6, judged=1.0)
+    monkeypatch.setattr(delayed_contact, "task_over", lambda round_trip: task)
+    shipped = LoadScenario("contact_transition")
+    slower = replace(shipped, rates=Rates(2000.0, 1000.0, 1000.0))
+    monkeypatch.setattr(study, "LoadScenario", {"contact_transition": slower}.get)
+    monkeypatch.setattr(study, "identified_load", lambda base, stage: identified_load(shipped))
     summary = study.compare_command(
         tmp_path, networks=["lan"], methods=["none", "tdpa"], jobs=1, quiet=True
     )
