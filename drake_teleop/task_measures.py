@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.measure_names import TASK_MEASURES
 from drake_teleop.operator.decision import (
     DONE,
     FEELING,
@@ -54,18 +55,6 @@ _DOING = {
     PRESSING: "pressing",
     SEEKING: "seeking the way into the slot",
 }
-
-TASK_MEASURES = (
-    "success",
-    "task_time_s",
-    "contact_force_overshoot_N",
-    "effort_Ns",
-    "task_work_J",
-    "detection_time_s",
-    "false_notices",
-    "press_error_N",
-)
-"""Names of the measures, in the order of `task_measures`."""
 
 
 def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:

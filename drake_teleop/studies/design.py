@@ -185,10 +185,11 @@ class Study:
         from drake_teleop.studies.adaptive import propose
 
         # Others in each batch, or the points would all be on one grid.
-        candidates: list[Values] = []
-        for point in self._sobol(_CANDIDATES, self.seed + len(points)):
-            if point not in points and point not in candidates:
-                candidates.append(point)
+        tried = {str(point) for point in points}
+        drawn = self._sobol(_CANDIDATES, self.seed + len(points))
+        candidates = list(
+            {str(point): point for point in drawn if str(point) not in tried}.values()
+        )
         if len(candidates) <= count:
             return candidates
         chosen = propose(self._places(points), objective, self._places(candidates), count)

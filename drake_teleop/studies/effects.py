@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from drake_teleop.studies.design import Factor, Study
 from drake_teleop.studies.level_model import CONFIDENCE, Levels, level_model, levels_of
@@ -292,6 +292,6 @@ def _interval(table: Array) -> tuple[Array, Array]:
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.nansum(table, axis=1) / count
         spread = np.nansum((table - mean[:, None]) ** 2, axis=1) / (count - 1)
-        quantile = student.ppf(0.5 + CONFIDENCE / 2, np.maximum(count - 1, 1))
+        quantile = stdtrit(np.maximum(count - 1, 1), 0.5 + CONFIDENCE / 2)
         half = quantile * np.sqrt(spread / count)
     return mean, np.where(count > 1, half, np.nan)

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from drake_teleop.studies.design import Factor, Value
 
@@ -223,7 +223,7 @@ def _codes(count: int) -> Array:
 
 def _quantile(together: int, freedom: int) -> float:
     """Student's, if so many intervals hold together with `CONFIDENCE`."""
-    return float(student.ppf(1 - (1 - CONFIDENCE) / 2 / together, freedom))
+    return float(stdtrit(freedom, 1 - (1 - CONFIDENCE) / 2 / together))
 
 
 def _name(value: Value) -> str:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.measure_names import TASK_MEASURES
 from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import Scenario
-from drake_teleop.task_measures import TASK_MEASURES, task_measures
+
+if TYPE_CHECKING:
+    from drake_teleop.scenario import Scenario
 
 Array = NDArray[np.float64]
 
@@ -75,5 +78,7 @@ def measured(
     own = [name for name in names if name in _OF_EVERY_RUN]
     found = {name: _OF_EVERY_RUN[name](result, force_threshold) for name in own}
     if len(own) < len(names):
+        from drake_teleop.task_measures import task_measures
+
         found |= task_measures(result, scenario)
     return {name: found[name] for name in names}
