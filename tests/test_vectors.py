@@ -48,6 +48,11 @@ def test_adding_is_to_the_place_that_is_named():
     np.testing.assert_array_equal(x, [0, 0, *(a + b), 0])
 
 
+@njit
+def solved(M, b, n):
+    vectors.solve(M, b, n)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 3, 6])
 def test_cholesky_and_solve_are_those_of_numpy_and_read_the_lower_half_only(n):
@@ -55,7 +60,7 @@ def test_cholesky_and_solve_are_those_of_numpy_and_read_the_lower_half_only(n):
     root, right = random.normal(size=(n, n)), random.normal(size=n)
     M = root @ root.T + np.eye(n)
     lower, x = np.where(np.tri(n) > 0, M, np.nan), right.copy()
-    njit(lambda M, b: vectors.solve(M, b, n))(lower, x)
+    solved(lower, x, n)
     np.testing.assert_allclose(x, np.linalg.solve(M, right), rtol=1e-10)
     np.testing.assert_allclose(np.tril(lower), np.linalg.cholesky(M), rtol=1e-10)
     vectors.solve(M, right, n)
