@@ -67,7 +67,7 @@ def with_entry(row: int, column: int, value: float) -> np.ndarray:
 
 LOGS = {
     "a missing column": (lambda p: write(p, rows()[:, :3], "t,f_x,f_y"), "f_z"),
-    "time that stands still": (lambda p: write(p, with_entry(20, 0, 0.019)), "t"),
+    "time that stands still": (lambda p: write(p, rows() * [0.0, *15 * [1.0]]), "never increase"),
     "time that runs backwards": (lambda p: write(p, with_entry(20, 0, -1.0)), "t"),
     "NaN": (lambda p: write(p, with_entry(20, 5, np.nan)), "tau_y"),
     "words among the numbers": (

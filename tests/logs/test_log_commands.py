@@ -74,6 +74,7 @@ def test_identify_finds_delay_and_load_in_a_noisy_log(tmp_path: Path) -> None:
     assert summary["not_identifiable"] == []
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_identify_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = simulated(tmp_path / "log.csv", noise=0.1)
@@ -170,6 +171,7 @@ def test_a_start_to_tare_with_has_samples(tmp_path: Path, load: Path) -> None:
         eliminate_log(log, load, delay=0.0, causal_tare_s=0.5)
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_eliminate_writes_its_files(
     tmp_path: Path, load: Path, capsys: pytest.CaptureFixture[str]

@@ -43,6 +43,7 @@ def log_with_push(path: Path, push: np.ndarray, seed: int) -> Path:
     return path
 
 
+@pytest.mark.pictures
 @pytest.mark.parametrize("statistic", ["level", "cusum", "glr"])
 def test_a_push_is_found_with_its_direction_and_place(tmp_path: Path, statistic: str) -> None:
     free = log_with_push(tmp_path / "free.parquet", np.zeros(3), 1)

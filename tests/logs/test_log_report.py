@@ -34,6 +34,7 @@ def record(path: Path) -> Path:
     return path
 
 
+@pytest.mark.pictures
 @pytest.mark.slow
 def test_the_page_stands_alone_and_has_the_numbers_of_the_summary(tmp_path: Path) -> None:
     out = tmp_path / "out"
