@@ -135,7 +135,7 @@ def test_what_is_beyond_all_units(name, value, tmp_path):
 def test_what_no_sensor_measures(name, value, expected, tmp_path):
     path = log_file(tmp_path, **{name: value})
     assert f"{path}:{expected}" in message(lambda: read_log(path))
-    assert len(read_log(log_file(tmp_path, **{name: value / 4}))) == 60
+    assert len(read_log(log_file(tmp_path, **{name: 0.45 * value}))) == 60
 
 
 @pytest.mark.parametrize(
