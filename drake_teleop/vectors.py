@@ -48,6 +48,16 @@ def add_into(x, i, a):
 
 
 @register_jitable
+def put(x, i, a, j, n):
+    """Copies n numbers from place j of a to place i of x.
+
+    For so few the check of shapes that a slice's assignment brings costs more than the copy.
+    """
+    for k in range(n):
+        x[i + k] = a[j + k]
+
+
+@register_jitable
 def plus(a, b):
     """a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]

@@ -43,19 +43,19 @@ def limit_wrench_into(wrench, J, displayed):
 
 
 @njit(cache=True)
-def motor_torque_into(wrench, q, J, displayed, torque):
+def motor_torque_into(wrench, state, J, displayed, torque):
     """Writes J_M^T F + gravity compensation (6,); `displayed` (6,) becomes F after the limits.
 
-    If q is not finite everything is zero. `J` (6, 6) is scratch.
+    `state` is [q; qdot]; if q is not finite everything is zero. `J` (6, 6) is scratch.
     """
     for k in range(6):
-        if not math.isfinite(q[k]):
+        if not math.isfinite(state[k]):
             displayed[:] = 0.0
             torque[:] = 0.0
             return
-    jacobian_into(q, J)
+    jacobian_into(state, J)
     limit_wrench_into(wrench, J, displayed)
-    gravity_torque_into(q, torque)
+    gravity_torque_into(state, torque)
     for i in range(6):
         for k in range(6):
             torque[i] += J[k, i] * displayed[k]
@@ -97,5 +97,5 @@ class ForceDisplay(LeafSystem):
         self._calc(context, output.get_mutable_value(), self._unused)
 
     def _calc(self, context: Context, displayed: np.ndarray, torque: np.ndarray) -> None:
-        q = self._state.Eval(context)[:6]
-        motor_torque_into(self._command.Eval(context), q, self._jacobian, displayed, torque)
+        command, state = self._command.Eval(context), self._state.Eval(context)
+        motor_torque_into(command, state, self._jacobian, displayed, torque)

@@ -2,6 +2,7 @@
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,9 +81,9 @@ def scales_at(change, time, scales):
 
 
 @njit(cache=True)
-def _scaled_into(sample, estimate, phi_gripper, scales, out):
-    """F' of one sample; what of the load is not gripper is object."""
-    phi_object = np.empty(10)
+def _scaled_into(sample, estimate, gripper, scales, out):
+    """F' of one sample; what of the load is not gripper is object. Both (16,) as the estimate."""
+    phi_gripper, phi_object = gripper[6:], np.empty(10)
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
     scaled_wrench_into(
@@ -93,26 +94,26 @@ def _scaled_into(sample, estimate, phi_gripper, scales, out):
 
 
 @njit(cache=True)
-def _scaled_now_into(sample, estimate, phi_gripper, change, time, out):
+def _scaled_now_into(sample, estimate, gripper, change, time, out):
     """F' of one sample with the scales of this time, see `scales_at`."""
     scales = np.empty(4)
     scales_at(change, time, scales)
-    _scaled_into(sample, estimate, phi_gripper, scales, out)
+    _scaled_into(sample, estimate, gripper, scales, out)
 
 
 @njit(cache=True)
-def _both_into(sample, estimate, phi_gripper, change, time, elimination, out):
+def _both_into(sample, estimate, gripper, change, time, elimination, out):
     """F' with the scales of this time, and the contact wrench."""
-    _scaled_now_into(sample, estimate, phi_gripper, change, time, out[:6])
-    _scaled_into(sample, estimate, phi_gripper, elimination, out[6:])
+    _scaled_now_into(sample, estimate, gripper, change, time, out[:6])
+    _scaled_into(sample, estimate, gripper, elimination, out[6:])
 
 
 @njit(cache=True)
-def _felt_into(sample, estimate, phi_gripper, change, time, arm, R_WB, out):
+def _felt_into(sample, estimate, gripper, change, time, arm, R_WB, out):
     """What the hand shall feel of F'; the orientation of S comes from the same sample."""
     scales, scaled_S, R_WS, p_WS = np.empty(4), np.empty(6), np.empty((3, 3)), np.empty(3)
     scales_at(change, time, scales)
-    _scaled_into(sample, estimate, phi_gripper, scales, scaled_S)
+    _scaled_into(sample, estimate, gripper, scales, scaled_S)
     forward_kinematics(arm, sample[JOINT_POSITION], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
 
@@ -149,7 +150,9 @@ class ForceScaling(LeafSystem):
         self, config: ForceScalingConfig, arm: ArmModel, R_WB: NDArray[np.float64]
     ) -> None:
         super().__init__()
-        self._gripper_phi = None if config.gripper_phi is None else np.array(config.gripper_phi)
+        self._gripper: NDArray[np.float64] | None = None
+        if config.gripper_phi is not None:
+            self._gripper = np.concatenate([np.zeros(6), config.gripper_phi])
         self._arm, self._R_WB = arm.table, np.ascontiguousarray(R_WB)
         # Old and new scales, start and length of the change; see `scales_at`.
         scales = [*config.scales(), config.force_scale]
@@ -198,14 +201,13 @@ class ForceScaling(LeafSystem):
         parameter.SetFromVector(np.concatenate([now, wanted[:4], [start, wanted[4]]]))
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
-        _scaled_now_into(*self._inputs(context), *self._now(context), output.get_mutable_value())
+        _scaled_now_into(*self._inputs(context), output.get_mutable_value())
 
     def _calc_both(self, context: Context, output: BasicVector) -> None:
-        inputs = (*self._inputs(context), *self._now(context))
-        _both_into(*inputs, _ELIMINATION, output.get_mutable_value())
+        _both_into(*self._inputs(context), _ELIMINATION, output.get_mutable_value())
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        _scaled_into(*self._inputs(context), _ELIMINATION, output.get_mutable_value())
+        _scaled_into(*self._inputs(context)[:3], _ELIMINATION, output.get_mutable_value())
 
     def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
         sample, phi = self._sample.Eval(context), self._estimate.Eval(context)[6:]
@@ -218,19 +220,15 @@ class ForceScaling(LeafSystem):
         )
 
     def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
-        _felt_into(
-            *self._inputs(context),
-            *self._now(context),
-            self._arm,
-            self._R_WB,
-            output.get_mutable_value(),
-        )
+        _felt_into(*self._inputs(context), self._arm, self._R_WB, output.get_mutable_value())
 
-    def _now(self, context: Context) -> tuple[NDArray[np.float64], float]:
-        return context.get_numeric_parameter(self._change).value(), context.get_time()
-
-    def _inputs(self, context: Context) -> tuple[NDArray[np.float64], ...]:
-        """The sample, the estimate, and the gripper's part of it."""
+    def _inputs(self, context: Context) -> tuple[Any, ...]:
+        """The sample, the estimate, the gripper's part of it, and of the scales: change, time."""
         estimate = self._estimate.Eval(context)
-        gripper = estimate[6:] if self._gripper_phi is None else self._gripper_phi
-        return self._sample.Eval(context), estimate, gripper
+        return (
+            self._sample.Eval(context),
+            estimate,
+            estimate if self._gripper is None else self._gripper,
+            context.get_numeric_parameter(self._change).value(),
+            context.get_time(),
+        )

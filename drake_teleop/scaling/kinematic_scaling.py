@@ -17,6 +17,7 @@ from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.quantities import quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, normalized, rotate
+from drake_teleop.vectors import put
 
 
 @settings
@@ -68,6 +69,16 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
         out[4 + k] = command[4 + k] + translation_scale * offset[k]
 
 
+@njit(cache=True)
+def _command_into(pose, references, alignment, translation_scale, rotation_scale, out):
+    """The commanded X_WS (7,), see the state of `KinematicScaling`."""
+    if references[14] > 0.5:
+        command, master = references[:7], references[7:14]
+        scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)
+    else:
+        put(out, 0, references, 0, 7)
+
+
 class KinematicScaling(LeafSystem):
     """Scales the master's motion into the slave's commanded pose, through a clutch.
 
@@ -110,23 +121,15 @@ class KinematicScaling(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
-        references = context.get_discrete_state(0).value()
-        self._command_into(context, references, output.get_mutable_value())
-
-    def _command_into(
-        self, context: Context, references: NDArray[np.float64], out: NDArray[np.float64]
-    ) -> None:
-        command, master, closed = references[:7], references[7:14], references[14] > 0.5
-        if closed:
-            scale_pose_into(self._pose.Eval(context), master, command, *self._scaling, out)
-        else:
-            out[:] = command
+        pose, references = self._pose.Eval(context), context.get_discrete_state(0).value()
+        _command_into(pose, references, *self._scaling, output.get_mutable_value())
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         references = discrete_state.get_mutable_value(0)
         engage = not self._clutch.HasValue(context) or self._clutch.Eval(context)[0] > 0.5
         if engage == (references[14] > 0.5):
             return
-        self._command_into(context, references, references[:7])
-        references[7:14] = self._pose.Eval(context)
+        pose = self._pose.Eval(context)
+        _command_into(pose, references, *self._scaling, references[:7])
+        references[7:14] = pose
         references[14] = float(engage)

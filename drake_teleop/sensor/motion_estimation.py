@@ -50,7 +50,7 @@ from drake_teleop.sensor.sensor_chain import (
     shift,
 )
 from drake_teleop.slave.arm import MOTION_SIZE, sensor_motion
-from drake_teleop.vectors import apply, cross, minus, nine, plus, plus_cross, three, transposed
+from drake_teleop.vectors import apply, cross, minus, nine, plus, plus_cross, put, three, transposed
 
 _SOURCES = ("encoders", "accelerometer", "fused")
 #: How far an encoder's error moves So, root mean square over joints and directions [m/rad]: that of
@@ -325,7 +325,7 @@ def estimate_into(constants, memory, arm, reading, sample):
     starts = memory[0] == 0.0
     motion, joints = memory[_MOTION:_JOINTS], memory[_JOINTS:][: _PER_JOINT * n]
     angles = sample[JOINT_POSITION]
-    angles[:] = reading[READ_ANGLES]
+    put(angles, 0, reading, READ_ANGLES.start, n)
     if starts:
         settle(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
     low_pass(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
@@ -336,7 +336,7 @@ def estimate_into(constants, memory, arm, reading, sample):
     _differentiate(constants, joints, angles)
     sensor_motion(arm, angles, joints[:n], joints[n:], motion)
     if constants[_ENCODERS] != 0.0:
-        sample[MOTION] = motion[:9]
+        put(sample, MOTION.start, motion, 0, 9)
     else:
         _accelerate(constants, memory, arm[n, _GRAVITY:], motion, sample)
     memory[0] += 1.0
@@ -358,7 +358,7 @@ def _wait(constants, memory, n, reading, sample):
         line[12 + i] = angles[i]
     if memory[0] == 0.0:
         for k in range(1, rows):
-            line[k * width : (k + 1) * width] = line[:width]
+            put(line, k * width, line, 0, width)
     wrench = int(constants[_WAITS]) * width
     acceleration = int(constants[_WAITS + 1]) * width
     waited, read = sample[WRENCH], sample[MOTION]
@@ -407,9 +407,10 @@ def _accelerate(constants, memory, gravity, motion, sample):
     angular, linear = memory[_ANGULAR:_LINEAR], memory[_LINEAR:_MOTION]
     if fused:
         if starts:
-            angular[3:6], angular[15:] = omega, R
+            put(angular, 3, omega, 0, 3)
+            put(angular, 15, R, 0, 9)
         _turned(angular[15:], R, motion)
-        angular[15:] = R
+        put(angular, 15, R, 0, 9)
         for i in range(3):
             alpha[i] -= angular[12 + i]
         _track(constants[_ANGULAR_GAINS:], period, motion, alpha, angular)
@@ -424,7 +425,7 @@ def _accelerate(constants, memory, gravity, motion, sample):
     s[0], s[1], s[2] = minus(s, plus_cross(cross(alpha, r), w, cross(w, r)))
     if fused:
         if starts:
-            linear[15:18] = motion[9:12]
+            put(linear, 15, motion, 9, 3)
         for i in range(3):
             motion[i] = motion[9 + i] - linear[15 + i]
             linear[15 + i] = motion[9 + i]

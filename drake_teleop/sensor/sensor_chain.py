@@ -38,7 +38,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fields import settings
 from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
 from drake_teleop.quantities import choice, plain, quantity
-from drake_teleop.vectors import apply, cross, cross_matrix, nine, plus_cross, three
+from drake_teleop.vectors import apply, cross, cross_matrix, nine, plus_cross, put, three
 
 #: Samples that share one block of random numbers: one event of a noise source, one step of a walk.
 NOISE_BLOCK = 128
@@ -514,7 +514,7 @@ def read_into(constants, memory, noise, truth, reading):
 
     if count == 0:
         for k in range(1, rows):
-            memory[_LINE + k * width :][:width] = row
+            put(memory, _LINE + k * width, row, 0, width)
     memory[0] += 1.0
     late = constants[_LATENCIES:_ENCODER]
     force = _LINE + int(late[0]) * width

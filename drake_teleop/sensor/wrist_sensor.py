@@ -64,7 +64,7 @@ from drake_teleop.sensor.sensor_chain import (
 from drake_teleop.slave.arm import MOTION_SIZE, ArmModel, forward_dynamics, sensor_motion
 from drake_teleop.slave.plant import SlavePlant
 from drake_teleop.slave.tool_contact import add_force, environment_wrench
-from drake_teleop.vectors import apply, cross, minus, nine, three, transposed
+from drake_teleop.vectors import apply, cross, minus, nine, put, three, transposed
 
 Array = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
     about the world's origin, in W.
     """
     sensor_motion(arm, q, v, vdot, motion)
-    out[MOTION] = motion[:9]
+    put(out, MOTION.start, motion, 0, 9)
     s, omega, alpha = out[SPECIFIC_FORCE], out[ANGULAR_VELOCITY], out[ANGULAR_ACCELERATION]
     wrench = out[WRENCH]
     non_contact_wrench_into(s, omega, alpha, phi, wrench)
@@ -111,7 +111,7 @@ def _motion(physics, x, tau, applied_W, wrench_W, xdot):
     arm, _, pairs, leaf = physics
     half = tau.shape[0] + 1
     forward_dynamics(arm, x[: half - 1], x[half:-1], tau, wrench_W, xdot[half:-1])
-    xdot[:half] = x[half:]
+    put(xdot, 0, x, half, half)
     push = 0.0
     if pairs.shape[0] > 0:  # which all are of one body, the leaf, or of what does not move
         for i in range(3):
@@ -147,10 +147,10 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
     v, vdot = x[half : half + n], xdot[half : half + n]
     rigid = truth[WRENCH_AND_MOTION]
     true_sample(arm, phi, x[:n], v, vdot, wrench_W, np.empty(MOTION_SIZE), rigid)
-    truth[TRUE_ANGLES] = x[:n]
+    put(truth, TRUE_ANGLES.start, x, 0, n)
     size = BEFORE_JOINTS + n
     sample = memory[:size]
-    memory[size : 2 * size] = sample
+    put(memory, size, memory, 0, size)
     if ideal:
         sample[WRENCH_AND_MOTION], sample[SATURATED] = truth[WRENCH_AND_MOTION], 0.0
         sample[JOINT_POSITION] = truth[TRUE_ANGLES]
@@ -164,8 +164,9 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
 def _join(state, sheet, x):
     """x = [q, sheet's deflection, v, its rate] of [q; v] and [deflection, rate]."""
     n = state.shape[0] // 2
-    x[:n], x[n] = state[:n], sheet[0]
-    x[n + 1 : -1], x[-1] = state[n:], sheet[1]
+    put(x, 0, state, 0, n)
+    put(x, n + 1, state, n, n)
+    x[n], x[2 * n + 1] = sheet[0], sheet[1]
 
 
 @njit(cache=True)
@@ -217,7 +218,7 @@ def sample_step(
     """
     size, width, half = BEFORE_JOINTS + tau.shape[0], state.shape[0] + 3, tau.shape[0] + 1
     after = result[size + 1 :]
-    after[:] = memory
+    put(after, 0, memory, 0, memory.shape[0])
     tail = after[sensor[3] :]
     count, queued = tail[0], int(tail[1])
     now, now_dot, now_wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
@@ -251,7 +252,7 @@ def sample_step(
             count += 1.0
     # A step that is all rounding may have ended a little before, and have taken this sample.
     taken = (count - 1.0 + _SAME) * period > time
-    result[:size] = after[size : 2 * size] if taken else after[:size]
+    put(result, 0, after, size if taken else 0, size)
     result[size] = (count - (2.0 if taken else 1.0)) * period
     if until_now and (count - _SAME) * period < time:
         _take(physics, sensor, now, now_dot, now_wrench_W, noise, after)

@@ -29,18 +29,20 @@ class JointControlConfig:
 
 @njit(cache=True)
 def joint_control_torque(
-    arm, command, q, v, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
+    arm, command, state, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
 ):  # fmt: skip
     """tau = ID(q, v, kv (clip(kp (q_command - q)) - v)), within the motors' torque.
 
-    All arrays (n,), rad, rad/s, N m; gains in 1/s. `torque` is written.
+    `state` is [q; v], all other arrays (n,), rad, rad/s, N m; gains in 1/s. `torque` is written.
     """
-    for i in range(q.shape[0]):
+    n = torque.shape[0]
+    q, v = state[:n], state[n:]
+    for i in range(n):
         setpoint = position_gain * (command[i] - q[i])
         setpoint = min(max(setpoint, -velocity_limit[i]), velocity_limit[i])
         scratch[i] = velocity_gain * (setpoint - v[i])
-    inverse_dynamics(arm, q, v, scratch[: q.shape[0]], torque)
-    for i in range(q.shape[0]):
+    inverse_dynamics(arm, q, v, scratch, torque)
+    for i in range(n):
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 
 
@@ -74,7 +76,6 @@ class JointControl(LeafSystem):
     ) -> None:
         super().__init__()
         n = arm.num_joints
-        self._n = n
         self._arm = arm.table
         self._constants = (
             2 * np.pi * config.position_bandwidth_hz,
@@ -91,12 +92,10 @@ class JointControl(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = self._state.Eval(context)
         joint_control_torque(
             self._arm,
             self._command.Eval(context),
-            state[: self._n],
-            state[self._n :],
+            self._state.Eval(context),
             *self._constants,
             discrete_state.get_mutable_value(0),
         )

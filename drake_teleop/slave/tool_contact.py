@@ -25,8 +25,11 @@ def environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W):
         sheet: (2,) deflection and its rate [m, m/s], of what moves.
         wrench_W: (6,) filled [N, N m].
     """
-    wrench_W[:] = applied_W
-    if pairs.shape[0] == 0 and not applied_W.any():
+    acts = pairs.shape[0] > 0
+    for i in range(6):
+        wrench_W[i] = applied_W[i]
+        acts = acts or applied_W[i] != 0.0
+    if not acts:
         return
     R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
     twist, velocity, has_twist = np.empty(6), np.empty(3), False

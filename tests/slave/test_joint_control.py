@@ -21,8 +21,7 @@ def torque(arm, command, q, v):
     joint_control_torque(
         arm.table,
         np.asarray(command, float),
-        np.asarray(q, float),
-        np.asarray(v, float),
+        np.concatenate([q, v]),
         2 * np.pi * config.position_bandwidth_hz,
         2 * np.pi * config.velocity_bandwidth_hz,
         arm.velocity_limit,
