@@ -7,14 +7,19 @@ leave the code of one under the number of the other.
 
 Here each type of a function has a file of its own, named by a hash of all that went into it: the
 bytecode of the function and of all that it calls, and the constants that they read. What is found
-under a name is right, whoever wrote it and when; times of files do not matter. numba still chooses
-the folder: `NUMBA_CACHE_DIR` if that is set, else `__pycache__`.
+under a name is right, whenever it was written; times of files do not matter. numba still chooses
+the folder: `NUMBA_CACHE_DIR` if that is set, else `__pycache__`, else the user's cache folder.
+
+The files are pickles with machine code, as numba's own are, and as little to be trusted as a `.pyc`
+file from elsewhere. So only those are read that belong to the user, to root or to the owner of this
+package, who could all change what it does anyway, and that not everybody may write to.
 """
 
 from __future__ import annotations
 
 import os
 import pickle
+import stat
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -69,14 +74,20 @@ class _Files:
 
     def load(self, key: Any) -> Any:
         """The compiled code, or None if there is none yet."""
-        with suppress(OSError, EOFError, pickle.UnpicklingError):
-            stored_key, code = pickle.loads(self._path(key).read_bytes())
+        with (
+            suppress(OSError, EOFError, pickle.UnpicklingError),
+            self._path(key).open("rb") as file,
+        ):
+            if not _is_ours(os.fstat(file.fileno())):
+                return None
+            stored_key, code = pickle.loads(file.read())
             return code if stored_key == key else None
 
     def save(self, key: Any, code: Any) -> None:
         path = self._path(key)
         unfinished = path.with_suffix(f".{uuid4().hex}")
         try:
+            unfinished.touch(mode=0o644)  # with any umask nobody else may write to it
             unfinished.write_bytes(dumps((key, code)))
             os.replace(unfinished, path)
             self._discard(keep=self._name + fingerprint(self._dispatcher))
@@ -96,6 +107,12 @@ class _Files:
         for path in self._folder.glob(f"{self._name}*.nbc"):
             if keep is None or not path.name.startswith(keep):
                 path.unlink(missing_ok=True)
+
+
+def _is_ours(file: os.stat_result) -> bool:
+    """Whether nobody else can have written a file, see the top of this module."""
+    owners = {os.getuid(), 0, Path(__file__).stat().st_uid}
+    return file.st_uid in owners and not file.st_mode & stat.S_IWOTH
 
 
 def fingerprint(dispatcher: Dispatcher) -> str:

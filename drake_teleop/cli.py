@@ -367,9 +367,12 @@ def compare_passivity(
     metavar="ADDRESS",
     help="Of a Dask scheduler, which has the processes; or local, for one on this machine.",
 )
+@option.yes
 @option.out("study")
 @option.quiet
-def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: bool) -> None:
+def study(
+    study: Path, jobs: int | None, cluster: str | None, yes: bool, out: Path, quiet: bool
+) -> None:
     """Run a scenario over a design of its fields.
 
     STUDY is a YAML file: factors, design, repeats, measures; or the name of one that is shipped.
@@ -378,7 +381,7 @@ def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: 
     """
     from drake_teleop.studies.study import study_command
 
-    study_command(study, out, jobs=jobs or -1, cluster=cluster, quiet=quiet)
+    study_command(study, out, jobs=jobs or -1, cluster=cluster, quiet=quiet, yes=yes or option.ask)
 
 
 @cli.command("scaling-study")
@@ -389,10 +392,11 @@ def study(study: Path, jobs: int | None, cluster: str | None, out: Path, quiet: 
     help="Of a Dask scheduler, which has the processes; or local, for one on this machine.",
 )
 @click.option("--repeats", type=option.Whole(1, 10**6), help="Seeds of each point.  [default: 12]")
+@option.yes
 @option.out("scaling-study")
 @option.quiet
 def scaling_study(
-    jobs: int | None, cluster: str | None, repeats: int | None, out: Path, quiet: bool
+    jobs: int | None, cluster: str | None, repeats: int | None, yes: bool, out: Path, quiet: bool
 ) -> None:
     """Answer how to scale forces, for a simulated operator.
 
@@ -401,7 +405,14 @@ def scaling_study(
     """
     from drake_teleop.studies.scaling_study import scaling_study_command
 
-    scaling_study_command(out, jobs=jobs or -1, cluster=cluster, repeats=repeats, quiet=quiet)
+    scaling_study_command(
+        out,
+        jobs=jobs or -1,
+        cluster=cluster,
+        repeats=repeats,
+        yes=yes or option.ask,
+        quiet=quiet,
+    )
 
 
 @cli.command()
@@ -496,7 +507,9 @@ def main(arguments: list[str] | None = None) -> None:
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with warnings.catch_warnings():
-        if not sys.warnoptions:  # they are for those who write programs
+        # They are for those who write programs. What a user has to know of a result this package
+        # never says so: it stands in the summary, and is printed from there.
+        if not sys.warnoptions:
             warnings.simplefilter("ignore")
             os.environ["PYTHONWARNINGS"] = "ignore"  # of the processes of a study
         status = _run(arguments)

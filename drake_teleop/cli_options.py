@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -157,6 +158,14 @@ free = click.option(
     help="Free motion with this load, which sets the threshold of contact."
     "  [default: what is quiet in LOG]",
 )
+
+
+def ask(question: str) -> bool:
+    """The answer of somebody at a terminal; nobody there says no."""
+    return sys.stdin.isatty() and click.confirm(question, err=True)
+
+
+yes = click.option("--yes", is_flag=True, help="Begin, also if there are more than 100,000 runs.")
 
 
 class Names(click.ParamType):

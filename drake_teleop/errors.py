@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 LONGEST_LINE = 300
@@ -48,6 +51,29 @@ def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = 
         wanted = " or ".join("None" if one is type(None) else one.__name__ for one in kinds)
         found = reprlib.repr(value)
         raise DrakeTeleopError(f"expected {wanted}, found {found}", where=where, remedy=remedy)
+
+
+@contextmanager
+def reading(path: str | Path, remedy: str, what: str = "cannot be read") -> Iterator[None]:
+    """Makes one error of whatever a damaged file leads to: zipfile, numpy and polars do not say.
+
+    Args:
+        path: of the file.
+        remedy: for the error.
+        what: for the error, before the first line of the reason.
+
+    Raises:
+        DrakeTeleopError: with what, the reason and the remedy.
+    """
+    try:
+        yield
+    except BaseException as error:
+        # A panic in polars is no Exception, so that programs end by it.
+        panic = type(error).__name__ == "PanicException"
+        if isinstance(error, DrakeTeleopError) or not (panic or isinstance(error, Exception)):
+            raise
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise DrakeTeleopError(f"{what}: {reason}", where=str(path), remedy=remedy) from error
 
 
 def inside(where: str, name: Any) -> str:

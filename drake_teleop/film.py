@@ -20,6 +20,7 @@ from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, MeshcatParams, Rgba
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.pages.html import render
+from drake_teleop.writing import make_folder, write_text
 
 Array = NDArray[np.float64]
 Show = Callable[[float, int], None]
@@ -108,8 +109,8 @@ class Film:
         finally:
             if collects:
                 gc.enable()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(self._with_player(page), encoding="utf-8")
+        make_folder(path.parent)
+        write_text(path, self._with_player(page))
 
     def _recorded(self, make_scene: Callable[[Meshcat], Show]) -> str:
         with _quiet_drake():  # nobody is to connect to its server

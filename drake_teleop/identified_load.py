@@ -21,7 +21,6 @@ from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +32,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.pages.progress import Stage
 from drake_teleop.resources import models_dir
 from drake_teleop.scenario import Scenario, check_scenario
+from drake_teleop.writing import CannotWrite, make_folder, whole_file
 
 CACHE_VARIABLE = "DRAKE_TELEOP_CACHE_DIR"
 """The environment variable that names another folder than the user's cache folder."""
@@ -94,7 +94,7 @@ def identified_load(
     found = identify_load(before, progress)
     floor = found.noise_floor(slave_arm(scenario)) if detects else None
     load = IdentifiedLoad(found.identification, floor, from_cache=False)
-    with suppress(OSError):  # a full or write-protected disk: it is identified again next time
+    with suppress(CannotWrite, OSError):  # a full disk: it is identified again next time
         _write(path, load)
     return load
 
@@ -135,14 +135,9 @@ def _write(path: Path, load: IdentifiedLoad) -> None:
         if part is not None
         for field in dataclasses.fields(part)
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(f".{uuid4().hex}")
-    try:
-        with unfinished.open("wb") as file:
-            np.savez(file, **columns)
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    make_folder(path.parent)
+    with whole_file(path, shared=True) as unfinished, unfinished.open("wb") as file:
+        np.savez(file, **columns)
     files = [(each.stat().st_mtime_ns, each) for each in path.parent.glob("load-*")]
     for _, old in sorted(files)[:-LARGEST_NUMBER]:
         old.unlink(missing_ok=True)

@@ -11,7 +11,6 @@ writes, or the YAML file of the log's own name, as in the folder `logs` of `repr
 
 from __future__ import annotations
 
-import json
 from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
@@ -34,6 +33,7 @@ from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario
 from drake_teleop.scenario_reference import commented
 from drake_teleop.slave.plant import AddEnvironment, ParseSlave, finalize
+from drake_teleop.writing import output_folder, write_json, write_text
 
 Array = NDArray[np.float64]
 Signals = Mapping[str, Array]
@@ -75,22 +75,22 @@ def replay_command(
     """
     logs = _logs(run)
     films = []
-    for log in logs:
-        path = out / ("replay.html" if len(logs) == 1 else f"{log.stem}.html")
-        result = SimulationResult.scan_parquet(log)
-        write_replay(path, result, LoadScenario(scenario or _scenario_of(log)))
-        films.append({"log": str(log), "film": str(path), "duration_s": float(result.t[-1])})
-        if not quiet:
-            print(f"written {path} ({path.stat().st_size / 1e6:.1f} MB): open it in a browser")
-    summary = {"films": films}
-    text = json.dumps(summary, indent=2, allow_nan=False)
-    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    with output_folder(out):
+        for log in logs:
+            path = out / ("replay.html" if len(logs) == 1 else f"{log.stem}.html")
+            result = SimulationResult.scan_parquet(log)
+            write_replay(path, result, LoadScenario(scenario or _scenario_of(log)))
+            films.append({"log": str(log), "film": str(path), "duration_s": float(result.t[-1])})
+            if not quiet:
+                print(f"written {path} ({path.stat().st_size / 1e6:.1f} MB): open it in a browser")
+        summary = {"films": films}
+        write_json(out / "summary.json", summary)
     return summary
 
 
 def write_scenario(path: Path, scenario: Scenario) -> None:
     """Writes every field of a scenario to a YAML file, for `LoadScenario`."""
-    path.write_text(commented(scenario), encoding="utf-8")
+    write_text(path, commented(scenario))
 
 
 def write_replay(

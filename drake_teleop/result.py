@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError, expect
+from drake_teleop.errors import DrakeTeleopError, expect, reading
+from drake_teleop.writing import make_folder, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -218,6 +219,9 @@ class SimulationResult:
 
         The same data give the same bytes.
         """
+        self._write(Path(path))
+
+    def _write(self, path: Path, aside: Path | None = None) -> None:
         specs = [
             {
                 "name": spec.name,
@@ -228,9 +232,9 @@ class SimulationResult:
             for spec in self.specs
         ]
         # Fixed row groups: polars' default may follow the number of threads.
-        self.to_dataframe().write_parquet(
-            path, metadata={_METADATA_KEY: json.dumps(specs)}, row_group_size=2**16
-        )
+        metadata = {_METADATA_KEY: json.dumps(specs)}
+        table = self.to_dataframe()
+        write_table(path, table, aside=aside, metadata=metadata, row_group_size=2**16)
 
     def write_part(self, folder: Path, first_row: int) -> None:
         """Writes these rows of a longer log into its folder; `write_parquet` has the format.
@@ -244,10 +248,8 @@ class SimulationResult:
         """
         part = folder / _PART_NAME.format(first_row)
         if len(self.t) or not part.exists():
-            folder.mkdir(parents=True, exist_ok=True)
-            # Beside the folder, since what reads folders reads all that is in them.
-            self.write_parquet(_unfinished(folder))
-            _unfinished(folder).replace(part)
+            make_folder(folder)
+            self._write(part, aside=folder)
 
     @classmethod
     def read_parquet(cls, path: str | Path) -> SimulationResult:
@@ -279,16 +281,11 @@ class SimulationResult:
         expect((str, Path), path, "result")
         path = Path(path)
         part = min(path.glob(_PART_NAMES), default=path)
-        try:
+        remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
+        with reading(path, remedy, "is not a simulation result"):
             text = pl.read_parquet_metadata(part)[_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]
             t = pl.read_parquet(path, columns=["t"])["t"].to_numpy()
-        except Exception as error:  # what a damaged file leads to, polars does not say
-            raise DrakeTeleopError(
-                "is not a simulation result",
-                where=str(path),
-                remedy="give what SimulationResult.write_parquet or drake-teleop run wrote",
-            ) from error
         return cls(t, _SignalsOnDisk(path, specs), specs)
 
     def plot(self, *names: str, contact: ArrayLike | None = None) -> Figure:
@@ -369,7 +366,9 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         import polars as pl
 
-        return _read_only(pl.read_parquet(self._path, columns=self._columns[name]).to_numpy())
+        with reading(self._path, "write it again"):
+            table = pl.read_parquet(self._path, columns=self._columns[name])
+        return _read_only(table.to_numpy())
 
     def __contains__(self, name: object) -> bool:
         return name in self._columns
@@ -387,7 +386,6 @@ def remove_log(path: Path) -> None:
     Raises:
         DrakeTeleopError: if it is a folder that holds something else.
     """
-    _unfinished(path).unlink(missing_ok=True)
     if not path.is_dir():
         path.unlink(missing_ok=True)
         return
@@ -400,10 +398,6 @@ def remove_log(path: Path) -> None:
         )
     for part in reversed(parts):  # from its end: what remains if we die here has no gap
         part.unlink()
-
-
-def _unfinished(folder: Path) -> Path:
-    return folder.with_name(f"{folder.name}.unfinished")
 
 
 def _drawn(

@@ -36,7 +36,6 @@ warnings                    what was not as it should be, and when, see `drake_t
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,6 +44,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import (
     identify_load,
     sensor_samples,
@@ -63,12 +63,21 @@ from drake_teleop.run_warnings import run_warnings
 from drake_teleop.scenario import LoadScenario, Scenario, check_scenario, replace
 from drake_teleop.station import MakeTeleopStation
 from drake_teleop.task_measures import task_failure, task_measures
+from drake_teleop.writing import (
+    CannotWrite,
+    naming,
+    output_folder,
+    write_json,
+    write_picture,
+    write_table,
+)
 
 Array = NDArray[np.float64]
 
 # After a contact has ended the sensor's filter still shows it for this long [s].
 FILTER_TAIL = 0.01
 _LEARNT = "learnt while it ran"
+_WRITTEN_AT_THE_END = ("sensor_log.parquet", "identification.json", "overview.png", "replay.html")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +113,8 @@ def run_command(
     Writes log.parquet, sensor_log.parquet (canonical, for `drake-teleop identify`), overview.png,
     replay.html (the film in 3D), scenario.yaml (all fields, as they were run), identification.json
     (unless the scenario learnt while it ran) and summary.json into `out`. The log is a folder,
-    written while the station runs; all but the scenario follow at the end, the summary last.
+    written while the station runs; all but the scenario follow at the end, the summary last. What
+    an earlier run left there is removed first; a run that fails before it begins leaves nothing.
 
     Args:
         scenario: the name of a shipped one, or a YAML file.
@@ -118,34 +128,50 @@ def run_command(
         The summary.
 
     Raises:
-        DrakeTeleopError: if the scenario cannot be used or a joint leaves its range.
+        DrakeTeleopError: if the scenario cannot be used, a joint leaves its range, or a file cannot
+            be written; then saying what was.
         KeyboardInterrupt: saying what was recorded until then.
     """
     setup = LoadScenario(scenario)
     if seed is not None:
         setup = replace(setup, simulation__seed=seed)
-    log = out / "log.parquet"
-    # What stays of an earlier run must not be taken for this one's, should this one be interrupted.
-    remove_log(log)
-    (out / "summary.json").unlink(missing_ok=True)
-    out.mkdir(parents=True, exist_ok=True)
-    write_scenario(out / "scenario.yaml", setup)
-    try:
+    with output_folder(out):
         with show_progress(progress and not quiet) as stage:
-            run = run_scenario(setup, stage, log, fresh=fresh)
-    except KeyboardInterrupt as interrupt:
-        raise KeyboardInterrupt(_kept(log)) from interrupt
-    summary = {"scenario": str(scenario)} | summarise(run)
-    run.result.sensor_log().write_parquet(out / "sensor_log.parquet")
-    if run.identification is not None:
-        run.identification.save(out / "identification.json")
-    overview(run.result).savefig(out / "overview.png")
-    write_replay(out / "replay.html", run.result, run.scenario)
-    text = json.dumps(summary, indent=2, allow_nan=False)
-    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+            run = _logged(setup, out, stage, fresh)
+        summary = {"scenario": str(scenario)} | summarise(run)
+        write_table(out / "sensor_log.parquet", run.result.sensor_log())
+        if run.identification is not None:
+            run.identification.save(out / "identification.json")
+        write_picture(out / "overview.png", overview(run.result))
+        write_replay(out / "replay.html", run.result, run.scenario)
+        write_json(out / "summary.json", summary)
     if not quiet:
         _print(summary, out)
     return summary
+
+
+def _logged(setup: Scenario, out: Path, stage: Stage, fresh: bool) -> ScenarioRun:
+    """Runs it with its log and its scenario in a folder, without what an earlier run left there."""
+    log, its_scenario = out / "log.parquet", out / "scenario.yaml"
+    # It must not be taken for what belongs to this run, should this one be interrupted.
+    remove_log(log)
+    for name in _WRITTEN_AT_THE_END:
+        with naming(out / name):
+            (out / name).unlink(missing_ok=True)
+    earlier = its_scenario.exists()
+    write_scenario(its_scenario, setup)
+    try:
+        return run_scenario(setup, stage, log, fresh=fresh)
+    except BaseException as error:
+        if log.is_dir() and not any(log.iterdir()):
+            log.rmdir()
+        if not log.exists() and not earlier:
+            its_scenario.unlink(missing_ok=True)
+        if isinstance(error, KeyboardInterrupt):
+            raise KeyboardInterrupt(_kept(log)) from error
+        if isinstance(error, CannotWrite):
+            raise DrakeTeleopError(str(error), remedy=_kept(log)) from error
+        raise
 
 
 def run_scenario(

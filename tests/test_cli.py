@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
 import types
@@ -219,6 +220,27 @@ def test_a_number_that_is_not_as_accepted_is_status_1(capsys, install, lines, st
     install("drake_teleop.reproduction.reproduce", "reproduce_command", lambda *_, **__: "figures")
     install("drake_teleop.reproduction.report", "unaccepted", {"figures": lines}.get)
     assert run_main(capsys, "reproduce") == (status, "", "".join(f"{x}\n" for x in lines))
+
+
+@pytest.mark.parametrize(
+    ("terminal", "typed", "status"),
+    [(False, "y", 2), (True, "n", 2), (True, "", 2), (True, "y", 0)],
+)
+def test_many_runs_are_asked_for_where_somebody_can_answer(
+    tmp_path, capsys, monkeypatch, install, terminal, typed, status
+):
+    def study_command(path, out, *, yes, **options):
+        if yes is not True and not yes("100,200 runs. Begin?"):
+            raise DrakeTeleopError("100,200 runs are many")
+
+    install("drake_teleop.studies.study", "study_command", study_command)
+    typing = io.StringIO(f"{typed}\n")
+    typing.isatty = lambda: terminal
+    monkeypatch.setattr("sys.stdin", typing)
+    code, _, err = run_main(capsys, "study", "x.yaml")
+    assert code == status
+    assert ("Begin? [y/N]" in err) == terminal
+    assert run_main(capsys, "study", "x.yaml", "--yes")[::2] == (0, "")
 
 
 def test_options_reach_the_commands(capsys, install):

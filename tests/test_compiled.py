@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import pickle
 import re
 import subprocess
 import sys
 from importlib import import_module, invalidate_caches
 from pathlib import Path
+from types import SimpleNamespace
 
 import numba
 import numpy as np
@@ -233,3 +235,41 @@ def test_a_full_disk_costs_nothing_but_time(tmp_path):
     files = _compiled._Files(tmp_path / "absent", _compiled.njit()(vectors.cross))
     files.save("key", "code")
     assert files.load("key") is None
+
+
+@_compiled.njit()
+def _kept(x):
+    return x
+
+
+def test_a_file_that_others_may_have_written_is_not_read(tmp_path):
+    """It is a pickle: reading it is running it."""
+    files, planted = _compiled._Files(tmp_path, _kept), tmp_path / "planted"
+    files.save("key", 3)
+    (path,) = tmp_path.glob("*.nbc")
+    assert files.load("key") == 3
+    path.write_bytes(pickle.dumps(Planted(planted)))
+    path.chmod(0o666)
+    assert files.load("key") is None and not planted.exists()
+    owner = Path(_compiled.__file__).stat().st_uid
+    for uid, ours in ((os.getuid(), True), (0, True), (owner, True), (owner + 12345, False)):
+        assert _compiled._is_ours(SimpleNamespace(st_uid=uid, st_mode=0o100664)) == ours
+
+
+def test_what_is_kept_is_nobody_else_s_to_write(tmp_path):
+    earlier = os.umask(0)
+    try:
+        _compiled._Files(tmp_path, _kept).save("key", 3)
+    finally:
+        os.umask(earlier)
+    assert [path.stat().st_mode & 0o777 for path in tmp_path.iterdir()] == [0o644]
+
+
+class Planted:
+    """What makes a file as soon as it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self._path),)

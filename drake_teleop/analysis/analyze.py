@@ -31,7 +31,6 @@ verdict      list of short sentences
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +64,7 @@ from drake_teleop.operator.operator import GRIPS
 from drake_teleop.pages.progress import Stage, show_progress
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.writing import make_folder, output_folder, write_json
 
 DIRECTIONS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _PRESSED = 5e-3  # m, how deep the hand presses into the leaf
@@ -94,13 +94,12 @@ def analyze_command(
         DrakeTeleopError: for a scenario that cannot be, or cannot be linearised.
     """
     setup = LoadScenario(scenario)
-    out.mkdir(parents=True, exist_ok=True)  # before the work: a bad path costs no time
+    make_folder(out)  # before the work: a bad path costs no time
     summary, curves = analyze(setup, direction, progress and not quiet)
     summary = {"scenario": str(scenario), **summary}
-    (out / "summary.json").write_text(
-        json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8"
-    )
-    write_report(summary, curves, out)
+    with output_folder(out):
+        write_report(summary, curves, out)
+        write_json(out / "summary.json", summary)
     if not quiet:
         print_tables(summary, out)
     return summary

@@ -25,6 +25,7 @@ from drake_teleop.analysis.two_port import (
 )
 from drake_teleop.pages.html import embedded, render
 from drake_teleop.pages.style import BLACK, COLOURS, GREY, VERMILION, Picture, house_style
+from drake_teleop.writing import write_picture, write_text
 
 _GRIP_COLOURS = {"light": COLOURS[3], "medium": COLOURS[4], "firm": COLOURS[1]}
 #: Parameter of a map -> its name on an axis, and the factor to its unit there.
@@ -68,7 +69,7 @@ def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
         "maps": draw_maps(curves, summary["grip"]),
     }
     for name, figure in pictures.items():
-        figure.savefig(out / f"{name}.png")
+        write_picture(out / f"{name}.png", figure)
     page = render(
         "drake_teleop.analysis",
         "report.html.j2",
@@ -78,7 +79,7 @@ def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
         axis_rows=axis_rows(summary["axis"]),
         margin_rows=[margin_cells(row, summary["delay_s"]) for row in summary["margins"]],
     )
-    (out / "report.html").write_text(page, encoding="utf-8")
+    write_text(out / "report.html", page)
 
 
 def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:

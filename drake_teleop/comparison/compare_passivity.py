@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -48,6 +47,7 @@ from drake_teleop.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
+from drake_teleop.writing import make_folder, output_folder, write_json, write_table
 
 NETWORKS = ("lan", "internet", "geostationary", "lunar")
 #: Round trips that are tried in one degree of freedom [s].
@@ -90,7 +90,7 @@ def compare_command(
     """
     _check("network", networks, tuple(PRESETS))
     _check("method", methods, METHODS)
-    out.mkdir(parents=True, exist_ok=True)  # before the work: a bad path costs no time
+    make_folder(out)  # before the work: a bad path costs no time
     with show_progress(progress and not quiet) as stage:
         limits = _one_dof_study(methods, seed, jobs, stage)
         runs, traces = _station_study(networks, methods, seed, jobs, stage)
@@ -103,13 +103,14 @@ def compare_command(
         "one_dof": limits,
         "covering": covering,
     }
+    import polars as pl
+
     from drake_teleop.comparison.report import print_tables, write_report
 
-    _write_table(runs, out / "runs.parquet")
-    (out / "summary.json").write_text(
-        json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8"
-    )
-    write_report(summary, traces, out)
+    with output_folder(out):
+        write_table(out / "runs.parquet", pl.DataFrame(runs, infer_schema_length=None))
+        write_report(summary, traces, out)
+        write_json(out / "summary.json", summary)
     if not quiet:
         print_tables(summary, out)
     return summary
@@ -253,9 +254,3 @@ def _plain(figures: dict[str, Any]) -> dict[str, Any]:
         name: None if isinstance(value, float) and not np.isfinite(value) else value
         for name, value in figures.items()
     }
-
-
-def _write_table(rows: list[dict[str, Any]], path: Path) -> None:
-    import polars as pl
-
-    pl.DataFrame(rows, infer_schema_length=None).write_parquet(path)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from drake_teleop.channel.network import PRESETS
 from drake_teleop.pages.html import embedded, render
 from drake_teleop.pages.style import COLOURS, GREY, Picture, house_style
+from drake_teleop.writing import write_picture, write_text
 
 #: Columns of the station's table: key of the row, heading, factor, decimals.
 COLUMNS = (
@@ -41,7 +42,7 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         "limits": draw_limits(summary["one_dof"]),
     }
     for name, figure in pictures.items():
-        figure.savefig(out / f"{name}.png")
+        write_picture(out / f"{name}.png", figure)
     page = render(
         "drake_teleop.comparison",
         "report.html.j2",
@@ -51,7 +52,7 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         covering=summary["covering"],
         pictures={name: embedded(figure) for name, figure in pictures.items()},
     )
-    (out / "report.html").write_text(page, encoding="utf-8")
+    write_text(out / "report.html", page)
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:

@@ -19,7 +19,6 @@ Nothing is written if no trajectory respects all limits.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +35,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.pages.progress import show_progress
 from drake_teleop.pages.style import BLACK, BLUE, COLOURS, GREY, Picture, house_style
 from drake_teleop.scenario import LoadScenario
+from drake_teleop.writing import make_folder, output_folder, write_json, write_picture, write_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -89,6 +89,7 @@ def excite_command(
         DrakeTeleopError: if the input cannot be used, or nothing respects all limits.
     """
     setup = LoadScenario(scenario)
+    make_folder(out)  # before the work: a bad path costs no time
     with show_progress(progress and not quiet) as stage:
         opened = stage("Read the robot")
         if model is None:
@@ -122,13 +123,12 @@ def excite_command(
             progress=stage,
         )
     summary = summarise(found) | {"seed": seed}
-    out.mkdir(parents=True, exist_ok=True)
-    table(found).write_csv(out / "trajectory.csv")
-    found.trajectory.save(out / "excitation.yaml", robot.arm.joint_names)
-    draw(found).savefig(out / "excitation.png")
-    write_motion_film(out / "excitation.html", found)
-    text = json.dumps(summary, indent=2, allow_nan=False)
-    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    with output_folder(out):
+        write_table(out / "trajectory.csv", table(found))
+        found.trajectory.save(out / "excitation.yaml", robot.arm.joint_names)
+        write_picture(out / "excitation.png", draw(found))
+        write_motion_film(out / "excitation.html", found)
+        write_json(out / "summary.json", summary)
     if not quiet:
         _print(summary, out)
     return summary

@@ -15,7 +15,6 @@ estimator gives numbers for the rest too. Two steps decide what `Identification.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 from drake_teleop.errors import DrakeTeleopError, expect
 from drake_teleop.load.arrays import Array, checked, learnt
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
+from drake_teleop.writing import write_json
 
 VERDICTS = ("identified", "weakly", "not", "prior")
 """What `Identification.verdicts` may say of a parameter."""
@@ -150,7 +150,13 @@ class Identification:
         )
 
     def save(self, path: str | Path) -> None:
-        """Writes identification.json."""
+        """Writes identification.json.
+
+        Raises:
+            DrakeTeleopError: if one of its figures is not finite, or the file cannot be written.
+        """
+        for name, shape in (("condition_number", ()), ("delay_s", ()), ("residual_rms", (6,))):
+            checked(f"{path}:{name}", getattr(self, name), *shape)
         covariance = self.covariance.tolist()
         for i in np.flatnonzero(np.isinf(np.diag(self.covariance))):
             covariance[i][i] = None
@@ -171,7 +177,7 @@ class Identification:
             ],
             "prior_dominated": self.prior_dominated.tolist(),
         }
-        Path(path).write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+        write_json(Path(path), document)
 
     @classmethod
     def load(cls, path: str | Path) -> Identification:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.writing import write_text
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -83,7 +84,7 @@ class FourierTrajectory:
         }
         data = {"frequency": float(self.frequency), "joints": joints}
         text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
-        Path(path).write_text(f"# Eqs. (9)-(10), rad and Hz.\n{text}", encoding="utf-8")
+        write_text(Path(path), f"# Eqs. (9)-(10), rad and Hz.\n{text}")
 
     @classmethod
     def load(cls, path: str | Path) -> FourierTrajectory:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,14 @@ from drake_teleop.logs.figures import (
     object_notes,
     plain,
     rms_figures,
-    write_summary,
 )
 from drake_teleop.logs.printing import print_elimination, print_identification
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import WRENCH
+from drake_teleop.writing import output_folder, write_json, write_picture, write_table
+
+if TYPE_CHECKING:
+    import polars as pl
 
 
 def identify_command(
@@ -82,15 +85,15 @@ def identify_command(
     from drake_teleop.logs.pictures import draw_fit, draw_knowledge, one_page
     from drake_teleop.logs.report import write_report
 
-    out.mkdir(parents=True, exist_ok=True)
-    result.save(out / "identification.json")
-    if alone is not None:
-        alone.save(out / "object.json")
-    draw_fit(found).savefig(out / "fit.png")
-    draw_knowledge(found).savefig(out / "knowledge.png")
-    one_page(out / "fit.png", out / "knowledge.png", out / "report.png")
-    write_report(out / "report.html", found, summary, alone)
-    write_summary(out, summary)
+    with output_folder(out):
+        result.save(out / "identification.json")
+        if alone is not None:
+            alone.save(out / "object.json")
+        write_picture(out / "fit.png", draw_fit(found))
+        write_picture(out / "knowledge.png", draw_knowledge(found))
+        one_page(out / "fit.png", out / "knowledge.png", out / "report.png")
+        write_report(out / "report.html", found, summary, alone)
+        write_json(out / "summary.json", summary)
     if not quiet:
         print_identification(summary, out)
     return summary
@@ -165,16 +168,16 @@ def eliminate_command(
     summary = plain(summary | rms_figures(found) | contact_figures(found, causal_tare_s))
     from drake_teleop.logs.pictures import draw_elimination
 
-    out.mkdir(parents=True, exist_ok=True)
-    _write_wrenches(found, out / "contact_wrench.parquet")
-    draw_elimination(found).savefig(out / "contact_wrench.png")
-    write_summary(out, summary)
+    with output_folder(out):
+        write_table(out / "contact_wrench.parquet", _wrenches(found))
+        write_picture(out / "contact_wrench.png", draw_elimination(found))
+        write_json(out / "summary.json", summary)
     if not quiet:
         print_elimination(summary, out)
     return summary
 
 
-def _write_wrenches(found: EliminatedLog, path: Path) -> None:
+def _wrenches(found: EliminatedLog) -> pl.DataFrame:
     import polars as pl
 
     columns: dict[str, NDArray[Any]] = {"t": found.log.t}
@@ -186,4 +189,4 @@ def _write_wrenches(found: EliminatedLog, path: Path) -> None:
             values = getattr(found.causal, name)
             columns |= {f"causal_{name}_{c}": values[:, i] for i, c in enumerate(WRENCH)}
     columns["in_contact"] = found.touched
-    pl.DataFrame(columns).write_parquet(path)
+    return pl.DataFrame(columns)

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,9 +37,13 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.contact.noise_floor import STATISTICS
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.contact import FEWEST, Detection, contacts_of
-from drake_teleop.logs.figures import common_figures, plain, write_summary
+from drake_teleop.logs.figures import common_figures, plain
 from drake_teleop.logs.printing import print_results
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
+from drake_teleop.writing import output_folder, write_json, write_picture, write_table
+
+if TYPE_CHECKING:
+    import polars as pl
 
 
 @dataclass(frozen=True)
@@ -136,10 +140,10 @@ def detect_command(
     }
     summary["notes"] += found.notes
     summary = plain(summary)
-    out.mkdir(parents=True, exist_ok=True)
-    _write_table(found, out / "detection.parquet")
-    draw_detection(found).savefig(out / "detection.png")
-    write_summary(out, summary)
+    with output_folder(out):
+        write_table(out / "detection.parquet", _table(found))
+        write_picture(out / "detection.png", draw_detection(found))
+        write_json(out / "summary.json", summary)
     if not quiet:
         _print_detection(summary, out)
     return summary
@@ -157,7 +161,7 @@ def _above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
     }
 
 
-def _write_table(found: DetectedLog, path: Path) -> None:
+def _table(found: DetectedLog) -> pl.DataFrame:
     import polars as pl
 
     from drake_teleop.logs.read.canonical import WRENCH
@@ -165,7 +169,7 @@ def _write_table(found: DetectedLog, path: Path) -> None:
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
     columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTICS)}
     columns |= {f"contact_{c}": found.eliminated.contact[:, i] for i, c in enumerate(WRENCH)}
-    pl.DataFrame(columns | {"in_contact": found.touched}).write_parquet(path)
+    return pl.DataFrame(columns | {"in_contact": found.touched})
 
 
 def draw_detection(found: DetectedLog) -> Any:

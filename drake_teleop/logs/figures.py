@@ -79,7 +79,6 @@ causal                    null, or, if --causal was given: mode, lag_s (by how m
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -236,10 +235,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, (np.ndarray, np.generic)):
         return plain(value.tolist())
     return None if value in (float("inf"), float("-inf")) else value
-
-
-def write_summary(out: Path, summary: dict[str, Any]) -> None:
-    """Writes summary.json into the folder."""
-    (out / "summary.json").write_text(
-        json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8"
-    )

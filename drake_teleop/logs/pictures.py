@@ -28,6 +28,7 @@ from drake_teleop.pages.style import (
     house_style,
     shade_contact,
 )
+from drake_teleop.writing import whole_file
 
 _CHANNELS = ("$f_x$", "$f_y$", "$f_z$", r"$\tau_x$", r"$\tau_y$", r"$\tau_z$")
 _SYMBOLS = (
@@ -72,7 +73,8 @@ def one_page(upper: Path, lower: Path, page: Path) -> None:
     """Writes two PNG files of the same width as one, the first above the second."""
     from matplotlib.image import imread, imsave
 
-    imsave(page, np.concatenate([imread(upper), imread(lower)]))
+    with whole_file(page) as unfinished:
+        imsave(unfinished, np.concatenate([imread(upper), imread(lower)]), format="png")
 
 
 def spectrum(x: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

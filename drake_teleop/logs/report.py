@@ -14,6 +14,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.pictures import VERDICT_WORDS
 from drake_teleop.logs.processing import IdentifiedLog
 from drake_teleop.pages.html import embedded_png, render
+from drake_teleop.writing import write_text
 
 # Eq. (7): symbol, index, unit as printed, and how many of it an SI unit has.
 _PARAMETERS = (
@@ -133,7 +134,7 @@ def write_report(
         ],
         summary=dict(summary),
     )
-    path.write_text(page, encoding="utf-8")
+    write_text(path, page)
 
 
 def _tiles(load: Identification) -> list[tuple[str, str, str]]:

@@ -8,7 +8,6 @@ commands read these files and nothing else; truth.json is for whoever wants to c
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,9 @@ from numpy.typing import NDArray
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.logs.figures import plain, write_summary
+from drake_teleop.logs.figures import plain
 from drake_teleop.logs.read.description import STANDARD_GRAVITY, UNITS
+from drake_teleop.writing import output_folder, write_json, write_table, write_text
 
 Array = NDArray[np.float64]
 
@@ -106,25 +106,25 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
     Returns:
         the summary: seed, files, duration_s, wrench_hz, pose_hz.
     """
-    out.mkdir(parents=True, exist_ok=True)
     random = np.random.default_rng(seed)
     records = {"free": ((), "in free motion"), "touched": (TOUCHES, "touched three times")}
     files = []
-    for row, (name, (touches, what)) in enumerate(records.items()):
-        text = _DESCRIPTION.format(what=what, name=name, offset=-CLOCK_S)
-        (out / f"{name}.yaml").write_text(text, encoding="utf-8")
-        _write_wrench(out / f"{name}_wrench.csv", _motion(row), touches, OFFSETS[row], random)
-        _write_pose(out / f"{name}_pose.csv", _motion(row), random)
-        files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
-    (out / "truth.json").write_text(json.dumps(plain(_truth()), indent=2) + "\n", encoding="utf-8")
-    summary = {
-        "seed": seed,
-        "files": [*files, "truth.json"],
-        "duration_s": PERIOD_S + 2 * REST_S,
-        "wrench_hz": WRENCH_HZ,
-        "pose_hz": POSE_HZ,
-    }
-    write_summary(out, summary)
+    with output_folder(out):
+        for row, (name, (touches, what)) in enumerate(records.items()):
+            text = _DESCRIPTION.format(what=what, name=name, offset=-CLOCK_S)
+            write_text(out / f"{name}.yaml", text)
+            _write_wrench(out / f"{name}_wrench.csv", _motion(row), touches, OFFSETS[row], random)
+            _write_pose(out / f"{name}_pose.csv", _motion(row), random)
+            files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
+        write_json(out / "truth.json", plain(_truth()))
+        summary = {
+            "seed": seed,
+            "files": [*files, "truth.json"],
+            "duration_s": PERIOD_S + 2 * REST_S,
+            "wrench_hz": WRENCH_HZ,
+            "pose_hz": POSE_HZ,
+        }
+        write_json(out / "summary.json", summary)
     if not quiet:
         _print(out)
     return summary
@@ -262,4 +262,4 @@ def _write(path: Path, names: str, columns: list[Array], digits: int) -> None:
     import polars as pl
 
     table = np.round(np.column_stack(columns), digits)
-    pl.DataFrame(table, schema=names.split()).write_csv(path, float_precision=digits)
+    write_table(path, pl.DataFrame(table, schema=names.split()), float_precision=digits)

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from drake_teleop.pages.html import embedded, render
+from drake_teleop.writing import write_text
 
 # Eq. (7): symbol, index, unit as printed, and how many of it an SI unit has.
 _PARAMETERS = (
@@ -255,7 +256,7 @@ def write_report(
         summary=summary,
         replay=replay,
     )
-    path.write_text(page, encoding="utf-8")
+    write_text(path, page)
 
 
 def _tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:

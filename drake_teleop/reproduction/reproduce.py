@@ -24,7 +24,6 @@ What is measured, all of it at the rate at which the hand is served:
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +60,14 @@ from drake_teleop.run import FILTER_TAIL, in_contact
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
+from drake_teleop.writing import (
+    make_folder,
+    output_folder,
+    write_json,
+    write_picture,
+    write_table,
+    write_text,
+)
 
 Array = NDArray[np.float64]
 Figures = dict[str, Any]
@@ -125,6 +132,7 @@ def reproduce_command(
         speed.
     """
     seed = seed or 0
+    make_folder(out)  # before the work: a bad path costs no time
     with show_progress(progress and not quiet) as stage:
         # Each run has noise of its own.
         force, torque, contact = (
@@ -150,7 +158,8 @@ def reproduce_command(
         }
         pictures = draw(force_run, torque_run, contact_run, summary)
         written = stage("Write figures, replay and report")
-        _write(out, seed, summary, load, (force_run, torque_run, contact_run), pictures)
+        with output_folder(out):
+            _write(out, seed, summary, load, (force_run, torque_run, contact_run), pictures)
         written(1.0)
     if not quiet:
         _print(compare_with_paper(flat(summary)), out)
@@ -382,7 +391,7 @@ def _write(
     pictures: dict[str, Figure],
 ) -> None:
     force, torque, contact = runs
-    (out / "logs").mkdir(parents=True, exist_ok=True)
+    make_folder(out / "logs")
     for name, result, scenario in (
         ("identification", load.result, identification_scenario(force.scenario, seed)),
         ("free_motion_force", force.result, force.scenario),
@@ -392,15 +401,13 @@ def _write(
     ):
         result.write_parquet(out / "logs" / f"{name}.parquet")
         write_scenario(out / "logs" / f"{name}.yaml", scenario)
-    load.result.sensor_log().write_parquet(out / "logs" / "identification_sensor_log.parquet")
+    write_table(out / "logs" / "identification_sensor_log.parquet", load.result.sensor_log())
     load.identification.save(out / "identification.json")
-    text = json.dumps(summary, indent=2, allow_nan=False)
-    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
     for name, picture in pictures.items():
-        picture.savefig(out / f"{name}.png")
+        write_picture(out / f"{name}.png", picture)
     write_replay(out / "replay.html", contact.touched, contact.scenario, slow_motion=_SLOW_MOTION)
     figures = flat(summary)
-    (out / "table.md").write_text(_markdown(compare_with_paper(figures)), encoding="utf-8")
+    write_text(out / "table.md", _markdown(compare_with_paper(figures)))
     write_report(
         out / "report.html",
         setup=_setup(seed, force.scenario, load),
@@ -411,6 +418,7 @@ def _write(
         ),
         replay="replay.html",
     )
+    write_json(out / "summary.json", summary)
 
 
 def _captioned(pictures: dict[str, Figure], figures: Figures) -> list[ReportFigure]:

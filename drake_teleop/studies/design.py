@@ -2,7 +2,8 @@
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -18,6 +19,11 @@ Array = NDArray[np.float64]
 Value: TypeAlias = float | str | bool | list[float]
 Values: TypeAlias = dict[str, Value]
 """The factors' values of one point of the design, by field."""
+
+MANY_RUNS = 10**5
+"""So many are days or weeks: somebody has to say that they are meant."""
+MOST_RUNS = 10**6
+"""The design of so many needs 1 GB."""
 
 # Among so many points (a power of two) an adaptive design chooses the next ones.
 _CANDIDATES = 1024
@@ -157,8 +163,30 @@ class Study:
     def size(self) -> int:
         """The number of points."""
         if self.design == "factorial":
-            return int(np.prod([len(factor.listed()) for factor in self.factors]))
+            return math.prod(len(factor.listed()) for factor in self.factors)
         return self.samples
+
+    def check_size(self, where: str, yes: bool | Callable[[str], bool]) -> None:
+        """Refuses a study that is too large, before there is anything as large as it.
+
+        Args:
+            where: its place, for messages.
+            yes: whether many runs are meant; or what answers, if there are many.
+
+        Raises:
+            DrakeTeleopError: for more than `MOST_RUNS`, or for more than `MANY_RUNS` that are not
+                meant, saying how many there are.
+        """
+        runs = self.size() * self.repeats
+        what = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
+        if runs > MOST_RUNS:
+            remedy = f"give fewer values or repeats: a study has {MOST_RUNS:,} runs at most"
+            raise DrakeTeleopError(f"{what} are too many", where=where, remedy=remedy)
+        if runs <= MANY_RUNS or yes is True:
+            return
+        if yes is False or not yes(f"{where}: {what}. Begin?"):
+            remedy = "--yes (in Python: yes=True) says that they are meant"
+            raise DrakeTeleopError(f"{what} are many", where=where, remedy=remedy)
 
     def points(self) -> list[Values]:
         """The design: the factors' values at each of its points; of an adaptive one, the first."""

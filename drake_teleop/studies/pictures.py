@@ -14,6 +14,7 @@ from drake_teleop.studies import effects
 from drake_teleop.studies.design import Study
 from drake_teleop.studies.effects import PARETO, numbers, pair_means, pareto, varied
 from drake_teleop.studies.level_model import CONFIDENCE
+from drake_teleop.writing import write_picture
 
 if TYPE_CHECKING:
     import polars as pl
@@ -40,7 +41,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
     for name, picture in pictures.items():
         if picture is not None:
             written.append(out / f"{name}.png")
-            picture.savefig(written[-1], bbox_inches="tight")
+            write_picture(written[-1], picture, bbox_inches="tight")
     return written
 
 

@@ -161,7 +161,8 @@ def _client(address: str, jobs: int) -> Iterator[Any]:
     local = {
         "n_workers": jobs if jobs > 0 else None,
         "threads_per_worker": 1,
-        "dashboard_address": ":0",
+        "host": "127.0.0.1",
+        "dashboard_address": "127.0.0.1:0",
     }
     settings = {
         # A worker that dies takes no chunk along that was only waiting there.

@@ -22,6 +22,7 @@ from drake_teleop.pages.progress import Progress, show_progress
 from drake_teleop.studies.design import Study, Values
 from drake_teleop.studies.processes import Chunk, processes
 from drake_teleop.studies.store import Store, open_store
+from drake_teleop.writing import CannotWrite
 
 if TYPE_CHECKING:
     import polars as pl
@@ -93,9 +94,11 @@ def run_study(
                         told.more(found)
                     new = study.next_points(points, _objective(study, store, len(points)))
                     points += new
-        except KeyboardInterrupt as interrupt:
+        except (KeyboardInterrupt, CannotWrite) as error:
             kept = f"{out} keeps {told.done} of {told.total} runs; the same command goes on"
-            raise KeyboardInterrupt(kept) from interrupt
+            if isinstance(error, CannotWrite):
+                raise DrakeTeleopError(str(error), remedy=kept) from error
+            raise KeyboardInterrupt(kept) from error
         return store.read()
 
 

@@ -25,7 +25,7 @@ choice.png  the merit, and how often each point is the best
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from drake_teleop.pages.style import COLOURS, Picture, house_style
 from drake_teleop.studies.effects import estimated, numbers
 from drake_teleop.studies.study import LoadStudy, study_command
+from drake_teleop.writing import make_folder, output_folder, write_json, write_picture, write_table
 
 if TYPE_CHECKING:
     import polars as pl
@@ -84,6 +85,7 @@ def scaling_study_command(
     jobs: int = -1,
     cluster: str | None = None,
     repeats: int | None = None,
+    yes: bool | Callable[[str], bool] = False,
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
@@ -91,7 +93,7 @@ def scaling_study_command(
 
     Args:
         out: the folder.
-        jobs, cluster, quiet, progress: as for `study_command`.
+        jobs, cluster, yes, quiet, progress: as for `study_command`.
         repeats: of each point, instead of the studies' own.
 
     Returns:
@@ -99,12 +101,12 @@ def scaling_study_command(
     """
     import polars as pl
 
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     rows = {}
     for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT):
         study_command(
             name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
-            progress=progress,
+            progress=progress, yes=yes,
         )  # fmt: skip
         rows[name] = pl.read_parquet(out / name / "runs.parquet").sort("run")
     tables = {task: _tables(rows[f"scaling_{task}"], task) for task in TASKS}
@@ -115,11 +117,11 @@ def scaling_study_command(
         "choice": {way: _chosen(found, sigmas, gammas) for way, found in answers.items()},
         "eta": _eta(rows[_OBJECT]),
     }
-    text = json.dumps(summary, indent=2, allow_nan=False)
-    (out / "answer.json").write_text(text + "\n", encoding="utf-8")
-    _merits(answers, sigmas, gammas).write_csv(out / "answer.csv")
-    criteria_picture(rows, sigmas, gammas).savefig(out / "answer.png")
-    choice_picture(answers, sigmas, gammas).savefig(out / "choice.png")
+    with output_folder(out, "answer.json"):
+        write_table(out / "answer.csv", _merits(answers, sigmas, gammas))
+        write_picture(out / "answer.png", criteria_picture(rows, sigmas, gammas))
+        write_picture(out / "choice.png", choice_picture(answers, sigmas, gammas))
+        write_json(out / "answer.json", summary)
     if not quiet:
         _print(summary, out)
     return summary

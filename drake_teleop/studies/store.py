@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, reading
+from drake_teleop.writing import make_folder, naming, write_table, write_text
 
 if TYPE_CHECKING:
     import polars as pl
@@ -40,16 +41,15 @@ class Store:
 
     def write(self, rows: pl.DataFrame) -> None:
         """Adds the rows of one chunk; column "run" of the first one gives the part's name."""
-        # Beside the folder, since what reads folders reads all that is in them.
-        unfinished = self.folder.with_name(f"{self.folder.name}.unfinished")
-        rows.write_parquet(unfinished)
-        unfinished.replace(self.folder / _PART.format(rows["run"][0]))
+        write_table(self.folder / _PART.format(rows["run"][0]), rows, aside=self.folder)
 
     def mark(self, run: int) -> None:
         """Notes that the chunk with this first run is under way, once more."""
-        self._marks.mkdir(exist_ok=True)
-        with (self._marks / str(run)).open("ab") as mark:
-            mark.write(b".")
+        path = self._marks / str(run)
+        with naming(path):
+            self._marks.mkdir(exist_ok=True)
+            with path.open("ab") as mark:
+                mark.write(b".")
 
     def unmark(self, run: int) -> None:
         """Takes its marks away, if it has any."""
@@ -67,7 +67,9 @@ class Store:
         """All rows, sorted by run."""
         import polars as pl
 
-        return pl.read_parquet(self.folder).sort("run")
+        remedy = "remove the part that is damaged; the same command makes it anew"
+        with reading(self.folder, remedy):
+            return pl.read_parquet(self.folder).sort("run")
 
 
 @contextmanager
@@ -82,7 +84,7 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
         DrakeTeleopError: if the folder holds the rows of something else, or is in use.
     """
     store = Store(out / "runs.parquet")
-    store.folder.mkdir(parents=True, exist_ok=True)
+    make_folder(store.folder)
     handle = os.open(out, os.O_RDONLY)
     try:
         _lock(handle, out)
@@ -106,10 +108,8 @@ def _check_identity(out: Path, identity: dict[str, Any]) -> None:
     path = out / "study.json"
     text = json.dumps(identity, indent=2) + "\n"
     if not path.exists():
-        unfinished = path.with_name("study.json.unfinished")
-        unfinished.write_text(text, encoding="utf-8")
-        unfinished.replace(path)
-    elif path.read_text(encoding="utf-8") != text:
+        write_text(path, text)
+    elif path.read_bytes() != text.encode():
         raise DrakeTeleopError(
             "holds the runs of another study, or of another version of this one",
             where=str(out),

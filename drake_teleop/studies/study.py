@@ -39,9 +39,8 @@ process is a failed run; only if there is one process for all does it end the st
 from __future__ import annotations
 
 import copy
-import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,6 +60,7 @@ from drake_teleop.studies.measures import measured
 from drake_teleop.studies.pictures import write_pictures
 from drake_teleop.studies.runs import ONCE, run_study
 from drake_teleop.texts import read_yaml
+from drake_teleop.writing import output_folder, write_json, write_table
 
 if TYPE_CHECKING:
     import polars as pl
@@ -108,6 +108,7 @@ def study_command(
     quiet: bool = False,
     progress: bool = True,
     repeats: int | None = None,
+    yes: bool | Callable[[str], bool] = False,
 ) -> dict[str, Any]:
     """Runs a study, or what is left of it.
 
@@ -119,28 +120,31 @@ def study_command(
         quiet: no progress bar and no table.
         progress: False for no progress bar alone.
         repeats: instead of the file's.
+        yes: whether more than 1e5 runs are meant; or what answers that, if there are so many.
 
     Returns:
         The summary, see the top of this module.
 
     Raises:
-        DrakeTeleopError: for a bad file, a folder of another study, or Dask that is not installed.
+        DrakeTeleopError: for a bad file, too many runs, a folder of another study or that cannot
+            be written, or Dask that is not installed.
         KeyboardInterrupt: saying what is kept.
     """
     study, path = LoadStudy(path), study_file(path)
+    study.repeats = repeats or study.repeats
+    study.check_size(str(path), yes)
     data, where = ReadScenario(_scenario_of(study, path))
     ScenarioFromData(data, where)
     for index, factor in enumerate(study.factors):
         _check_values(factor, f"{path}:factors[{index}]")
-    study.repeats = repeats or study.repeats
     work = StationWork(data, where, tuple(study.measures), study.force_threshold)
     shown = progress and not quiet
     rows = run_study(study, out, work, {"data": data}, jobs=jobs, cluster=cluster, progress=shown)
     summary = _summary(study, rows)
-    text = json.dumps(summary, indent=2, allow_nan=False)
-    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
-    effects(study, rows).write_csv(out / "effects.csv")
-    write_pictures(study, rows, out)
+    with output_folder(out, kept=["runs.parquet"]):
+        write_table(out / "effects.csv", effects(study, rows))
+        write_pictures(study, rows, out)
+        write_json(out / "summary.json", summary)
     if not quiet:
         _print(study, summary, out)
     return summary

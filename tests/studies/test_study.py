@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from sockets import THIS_MACHINE, listening
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from drake_teleop.errors import DrakeTeleopError
@@ -24,7 +26,7 @@ from drake_teleop.studies import study as studies
 from drake_teleop.studies.design import Factor, Study
 from drake_teleop.studies.measures import default_measures, measured
 from drake_teleop.studies.runs import ONCE, Told, run_study
-from drake_teleop.studies.store import open_store
+from drake_teleop.studies.store import Store, open_store
 from drake_teleop.studies.study import LoadStudy, study_command
 
 # Learns while it moves, so that no identification comes first.
@@ -140,11 +142,20 @@ def test_processes_give_the_same_bytes(serial, files):
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_gives_the_same_bytes(serial, files):
-    out = files / "dask"
+def test_a_dask_cluster_gives_the_same_bytes_and_is_for_this_machine_alone(
+    serial, files, monkeypatch
+):
+    out, write, seen = files / "dask", Store.write, set()
+
+    def look_and_write(store, rows):
+        seen.update(seen or listening())
+        write(store, rows)
+
+    monkeypatch.setattr(Store, "write", look_and_write)
     summary = study_command(files / "study.yaml", out, jobs=1, cluster="local", quiet=True)
     assert summary == serial[0]
     assert parts(out) == parts(serial[1])
+    assert seen and seen <= THIS_MACHINE
 
 
 def test_without_dask_the_extra_is_named(files, monkeypatch):
@@ -513,6 +524,52 @@ def test_a_bad_file_is_one_line_with_its_field(files, tmp_path, change, message)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "out").exists()
+
+
+MANY = """
+scenario: tiny.yaml
+factors: [{field: force_scaling.sigma, low: 0, high: 1, levels: LEVELS}]
+repeats: 200
+"""
+
+
+@pytest.mark.parametrize(
+    ("factors", "runs"),
+    [(2, "1,000,000,000,000 runs"), (5, "10^21.0 runs"), (300, "10^906.0 runs")],
+)
+def test_a_study_that_is_too_large_is_refused_before_there_is_any_of_it(
+    files, tmp_path, monkeypatch, factors, runs
+):
+    monkeypatch.setattr(Study, "points", lambda self: pytest.fail("as large as that"))
+    fields = [f"{{field: a.b{k}, low: 0, high: 1, levels: 1000}}" for k in range(factors)]
+    path = files / "huge.yaml"
+    path.write_text(f"factors: [{', '.join(fields)}]\nrepeats: 1000000")
+    with pytest.raises(DrakeTeleopError, match=re.escape(f"huge.yaml: {runs} are too many; give")):
+        study_command(path, tmp_path / "out", yes=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_many_runs_have_to_be_meant(files, tmp_path, monkeypatch):
+    class Begun(Exception):
+        pass
+
+    def begin(*arguments, **options):
+        raise Begun
+
+    monkeypatch.setattr(studies, "run_study", begin)
+    path, out, asked = files / "many.yaml", tmp_path / "out", []
+    path.write_text(MANY.replace("LEVELS", "501"))
+    with pytest.raises(DrakeTeleopError, match=r"many\.yaml: 100,200 runs are many; --yes"):
+        study_command(path, out)
+    with pytest.raises(DrakeTeleopError, match="--yes"):
+        study_command(path, out, yes=lambda question: asked.append(question))
+    assert asked == [f"{path}: 100,200 runs. Begin?"]
+    for yes in (True, lambda question: True):
+        with pytest.raises(Begun):
+            study_command(path, out, yes=yes)
+    path.write_text(MANY.replace("LEVELS", "500"))
+    with pytest.raises(Begun):
+        study_command(path, out, yes=lambda question: pytest.fail("nobody need ask"))
 
 
 def test_no_file(tmp_path):

@@ -22,7 +22,6 @@ draft           the file with a draft description of an unknown table or a bag, 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -41,6 +40,7 @@ from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import shortest_gap
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.tables import Table, read_table
+from drake_teleop.writing import make_folder, output_folder, write_json, write_text
 
 BANDWIDTH = 30.0
 """Gaps are those that matter below this frequency [Hz]."""
@@ -84,7 +84,7 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
         "delay_s": None,
         "draft": None,
     }
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     description: Description | None = None
     draft = ""
     if is_bag(log):
@@ -115,11 +115,12 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
             summary["kind"] = "unknown"
     if description is None:
         summary["draft"] = str(out / "draft.yaml")
-        (out / "draft.yaml").write_text(draft, encoding="utf-8")
     else:
         _inspect(description, str(log), tables, summary)
-    text = json.dumps(summary, indent=2, allow_nan=False)
-    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    with output_folder(out):
+        if description is None:
+            write_text(out / "draft.yaml", draft)
+        write_json(out / "summary.json", summary)
     if not quiet:
         _print(summary)
     return summary

@@ -27,6 +27,7 @@ from drake_teleop.logs.read.description import (
     Wrench,
 )
 from drake_teleop.logs.read.tables import Table
+from drake_teleop.writing import write_table
 
 WRENCH = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 SPECIFIC_FORCE = ("s_x", "s_y", "s_z")
@@ -150,16 +151,13 @@ def write_log(log: Log, path: str | Path) -> None:
     names = (*WRENCH, *SPECIFIC_FORCE, *ANGULAR_VELOCITY, *ANGULAR_ACCELERATION)
     values = np.hstack([log.wrench, *log.motion])
     frame = pl.DataFrame({"t": log.t} | dict(zip(names, values.T, strict=True)))
-    if path.suffix == ".csv":
-        frame.write_csv(path)
-    elif path.suffix == ".parquet":
-        frame.write_parquet(path)
-    else:
+    if path.suffix not in (".csv", ".parquet"):
         raise DrakeTeleopError(
             f"format {path.suffix!r} is not known",
             where=str(path),
             remedy="name it .csv or .parquet",
         )
+    write_table(path, frame)
 
 
 def describe_canonical(path: Path, table: Table) -> Description:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, reading
 
 if TYPE_CHECKING:
     import polars as pl
@@ -185,10 +185,8 @@ def read_table(path: Path, *, header: bool = True) -> Table:
         )
     if not path.is_file():
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
-    try:
+    with reading(path, f"check that it is a valid {path.suffix} file"):
         table = _read_npz(path) if path.suffix.lower() == ".npz" else _read_frame(path, header)
-    except Exception as error:  # what a damaged file leads to, zipfile, numpy, polars do not say
-        raise _unreadable(path, error) from error
     if not table.columns or not all(len(c) for c in table.columns.values()):
         raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
     return table
@@ -243,14 +241,6 @@ def _as_numbers(
         except (TypeError, ValueError) as error:
             raise bad(row, cell) from error
     return numbers
-
-
-def _unreadable(path: Path, error: Exception) -> DrakeTeleopError:
-    return DrakeTeleopError(
-        f"cannot be read: {(str(error).splitlines() or [type(error).__name__])[0]}",
-        where=str(path),
-        remedy=f"check that it is a valid {path.suffix} file",
-    )
 
 
 def _listed(names: Sequence[str]) -> str:

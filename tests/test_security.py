@@ -1,0 +1,206 @@
+"""What docs/security.md says: nothing that is read is run, no other machine is listened to."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sockets import THIS_MACHINE, listening
+
+from drake_teleop import identified_load
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.film import Film
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.logs.read.description import load_description
+from drake_teleop.logs.read.tables import read_table
+from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import LoadScenario
+from drake_teleop.studies.study import LoadStudy, study_command
+
+ROOT = Path(__file__).parents[1]
+RUNS_WHAT_IT_READS = re.compile(
+    r"\w*pickle\w*|\b(?<!re\.)(?:eval|exec|compile|__import__)(?=\()|shell ?=|os\.(?:system|popen)"
+    r"|subprocess|marshal|shelve|\bdill\b|joblib|import_module|ctypes|runpy|code_from|\bcffi\b"
+    r"|yaml\.\w*load\w*|np\.(?:load|fromfile|memmap)|Loader=|SourceFileLoader|spec_from\w*"
+)
+EXPLAINED = {
+    # The compiled code of this package, which lies where its .pyc files lie; see the file itself.
+    ("_compiled.py", "pickle"), ("_compiled.py", "pickles"),
+    # Of NumPy's formats those without objects.
+    ("identified_load.py", "np.load"), ("identified_load.py", "allow_pickle"),
+    ("logs/read/tables.py", "np.load"), ("logs/read/tables.py", "allow_pickle"),
+    # Processes that this one starts: what they say to each other goes through pipes.
+    ("studies/processes.py", "joblib"), ("comparison/compare_passivity.py", "joblib"),
+    ("studies/runs.py", "pickled"),
+    # An `if` for each of the package's own methods, and a module of the package by its name.
+    ("passivity/methods.py", "exec"), ("passivity/methods.py", "import_module"),
+    ("__init__.py", "import_module"),
+}  # fmt: skip
+LISTENS = re.compile(
+    r"\bMeshcat\(.*|\bClient\(|LocalCluster\(|\bsocket\b|\bhttp\.|socketserver|asyncio"
+)
+LISTENING = {
+    ("film.py", 'Meshcat(MeshcatParams(host="localhost", port=0))'),
+    ("studies/processes.py", "Client("),
+}
+"""All that can listen; tests look at the sockets of both."""
+WRITES = re.compile(
+    r"\.write_(?:text|bytes|csv|ipc|json|ndjson)(?=\()|\.(?:write_parquet|save|savefig|touch)(?=\()"
+    r"|np\.save\w*|\bopen\(\"[wax]\w*|json\.dump(?=\()|os\.replace"
+)
+WRITING = {
+    # To memory.
+    ("pages/html.py", ".savefig"), ("pages/style.py", ".savefig"),
+    # What is kept for the next time, whole or not at all; and a temporary folder.
+    ("_compiled.py", ".touch"), ("_compiled.py", ".write_bytes"), ("_compiled.py", "os.replace"),
+    ("identified_load.py", 'open("wb'), ("identified_load.py", "np.savez"),
+    ("excitation/models.py", ".write_text"),
+    # A mark of one byte more.
+    ("studies/store.py", 'open("ab'),
+    # Functions of the package that write by `writing.py`.
+    ("run.py", ".save"), ("logs/commands.py", ".save"), ("excitation/command.py", ".save"),
+    ("reproduction/reproduce.py", ".save"), ("reproduction/reproduce.py", ".write_parquet"),
+}  # fmt: skip
+
+
+def found(pattern: re.Pattern[str], folder: Path) -> set[tuple[str, str]]:
+    """File and words of everything in a package that a pattern finds."""
+    return {
+        (path.relative_to(folder).as_posix(), match.group())
+        for path in folder.rglob("*.py")
+        for line in path.read_text(encoding="utf-8").splitlines()
+        for match in pattern.finditer(line)
+    }
+
+
+@pytest.mark.parametrize(
+    ("pattern", "explained"),
+    [
+        (RUNS_WHAT_IT_READS, EXPLAINED),
+        (LISTENS, LISTENING),
+        (WRITES, WRITING),
+        # The command line hides them, so what users have to know is said in another way.
+        (re.compile(r"\bwarn\("), set()),
+    ],
+    ids=["run", "listen", "write", "warn"],
+)
+def test_what_runs_listens_writes_and_warns_is_explained(pattern, explained):
+    there = found(pattern, ROOT / "drake_teleop")
+    assert {(file, what) for file, what in there if file != "writing.py"} == explained
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "pickle.load(file)", "import cloudpickle", "eval(text)", "exec(text)", "os.system(text)",
+        "np.load(path)", "np.load(path, allow_pickle=True)", "yaml.load(text)", "joblib.load(path)",
+        "yaml.unsafe_load(text)", "run(text, shell=True)", "subprocess.run(words)",
+    ],
+)  # fmt: skip
+def test_a_line_that_runs_what_it_reads_is_found(tmp_path, line):
+    (tmp_path / "new.py").write_text(f"def f():\n    {line}\n")
+    assert found(RUNS_WHAT_IT_READS, tmp_path)
+
+
+class Planted:
+    """What makes a folder as soon as somebody unpickles it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self._path),)
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "x.npz": read_table,
+    "x.csv": read_table,
+    "x.parquet": read_table,
+    "x.yaml": load_description,
+    "log.parquet": SimulationResult.read_parquet,
+    "load-1.npz": identified_load._read,
+    "identification.json": Identification.load,
+    "excitation.yaml": FourierTrajectory.load,
+    "scenario.yaml": LoadScenario,
+    "study.yaml": LoadStudy,
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_planted_pickle_is_not_run(tmp_path, name):
+    done, path = tmp_path / "done", tmp_path / name
+    path.write_bytes(pickle.dumps(Planted(done)))
+    with suppress(DrakeTeleopError):
+        READERS[name](path)
+    if name.endswith(".npz"):
+        np.savez(path, a=np.array([Planted(done)], dtype=object))
+        with suppress(DrakeTeleopError):
+            READERS[name](path)
+    assert not done.exists()
+    pickle.loads(pickle.dumps(Planted(done)))
+    assert done.exists()  # it would have been
+
+
+STUDY = (
+    "scenario: reach\nmeasures: [hand_work_J]\nfactors: [{field: rates.log_hz, values: [1e3]}]\n"
+)
+
+
+def test_a_pickle_that_is_planted_in_a_study_is_not_run(tmp_path, monkeypatch):
+    """Under every name that a study has, or ever had."""
+    monkeypatch.setattr(
+        "drake_teleop.studies.study.StationWork.__call__",
+        lambda self, values, seed: {"hand_work_J": 1.0},
+    )
+    path, out, done = tmp_path / "study.yaml", tmp_path / "out", tmp_path / "done"
+    path.write_text(STUDY)
+
+    def go_on() -> None:
+        with suppress(DrakeTeleopError):
+            study_command(path, out, jobs=1, quiet=True)
+
+    go_on()
+    names = [file.relative_to(out) for file in out.rglob("*") if file.is_file()]
+    assert Path("runs.parquet/run_00000000.parquet") in names
+    names += [Path("loads") / f"{key}.pickle" for key in ("0", "a" * 64)]
+    names += map(
+        Path, ("running/0", "runs.parquet.unfinished", "runs.parquet/run_00000001.parquet")
+    )
+    for name in names:
+        file = out / name
+        earlier = file.read_bytes() if file.exists() else None
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(pickle.dumps(Planted(done)))
+        go_on()
+        assert not done.exists()
+        if earlier is not None:
+            file.write_bytes(earlier)
+        else:
+            file.unlink(missing_ok=True)
+
+
+def test_a_film_is_made_for_this_machine_alone(tmp_path):
+    seen = []
+
+    def make_scene(meshcat):
+        seen.append(listening())
+        return lambda time, frame: None
+
+    Film("x", np.arange(2.0), 1.0).write(tmp_path / "x.html", make_scene)
+    assert seen[0] and seen[0] <= THIS_MACHINE
+
+
+def test_a_socket_for_all_is_seen():
+    import socket
+
+    with socket.create_server(("0.0.0.0", 0)):
+        assert not listening() <= THIS_MACHINE
+    with socket.create_server(("127.0.0.1", 0)):
+        assert listening() <= THIS_MACHINE

@@ -1,0 +1,259 @@
+"""Files are complete or absent; what cannot be written is one line, wherever the disk is full."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import json
+import os
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from matplotlib.figure import Figure
+
+from drake_teleop import run as runs
+from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.film import Film
+from drake_teleop.logs import sample
+from drake_teleop.result import Signal, SimulationResult
+from drake_teleop.scenario import LoadScenario
+from drake_teleop.studies import study as studies
+from drake_teleop.writing import (
+    CannotWrite,
+    make_folder,
+    output_folder,
+    whole_file,
+    write_json,
+    write_picture,
+    write_table,
+    write_text,
+)
+
+TABLE = pl.DataFrame({"x": np.random.default_rng(0).random(5000)})
+
+
+@contextmanager
+def small_disk(size: int = 100) -> Iterator[None]:
+    """While it lasts no file of this process grows beyond so many bytes: the kernel refuses."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@contextmanager
+def full_at(write: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
+    """The disk is full when the file with this number gets its name; gives those that had it."""
+    replace, named = Path.replace, []
+
+    def filling(path: Path, target: Path) -> Path:
+        if len(named) >= write:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        named.append(Path(target))
+        return replace(path, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", filling)
+        yield named
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "x.txt": lambda path: write_text(path, "x" * 5000),
+    "x.json": lambda path: write_json(path, ["x" * 5000]),
+    "x.csv": lambda path: write_table(path, TABLE),
+    "x.parquet": lambda path: write_table(path, TABLE),
+    "x.png": lambda path: write_picture(path, Figure()),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_file_that_has_no_room_is_one_line_and_the_earlier_one_stays(tmp_path, name):
+    path = tmp_path / name
+    path.write_text("earlier")
+    with small_disk(), pytest.raises(CannotWrite) as error:
+        WRITERS[name](path)
+    assert str(error.value) == f"{path}: cannot be written (File too large)"
+    assert path.read_text() == "earlier"
+    WRITERS[name](path)
+    assert path.stat().st_size > 1000
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_interrupt_leaves_the_earlier_file_alone(tmp_path):
+    path = tmp_path / "x"
+    path.write_text("earlier")
+    with pytest.raises(KeyboardInterrupt), whole_file(path) as unfinished:
+        unfinished.write_text("half")
+        raise KeyboardInterrupt
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["earlier"]
+
+
+def test_what_is_not_finite_is_null(tmp_path):
+    path = tmp_path / "x.json"
+    write_json(path, {"a": float("nan"), "b": (float("inf"), {"c": -float("inf")}), "d": 1.5})
+    assert json.loads(path.read_text()) == {"a": None, "b": [None, {"c": None}], "d": 1.5}
+
+
+def test_a_folder_that_cannot_be_is_one_line(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    for folder, reason in (("file", "File exists"), ("file/x", "Not a directory")):
+        with pytest.raises(CannotWrite, match=f"cannot be made a folder .{reason}.; give another"):
+            make_folder(tmp_path / folder)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # which root never sees
+    with pytest.raises(CannotWrite, match="is a write-protected folder; give another"):
+        make_folder(tmp_path)
+
+
+def test_the_last_file_says_that_all_is_there(tmp_path):
+    """It goes first and comes last; the error names what of this time is there."""
+    out = tmp_path / "Käse und Brot"
+    for name in ("summary.json", "earlier", "a"):
+        make_folder(out)
+        (out / name).touch()
+    with pytest.raises(CannotWrite) as error, output_folder(out, kept=["earlier"]):
+        write_text(out / "a", "a")
+        write_text(out / "b", "b")
+        (out / "c").mkdir()
+        write_text(out / "c", "c")
+    message = f"{out / 'c'}: cannot be written (Is a directory); {out} keeps a, b, c, earlier"
+    assert str(error.value) == message
+    assert sorted(path.name for path in out.iterdir()) == ["a", "b", "c", "earlier"]
+
+
+def a_run(scenario, stage, log, *, fresh):
+    """What `run_scenario` gives, of a station that nobody has simulated."""
+    t = np.arange(3.0)
+    sizes = {"measured_wrench_S": 6, "specific_force_S": 3, "angular_velocity_S": 3}
+    sizes |= {"angular_acceleration_S": 3, "sample_time": 1}
+    specs = [Signal(name, tuple("abcdef"[:n]), "1") for name, n in sizes.items()]
+    result = SimulationResult(t, {name: np.ones((3, n)) for name, n in sizes.items()}, specs)
+    result.write_part(log, 0)
+    return runs.ScenarioRun(scenario, SimulationResult.scan_parquet(log), None, "cache", 1.0)
+
+
+def run(out: Path) -> None:
+    runs.run_command("reach", out, quiet=True)
+
+
+def study(out: Path) -> None:
+    path = out.parent / "study.yaml"
+    path.write_text(
+        "scenario: reach\nmeasures: [hand_work_J]\n"
+        "factors: [{field: force_scaling.sigma, values: [0, 1]}]\n"
+    )
+    studies.study_command(path, out, jobs=1, quiet=True)
+
+
+def sample_log(out: Path) -> None:
+    sample.sample_log_command(out, quiet=True)
+
+
+COMMANDS: dict[str, tuple[Callable[[Path], None], int, str]] = {
+    "run": (run, 6, "keeps log.parquet, scenario.yaml"),
+    "study": (study, 6, "keeps 1 of 2 runs; the same command goes on"),
+    "sample-log": (sample_log, 8, "keeps free.yaml, free_wrench.csv"),
+}
+"""Each command, the files that it writes, and what it says when the third one has no room."""
+
+
+@pytest.fixture
+def little_work(monkeypatch):
+    """The commands write all of their files, and have little to do for it."""
+    monkeypatch.setattr(runs, "run_scenario", a_run)
+    monkeypatch.setattr(runs, "summarise", lambda run: {"x": float("nan")})
+    monkeypatch.setattr(runs, "overview", lambda result: Figure())
+    monkeypatch.setattr(runs, "write_replay", lambda path, *_: write_text(path, "film"))
+    monkeypatch.setattr(
+        studies.StationWork, "__call__", lambda self, values, seed: {"hand_work_J": 1.0}
+    )
+    painted = Figure.savefig
+    monkeypatch.setattr(
+        Figure,
+        "savefig",
+        lambda _, path, **options: painted(Figure(figsize=(1, 1)), path, format="png"),
+    )
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_disk_that_is_full_at_any_file(tmp_path, monkeypatch, little_work, name):
+    command, files, third = COMMANDS[name]
+    for write in itertools.count():
+        out = tmp_path / str(write) / "out"
+        out.parent.mkdir()
+        with full_at(write, monkeypatch) as named:
+            try:
+                command(out)
+                break
+            except DrakeTeleopError as error:
+                said = str(error)
+        assert "cannot be written (No space left on device)" in said
+        assert said.count(str(out)) >= 1 and len(said) <= LONGEST_LINE
+        if write == 2:
+            assert third in said
+        there = {path for path in out.rglob("*") if path.is_file()}
+        lone = name == "run" and write == 1  # the scenario alone is of no use
+        assert there == (set() if lone else set(named))
+        assert not (out / "summary.json").exists()
+        for path in there:
+            whole(path)
+    assert write == files
+    json.loads((out / "summary.json").read_text())
+
+
+def whole(path: Path) -> None:
+    if path.suffix == ".parquet":
+        pl.read_parquet(path)
+    elif path.suffix == ".json":
+        json.loads(path.read_text())
+    else:
+        assert path.stat().st_size
+
+
+def test_a_study_that_found_no_room_goes_on(tmp_path, monkeypatch, little_work):
+    out = tmp_path / "out"
+    with full_at(2, monkeypatch), pytest.raises(DrakeTeleopError):
+        study(out)
+    calls = []
+    monkeypatch.setattr(
+        studies.StationWork, "__call__", lambda self, values, seed: calls.append(seed) or {}
+    )
+    study(out)
+    assert len(calls) == 1
+
+
+def test_a_run_that_fails_before_it_begins_leaves_nothing(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise DrakeTeleopError("joint 1 leaves its range")
+
+    monkeypatch.setattr(runs, "run_scenario", fail)
+    with pytest.raises(DrakeTeleopError):
+        run(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    mine = tmp_path / "scenario.yaml"  # which is somebody's own
+    mine.write_text("description: mine\n")
+    with pytest.raises(DrakeTeleopError):
+        runs.run_command(mine, tmp_path, quiet=True)
+    assert LoadScenario(mine).description == "mine"
+
+
+def test_what_an_earlier_run_left_is_not_taken_for_this_one_s(tmp_path, monkeypatch, little_work):
+    run(tmp_path)
+    (tmp_path / "identification.json").touch()
+    with full_at(2, monkeypatch), pytest.raises(DrakeTeleopError):
+        run(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"scenario.yaml", "log.parquet"}
+
+
+def test_a_film_cannot_be_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(Film, "_recorded", lambda self, make_scene: "<body></body>")
+    film = Film("x", np.arange(2.0), 1.0)
+    with small_disk(), pytest.raises(CannotWrite, match=r"x\.html: cannot be written"):
+        film.write(tmp_path / "x.html", lambda meshcat: lambda time, frame: None)
+    assert list(tmp_path.iterdir()) == []
