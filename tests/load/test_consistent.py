@@ -20,6 +20,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 
 ROD = phi_from_mass_com_inertia(0.009, [0, 0.002, 0.06], np.diag([5e-5, 5e-5, 0.0]))
 PLATE = phi_from_mass_com_inertia(0.3, [0, 0.01, 0.1], np.diag([1e-3, 2e-3, 3e-3]))
+CENTRED = phi_from_mass_com_inertia(0.009, [0, 0, 0], np.diag([5e-5, 5e-5, 0.0]))
 POINT = phi_from_mass_com_inertia(1.0, [0, 0.01, 0.1], np.zeros((3, 3)))
 WRENCH_NOISE = np.array([0.1] * 3 + [0.005] * 3)
 
@@ -57,6 +58,19 @@ def test_the_edge_of_consistency_without_noise(phi):
     assert is_physically_consistent(found)
     scale = np.repeat([phi[0], np.linalg.norm(phi[1:4]), np.abs(phi[4:]).max()], [1, 3, 6])
     assert np.abs((found - phi) / scale).max() < 1e-6
+
+
+@pytest.mark.parametrize("phi", [TOOL, ROD, CENTRED])
+def test_the_unit_of_length_plays_no_part(phi):
+    form = inconsistent_fit(phi, 1e-6 if phi is not TOOL else 100.0)
+    metres = np.repeat([1.0, 1e-3, 1e-6], [7, 3, 6])  # of the parameters' units, in mm
+    found = consistent_least_squares(
+        np.outer(metres, metres) * form.gram, metres * form.right, form.theta / metres
+    )
+    expected = consistent(form)
+    assert np.abs(expected - form.theta)[10:].max() > 0.0  # the program is solved
+    size = np.linalg.norm(expected[6:])
+    np.testing.assert_allclose((found * metres)[6:], expected[6:], rtol=1e-9, atol=1e-11 * size)
 
 
 @pytest.mark.parametrize("seed", range(5))

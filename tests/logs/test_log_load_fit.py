@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from known_motion import motion_at
+from planted import PHI
 
-from drake_teleop.logs.check.load_fit import LoadFit, white_noise
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.check.load_fit import LoadFit, load_fit, white_noise
+from drake_teleop.logs.read.canonical import Log
 
 
 def test_white_noise_is_seen_under_a_smooth_motion() -> None:
@@ -14,6 +19,17 @@ def test_white_noise_is_seen_under_a_smooth_motion() -> None:
     found = white_noise(motion + sigma * rng.normal(size=(len(t), 3)))
     np.testing.assert_allclose(found, sigma, rtol=0.05)
     assert not white_noise(motion[:3]).any()
+
+
+@pytest.mark.parametrize("start", [0.0, 1000.0])
+def test_samples_that_say_something_new_are_those_of_the_pass_band(start: float) -> None:
+    t = start + np.arange(0, 4, 2e-3)
+    motion = motion_at(t - start)
+    wrench = non_contact_wrench(motion.specific_force, motion.omega, motion.alpha, PHI)
+    log = Log(t, wrench, motion.specific_force, motion.omega, motion.alpha)
+    fit = load_fit(log)
+    assert fit.independent == pytest.approx(2 * 15 * 4, rel=1e-3)  # at 15 Hz, of 4 s
+    assert fit.unexplained < 1e-6 and fit.mass == pytest.approx(PHI[0], rel=1e-3)
 
 
 def test_a_good_fit_explains_most_and_has_a_mass() -> None:

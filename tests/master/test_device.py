@@ -266,11 +266,11 @@ def test_a_hand_wrench_equals_its_joint_torque():
         np.testing.assert_allclose(by_hand, by_motor, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("joint", "side"),
-    # q2 = -124 and q3 = 214 degrees are beyond what the five-bar lets the other link reach.
-    [(0, -1), (0, 1), (1, 1), (2, -1), (3, -1), (3, 1), (4, -1), (4, 1), (5, -1), (5, 1)],
-)
+# q2 = -124 and q3 = 214 degrees are beyond what the five-bar lets the other link reach.
+STOPS = [(0, -1), (0, 1), (1, 1), (2, -1), (3, -1), (3, 1), (4, -1), (4, 1), (5, -1), (5, 1)]
+
+
+@pytest.mark.parametrize(("joint", "side"), STOPS)
 def test_a_joint_stops_at_its_limit(joint, side):
     limit = (phantom.JOINT_UPPER if side > 0 else phantom.JOINT_LOWER)[joint]
     q = phantom.HOME.copy()
@@ -289,6 +289,23 @@ def test_a_joint_stops_at_its_limit(joint, side):
     assert 0 < farthest < 0.05
     assert 0 < side * (state[joint] - limit) < 0.02
     assert np.all(np.abs(state[6:]) < 0.05)
+
+
+@pytest.mark.parametrize(("joint", "side"), STOPS)
+def test_an_end_stop_pushes_back_and_never_pulls(joint, side):
+    q = phantom.HOME.copy()
+    q[joint] = (phantom.JOINT_UPPER if side > 0 else phantom.JOINT_LOWER)[joint] + side * 0.01
+    if joint in (1, 2):
+        q[3 - joint] = q[joint] - side * 0.1
+    back = []
+    for rate in (-10.0, -0.01, 0.0, 0.01, 10.0):  # out of the stop and into it
+        # No joint alone has a Coriolis force on itself.
+        v = side * rate * np.eye(6)[joint]
+        held = acceleration(q, v, np.zeros(6), phantom.gravity_torque(q), parameters())
+        back.append(-side * (phantom.mass_matrix(q) @ held)[joint])
+    assert back[0] == pytest.approx(0.0, abs=1e-9)
+    assert 0.0 < back[1] < back[2] < back[3] < back[4]
+    assert back[3] - back[2] == pytest.approx(back[2] - back[1])  # damped alike both ways
 
 
 def test_the_five_bar_stops_at_its_limits():
@@ -348,10 +365,17 @@ def test_a_slow_period_or_a_start_beyond_a_limit_is_refused():
         )
 
 
-def test_friction_that_the_step_cannot_follow_is_refused():
-    friction = device.JointFriction(viscous=[5e-4, 5e-4, 5e-4, 5e-5, 5e-5, 2.0])
-    with pytest.raises(DrakeTeleopError, match=r"master\.friction"):
+@pytest.mark.parametrize(("name", "slope"), [("viscous", 1.0), ("coulomb", 0.01)])
+def test_friction_that_the_step_cannot_follow_is_refused(name, slope):
+    """The wrist's last joint turns 1.5e-4 kg m^2, of which a step of 0.5 ms follows 0.6 N m s."""
+
+    def made(last):
+        friction = device.JointFriction(**{name: [*[0.0] * 5, slope * last]})
         device.MasterDevice(5e-4, hand_mass=0.1, hand_inertia=1e-4, friction=friction)
+
+    made(0.5)
+    with pytest.raises(DrakeTeleopError, match=r"master\.friction"):
+        made(0.7)
 
 
 def test_serial_joint_angles_turn_the_outer_link_relative_to_the_inner():
