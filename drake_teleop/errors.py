@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from drake_teleop.silence import silent_stderr
+
 LONGEST_LINE = 300
 """Characters of a line that the command line says about an error."""
 
@@ -66,13 +68,15 @@ def reading(path: str | Path, remedy: str, what: str = "cannot be read") -> Iter
         DrakeTeleopError: with what, the reason and the remedy.
     """
     try:
-        yield
+        with silent_stderr():  # where a panic in polars would say some pages, from another thread
+            yield
     except BaseException as error:
-        # A panic in polars is no Exception, so that programs end by it.
+        # Such a panic is no Exception, so that programs end by it.
         panic = type(error).__name__ == "PanicException"
-        if isinstance(error, DrakeTeleopError) or not (panic or isinstance(error, Exception)):
+        if not (panic or isinstance(error, Exception)):
             raise
         reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = "it is damaged" if panic else reason
         raise DrakeTeleopError(f"{what}: {reason}", where=str(path), remedy=remedy) from error
 
 

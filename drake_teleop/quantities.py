@@ -200,7 +200,7 @@ def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
 def _block(blocks: tuple[type, ...], value: Any, place: str) -> type:
     """The one that the tag of a mapping tells; the first if it has none."""
     names = [block.__name__ for block in blocks]
-    tag = str(value.get("_tag", "")).lstrip("!") if isinstance(value, dict) else ""
+    tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:
         raise DrakeTeleopError(
             f"'!{tag}' is not known", where=place, remedy=f"use one of !{', !'.join(names)}"

@@ -6,7 +6,7 @@ import difflib
 import html
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -62,6 +62,8 @@ class Signal:
         units = self.units
         units = (units,) * len(self.components) if isinstance(units, str) else tuple(units)
         object.__setattr__(self, "units", units)
+        for text in (self.name, self.description, *self.components, *units):
+            expect(str, text, "signal")
         if len(units) != len(self.components):
             raise DrakeTeleopError(
                 f"{len(self.components)} components, {len(units)} units", where=self.name
@@ -222,15 +224,7 @@ class SimulationResult:
         self._write(Path(path))
 
     def _write(self, path: Path, aside: Path | None = None) -> None:
-        specs = [
-            {
-                "name": spec.name,
-                "components": spec.components,
-                "units": spec.units,
-                "description": spec.description,
-            }
-            for spec in self.specs
-        ]
+        specs = [asdict(spec) for spec in self.specs]
         # Fixed row groups: polars' default may follow the number of threads.
         metadata = {_METADATA_KEY: json.dumps(specs)}
         table = self.to_dataframe()
@@ -286,6 +280,8 @@ class SimulationResult:
             text = pl.read_parquet_metadata(part)[_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]
             t = pl.read_parquet(path, columns=["t"])["t"].to_numpy()
+            if t.ndim != 1 or t.dtype.kind not in "fiu":
+                raise ValueError("t is no column of numbers")
         return cls(t, _SignalsOnDisk(path, specs), specs)
 
     def plot(self, *names: str, contact: ArrayLike | None = None) -> Figure:
@@ -368,7 +364,7 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
 
         with reading(self._path, "write it again"):
             table = pl.read_parquet(self._path, columns=self._columns[name])
-        return _read_only(table.to_numpy())
+        return _read_only(_numbers(f"{self._path}:{name}", table.to_numpy()))
 
     def __contains__(self, name: object) -> bool:
         return name in self._columns

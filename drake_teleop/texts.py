@@ -147,7 +147,7 @@ class _Reading:
             if key.value == "_tag":
                 raise _wrong("there is no such field", key, field, "a kind is a tag: !Kind {...}")
             found[key.value] = self.data(value, field)
-        if node.tag != f"{_TAG}map":
+        if node.tag not in (f"{_TAG}map", "!"):  # YAML's own sign for no kind in particular
             if not self._tagged:
                 raise _wrong(f"the tag {_shown(node.tag)} means nothing here", node, place)
             found["_tag"] = node.tag

@@ -191,7 +191,12 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
 
     table = read_table(path)
     time = table.numbers(["time"], 1, str(path))[:, 0]
-    delay = table.raw("delay", str(path))[:, 0]
+    delay = table.raw("delay", str(path))
+    if delay.shape != (len(time), 1):
+        raise DrakeTeleopError(
+            f"has shape {delay.shape}, needs {(len(time), 1)}", where=f"{path}:delay"
+        )
+    delay = delay[:, 0]
     lost, age = np.isnan(delay), time - time[0]
     for column, bad, what in (
         ("time", np.diff(time, prepend=-np.inf) <= 0, "does not increase"),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +18,7 @@ from pydrake.multibody.tree import Frame, ModelInstanceIndex
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.model_check import check_model
+from drake_teleop.silence import silent_stderr
 
 # Of meshes that Drake can use as collision shapes.
 _READABLE = (".obj", ".gltf", ".vtk")
@@ -70,31 +73,27 @@ def ParseModel(
     lost: dict[str, list[str]] = {}
     assumptions: list[str] = []
     converted = TemporaryDirectory(prefix="drake_teleop_")
-    log = logging.getLogger("drake")
-    level = log.level
     try:
-        # Of elements that Drake does not know; what it cannot do without raises.
-        log.setLevel(logging.ERROR)
         root = _xml(path) if kind in ("urdf", "sdf") else None
         if root is None:
-            instances = parser.AddModels(str(path))
+            with _drakes_errors_raised():
+                instances = parser.AddModels(str(path))
         else:
             assumptions = check_model(root, str(path))
             lost = _without_lost_meshes(root, packages, Path(converted.name))
             efforts = _efforts(root)
             text = ElementTree.tostring(root, encoding="unicode")
-            instances = parser.AddModelsFromString(text, kind)
+            with _drakes_errors_raised():
+                instances = parser.AddModelsFromString(text, kind)
     except DrakeTeleopError:
         raise
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, SystemExit, ValueError) as error:  # SystemExit: a condition of Drake's
         reason = str(error).replace("<literal-string>", "")
         raise DrakeTeleopError(
             f"cannot be read as a robot ({reason.strip()})",
             where=str(path),
             remedy="give a URDF, SDF, MJCF or .dmd.yaml model, with --package-path for package://",
         ) from None
-    finally:
-        log.setLevel(level)
     having = [i for i in instances if plant.HasFrameNamed(sensor_frame, i)]
     if len(having) != 1:
         frames = [
@@ -112,6 +111,30 @@ def ParseModel(
     frame = plant.GetFrameByName(sensor_frame, having[0])
     _weld_base(plant, frame, {} if root is None else _peculiar_joints(root), str(path))
     return ParsedModel(having[0], frame, efforts, lost, assumptions, converted)
+
+
+@contextmanager
+def _drakes_errors_raised() -> Iterator[None]:
+    """Raises RuntimeError for an error that Drake only logs, going on without what it cannot read.
+
+    Its warnings are of elements that it does not know; they are not said.
+    """
+    errors: list[str] = []
+
+    def keep(record: logging.LogRecord) -> bool:
+        if record.levelno >= logging.ERROR:
+            errors.append(record.getMessage())
+        return False
+
+    log = logging.getLogger("drake")
+    log.addFilter(keep)
+    try:
+        with silent_stderr():  # where the parsers below it write some more
+            yield
+    finally:
+        log.removeFilter(keep)
+    if errors:
+        raise RuntimeError(errors[0])
 
 
 def _xml(path: Path) -> ElementTree.Element | None:

@@ -211,8 +211,11 @@ class Identification:
             optional[name] = _read_degrees(f"{path}:{name}", document[name])
         if (name := "prior_dominated") in document:
             optional[name] = _read_flags(f"{path}:{name}", document[name])
+        phi = learnt(f"{path}:phi", numbers("phi", 10, largest=_LARGEST))
+        if phi[0] == 0.0:  # what is natural for a load goes with its mass
+            raise DrakeTeleopError("has no mass", where=f"{path}:phi")
         result = cls(
-            phi=learnt(f"{path}:phi", numbers("phi", 10, largest=_LARGEST)),
+            phi=phi,
             offsets=numbers("offsets", 6, largest=_LARGEST),
             covariance=_read_covariance(f"{path}:covariance", document["covariance"]),
             identifiable=_read_flags(f"{path}:identifiable", document["identifiable"]),
@@ -308,20 +311,24 @@ def _read_covariance(where: str, value: Any) -> Array:
     if raw.shape != (16, 16):
         raise DrakeTeleopError("is not a (16, 16) table of numbers", where=where)
     unknown = np.array([[i == j and raw[i, j] is None for j in range(16)] for i in range(16)])
+    if not _holds_numbers(raw[~unknown].tolist()):
+        raise DrakeTeleopError("holds no numbers", where=where)
     covariance = checked(where, np.where(unknown, 0.0, raw), 16, 16)
+    if (np.diag(covariance) < 0.0).any():
+        raise DrakeTeleopError("has a negative variance", where=where)
     return np.where(unknown, np.inf, covariance)
 
 
 def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
     if not (
-        isinstance(value, list) and len(value) == 16 and all(v in (True, False) for v in value)
+        isinstance(value, list) and len(value) == 16 and all(isinstance(v, bool) for v in value)
     ):
         raise DrakeTeleopError("is not a list of 16 true or false", where=where)
     return np.array(value, dtype=bool)
 
 
 def _read_degrees(where: str, value: Any) -> Array:
-    if not isinstance(value, list):
+    if not (isinstance(value, list) and _holds_numbers([v for v in value if v is not None])):
         raise DrakeTeleopError("is not a list of 16 numbers or null", where=where)
     degrees = checked(where, [0.0 if v is None else v for v in value], 16)
     unknown = np.array([v is None for v in value])

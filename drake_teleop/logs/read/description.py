@@ -65,12 +65,12 @@ def _frame(value: Any) -> Any:
     if value in ("sensor", "base"):
         return value
     try:
-        matrix = np.asarray(value, float)
+        matrix = np.asarray(value)
     except (TypeError, ValueError):
         matrix = np.empty(0)
-    if matrix.shape != (3, 3):
+    if matrix.shape != (3, 3) or matrix.dtype.kind not in "fi":
         raise ValueError("must be sensor, base, or a 3x3 rotation matrix from the stream to S")
-    if rotation_error(matrix) > ROTATION_TOLERANCE:
+    if not (np.abs(matrix) < 2.0).all() or rotation_error(matrix) > ROTATION_TOLERANCE:
         raise ValueError("is not a rotation: rows must be orthonormal with determinant +1")
     return tuple(map(tuple, nearest_rotation(matrix).tolist()))
 

@@ -1,0 +1,324 @@
+"""Is there a file or an option that ends in anything but a result or one line?
+
+Feeds damaged inputs, made by grammar from good ones, to every reader (`fuzz_targets.py`,
+`fuzz_mutations.py`). A case is a finding if it raises anything but a DrakeTeleopError of one line
+of at most 300 characters, if a warning or anything else reaches stderr, if it takes more than 5 s
+of CPU (or a minute in all) or more than 4 GB, or if its process dies.
+
+    python benchmarks/fuzz.py [--seconds 60] [--seed 0] [--only scenario,sdf] [--json FILE]
+    python benchmarks/fuzz.py --replay FILE          # one case again, in this process
+
+Each finding is written to a folder, once for each place that it comes from, with the command that
+repeats it; the exit status is then 1. The cases of a target follow from the seed, one after the
+other; how many there are is a question of time.
+
+Guided by coverage: of every fourth case the lines of the package that it reaches are noted, and
+what reaches a new one becomes an input to begin with. That is twenty lines here, and not a tool,
+for these reasons (2026): Atheris does not go on after an abort or a hang, which are to be counted,
+has no wheels for macOS and Python 3.10, and its changes of bytes do not get past a parser, so that
+the grammars would have to be written all the same; the targets of hypothesis are numbers that a
+test has to name, and its cases change from version to version.
+"""
+
+from __future__ import annotations
+
+import argparse
+import faulthandler
+import json
+import math
+import multiprocessing
+import os
+import random
+import re
+import resource
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+if __name__ == "__main__":  # before libraries look
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    os.environ |= {"POLARS_MAX_THREADS": "1"}
+
+from fuzz_targets import TARGETS, Target, target_of
+
+import drake_teleop
+from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.pages.progress import show_progress
+
+_PACKAGE = str(Path(drake_teleop.__file__).parent)
+_CPU_SECONDS, _SECONDS, _BYTES = 5.0, 60.0, 4 << 30
+_DEATHS = {signal.SIGPROF: f"more than {_CPU_SECONDS:g} s of CPU"}
+_DEATHS |= {signal.SIGALRM: f"more than {_SECONDS:g} s"}
+_TRACED = 4  # of so many cases one
+_LONGEST = 20_000  # bytes of a case that others may begin with, beyond those of the good inputs
+
+
+def main() -> None:
+    """Runs the targets at once, and reports."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--seconds", type=float, default=60.0, help="of the whole run")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
+    parser.add_argument("--only", default="", help="targets, with commas between them")
+    parser.add_argument("--cases", type=int, help="of each target, in place of --seconds")
+    parser.add_argument("--folder", type=Path, help="of findings; default: out/fuzz")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--replay", type=Path, metavar="FILE", help="TARGET-anything.suffix")
+    arguments = parser.parse_args()
+    if arguments.replay:
+        replay(arguments.replay)
+        return
+    targets = [t for t in TARGETS if not arguments.only or t.name in arguments.only.split(",")]
+    with tempfile.TemporaryDirectory(prefix="fuzz_") as folder:
+        found = fuzzed(targets, arguments, Path(folder))
+    figures = report(found, arguments.folder or Path("out/fuzz"))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+    sys.exit(1 if figures["findings"] else 0)
+
+
+def replay(path: Path) -> None:
+    """One case, named TARGET-anything, in this process, so that a debugger may look at it."""
+    target = target_of(path)
+    with tempfile.TemporaryDirectory() as folder:
+        target.seeds(Path(folder))
+        case = Path(folder) / f"case{target.suffix}"
+        case.write_bytes(path.read_bytes())
+        try:
+            target.run(case)
+        except DrakeTeleopError as error:
+            print(f"error: {error}")
+        else:
+            print("no error")
+
+
+# One process: the cases of one target, one after the other.
+
+
+@dataclass
+class State:
+    """How far a target has come; a process that takes over from a dead one begins with it."""
+
+    target: Target
+    folder: Path
+    seconds: float
+    counts: Any  # shared by the processes: cases, and those that were refused
+    kept: list[bytes] = field(default_factory=list)
+    lines: set[tuple[str, int]] = field(default_factory=set)
+    findings: dict[str, Finding] = field(default_factory=dict)
+
+    def keep(self, content: bytes, lines: set[tuple[str, int]]) -> None:
+        """Has one more input to begin with, which reached these lines."""
+        self.kept.append(content)
+        self.lines |= lines
+
+    def find(self, content: bytes, place: str, what: str) -> None:
+        """Notes a finding: the shortest content of each place, and how often it was found."""
+        finding = self.findings.setdefault(place, Finding(content, what))
+        finding.times += 1
+        if len(content) < len(finding.content):
+            finding.content, finding.what = content, what
+
+
+@dataclass
+class Finding:
+    """What is wrong, with the content that shows it."""
+
+    content: bytes
+    what: str
+    times: int = 0
+
+
+def work(state: State, seed: int, most: float, pipe: Connection) -> None:
+    """Runs cases until the time is up; tells what is found at once, because it may die."""
+    end = time.monotonic() + state.seconds
+    target, errors = state.target, _quiet(state.folder)
+    case = state.folder / f"case{target.suffix}"
+    good = target.seeds(state.folder)
+    for content in good:  # a good input is no finding, or all that follows means little
+        case.write_bytes(content)
+        with _traced(state.lines):
+            target.run(case)
+    os.ftruncate(errors, 0)
+    _limit_memory()
+    longest = max(map(len, good)) + _LONGEST
+    while state.counts[0] < most and time.monotonic() < end:
+        rng = random.Random(f"{seed} {target.name} {state.counts[0]}")
+        pool = state.kept if state.kept and rng.random() < 0.5 else good
+        content = target.mutate(rng, rng.choice(pool), rng.choice(good))
+        os.ftruncate(errors, 0)  # what libraries say while a case is made
+        case.write_bytes(content)
+        state.counts[0] += 1
+        lines: set[tuple[str, int]] = set()
+        with _traced(lines) if state.counts[0] % _TRACED == 0 else nullcontext():
+            kind, *finding = _outcome(target, case, errors)
+        state.counts[1] += kind == "refused"
+        if finding:
+            pipe.send((State.find, content, *finding))
+        if not lines <= state.lines and len(content) < longest:
+            state.keep(content, lines)
+            pipe.send((State.keep, content, lines))
+
+
+def _quiet(folder: Path) -> int:
+    """Sends what is printed to nowhere, and errors to a file, which it returns."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    errors = os.open(folder / "stderr", os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND)
+    for number, file in ((0, nowhere), (1, nowhere), (2, errors)):
+        os.dup2(file, number)
+    warnings.simplefilter("always")
+    for kind in (DeprecationWarning, PendingDeprecationWarning, ResourceWarning):
+        warnings.simplefilter("ignore", kind)  # as Python does
+    faulthandler.enable(errors)
+    for late in _DEATHS:
+        faulthandler.register(late, errors, all_threads=False, chain=True)
+    return errors
+
+
+def _limit_memory() -> None:
+    if sys.platform == "linux":
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        most = pages * resource.getpagesize() + _BYTES
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
+@contextmanager
+def _traced(lines: set[tuple[str, int]]) -> Iterator[None]:
+    """Notes the lines of the package that are reached."""
+
+    def in_function(frame: Any, event: str, _: Any) -> Any:
+        lines.add((frame.f_code.co_filename, frame.f_lineno))
+        return in_function
+
+    def anywhere(frame: Any, event: str, _: Any) -> Any:
+        return in_function if frame.f_code.co_filename.startswith(_PACKAGE) else None
+
+    sys.settrace(anywhere)
+    try:
+        yield
+    finally:
+        sys.settrace(None)
+
+
+def _outcome(target: Target, case: Path, errors: int) -> tuple[str, ...]:
+    """("good",), ("refused",) by one line, or ("finding", place, what)."""
+    # The kernel ends a process that is late, wherever it is.
+    signal.setitimer(signal.ITIMER_PROF, _CPU_SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, _SECONDS)
+    outcome: tuple[str, ...] = ("good",)
+    try:
+        target.run(case)
+    except DrakeTeleopError as error:
+        line, outcome = str(error), ("refused",)
+        if len(line) > LONGEST_LINE or len(line.splitlines()) != 1:
+            what = f"a message of {len(line)} characters: {line}"
+            outcome = "finding", _place(traceback.format_exc()), what
+    except BaseException as error:
+        said = traceback.format_exc()
+        outcome = "finding", f"{type(error).__name__} at {_place(said)}", said
+    signal.setitimer(signal.ITIMER_PROF, 0.0)
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    sys.stderr.flush()
+    if said := os.pread(errors, 10_000, 0).decode(errors="replace"):
+        os.ftruncate(errors, 0)
+        outcome = "finding", "stderr " + re.sub(r"[\d.e+-]+", "0", said)[:80], said
+    return outcome
+
+
+def _place(said: str) -> str:
+    """Of a traceback, the innermost line of the package."""
+    places = re.findall(rf'File "{re.escape(_PACKAGE)}/(.*)", line (\d+)', said)
+    in_order = places if "Traceback (" in said else places[::-1]  # faulthandler begins within
+    return ":".join(in_order[-1]) if in_order else "somewhere"
+
+
+# All of them.
+
+
+def fuzzed(targets: list[Target], arguments: argparse.Namespace, folder: Path) -> list[State]:
+    """Runs so many targets at once as there are processes, those with the largest share first."""
+    context = multiprocessing.get_context("fork")
+    second = arguments.seconds * arguments.jobs / sum(target.share for target in targets)
+    states = []
+    for target in sorted(targets, key=lambda target: -target.share):
+        (folder / target.name).mkdir()
+        counts = context.Array("q", 2, lock=False)
+        seconds = math.inf if arguments.cases else second * target.share
+        states.append(State(target, folder / target.name, seconds, counts))
+    most = arguments.cases or math.inf
+    waiting, running, begin = list(states), {}, time.monotonic()
+    with show_progress(True) as stage:
+        told = stage("Fuzz")
+        while waiting or running:
+            while waiting and len(running) < arguments.jobs:
+                state = waiting.pop(0)
+                here, there = context.Pipe(duplex=False)
+                options = (state, arguments.seed, most, there)
+                process = context.Process(target=work, args=options, daemon=True)
+                process.start()
+                there.close()
+                running[here] = state, process, time.monotonic()
+            for pipe in wait(list(running), timeout=1.0):
+                state, process, since = running[pipe]
+                try:
+                    note, *found = pipe.recv()
+                    note(state, *found)
+                except EOFError:
+                    process.join()
+                    del running[pipe]
+                    state.seconds -= time.monotonic() - since
+                    if process.exitcode:
+                        _died(state, process.exitcode)
+                    if process.exitcode and state.seconds > 0.0:
+                        waiting.insert(0, state)
+            done = sum(state.counts[0] for state in states)
+            part = done / most / len(states) or (time.monotonic() - begin) / arguments.seconds
+            told(min(part, 1.0), f"{done} cases")
+    return states
+
+
+def _died(state: State, status: int) -> None:
+    """Notes the case at which a process has died."""
+    said = (state.folder / "stderr").read_text(errors="replace")
+    if status < 0:
+        name = _DEATHS.get(signal.Signals(-status), signal.Signals(-status).name)
+    else:  # a good input is refused, or the fuzzer has a mistake
+        name, state.seconds = "the fuzzer", 0.0
+    case = state.folder / f"case{state.target.suffix}"
+    state.find(case.read_bytes(), f"{name} at {_place(said)}", f"{name}\n{said}")
+
+
+def report(states: list[State], folder: Path) -> dict[str, Any]:
+    """Prints counts and findings, and writes the latter."""
+    print(f"{'':14}{'cases':>8}{'results':>9}{'one line':>9}{'lines':>7}{'findings':>9}")
+    for state in states:
+        cases, refused = state.counts
+        wrong = sum(finding.times for finding in state.findings.values())
+        figures = (cases, cases - refused - wrong, refused, len(state.lines), wrong)
+        print("{:14}{:8}{:9}{:9}{:7}{:9}".format(state.target.name, *figures))
+    for state in states:
+        for number, (place, finding) in enumerate(sorted(state.findings.items())):
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / f"{state.target.name}-{number}{state.target.suffix}"
+            path.write_bytes(finding.content)
+            print(f"\n{state.target.name}: {place}, {finding.times} times")
+            print(finding.what.rstrip()[-3000:])
+            print(f"again: python benchmarks/fuzz.py --replay {path}")
+    figures = {f"{state.target.name}.cases": state.counts[0] for state in states}
+    figures |= {"cases": sum(figures.values())}
+    figures |= {"findings": sum(len(state.findings) for state in states)}
+    print(f"\n{figures['cases']} cases, {figures['findings']} findings")
+    return figures
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""What the fuzzer has found stays mended, and the fuzzer finds what there is to find."""
+
+from __future__ import annotations
+
+import os
+import random
+import sys
+import warnings
+from argparse import Namespace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+CASES = Path(__file__).parent / "fuzz_cases"
+SAID = {
+    "description-frame_nan.yaml": "imu.frame: must be sensor, base, or a 3x3 rotation",
+    "load-negative_variance.json": "covariance: has a negative variance",
+    "load-no_mass.json": "phi: has no mass",
+    "log_parquet-panic.parquet": "cannot be read: it is damaged",
+    "result-absent_column.parquet": "cannot be read: unable to find column",
+    "result-metadata_panic.parquet": "is not a simulation result",
+    "result-name_3.parquet": "is not a simulation result",
+    "result-name_of_fields.parquet": "is not a simulation result",
+    "result-panic.parquet": "cannot be read: it is damaged",
+    "result-panic_2.parquet": "cannot be read: it is damaged",
+    "result-panic_3.parquet": "is not a simulation result",
+    "result-times_in_pairs.parquet": "is not a simulation result",
+    "robot-no_radius.urdf": "cannot be read as a robot",
+    "scenario-tag_of_nothing.yaml": "operator.task: '!!' is not known",
+    "sdf-colour.sdf": "",
+    "sdf-logged_error.sdf": "cannot be read as a robot",
+    "trace_npz-empty_delay.npz": "delay: has shape (40, 0), needs (40, 1)",
+}
+"""Of each case a part of its error; empty if it is none."""
+
+
+@pytest.fixture(scope="module")
+def fuzz() -> ModuleType:
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        import fuzz  # type: ignore[import-not-found]
+    finally:
+        sys.path.remove(str(BENCHMARKS))
+    return fuzz
+
+
+def test_each_case_that_is_kept_is_a_test() -> None:
+    assert sorted(path.name for path in CASES.iterdir()) == sorted(SAID)
+
+
+@pytest.mark.parametrize("name", SAID)
+def test_what_was_found_is_one_line(name: str, fuzz: ModuleType, tmp_path: Path, capfd) -> None:
+    target = fuzz.target_of(CASES / name)
+    case = tmp_path / f"case{target.suffix}"
+    case.write_bytes((CASES / name).read_bytes())
+    line = ""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        try:
+            target.run(case)
+        except DrakeTeleopError as error:
+            line = str(error)
+    assert SAID[name] in line and bool(SAID[name]) == bool(line)
+    assert len(line) <= LONGEST_LINE and len(line.splitlines()) <= 1
+    assert capfd.readouterr().err == ""
+
+
+def test_the_same_numbers_make_the_same_case(fuzz: ModuleType, tmp_path: Path) -> None:
+    for name in ("trajectory", "load", "log_npz", "urdf"):
+        target = next(each for each in fuzz.TARGETS if each.name == name)
+        good = target.seeds(tmp_path)
+
+        def made(target: Any = target, good: list[bytes] = good) -> list[bytes]:
+            draws = random.Random(5)
+            return [target.mutate(draws, good[0], good[-1]) for _ in range(8)]
+
+        assert made() == made()
+        assert len({*made(), good[0]}) > 6
+
+
+def _read(path: Path) -> None:
+    """Does what the first letter of a file says."""
+    word = path.read_bytes()[:1]
+    if word == b"e":
+        raise KeyError("no such key")
+    if word == b"w":
+        os.write(2, b"beware")
+    if word == b"h":
+        while True:
+            pass
+    if word == b"d":
+        os.abort()
+    if word == b"r":
+        raise DrakeTeleopError("is refused")
+
+
+@pytest.mark.slow
+def test_errors_warnings_hangs_and_deaths_are_found(
+    fuzz: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def mutate(draws: random.Random, content: bytes, other: bytes) -> bytes:
+        return [b"good", b"error", b"warn", b"refuse", b"hang", b"die"][draws.randrange(6)]
+
+    target = fuzz.Target("letters", ".txt", 1.0, lambda _: [b"good"], mutate, _read)
+    monkeypatch.setattr(fuzz, "_CPU_SECONDS", 0.05)
+    options = Namespace(seconds=60.0, seed=1, jobs=2, cases=25)
+    (state,) = fuzz.fuzzed([target], options, tmp_path)
+    found = {finding.content: finding.times for finding in state.findings.values()}
+    assert set(found) == {b"error", b"warn", b"hang", b"die"}
+    assert state.counts[0] == 25 and state.counts[1] > 0
+    figures = fuzz.report([state], tmp_path / "out")
+    assert figures == {"letters.cases": 25, "cases": 25, "findings": 4}
+    assert len(list((tmp_path / "out").iterdir())) == 4
