@@ -362,8 +362,9 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         import polars as pl
 
+        columns = self._columns[name]
         with reading(self._path, "write it again"):
-            table = pl.read_parquet(self._path, columns=self._columns[name])
+            table = pl.read_parquet(self._path, columns=columns)
         return _read_only(_numbers(f"{self._path}:{name}", table.to_numpy()))
 
     def __contains__(self, name: object) -> bool:
