@@ -41,6 +41,7 @@ from drake_teleop.fields import settings
 from drake_teleop.noise import random_bits
 from drake_teleop.passivity.packet import POSE, VELOCITY, WRENCH, arrived, moved_into
 from drake_teleop.quantities import check_ranges, choice, plain, quantity
+from drake_teleop.vectors import put
 
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
 LONGEST_DELAY = 10.0  # [s], which bounds the memory
@@ -286,7 +287,7 @@ def send(p, state, k, packet):
             state[_FIRST_SLOT + (k + travel) % slots] = k
     # What is lost is written too: a redundant packet after it may bring it.
     row = _FIRST_SLOT + slots + size * (1 + k % slots)
-    state[row : row + size] = packet
+    put(state, row, packet, 0, size)
 
 
 @njit(cache=True)
@@ -311,10 +312,10 @@ def receive(p, state, k, packet):
     if fresh:
         state[_RECEIVED], state[_SILENT] = newest, 0.0
         row = last + size * (1 + int(newest) % slots)
-        state[last : last + size] = state[row : row + size]
+        put(state, last, state, row, size)
     else:
         state[_SILENT] += 1.0
-    packet[:] = state[last : last + size]
+    put(packet, 0, state, last, size)
     if not fresh:
         _fill_silence(p[_POLICY], state[_SILENT] * p[_PERIOD], packet)
     return int(state[_RECEIVED]), fresh

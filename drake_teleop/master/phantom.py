@@ -31,7 +31,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.quaternions import multiply
-from drake_teleop.vectors import cross, dot, plus, solve, times
+from drake_teleop.vectors import cross, dot, plus, put, solve, times
 
 GRAVITY = 9.81  # m/s^2, along -z_B
 
@@ -262,10 +262,10 @@ def step(state, hand_wrench, motor_torque, parameters, period, work, stages):
     Error per step O(period^5). `work` (2, 6, 6) and `stages` (3, 12) are scratch.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
-    stage[:] = state
+    put(stage, 0, state, 0, 12)
     total[:] = 0.0
     for i in range(4):
-        slope[:6] = stage[6:]
+        put(slope, 0, stage, 6, 6)
         acceleration_into(
             stage[:6], stage[6:], hand_wrench, motor_torque, parameters, work, slope[6:]
         )

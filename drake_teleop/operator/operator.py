@@ -35,6 +35,7 @@ from drake_teleop.operator.task import Insert, Movement, Press, Reach, Task, Tou
 from drake_teleop.quantities import choice, plain, quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, rotate
 from drake_teleop.slave.arm import ArmModel, forward_kinematics
+from drake_teleop.vectors import put
 
 _FORCE_LIMIT = 60.0  # N, what a hand can exert on a stylus and still control, E
 _TORQUE_LIMIT = 2.0  # N m, E
@@ -154,7 +155,7 @@ def intent_into(packed, start, t, pose, twist):
     """
     orientation = (start[0], start[1], start[2], start[3])
     omega = (0.0, 0.0, 0.0)
-    pose[4:7] = start[4:7]
+    put(pose, 4, start, 4, 3)
     twist[:3] = 0.0
     for n in range(packed.shape[0]):
         row = packed[n]

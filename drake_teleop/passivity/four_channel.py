@@ -41,6 +41,7 @@ from drake_teleop.passivity.packet import (
     moved_into,
 )
 from drake_teleop.quantities import quantity
+from drake_teleop.vectors import put
 
 # Parameters; those of two numbers are for translation and rotation.
 _places = own_parameters()
@@ -103,6 +104,6 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             shift[i] = (force + p[DAMPING][g] * received[VELOCITY][i]) / p[STIFFNESS][g]
         moved_into(received[POSE], shift, memory[COMMAND_POSE])
         memory[COMMAND_TWIST] = received[VELOCITY]
-    command[:] = memory[COMMAND]
+    put(command, 0, memory, COMMAND.start, 13)
     memory[HELD] = wrench
     fill(pose, twist, wrench, packet)

@@ -46,6 +46,7 @@ from drake_teleop.passivity.tdpa import TdpaConfig, charged
 from drake_teleop.passivity.two_layer import TwoLayerConfig
 from drake_teleop.passivity.wave import WaveConfig
 from drake_teleop.quantities import choice, quantity
+from drake_teleop.vectors import put
 
 
 @settings
@@ -249,7 +250,7 @@ def slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, c
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(wrench)
     if not healthy:
         memory[COMMAND_TWIST] = 0.0
-        command[:] = memory[COMMAND]
+        put(command, 0, memory, COMMAND.start, 13)
     else:
         _slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
     _finish(healthy, memory, packet)

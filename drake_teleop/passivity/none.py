@@ -8,6 +8,7 @@ from __future__ import annotations
 from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import COMMAND, COMMAND_POSE, COMMAND_TWIST, HELD
 from drake_teleop.passivity.packet import POSE, VELOCITY, WRENCH, arrived, fill, limit
+from drake_teleop.vectors import put
 
 
 @njit(cache=True)
@@ -28,6 +29,6 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     if arrived(received):
         memory[COMMAND_POSE] = received[POSE]
         memory[COMMAND_TWIST] = received[VELOCITY]
-    command[:] = memory[COMMAND]
+    put(command, 0, memory, COMMAND.start, 13)
     memory[HELD] = wrench
     fill(pose, twist, wrench, packet)

@@ -56,6 +56,7 @@ from drake_teleop.passivity.packet import (
     moved_into,
 )
 from drake_teleop.quantities import quantity
+from drake_teleop.vectors import put
 
 # Parameters, for translation and rotation.
 _places = own_parameters()
@@ -162,7 +163,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         for i in range(3 * g, 3 * g + 3):
             held[i] = K[g] * offset[i] - D[g] * twist[i]
     moved_into(pose, offset, now)
-    command[:] = memory[COMMAND]
+    put(command, 0, memory, COMMAND.start, 13)
     fill(pose, twist, wrench, packet)
 
 

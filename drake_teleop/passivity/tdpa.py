@@ -80,6 +80,7 @@ from drake_teleop.passivity.packet import (
     scale,
 )
 from drake_teleop.quantities import quantity
+from drake_teleop.vectors import put
 
 # Of what the hand puts in, until the reserve is full: all of it would leave a soft wall too little.
 _SHARE_KEPT = 0.5
@@ -241,7 +242,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         packet[ENERGY][g] = memory[SENT][g]
         packet[_SLAVES_LEDGER][g] = memory[LEDGER][g]
         _filter(g, received, dx, wrench, T, p, memory)
-    command[:] = memory[COMMAND]
+    put(command, 0, memory, COMMAND.start, 13)
     memory[HELD] = wrench
     fill(pose, twist, memory[_FILTERED], packet)
 

@@ -59,6 +59,7 @@ from drake_teleop.passivity.packet import (
     scale,
 )
 from drake_teleop.quantities import quantity
+from drake_teleop.vectors import put
 
 # Parameters; those of two numbers are for translation and rotation.
 _places = own_parameters()
@@ -188,7 +189,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             spring[i] = (pull[i] - brake[i]) / K[g]
     moved_into(pose, spring, memory[COMMAND_POSE])
     memory[COMMAND_TWIST] = received[VELOCITY]
-    command[:] = memory[COMMAND]
+    put(command, 0, memory, COMMAND.start, 13)
     fill(pose, twist, wrench, packet)
 
 

@@ -59,6 +59,7 @@ from drake_teleop.passivity.packet import (
     moved_into,
 )
 from drake_teleop.quantities import quantity
+from drake_teleop.vectors import put
 
 # Parameters.
 _places = own_parameters()
@@ -160,7 +161,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         _rest(wrench, T, p, memory)
     packet[INTEGRAL] = memory[_INTEGRAL]
     packet[ENERGY] = memory[SENT]
-    command[:] = memory[COMMAND]
+    put(command, 0, memory, COMMAND.start, 13)
     memory[HELD] = wrench
     fill(pose, twist, wrench, packet)
 

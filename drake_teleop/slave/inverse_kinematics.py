@@ -20,6 +20,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT, weak_callback
+from drake_teleop.vectors import put
 
 Array = NDArray[np.float64]
 
@@ -164,7 +165,7 @@ def _nearest_branch(
             best, best_distance = row, distance
     if best < 0:
         return _JOINT_LIMIT
-    q[:] = branches[best]
+    put(q, 0, branches[best], 0, 6)
     if abs(np.sin(q[4])) < _SINGULAR:
         status = max(status, _WRIST_SINGULAR)
     return status

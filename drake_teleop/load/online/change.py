@@ -59,6 +59,7 @@ from drake_teleop.load.sample import (
     SPECIFIC_FORCE,
     WRENCH_AND_MOTION,
 )
+from drake_teleop.vectors import put
 
 STATES = ("known", "disturbed", "changed", "identified")
 """What `LoadChangeMonitor.state` may say."""
@@ -105,7 +106,7 @@ def _explain(memory, belief, block, noise):
     before = memory[belief : belief + 272].copy()
     chi = learn(before, V, wrench, whitening(motion, phi, noise, noise[15], block))
     if noise[15] == 0.0:
-        memory[belief : belief + 272] = before
+        put(memory, belief, before, 0, 272)
     else:
         lasting = whitening(motion, phi, noise, noise[15] * noise[16], block)
         learn(memory[belief : belief + 272], V, wrench, lasting)
@@ -115,7 +116,7 @@ def _explain(memory, belief, block, noise):
 @njit(cache=True)
 def _restart(memory, belief):
     """Sets a filter back to the known load, the new load's with a wide prior, and its test."""
-    memory[belief : belief + 272] = memory[_KNOWN:_WATCH]
+    put(memory, belief, memory, _KNOWN, 272)
     if belief == _NEW:
         for j in range(10):
             memory[belief + 16 + 17 * (6 + j)] += WIDE[j] ** 2
@@ -197,7 +198,7 @@ def _judge(memory, block, noise, window, hold, bound):
             _restart(memory, _NEW)
         return
     # Does the old load explain this block by itself?
-    memory[_WATCH:_NEW] = memory[_KNOWN:_WATCH]
+    put(memory, _WATCH, memory, _KNOWN, 272)
     chi = _explain(memory, _WATCH, block, noise)
     memory[_BACK_SUM] = min(0.0, memory[_BACK_SUM] + chi - _SLACK)
     if memory[_BACK_SUM] < _BACK:
@@ -225,7 +226,7 @@ def _judge(memory, block, noise, window, hold, bound):
     elif memory[_STATE] == CHANGED and _settled(memory, bound):
         memory[_STATE] = memory[_BASE] = IDENTIFIED
         _doubt_inertias(memory, noise, block)
-        memory[_KNOWN:_WATCH] = memory[_NEW:SIZE]
+        put(memory, _KNOWN, memory, _NEW, 272)
         memory[_LEARNT] = memory[_AGE] * block
         memory[_RESIDUAL:_SQUARES] = memory[_SQUARES:_WRENCH] * (block / memory[_AGE])
         _restart(memory, _WATCH)
@@ -287,7 +288,7 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
     memory = np.zeros(SIZE)
     memory[_KNOWN : _KNOWN + 16] = np.concatenate([theta[:6], phi])
     memory[_KNOWN + 16 : _WATCH] = P.ravel()
-    memory[_WATCH:_NEW] = memory[_KNOWN:_WATCH]
+    put(memory, _WATCH, memory, _KNOWN, 272)
     return memory
 
 

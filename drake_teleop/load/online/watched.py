@@ -47,6 +47,7 @@ from drake_teleop.load.online.change import (
 )
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
+from drake_teleop.vectors import put
 
 LOAD_STATES = ("learning", "settled", "disturbed", "changed")
 """What the state of a load estimator means; learning is what comes before this module."""
@@ -106,7 +107,7 @@ def _rests(memory, sample, period):
         turning += memory[_OMEGA + i] ** 2
     if moved > _MOVED**2 or turning > _TURNING**2:
         memory[_RESTED] = 0.0
-        memory[_WHERE : _WHERE + 3] = memory[_S : _S + 3]
+        put(memory, _WHERE, memory, _S, 3)
     memory[_RESTED] += 1.0
     return memory[_RESTED] * period > REST
 
@@ -164,7 +165,7 @@ def watched_update(out, memory, sample, fallback, period, block, noise, window, 
     elif memory[_STATE] != OTHER_LOAD:
         another = verdict == CHANGED and varies and _is_within_reach(known, new_load(watch))
         memory[_STATE] = OTHER_LOAD if another else DISTURBED
-    target[:] = known
+    put(target, 0, known, 0, 16)
     if memory[_STATE] == OTHER_LOAD:
-        target[6:] = fallback
+        put(target, 6, fallback, 0, 10)
     out += period / (FADE + period) * (target - out)
