@@ -7,23 +7,28 @@ seeds. Differences between levels are taken within each seed: what a seed does t
 cancels. One repeat says nothing about other seeds, and has no intervals (nan).
 
 The points of any other design are a sample, too, and its levels differ by chance in what else is
-varied; likewise those of a factorial one if a point failed with every seed. There the effects are
-those of a regression, and the intervals hold for the design and the seeds together; see
-`level_model.py`. With one repeat the intervals of effects are those of the design alone.
+varied. There the effects are those of a regression, and the intervals hold for the design and the
+seeds together; see `level_model.py`. With one repeat the intervals of effects are those of the
+design alone.
+
+If points fail with every seed, levels are compared over those combinations of the other factors at
+which all of them have a successful run, in any design; see `cells.py`.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
+from drake_teleop.studies.cells import TOO_FEW, Flags, reasons
 from drake_teleop.studies.design import Factor, Study
-from drake_teleop.studies.level_model import CONFIDENCE, Levels, level_model, levels_of
+from drake_teleop.studies.factorial import Factorial, filled, interval
+from drake_teleop.studies.level_model import LevelModel, level_model, levels_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -52,15 +57,18 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class MainEffect:
-    """What one factor does to a measure.
+    """What one factor does to a measure; nan at a level that cannot be compared.
 
     Attributes:
         names: of its n levels, or of parts of its range.
-        runs: (n,) at each.
-        mean: (n,) over all other factors and the seeds.
+        runs: (n,) at each that have the measure.
+        mean: (n,) over the other factors and the seeds.
         half: (n,) half the width of the interval of the mean.
         effect: (n,) the difference of the mean from that over all levels.
         effect_half: (n,) half the width of its interval.
+        why: (n,) why a level has no value; empty if it has.
+        compared: over so many combinations of the other factors' levels.
+        left_out: so many more there are.
         fitted: whether a regression found it, see `level_model.py`.
     """
 
@@ -70,23 +78,32 @@ class MainEffect:
     half: Array
     effect: Array
     effect_half: Array
+    why: list[str]
+    compared: int
+    left_out: int
     fitted: bool
 
 
 @dataclass(frozen=True, eq=False)
 class PairMeans:
-    """The means of a measure over two factors.
+    """The means of a measure over two factors; nan in a cell that cannot be compared.
 
     Attributes:
         fields: of the two, n and m levels.
         names: of the levels.
-        mean: (n, m) over all other factors and the seeds.
+        mean: (n, m) over the other factors and the seeds.
+        why: (n, m) why a cell has no value; empty if it has.
+        compared: over so many combinations of the other factors' levels.
+        left_out: so many more there are.
         fitted: whether a regression found it, see `level_model.py`.
     """
 
     fields: tuple[str, str]
     names: tuple[list[str], list[str]]
     mean: Array
+    why: NDArray[np.str_]
+    compared: int
+    left_out: int
     fitted: bool
 
 
@@ -107,9 +124,9 @@ def estimated(
     np.add.at(runs, (levels[known], seed[known]), 1.0)
     with np.errstate(invalid="ignore"):
         table = sums / runs
-    mean, half = _interval(table)
+    mean, half = interval(table)
     # Differences only between what is there: a seed that lacks a level would shift all others.
-    _, effect_half = _interval(table - table.mean(axis=0))
+    _, effect_half = interval(table - table.mean(axis=0))
     return Estimate(mean, half, effect_half)
 
 
@@ -127,6 +144,9 @@ def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
             "mean_half": found.half[index],
             "effect": found.effect[index],
             "effect_half": found.effect_half[index],
+            "combinations": found.compared,
+            "left_out": found.left_out,
+            "why": found.why[index] or None,
         }
         for measure in study.measures
         for field, found in main_effects(study, rows, measure).items()
@@ -155,81 +175,89 @@ class _Data:
 
     def __init__(self, study: Study, rows: pl.DataFrame, measure: str) -> None:
         self.factors = varied(study)
-        points, self.table = _points_and_seeds(rows, measure)
-        self.nothing = not len(points)
-        self.columns = [points[factor.field].to_list() for factor in self.factors]
-        self.balanced = study.design == "factorial" and len(points) == study.size()
-        self.model = None
-        if not self.balanced and not self.nothing:
-            self.model = level_model(self.factors, self.columns)
+        points, values = _points_and_seeds(rows, measure)
+        seen = np.isfinite(values)
+        self.runs = seen.sum(axis=1)
+        known = self.runs > 0
+        self.nothing = not known.any()
+        if self.nothing:
+            return
+        kept = np.ix_(known, seen.any(axis=0))
+        self.table = filled(values[kept])
+        columns = [points[factor.field].to_list() for factor in self.factors]
+        self.levels = [levels_of(f, c) for f, c in zip(self.factors, columns, strict=True)]
+        self.model: Factorial | LevelModel | None
+        if study.design == "factorial":
+            index = [levels.index[known] for levels in self.levels]
+            counts = [len(levels.names) for levels in self.levels]
+            self.model = Factorial(index, counts, seen[kept])
+        else:
+            by_chance = study.design == "sobol"
+            self.model = level_model(self.factors, columns, known, by_chance=by_chance)
+            self.levels = self.levels if self.model is None else self.model.factors
 
     def main_effect(self, factor: int) -> MainEffect:
-        levels = self._levels(factor)
-        mean = half = effect = effect_half = np.full(len(levels.names), np.nan)
+        levels = self.levels[factor]
+        count = len(levels.names)
+        mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
+        why, compared = [TOO_FEW] * count, 0
         if self.model is not None:
-            effect, effect_half = (found[factor] for found in self.model.effects(self.table))
-            mean, half = self.model.means(self.table, factor)
-        elif self.balanced:
-            found = self._cells(levels.index, len(levels.names))
-            mean, half, effect_half = found.mean, found.half, found.effect_half
-            effect = mean - mean.mean()
-        runs = np.bincount(levels.index) * self.table.shape[1]
+            kept, over, weights = self.model.compared(factor)
+            if kept.sum() > 1:
+                effects, halves = self.model.effects(self.table)
+                found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
+                figures[:, kept] = found
+                compared = self._combinations(over, factor)
+            why = self._reasons(kept & (kept.sum() > 1), levels.index)
+        runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
+        left_out = self._combinations(np.ones(1), factor) - compared
         return MainEffect(
-            levels.names, runs, mean, half, effect, effect_half, self.model is not None
-        )
+            levels.names, runs, mean, half, effect, effect_half, why, compared, left_out,
+            self.fitted,
+        )  # fmt: skip
 
     def pair(self, first: int, second: int) -> PairMeans | None:
-        a, b = self._levels(first), self._levels(second)
-        if self.balanced:
-            shape = len(a.names), len(b.names)
-            index = a.index * shape[1] + b.index
-            mean = self._cells(index, shape[0] * shape[1]).mean.reshape(shape)
-        elif self.model is not None and self.model.products:
-            mean = self.model.cells(self.table, first, second)
-        else:
+        if self.model is None or (isinstance(self.model, LevelModel) and not self.model.products):
             return None
+        a, b = self.levels[first], self.levels[second]
+        shape = len(a.names), len(b.names)
+        kept, over, weights = self.model.compared(first, second)
+        mean = np.full(len(kept), np.nan)
+        mean[kept] = self.model.means(self.table, weights)[0]
+        # A cell in which no point happens to lie is fitted, too, but nobody has been there.
+        cell = a.index * shape[1] + b.index
+        kept &= np.bincount(cell, self.runs, len(kept)) > 0
+        mean[~kept] = np.nan
+        why = np.array(self._reasons(kept, cell)).reshape(shape)
+        compared = self._combinations(over, first, second)
+        left_out = self._combinations(np.ones(1), first, second) - compared
         fields = self.factors[first].field, self.factors[second].field
-        return PairMeans(fields, (a.names, b.names), mean, not self.balanced)
+        names = a.names, b.names
+        return PairMeans(fields, names, mean.reshape(shape), why, compared, left_out, self.fitted)
 
-    def _levels(self, factor: int) -> Levels:
-        if self.model is not None:
-            return self.model.factors[factor]
-        return levels_of(self.factors[factor], self.columns[factor])
+    @property
+    def fitted(self) -> bool:
+        return not isinstance(self.model, Factorial)
 
-    def _cells(self, index: NDArray[np.int64], count: int) -> Estimate:
-        seeds = self.table.shape[1]
-        places, of_seed = np.repeat(index, seeds), np.tile(np.arange(seeds), len(index))
-        return estimated(self.table.ravel(), places, of_seed, count)
+    def _combinations(self, over: NDArray[Any], *shown: int) -> int:
+        """How many of the levels of the other factors there are at this share of them."""
+        others = (len(f.names) for k, f in enumerate(self.levels) if k not in shown)
+        return round(np.mean(over) * math.prod(others))
+
+    def _reasons(self, compared: Flags, cell: NDArray[np.int64]) -> list[str]:
+        """Why cells have no value; (n,) `cell` is that of each point."""
+        runs = np.bincount(cell, minlength=len(compared))
+        return reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
 
 
 def _points_and_seeds(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
-    """The points at which a run has the measure, and (n, seeds) its values.
-
-    What a failed run lacks is taken as its point and its seed have it elsewhere: the point's other
-    runs alone would move it by what their seeds do to all points.
-    """
-    import polars as pl
-
+    """The points, and (n, seeds) the values of a measure; nan where there is none."""
     points = rows.unique("point", keep="first").sort("point")
     _, point = np.unique(rows["point"].to_numpy(), return_inverse=True)
     seeds, seed = np.unique(rows["seed"].to_numpy(), return_inverse=True)
     table = np.full((points.height, len(seeds)), np.nan)
     table[point, seed] = numbers(rows, measure)
-    known = np.isfinite(table)
-    kept, table = known.any(axis=1), table[known.any(axis=1)][:, known.any(axis=0)]
-    return points.filter(pl.Series(kept)), _filled(table)
-
-
-def _filled(table: Array) -> Array:
-    """A table of points and seeds with sums of both where it has no number."""
-    known = np.isfinite(table)
-    if known.all():
-        return table
-    of_seed = np.zeros(table.shape[1])
-    for _ in range(100):  # least squares, in turns
-        of_point = np.mean(table - of_seed, axis=1, where=known)
-        of_seed = np.mean(table - of_point[:, None], axis=0, where=known)
-    return np.where(known, table, of_point[:, None] + of_seed)
+    return points, table
 
 
 def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
@@ -284,14 +312,3 @@ def numbers(rows: pl.DataFrame, measure: str) -> Array:
 
     column: Array = rows[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()
     return column
-
-
-def _interval(table: Array) -> tuple[Array, Array]:
-    """Mean over the columns that are not nan, and half the width of its interval."""
-    count = np.isfinite(table).sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.nansum(table, axis=1) / count
-        spread = np.nansum((table - mean[:, None]) ** 2, axis=1) / (count - 1)
-        quantile = stdtrit(np.maximum(count - 1, 1), 0.5 + CONFIDENCE / 2)
-        half = quantile * np.sqrt(spread / count)
-    return mean, np.where(count > 1, half, np.nan)

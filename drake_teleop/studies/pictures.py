@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from drake_teleop.pages.style import BLUE, GREY, VERMILION, Picture, house_style
 from drake_teleop.studies import effects
+from drake_teleop.studies.cells import NO_RUN, NO_SUCCESS, NOT_COMPARABLE, TOO_FEW
 from drake_teleop.studies.design import Study
 from drake_teleop.studies.effects import PARETO, numbers, pair_means, pareto, varied
 from drake_teleop.studies.level_model import CONFIDENCE
@@ -19,7 +23,10 @@ from drake_teleop.writing import write_picture
 if TYPE_CHECKING:
     import polars as pl
 
-_LABELLED = 12  # points of the front that have room for their names
+_LABELLED = 24  # points of the front that have room for their names
+_WIDTH = 24  # letters that have room below a picture
+# What has no value is hatched, by the reason.
+_HATCHES = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW: ""}
 
 
 def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
@@ -49,8 +56,9 @@ def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figur
     """The mean of each measure at each level of each factor; dotted, that of all levels.
 
     Bars are intervals of the level's difference from the mean of all, which is what a factor does.
+    A level that cannot be compared is hatched.
     """
-    factors, fitted = varied(study), False
+    factors, fitted, reasons = varied(study), False, set[str]()
     with house_style():
         size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
         figure = Picture(figsize=size)
@@ -60,10 +68,13 @@ def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figur
             for axes, factor in zip(line, factors, strict=True):
                 _levels(axes, found[factor.field])
                 fitted |= found[factor.field].fitted
-            line[0].set_ylabel(measure, fontsize=7)
+                reasons |= set(found[factor.field].why)
+            words = textwrap.wrap(measure.replace("_", "_ "), 18)
+            line[0].set_ylabel("\n".join(words).replace(" ", ""), fontsize=7)
         for axes, factor in zip(grid[-1], factors, strict=True):
             axes.set_xlabel(factor.field)
         figure.suptitle(f"Main effects{_effects_caption(study, fitted)}", x=0.01, ha="left")
+        _legend(figure, reasons)
     return figure
 
 
@@ -71,16 +82,53 @@ def _levels(axes: Axes, found: effects.MainEffect) -> None:
     place = np.arange(len(found.names))
     bars = np.nan_to_num(found.effect_half)
     axes.errorbar(place, found.mean, bars, color=BLUE, marker="o", ms=3.5, capsize=3)
-    axes.axhline(found.mean[0] - found.effect[0], color=GREY, lw=0.8, ls=":")
-    axes.set_xticks(place, found.names)
-    axes.set_xlim(-0.4, len(place) - 0.6)
+    _name(axes, found.names)
+    axes.set_xlim(-0.5, len(place) - 0.5)
+    for level in place[np.isnan(found.mean)]:
+        bar = _hatched(found.why[level], (level - 0.5, 0.0))
+        bar.set_transform(axes.get_xaxis_transform())
+        axes.add_patch(bar)
     if np.isnan(found.mean).all():
-        axes.text(0.5, 0.5, "too few points", transform=axes.transAxes, ha="center", fontsize=8)
+        words = TOO_FEW if TOO_FEW in found.why else ""
+        axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", fontsize=8)
+        return
+    axes.axhline(np.nanmax(found.mean - found.effect), color=GREY, lw=0.8, ls=":")
+    axes.set_title(_combinations(found), fontsize=7, color=GREY, loc="right")
+
+
+def _name(axes: Axes, levels: list[str]) -> None:
+    axes.set_xticks(range(len(levels)), levels)
+    if len("".join(levels)) > _WIDTH:
+        for label in axes.get_xticklabels():
+            label.set(rotation=20, ha="right", rotation_mode="anchor")
+
+
+def _combinations(found: effects.MainEffect | effects.PairMeans) -> str:
+    """What is left of the other factors, if something is left out."""
+    if not found.left_out:
+        return ""
+    return f"over {found.compared} of {found.compared + found.left_out} combinations of the rest"
+
+
+def _hatched(why: str, corner: tuple[float, float]) -> Rectangle:
+    """A hatched cell of width and height 1."""
+    return Rectangle(corner, 1.0, 1.0, hatch=_HATCHES[why], fc="white", ec=GREY, lw=0)
+
+
+def _legend(figure: Figure, reasons: Iterable[str]) -> None:
+    """Of the reasons for hatched cells, if there are any."""
+    names = [why for why in _HATCHES if why in reasons and why != TOO_FEW]
+    if names:
+        patches = [_hatched(why, (0.0, 0.0)) for why in names]
+        figure.legend(patches, names, loc="outside lower left", ncols=len(names))
 
 
 def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
-    """The mean of a measure over each pair of factors; None if there are too few points for it."""
-    maps = pair_means(study, rows, measure)
+    """The mean of a measure over each pair of factors; None if there are too few points for it.
+
+    A cell without a value is hatched.
+    """
+    maps = [found for found in pair_means(study, rows, measure) if np.isfinite(found.mean).any()]
     if not maps:
         return None
     columns = min(len(maps), 3)
@@ -88,19 +136,23 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
     with house_style():
         figure = Picture(figsize=(1.0 + 3.1 * columns, 0.6 + 2.6 * lines))
         grid = figure.subplots(lines, columns, squeeze=False)
-        low, high = (end([end(found.mean) for found in maps]) for end in (np.min, np.max))
+        low, high = (end([end(found.mean) for found in maps]) for end in (np.nanmin, np.nanmax))
         for axes, found in zip(grid.ravel(), maps, strict=False):
             drawn = axes.imshow(found.mean, origin="lower", aspect="auto", vmin=low, vmax=high)
+            for row, column in np.argwhere(np.isnan(found.mean)):
+                axes.add_patch(_hatched(found.why[row, column], (column - 0.5, row - 0.5)))
             axes.grid(False)
-            axes.set_xticks(range(len(found.names[1])), found.names[1])
+            _name(axes, found.names[1])
             axes.set_yticks(range(len(found.names[0])), found.names[0])
             axes.set_xlabel(found.fields[1])
             axes.set_ylabel(found.fields[0])
+            axes.set_title(_combinations(found), fontsize=7, color=GREY, loc="right")
         for axes in grid.ravel()[len(maps) :]:
             axes.set_visible(False)
         figure.colorbar(drawn, ax=grid, label=measure)
         words = ", fitted: levels of each, and products" if maps[0].fitted else ""
         figure.suptitle(f"Interactions: mean of {measure}{words}", x=0.01, ha="left")
+        _legend(figure, set().union(*(found.why.ravel() for found in maps)))
     return figure
 
 
@@ -147,9 +199,10 @@ def _bars(axes: Axes, points: pl.DataFrame, name: str) -> None:
 
 def _effects_caption(study: Study, fitted: bool) -> str:
     if not fitted:
-        return _caption(study, "of a level against the mean")
-    words = f"; bars: {CONFIDENCE:.0%} intervals of all levels against the mean, over the design"
-    return f"{words}; one seed" if study.repeats == 1 else f"{words} and {study.repeats} seeds"
+        return _caption(study, "of a level against the mean (dotted)")
+    words = f"; bars: {CONFIDENCE:.0%} intervals of all levels against the mean (dotted)"
+    over = "one seed" if study.repeats == 1 else f"{study.repeats} seeds"
+    return f"{words}, over the design and {over}"
 
 
 def _caption(study: Study, what: str) -> str:

@@ -24,9 +24,11 @@ runs.parquet a folder of parts, one table: run (the key, its place in the design
              seed, a column for each factor and each measure, and error: why a run failed; its
              measures are then null
 summary.json runs, failed, and of each measure mean, least and largest
-effects.csv  of each level of each factor: mean of each measure, effect (its difference from the
-             mean of all levels), and half the widths of their 95 % intervals: over the seeds, and
-             if the design is not balanced over the design, see `effects.py`
+effects.csv  of each level of each factor: its successful runs, mean of each measure, effect (its
+             difference from the mean of all levels), and half the widths of their 95 % intervals:
+             over the seeds, and if the design is not factorial over the design; over how many
+             combinations of the other factors' levels, how many were left out, and why a level has
+             no value, see `effects.py`
 *.png        main_effects, interactions of two factors, and the front of effort against task time
              and overshoot of the contact force, as far as the study has what they show
 ============ =====================================================================================

@@ -1,0 +1,213 @@
+"""Where all runs fail nothing is shown, and nothing else is averaged over what is not there."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import polars as pl
+import pytest
+from matplotlib.patches import Rectangle
+from scipy.special import stdtrit
+from scipy.stats import qmc
+
+from drake_teleop.studies import pictures
+from drake_teleop.studies.cells import NO_RUN, NO_SUCCESS, NOT_COMPARABLE, comparable, reasons
+from drake_teleop.studies.design import Factor, Study
+from drake_teleop.studies.effects import effects, main_effects, pair_means
+from drake_teleop.studies.factorial import Factorial, filled, interval
+from drake_teleop.studies.level_model import level_model
+
+EFFORT = "effort_Ns"
+SIGMAS, GAMMAS = [0.0, 0.1, 0.5, 1.0], [0.25, 1.0, 4.0, 8.0, 16.0]
+TOUCH = Study(
+    factors=[
+        Factor("force_scaling.sigma", values=SIGMAS),
+        Factor("force_scaling.gamma", values=GAMMAS),
+    ],
+    repeats=4,
+    measures=[EFFORT],
+)
+
+
+def fails(sigma: float, gamma: float) -> bool:
+    """As in `scaling_touch`: a large gamma needs a large sigma. 16 never works."""
+    return gamma > 8 or sigma < {4.0: 0.5, 8.0: 1.0}.get(gamma, 0.0)
+
+
+def effort(sigma: float, gamma: float) -> float:
+    """Steepest where both are small, so that no straight line goes on beyond."""
+    return 1.0 + 10.0 * sigma**2 / gamma + np.log2(gamma) ** 2
+
+
+def rows_of(study: Study, noise: float = 0.0) -> pl.DataFrame:
+    random, rows = np.random.default_rng(0), study.rows(study.points())
+    for row in rows:
+        sigma, gamma = row["force_scaling.sigma"], row["force_scaling.gamma"]
+        value = effort(sigma, gamma) + 0.3 * row["seed"] + noise * random.normal()
+        row[EFFORT] = None if fails(sigma, gamma) else value
+    return pl.DataFrame(rows, infer_schema_length=None)
+
+
+def test_a_cell_without_a_successful_run_stays_empty():
+    rows = rows_of(TOUCH)
+    (pair,) = pair_means(TOUCH, rows, EFFORT)
+    expected = [
+        [np.nan if fails(s, g) else effort(s, g) + 0.9 for g in GAMMAS] for s in SIGMAS
+    ]  # the mean of seeds 0, 2, 4, 6 is 3
+    np.testing.assert_allclose(pair.mean, expected)
+    assert set(pair.why[np.isnan(pair.mean)]) == {NO_SUCCESS}
+    assert set(pair.why[np.isfinite(pair.mean)]) == {""}
+
+
+def test_no_effect_is_averaged_over_what_is_not_there():
+    """Levels differ by what they do at the same combinations; the table says at how many."""
+    found = main_effects(TOUCH, rows_of(TOUCH, noise=0.1), EFFORT)
+    sigma, gamma = found["force_scaling.sigma"], found["force_scaling.gamma"]
+    # All sigmas have gamma 0.25 and 1; sigma 1 alone has every gamma that any has.
+    assert (sigma.compared, sigma.left_out) == (2, 3)
+    assert (gamma.compared, gamma.left_out) == (1, 3)
+    truth = np.array([np.mean([effort(s, g) for g in GAMMAS[:2]]) for s in SIGMAS])
+    assert np.all(np.abs(sigma.effect - truth + truth.mean()) <= sigma.effect_half)
+    assert np.all(np.abs(sigma.mean - truth - 0.9) <= sigma.half)
+    truth = np.array([effort(1.0, g) for g in GAMMAS[:4]])
+    assert np.all(np.abs(gamma.effect[:4] - truth + truth.mean()) <= gamma.effect_half[:4])
+    assert np.all(gamma.effect_half[:4] < 1.0)
+    assert gamma.why == ["", "", "", "", NO_SUCCESS]
+    for figures in (gamma.mean, gamma.half, gamma.effect, gamma.effect_half):
+        assert np.isnan(figures[4])
+    assert not gamma.fitted
+
+
+def test_the_table_says_what_is_left_out():
+    table = effects(TOUCH, rows_of(TOUCH)).filter(factor="force_scaling.gamma")
+    assert table["level"].to_list() == ["0.25", "1", "4", "8", "16"]
+    assert table["runs"].to_list() == [16, 16, 8, 4, 0]
+    assert table["combinations"].to_list() == [1] * 5
+    assert table["left_out"].to_list() == [3] * 5
+    assert table["why"].to_list() == [None] * 4 + [NO_SUCCESS]
+
+
+def test_pictures_hatch_what_is_empty_and_say_why():
+    rows = rows_of(TOUCH)
+    main, pairs = (
+        pictures.main_effects(TOUCH, rows, [EFFORT]),
+        pictures.interactions(TOUCH, rows, EFFORT),
+    )
+    empty = sum(fails(*point) for point in itertools.product(SIGMAS, GAMMAS))
+    for figure, hatched in ((main, 1), (pairs, empty)):
+        patches = [patch for axes in figure.axes for patch in axes.findobj(Rectangle)]
+        assert sum(patch.get_hatch() == "////" for patch in patches) == hatched
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == [NO_SUCCESS]
+    words = [axes.get_title(loc="right") for axes in main.axes]
+    assert words == ["over 2 of 5 combinations of the rest", "over 1 of 4 combinations of the rest"]
+    # Colours are of runs that there were.
+    assert pairs.axes[0].images[0].get_clim() == pytest.approx((1.9, effort(1.0, 0.25) + 0.9))
+
+
+def test_the_levels_are_as_many_as_any_combination_has():
+    there = np.array([[1, 1, 0, 0], [1, 1, 1, 1], [0, 0, 1, 0]], dtype=bool)
+    rows, columns = comparable(there)
+    assert rows.tolist() == [True, True, False] and columns.tolist() == [True, True, False, False]
+    runs, good = np.array([3, 3, 0, 3]), np.array([2, 0, 0, 1])
+    compared = np.array([True, False, False, False])
+    assert reasons(compared, runs, good) == ["", NO_SUCCESS, NO_RUN, NOT_COMPARABLE]
+
+
+def test_levels_that_never_meet_are_not_compared():
+    """One sigma has only small gammas, the other one only large ones."""
+    factors = [Factor("a.x", values=[0.0, 1.0]), Factor("a.y", values=[0.0, 1.0, 2.0])]
+    study = Study(factors=factors, measures=[EFFORT])
+    rows = pl.DataFrame(study.rows(study.points()))
+    rows = rows.with_columns(
+        pl.when((pl.col("a.x") > 0.5) == (pl.col("a.y") > 0.5)).then(1.0).alias(EFFORT)
+    )
+    found = main_effects(study, rows, EFFORT)["a.x"]
+    assert np.isnan(found.effect).all() and found.compared == 0 and found.left_out == 3
+    assert found.why == [NOT_COMPARABLE] * 2
+
+
+def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
+    """A point with one run of six is as uncertain as that run, not as six of its like."""
+    random, inside, narrow = np.random.default_rng(2), [], []
+    levels = [np.repeat([0, 1, 2], 2), np.tile([0, 1], 3)]
+    seen = np.ones((6, 6), dtype=bool)
+    seen[:2, 1:] = False
+    for _ in range(40):
+        table = random.normal(0, 3.0, 6) + random.normal(0, 0.5, (6, 6))
+        table = filled(np.where(seen, table, np.nan))
+        for which, into in ((seen, inside), (np.ones_like(seen), narrow)):
+            found, halves = Factorial(levels, [3, 2], which).effects(table)
+            into.append(np.abs(found[0]) <= halves[0])
+    assert np.mean(inside) >= 0.9  # 0.95 in the long run
+    assert np.mean(narrow) < 0.8
+
+
+def test_their_widths_are_those_of_least_squares():
+    """With a column for each point and each seed, and what Student's interval shows of it."""
+    random = np.random.default_rng(4)
+    levels = [np.repeat([0, 1, 2], 2), np.tile([0, 1], 3)]
+    seen = random.random((6, 4)) < 0.7
+    table = filled(np.where(seen, random.normal(size=(6, 4)), np.nan))
+    design = Factorial(levels, [3, 2], seen)
+    weights = design.compared(0)[2]
+    weights -= weights.mean(axis=0)
+    X = np.hstack([np.repeat(np.eye(6), 4, axis=0), np.tile(np.eye(4), (6, 1))])[seen.ravel()]
+    solve = np.linalg.pinv(X)
+    y = table.ravel()[seen.ravel()]
+    freedom = seen.sum() - 9
+    variance = np.sum((y - X @ solve @ y) ** 2) / freedom
+    runs = seen.sum(axis=1)
+    spread = np.sum((weights @ solve[:6]) ** 2, axis=1) - weights**2 @ ((runs - 1) / 12)
+    expected = stdtrit(freedom, 0.975) ** 2 * variance * spread
+    found = design.means(table, weights)[1] ** 2 - interval(weights @ table)[1] ** 2
+    assert spread.min() > 0
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_a_regression_does_not_go_on_beyond_the_edge_of_failures():
+    factors = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xy"]
+    points = qmc.Sobol(2, seed=np.random.default_rng(0)).random_base2(6)
+    known = points[:, 0] - points[:, 1] < 0.4
+    value = np.exp(3 * (points[:, 0] - points[:, 1]))[:, None]
+    model = level_model(factors, points.T.tolist(), known)
+    kept, over, terms = model.compared(0)
+    assert kept.all() and 1 <= over.sum() < 5
+    means = model.means(value[known], terms)[0]
+    assert value[known].min() < means.min() and means.max() < value[known].max()
+    cells, _, terms = model.compared(0, 1)
+    lost = model.failed[0, 1]
+    assert np.argwhere(lost).tolist() == [[2, 0], [3, 0], [3, 1], [4, 0], [4, 1]]
+    assert np.array_equal(cells, ~lost.ravel())
+    # The edge goes through one of them: one of its four points is on this side.
+    x, y = (model.factors[k].index for k in (0, 1))
+    assert known[(x == 3) & (y == 1)].sum() == 1
+
+
+def looked(design: str) -> tuple[Study, pl.DataFrame]:
+    """A study whose points leave out a corner, and more cells by chance."""
+    factors = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xy"]
+    study = Study(factors=factors, design=design, samples=32, objective=EFFORT, measures=[EFFORT])
+    points = qmc.Sobol(2, seed=np.random.default_rng(0)).random_base2(5)
+    points = points[(points[:, 0] < 0.6) | (points[:, 1] < 0.4)]
+    rows = study.rows([{"a.x": x, "a.y": y} for x, y in points.tolist()])
+    return study, pl.DataFrame(rows).with_columns((pl.col("a.x") + pl.col("a.y")).alias(EFFORT))
+
+
+def test_a_cell_where_no_point_lies_is_empty_but_says_no_more():
+    study, rows = looked("sobol")
+    (pair,) = pair_means(study, rows, EFFORT)
+    points = rows.select("a.x", "a.y").to_numpy()
+    there = np.histogram2d(*points.T, bins=5, range=[[0, 1], [0, 1]])[0] > 0
+    assert 6 < (~there).sum() < 15
+    assert np.array_equal(np.isfinite(pair.mean), there)
+    assert set(pair.why[~there]) == {NO_RUN}
+    assert all(found.left_out == 0 for found in main_effects(study, rows, EFFORT).values())
+
+
+def test_an_adaptive_design_says_nothing_of_where_it_did_not_look():
+    study, rows = looked("adaptive")
+    for found in main_effects(study, rows, EFFORT).values():
+        assert found.left_out > 0
+        shown = np.isfinite(found.effect)
+        np.testing.assert_allclose(np.diff(found.mean[shown]), 0.2 * np.diff(np.flatnonzero(shown)))
