@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,12 @@ def reading(path: str | Path, remedy: str, what: str = "cannot be read") -> Iter
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         reason = "it is damaged" if panic else reason
         raise DrakeTeleopError(f"{what}: {reason}", where=str(path), remedy=remedy) from error
+
+
+def meant(name: object, names: Sequence[str], otherwise: str) -> str:
+    """The remedy for a name that is none of some: the nearest one, if it is near, or `otherwise`."""
+    near = difflib.get_close_matches(str(name), names, n=1)
+    return f"did you mean '{near[0]}'?" if near else otherwise
 
 
 def inside(where: str, name: Any) -> str:

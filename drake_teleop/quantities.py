@@ -7,7 +7,6 @@ range and meaning, and a value that cannot be right is refused where it stands.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import numbers
 import reprlib
@@ -16,7 +15,7 @@ import typing
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from drake_teleop.errors import DrakeTeleopError, inside
+from drake_teleop.errors import DrakeTeleopError, inside, meant
 
 KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
 """What a field that is no block may hold, in words."""
@@ -91,9 +90,8 @@ def check_name(schema: type, name: Any, where: str) -> None:
     """Raises DrakeTeleopError, with the field that may be meant, unless the dataclass has it."""
     names = _names(schema)
     if name not in names:
-        near = difflib.get_close_matches(str(name), names, n=1)
-        hint = f"did you mean '{near[0]}'?" if near else f"fields: {', '.join(names)}"
-        raise DrakeTeleopError("there is no such field", where=where, remedy=hint)
+        remedy = meant(name, names, f"fields: {', '.join(names)}")
+        raise DrakeTeleopError("there is no such field", where=where, remedy=remedy)
 
 
 def check_ranges(config: Any, where: str) -> None:

@@ -17,7 +17,7 @@ from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.environment.environment import Environment
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
-from drake_teleop.errors import DrakeTeleopError, expect
+from drake_teleop.errors import DrakeTeleopError, expect, meant
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.fields import settings
@@ -205,13 +205,13 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
         DrakeTeleopError: if there is no such scenario, or as `read_yaml`.
     """
     expect((str, Path), name_or_path, "scenario")
-    path = scenarios_dir() / f"{name_or_path}.yaml"
-    if str(name_or_path) not in ScenarioNames():
+    path, names = scenarios_dir() / f"{name_or_path}.yaml", ScenarioNames()
+    if str(name_or_path) not in names:
         path = Path(name_or_path)
     if not path.is_file():
         raise DrakeTeleopError(
             f"there is no scenario '{name_or_path}'",
-            remedy=f"give a YAML file or one of {', '.join(ScenarioNames())}",
+            remedy=meant(name_or_path, names, f"give a YAML file or one of {', '.join(names)}"),
         )
     return read_yaml(path, tagged=True), str(path)
 

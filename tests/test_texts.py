@@ -190,3 +190,18 @@ def test_a_line_keeps_its_beginning_and_its_end():
     line = one_line("begin\n" + "x" * 1000 + " \x1b[31m end")
     assert len(line) == LONGEST_LINE
     assert line.startswith("begin x") and line.endswith("x ?[31m end")
+
+
+@pytest.mark.parametrize(
+    ("load", "name", "expected"),
+    [
+        (LoadScenario, "prees", "no scenario 'prees'; did you mean 'press'?"),
+        (LoadScenario, "press.yml", "did you mean 'press'?"),
+        (LoadScenario, "xyz", "give a YAML file or one of contact_transition, "),
+        (LoadStudy, "scaling_tuch", "no study 'scaling_tuch'; did you mean 'scaling_touch'?"),
+    ],
+)
+def test_a_misspelt_name_is_told_which_one_is_near(load, name, expected):
+    with pytest.raises(DrakeTeleopError) as error:
+        load(name)
+    assert expected in str(error.value)

@@ -40,7 +40,7 @@ from drake_teleop.comparison.delayed_contact import (
     vertical_traces,
 )
 from drake_teleop.comparison.one_dof import Figures, OneDof, figures, run_one_dof
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, meant
 from drake_teleop.identified_load import identified_load
 from drake_teleop.pages.progress import Stage, show_progress
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
@@ -245,7 +245,7 @@ def _check(what: str, wanted: Sequence[str], known: Sequence[str]) -> None:
             raise DrakeTeleopError(
                 f"there is no {what} '{name}'",
                 where=f"{what}s",
-                remedy=f"choose among {', '.join(known)}",
+                remedy=meant(name, known, f"choose among {', '.join(known)}"),
             )
 
 

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, meant
 from drake_teleop.fields import settings
 from drake_teleop.quantities import check_ranges, choice, plain, quantity
 from drake_teleop.studies.measures import MEASURES, default_measures
@@ -132,7 +132,7 @@ class Study:
                 raise DrakeTeleopError(
                     f"there is no measure '{name}'",
                     where=f"{where}:measures",
-                    remedy=f"choose among {', '.join(MEASURES)}",
+                    remedy=meant(name, MEASURES, f"choose among {', '.join(MEASURES)}"),
                 )
         for index, factor in enumerate(self.factors):
             factor.check(f"{where}:factors[{index}]")

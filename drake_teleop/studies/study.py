@@ -51,7 +51,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
-from drake_teleop.errors import DrakeTeleopError, expect
+from drake_teleop.errors import DrakeTeleopError, expect, meant
 from drake_teleop.quantities import check_ranges, check_structure
 from drake_teleop.resources import studies_dir
 from drake_teleop.run import run_scenario
@@ -165,7 +165,7 @@ def study_file(name_or_path: str | Path) -> Path:
         names = sorted(file.stem for file in studies_dir().glob("*.yaml"))
         raise DrakeTeleopError(
             f"there is no study '{name_or_path}'",
-            remedy=f"give a YAML file or one of {', '.join(names)}",
+            remedy=meant(name_or_path, names, f"give a YAML file or one of {', '.join(names)}"),
         )
     return path
 

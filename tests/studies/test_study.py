@@ -510,6 +510,7 @@ def test_a_preset_brings_its_values():
         (("repeats: 2", "{design: sobol, samples: 48}"), "is not YAML"),
         (("repeats: 2", "design: sobol\nsamples: 48"), "samples: 48 Sobol points"),
         (("repeats: 2", "measures: [joy]"), "there is no measure 'joy'"),
+        (("repeats: 2", "measures: [hand_work]"), "did you mean 'hand_work_J'"),
         (("repeats: 2", "design: adaptive"), "objective: '' is no objective"),
         (("repeats: 2", "objective: hand_work_J"), "no objective for a design that is factorial"),
         ((STUDY, "scenario: tiny.yaml"), "factors: nothing is varied"),
