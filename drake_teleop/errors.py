@@ -82,7 +82,7 @@ def reading(path: str | Path, remedy: str, what: str = "cannot be read") -> Iter
 
 
 def meant(name: object, names: Sequence[str], otherwise: str) -> str:
-    """The remedy for a name that is none of some: the nearest one, if it is near, or `otherwise`."""
+    """The remedy for a name that is none of these: the one that is near, or else `otherwise`."""
     near = difflib.get_close_matches(str(name), names, n=1)
     return f"did you mean '{near[0]}'?" if near else otherwise
 

@@ -299,6 +299,14 @@ def test_inspecting_a_bag_lists_its_topics_and_drafts_a_description(
     assert found["fit"]["mass"] == pytest.approx(1.7, rel=0.01)
 
 
+def test_the_draft_of_a_bag_without_wrenches_has_none(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run1", {"/odometry": islice(poses("Odometry"), 5)})
+    (finding,) = inspect_command(bag, tmp_path / "out", quiet=True)["findings"]
+    assert finding["message"].startswith("the draft has no wrench: add wrench")
+    draft = yaml.safe_load((tmp_path / "out" / "draft.yaml").read_text())
+    assert draft == {"pose": {"file": "../run1", "topic": "/odometry"}}
+
+
 @pytest.mark.parametrize(
     ("stream", "change", "words"),
     [

@@ -134,6 +134,33 @@ def test_an_unknown_table_gets_a_draft(tmp_path: Path, capsys: pytest.CaptureFix
     assert json.loads((tmp_path / "again" / "summary.json").read_text()) == summary
 
 
+@pytest.mark.parametrize(
+    ("columns", "streams", "lacking"),
+    [
+        (
+            ["qw", "qx", "qy", "qz"],
+            {"pose"},
+            ["the draft has no wrench: add wrench, from whichever"],
+        ),
+        (["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], {"wrench"}, ["the draft has a wrench without kine"]),
+        (["Fx", "Fy", "Fz", "wx"], {"wrench"}, ["not recognized: FILL IN", "without kinematics"]),
+        (["a", "b"], {"wrench"}, ["not recognized: FILL IN", "without kinematics"]),
+    ],
+)
+def test_a_draft_has_what_there_is_and_says_what_is_missing(
+    tmp_path: Path, columns: list[str], streams: set[str], lacking: list[str]
+) -> None:
+    t = np.arange(50) * 0.01
+    pl.DataFrame({"t": t} | {name: t for name in columns}).write_csv(tmp_path / "table.csv")
+    summary = inspect_command(tmp_path / "table.csv", tmp_path, quiet=True)
+    text = (tmp_path / "draft.yaml").read_text()
+    assert set(yaml.safe_load(text)) == streams
+    assert [found["name"] for found in summary["findings"]] == ["incomplete"] * len(lacking)
+    for words, found in zip(lacking, summary["findings"], strict=True):
+        assert words in found["message"]
+        assert f"# INCOMPLETE, this has {found['message'].removeprefix('the draft has ')}" in text
+
+
 def test_unreadable_input_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as done:
         main(["inspect", str(tmp_path / "none.csv"), "--out", str(tmp_path)])

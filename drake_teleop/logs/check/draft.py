@@ -51,7 +51,9 @@ def draft_description(table: Table, folder: Path) -> str:
         "torque": {"columns": columns["torque"] or ["FILL IN"] * 3},
         "sign": 1,
     }
-    draft: dict[str, Any] = {"wrench": wrench}
+    draft: dict[str, Any] = {}
+    if columns["force"] or columns["torque"]:
+        draft["wrench"] = wrench
     imu: dict[str, Any] = {}
     if len(columns["specific_force"]) == 3:
         size = float(np.median(_norm(table, columns["specific_force"])))
@@ -72,6 +74,8 @@ def draft_description(table: Table, folder: Path) -> str:
             size = float(np.nanmax(_norm(table, columns["position"])))
             unit = "mm" if size > 20 else "m"
             draft["pose"]["position"] = {"columns": columns["position"], "unit": unit}
+    if not draft:
+        draft["wrench"] = wrench  # to begin with something
     unused = [n for n in table.columns if not any(n in found for found in columns.values())]
     head = [
         "# DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",

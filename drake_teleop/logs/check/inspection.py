@@ -113,17 +113,30 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
         if description is None:
             draft = draft_description(table, out)
             summary["kind"] = "unknown"
-    if description is None:
-        summary["draft"] = str(out / "draft.yaml")
-    else:
+    if description is not None:
         _inspect(description, str(log), tables, summary)
     with output_folder(out):
         if description is None:
-            write_text(out / "draft.yaml", draft)
+            _write_draft(draft, out / "draft.yaml", summary)
         write_json(out / "summary.json", summary)
     if not quiet:
         _print(summary)
     return summary
+
+
+def _write_draft(draft: str, path: Path, summary: dict[str, Any]) -> None:
+    """Writes a draft, and says at its end and in the summary what it lacks."""
+    write_text(path, draft)
+    summary["draft"] = str(path)
+    lacking = ["places that were not recognized: FILL IN"] if "FILL IN" in draft else []
+    try:
+        load_description(path)
+    except DrakeTeleopError as error:
+        lacking.append(str(error).removeprefix(f"{path}: "))
+    for message in lacking:
+        summary["findings"].append({"name": "incomplete", "message": f"the draft has {message}"})
+        draft += f"# INCOMPLETE, this has {message}\n"
+    write_text(path, draft)
 
 
 def _inspect(

@@ -183,12 +183,13 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
     for stream, types in _TYPES.items():
         kinds = {topic.name: topic.type.split("/")[-1] for topic in topics if topic.messages}
         suited = [name for kind in types for name in kinds if kinds[name] == kind]
-        if suited or stream == "wrench":
-            draft[stream] = {"file": file, "topic": suited[0] if suited else "FILL IN"}
+        if suited:
+            draft[stream] = {"file": file, "topic": suited[0]}
         if suited and kinds[suited[0]] == "TFMessage":
             draft[stream]["child_frame"] = "FILL IN"
         others += [f"{name} ({stream})" for name in suited[1:]]
-    draft["wrench"]["sign"] = 1
+    if "wrench" in draft or not draft:
+        draft["wrench"] = {"file": file, "topic": "FILL IN"} | draft.get("wrench", {}) | {"sign": 1}
     head = [
         "# DRAFT, guessed from the types of topics by `drake-teleop inspect`: check every line,",
         "# above all wrench.sign and the frames, and inspect it.",

@@ -332,9 +332,13 @@ class Description(_Strict):
                 raise ValueError("static poses stand alone: remove wrench, imu and pose")
             return self
         if self.wrench is None:
-            raise ValueError("no wrench: give wrench with imu or pose, or give static")
+            raise ValueError(
+                "no wrench: add wrench, from whichever file has it, or give static poses"
+            )
         if self.imu is None and self.pose is None:
-            raise ValueError("a wrench without kinematics: add imu or pose")
+            raise ValueError(
+                "a wrench without kinematics: add imu or pose, from whichever file has it"
+            )
         if self.pose is None and (self.imu is None or self.imu.angular_velocity is None):
             raise ValueError("nothing gives the angular velocity: add imu.angular_velocity or pose")
         if self.pose is None and (self.imu is None or self.imu.specific_force is None):
