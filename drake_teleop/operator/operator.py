@@ -117,9 +117,8 @@ class OperatorConfig:
 def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
     """The segments as an array (n, 12) for the compiled functions.
 
-    Columns: ramp in [start, length], ramp out [start, length], 2 pi frequency, phase,
-    translation (3), rotation (3). A minimum-jerk move is a ramp that never fades out, times
-    sin(pi / 2).
+    Columns: ramp in [start, length], ramp out [start, length], 2 pi frequency, phase, translation
+    (3), rotation (3). A minimum-jerk move is a ramp that never fades out, times sin(pi / 2).
     """
     packed = np.zeros((len(segments), 12))
     for row, segment in zip(packed, segments, strict=True):
