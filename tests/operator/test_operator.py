@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
@@ -203,3 +207,12 @@ def test_intent_loads_from_yaml():
         MinimumJerk(duration=2.0, translation=[0.0, 0.0, 0.1]),
         Sine(frequency=3.0, rotation=[0.0, 0.2, 0.0]),
     ]
+
+
+def test_the_grips_of_the_document_are_those_of_the_hands():
+    page = Path(__file__).parents[2] / "docs" / "operator.md"
+    text = page.read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(light|medium|firm)` \| (.*) \|$", text, re.MULTILINE)
+    numbers = r"\d[\d.]*(?:e-\d)?"
+    found = {name: tuple(float(x) for x in re.findall(numbers, row)) for name, row in rows}
+    assert found == {name: dataclasses.astuple(hand) for name, hand in GRIPS.items()}
