@@ -23,7 +23,7 @@ from drake_teleop.analysis.cut_loop import (
     unstable_multipliers,
 )
 from drake_teleop.analysis.one_axis import OneAxis
-from drake_teleop.analysis.period_map import Sampling, _held_response
+from drake_teleop.analysis.period_map import Sampling, _held_response, delay_steps
 from drake_teleop.analysis.sampled_loop import (
     growth_rate,
     multipliers,
@@ -155,6 +155,13 @@ def test_short_periods_give_the_continuous_two_port() -> None:
     expected[:, 1, 1] = 1 / (slave + spring)
     limit = _without_first_order(lambda rates: sampled_two_port(axis, rates, w), 8.0)
     np.testing.assert_allclose(limit / expected, 1.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("delay", "steps"), [(0.0, 0), (1e-6, 1), (2e-4, 1), (7e-4, 1), (8e-4, 2), (1e-2, 20)]
+)
+def test_a_delay_is_whole_periods_of_the_hand_and_at_least_one(delay: float, steps: int) -> None:
+    assert delay_steps(OneAxis(delay=delay), STATION) == steps
 
 
 @pytest.mark.parametrize("sampling", [STATION, JR3])

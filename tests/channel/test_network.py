@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numba import njit
 from pydrake.common.yaml import yaml_load_typed
 
+from drake_teleop.channel import network
 from drake_teleop.channel.network import (
     BACKWARD,
     FORWARD,
@@ -275,6 +276,29 @@ def test_delays_are_independent_of_each_other():
     pairs = [(first[1:], first[:-1]), (first, second), (first, backward), (first, next_seed)]
     for a, b in pairs:
         assert abs(np.corrcoef(a, b)[0, 1]) < 5 / math.sqrt(MANY)
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "normal", "gamma"])
+def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
+    """A packet has sixteen of its own, and takes each for one thing."""
+    config = NetworkConfig(
+        delay=0.1, jitter=0.5, distribution=distribution, loss=0.2, burst_loss=0.5, duplicate=0.7
+    )
+    p, taken = parameters(config, 0, FORWARD, PERIOD), []
+
+    def uniform(p, k, draw):
+        taken.append((k, draw))
+        return 0.6  # nothing is lost, all comes twice
+
+    monkeypatch.setattr(network, "_uniform", uniform)
+    monkeypatch.setattr(network, "_travel", network._travel.py_func)
+    for k in range(100, 120):
+        network._fate.py_func(p, k, 0.0)
+    packets, draws = np.array(taken).T
+    assert set(packets) == set(range(100, 120)) and set(draws) <= set(range(16))
+    each = {"uniform": 1, "normal": 2, "gamma": 3}[distribution]
+    # The chain's, the duplicate's, and both delays'.
+    assert len(taken) == len(set(taken)) == 20 * (2 + 2 * each)
 
 
 def runs_of(lost: np.ndarray) -> np.ndarray:

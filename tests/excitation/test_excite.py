@@ -232,6 +232,17 @@ def test_the_check_finds_every_kind_of_violation(slave, short):
         assert (worst.limit, worst.share > 1, worst.share < 1.03) == (name, True, True)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("axis", range(3))
+def test_a_box_is_left_on_either_side(slave, axis, side):
+    limits, still = slave.limits, np.zeros((1, 6))
+    aside = limits.box_middle + 5 * side * limits.box_half * np.eye(3)[axis]
+    moved = dataclasses.replace(slave, limits=limits._replace(box_middle=aside))
+    uses = check_motion(moved, np.zeros(1), still, still, still)
+    use = next(use for use in uses if use.limit == "workspace")
+    assert use.share > 2 and use.what == "xyz"[axis]
+
+
 @pytest.mark.slow
 def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
     t = np.zeros((6, 2))

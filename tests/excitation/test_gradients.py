@@ -95,6 +95,8 @@ def test_predicted_deviations_are_those_of_white_noise():
 
 def test_the_length_is_never_above_the_radius_of_gyration():
     assert characteristic_length(PHI) == pytest.approx(0.1, rel=0.05)
+    far = phi_from_mass_com_inertia(2.0, [0, 0, 0.3], 0.01 * np.eye(3))
+    assert characteristic_length(far) == 0.1
     near = phi_from_mass_com_inertia(2.0, [0, 0, 0], 2.0 * 0.03**2 * np.eye(3) * 2 / 3)
     assert characteristic_length(near) == pytest.approx(0.03)
 

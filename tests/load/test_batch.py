@@ -13,7 +13,7 @@ from load_cases import OFFSETS, TOOL, rich_motion, rotations
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.batch.consistent import Prior
-from drake_teleop.load.batch.methods import METHODS, identify_batch
+from drake_teleop.load.batch.methods import METHODS, _loss, identify_batch
 from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.batch.record import Options, Record
 from drake_teleop.load.identification import METHODS as KNOWN_NAMES
@@ -135,6 +135,14 @@ def test_motion_is_not_rejected_for_a_disturbance():
     late = identify_batch(F, *(np.roll(x, 4, axis=0) for x in motion))
     assert not late.rejected.any() and "no sample was rejected" in late.note
     assert late.identification.mass == pytest.approx(TOOL[0], rel=0.05)
+
+
+def test_a_quarter_of_the_samples_doubles_the_deviations():
+    """Where nothing is rejected any more."""
+    whole = Record(*record(2000, noise=1.0))
+    fit = METHODS["whitened"].fit(whole, Options(Noise(WRENCH_NOISE)))
+    assert _loss(fit, whole.every(4).moments) == pytest.approx(2.0, rel=0.02)
+    assert _loss(fit, whole.moments) == pytest.approx(1.0)
 
 
 def test_poses_share_a_noise():

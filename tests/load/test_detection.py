@@ -116,6 +116,11 @@ def test_coloured_noise_is_made_white():
     assert (statistics(white(), noise, *at_rest(len(noise)))[:, 2] > 6.2).mean() > 0.1
 
 
+def test_a_record_without_noise_has_a_floor_nevertheless():
+    found = fit_noise_floor(np.zeros((200, 6)), *at_rest(200), np.zeros((16, 16)))
+    np.testing.assert_allclose(found.noise, [1e-3] * 3 + [1e-4] * 3)
+
+
 def test_a_slow_error_does_not_set_the_threshold_of_quick_contacts():
     """Half a standard deviation that swings within seconds: long sums are full of it."""
     rng, n = np.random.default_rng(6), 60_000

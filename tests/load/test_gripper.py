@@ -88,6 +88,13 @@ def test_the_margin_tells_a_body_from_none_and_from_noise() -> None:
     assert margin < -3 * deviation < 0
 
 
+def test_a_negative_mass_is_far_outside() -> None:
+    load = recorded(OBJECT, 1)
+    margin, deviation = consistency_margin(replace(load, phi=-load.phi))
+    assert margin < -0.5  # of four eigenvalues with the sum -2
+    assert deviation == pytest.approx(consistency_margin(load)[1], rel=10.0)
+
+
 def test_the_margin_s_deviation_is_that_of_its_scatter() -> None:
     pairs = [consistency_margin(recorded(OBJECT, seed)) for seed in range(80)]
     margins, deviations = np.array(pairs).T

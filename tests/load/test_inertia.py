@@ -100,7 +100,10 @@ def test_physical_consistency(phi, consistent):
 def test_tolerance_admits_what_lies_just_outside():
     phi = phi_from_mass_com_inertia(1.0, np.zeros(3), np.diag([1.0, 1.0, 2.0 + 1e-6]))
     assert not is_physically_consistent(phi)
-    assert is_physically_consistent(phi, tolerance=1e-6)
+    # Sigma's least is -5e-7, and its trace, the unit, 2; of a load of any mass.
+    for mass in (1e-3, 1.0, 1e3):
+        assert is_physically_consistent(mass * phi, tolerance=2.6e-7)
+        assert not is_physically_consistent(mass * phi, tolerance=2.4e-7)
 
 
 def test_the_object_is_what_the_gripper_is_not():

@@ -196,6 +196,19 @@ def test_a_load_that_touches_something_tells_nothing() -> None:
         read_description(described(pose=False, position="auto"), "log.yaml", tables=tables)
 
 
+@pytest.mark.parametrize(("force", "torque"), [(0.043, 0.043), (0.0, 0.057)])
+def test_a_load_may_leave_a_twentieth_of_the_wrench(force: float, torque: float) -> None:
+    recorder = Recorder(np.eye(3), np.array([0.05, 0, 0]))
+    log = read_description(described(pose=False), "log.yaml", tables=recorder.tables())
+    touch = np.zeros((len(log), 2, 3))
+    # Of the variance of a step down and up, 1/6 of the record long, the motion explains a little.
+    touch[len(log) // 3 : len(log) // 2, :, 0] = 1.0
+    whole = log.wrench.reshape(-1, 2, 3).var(axis=0).sum(axis=1)
+    touch *= np.sqrt(np.array([force, torque]) * whole / (5 / 36))[:, None]
+    log = replace(log, wrench=log.wrench + touch.reshape(-1, 6))
+    assert (lever_arm_from_wrench(log) is None) == (torque > 0.05)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["pose", "wrench"])
 def test_rotation_about_one_axis_tells_two_coordinates(source: str) -> None:
@@ -307,6 +320,14 @@ def test_a_rotation_that_the_data_do_not_determine_is_an_error(
     assert message.startswith("log.yaml:imu.frame: the data do not determine the rotation")
     for word in words:
         assert word in message
+
+
+def test_a_late_clock_does_not_hide_that_axes_are_mirrored() -> None:
+    recorder = Recorder(a_rotation(3), np.zeros(3), lag=0.5)
+    tables = recorder.tables()
+    columns = tables[Path("i")].columns
+    columns |= {"s": columns["s"][:, [1, 0, 2]], "omega": columns["omega"][:, [1, 0, 2]]}
+    assert mounting(recorder, tables).mirrored
 
 
 def test_the_clock_of_the_imu_is_mentioned_and_left_alone() -> None:

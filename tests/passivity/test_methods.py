@@ -171,6 +171,37 @@ def test_what_is_not_finite_gives_no_force_and_leaves_the_ledgers_alone(method, 
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_a_step_stays_within_what_it_is_given(method):
+    """Compiled code does not notice the end of an array: here each lies between other numbers."""
+    rng, m = np.random.default_rng(4), METHODS.index(method)
+    around = []
+
+    def guarded(values):
+        wide = rng.uniform(1.0, 2.0, len(values) + 16)
+        wide[8:-8] = values
+        around.append((wide, wide.copy()))
+        return wide[8:-8]
+
+    p = guarded(parameters(PassivityConfig(method=method)))
+    ends = [guarded(initial_memory(method, p, START)) for _ in range(2)]
+    packets = [guarded(np.zeros(PACKET_SIZE)) for _ in range(2)]
+    wrench, command, hand, limits = (guarded(x) for x in np.split(np.zeros(27), [6, 19, 25]))
+    limits[:] = p[LIMIT]
+    path = poses(rng, 200)
+    for k in range(1, 200):
+        pose, dx, f_e = guarded(path[k]), guarded(np.zeros(6)), guarded(rng.normal(size=6))
+        difference_into(pose, path[k - 1], dx)
+        twist, given = guarded(dx / T), [packet.copy() for packet in packets]
+        master_step(
+            m, given[1], True, pose, twist, dx, hand, limits, T, p, ends[0], wrench, packets[0]
+        )
+        slave_step(m, given[0], True, pose, twist, dx, f_e, T, p, ends[1], command, packets[1])
+    for wide, before in around:
+        np.testing.assert_array_equal(wide[:8], before[:8])
+        np.testing.assert_array_equal(wide[-8:], before[-8:])
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_the_slave_stays_until_a_packet_arrives(method):
     rng = np.random.default_rng(3)
     config = PassivityConfig(method=method)

@@ -14,7 +14,7 @@ from drake_teleop.passivity.methods import (
     parameters,
     slave_step,
 )
-from drake_teleop.passivity.packet import INTEGRAL, PACKET_SIZE
+from drake_teleop.passivity.packet import INTEGRAL, PACKET_SIZE, POSE
 from drake_teleop.passivity.wave import WaveConfig
 
 T, STEPS = 1e-3, 1200
@@ -88,3 +88,23 @@ def test_the_slave_stays_behind_by_the_momentum_on_the_line(delay):
     f, x = line(config, pressed, lambda u, x: -stiffness * max(x, 0.0), delay, delay)
     assert -f[-1] == pytest.approx(stiffness * x[-1], rel=0.01)
     assert pressed[-1] - x[-1] == pytest.approx(-f[-1] * (delay * T + filtering) / b, rel=0.03)
+
+
+@pytest.mark.parametrize(("touch", "rest"), [(0.0, (1 - 3 * T) ** 200), (1e-9, 1.0)])
+def test_a_drift_fades_at_its_rate_unless_that_presses(touch, rest):
+    """The wave line brings velocities; what the command lacks of the position is added slowly."""
+    p = parameters(PassivityConfig(method="wave", wave=WaveConfig(drift_rate=3.0)))
+    start, zero = np.array([1.0, 0, 0, 0, 0, 0, 0]), np.zeros(6)
+    memory = [initial_memory("wave", p, start) for _ in range(2)]
+    sent, packet, command = np.zeros(PACKET_SIZE), np.zeros(PACKET_SIZE), np.zeros(13)
+    nothing = np.zeros(PACKET_SIZE)
+    aside = np.array([0.01, -0.02, 0.03])
+    for _ in range(200):
+        master_step(
+            WAVE, nothing, True, start, zero, zero, zero, p[LIMIT], T, p, memory[0], zero.copy(),
+            sent,
+        )  # fmt: skip
+        sent[POSE][4:] = aside
+        f_e = np.array([*(-touch * aside), 0.0, 0.0, 0.0])
+        slave_step(WAVE, sent, True, start, zero, zero, f_e, T, p, memory[1], command, packet)
+    np.testing.assert_allclose(aside - command[4:7], rest * aside, rtol=1e-6)

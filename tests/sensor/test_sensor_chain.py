@@ -386,6 +386,13 @@ def test_the_same_seed_gives_the_same_bytes():
     assert first.tobytes() != rest_record(WristSensorConfig(), 1000, PERIOD, 6).tobytes()
 
 
+def test_at_rest_gravity_is_along_z_and_the_wrench_is_the_offset():
+    config = WristSensorConfig()
+    mean = rest_record(config, 1000, PERIOD, 5).mean(axis=0)
+    np.testing.assert_allclose(mean[:6], config.offset, atol=0.1)
+    np.testing.assert_allclose(mean[6:9], [0.0, 0.0, 9.81], atol=0.05)
+
+
 @pytest.mark.skipif(not ATI_AT_REST.is_dir(), reason="the recordings are not here")
 @pytest.mark.parametrize(
     ("file", "figures", "unit"),
