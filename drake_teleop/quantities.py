@@ -59,7 +59,7 @@ def in_short(value: Any) -> str:
     return reprlib.repr(int(value)) if isinstance(value, numbers.Integral) else f"{value:g}"
 
 
-def check_structure(schema: type, data: Any, where: str) -> None:
+def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
     """Checks parsed YAML against a dataclass before it is loaded.
 
     Args:
@@ -67,6 +67,7 @@ def check_structure(schema: type, data: Any, where: str) -> None:
         data: what the YAML parser made of the file (mappings, sequences, scalars; the tag of a
             variant under the key "_tag").
         where: the place for the message, as `file` or `file:field`.
+        tagged: whether it is one of several kinds, so that a tag may say which.
 
     Raises:
         DrakeTeleopError: for an unknown field, or a value of the wrong kind.
@@ -77,6 +78,8 @@ def check_structure(schema: type, data: Any, where: str) -> None:
             where=where,
             remedy=f"the fields are {', '.join(_names(schema))}",
         )
+    if "_tag" in data and not tagged:
+        raise DrakeTeleopError(f"the tag {data['_tag']} means nothing here", where=where)
     kinds = _kinds(schema)
     for key, value in data.items():
         if key == "_tag":
@@ -190,7 +193,8 @@ def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
             remedy = "write the number alone; its unit is in the field's name or documentation"
             raise _unexpected(KINDS[first], value, place, remedy if first is float else "")
     elif from_file:
-        check_structure(_block(kind.items, value, place), value, place)
+        several = len(kind.items) > 1
+        check_structure(_block(kind.items, value, place), value, place, tagged=several)
     elif not isinstance(value, kind.items):
         raise _unexpected(" or ".join(block.__name__ for block in kind.items), value, place)
 

@@ -279,9 +279,7 @@ class SimulationResult:
         with reading(path, remedy, "is not a simulation result"):
             text = pl.read_parquet_metadata(part)[_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]
-            t = pl.read_parquet(path, columns=["t"])["t"].to_numpy()
-            if t.ndim != 1 or t.dtype.kind not in "fiu":
-                raise ValueError("t is no column of numbers")
+            t = _columns_of_numbers(path, ["t"])[:, 0]
         return cls(t, _SignalsOnDisk(path, specs), specs)
 
     def plot(self, *names: str, contact: ArrayLike | None = None) -> Figure:
@@ -360,12 +358,9 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
         self._path, self._columns = path, {spec.name: spec.columns for spec in specs}
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
-        import polars as pl
-
         columns = self._columns[name]
         with reading(self._path, "write it again"):
-            table = pl.read_parquet(self._path, columns=columns)
-        return _read_only(_numbers(f"{self._path}:{name}", table.to_numpy()))
+            return _read_only(_columns_of_numbers(self._path, columns))
 
     def __contains__(self, name: object) -> bool:
         return name in self._columns
@@ -426,6 +421,16 @@ def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
         raise DrakeTeleopError(f"holds no numbers ({error})", where=name) from None
+
+
+def _columns_of_numbers(path: Path, columns: list[str]) -> NDArray[np.float64]:
+    """(N, k) the columns of a Parquet file; whatever goes wrong is for `reading`."""
+    import polars as pl
+
+    table = pl.read_parquet(path, columns=columns)
+    if not all(dtype.is_numeric() for dtype in table.dtypes):
+        raise ValueError(f"{', '.join(columns)} hold no numbers")
+    return table.to_numpy()
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:

@@ -45,6 +45,14 @@ class _Loader(yaml.SafeLoader):
             raise yaml.scanner.ScannerError(None, None, "nested too deeply", self.get_mark())
         super().fetch_flow_collection_start(TokenClass)
 
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        # Counted here too, so that a huge file is not read to its end.
+        self.nodes = getattr(self, "nodes", 0) + 1
+        if self.nodes > 2 * _MOST_VALUES:  # names are nodes as well
+            what = f"there are more than {_MOST_VALUES} values"
+            raise yaml.composer.ComposerError(None, None, what, self.get_mark())
+        return super().compose_node(parent, index)
+
 
 _PATTERNS = {kind: re.compile(rf"(?:{pattern})\Z") for kind, pattern, _ in _CORE}
 for _kind, _, _first in _CORE:
@@ -89,11 +97,12 @@ def read_json(path: str | Path) -> Any:
     where, text = str(path), _text(path)
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        names = [name for name, _ in pairs]
-        for name in names:
-            if names.count(name) > 1:
+        found: dict[str, Any] = {}
+        for name, value in pairs:
+            if name in found:
                 raise DrakeTeleopError("stands there twice", where=inside(where, name))
-        return dict(pairs)
+            found[name] = value
+        return found
 
     def whole(digits: str) -> float:
         return int(digits) if len(digits) <= _LONGEST_INTEGER else float(digits)

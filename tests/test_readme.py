@@ -39,7 +39,7 @@ def test_every_link_into_the_repository_leads_somewhere():
     assert [target for target in targets if not (ROOT / target).exists()] == []
 
 
-def test_ci_runs_the_readmes_test_command(tmp_path):
+def test_ci_runs_the_readmes_test_commands(tmp_path):
     # A copy of the two files in a folder where the command's programs only say their names.
     (tmp_path / ".ci").mkdir()
     (tmp_path / ".ci" / "run").write_text((ROOT / ".ci" / "run").read_text())
@@ -49,7 +49,8 @@ def test_ci_runs_the_readmes_test_command(tmp_path):
     fake.mkdir()
     (fake / "python3").write_text(
         f"#!/bin/sh\necho python3 $*\nmkdir -p {programs}\n"
-        f"for name in pip pytest; do printf '#!/bin/sh\\necho '$name' $*\\n' > {programs}/$name\n"
+        "for name in pip pytest python; do\n"
+        f"printf '#!/bin/sh\\necho '$name' $*\\n' > {programs}/$name\n"
         f"chmod +x {programs}/$name; done\n"
     )
     (fake / "python3").chmod(0o755)
@@ -61,10 +62,11 @@ def test_ci_runs_the_readmes_test_command(tmp_path):
         text=True,
         check=True,
     )
-    (command,) = re.findall("<!-- the test command -->\n```sh\n(.*)\n```", README)
+    (commands,) = re.findall("<!-- the test command -->\n```sh\n(.*?)\n```", README, re.S)
+    assert answer.stderr == commands + "\n"  # as it says what it runs
     assert answer.stdout.splitlines() == [
-        f"+ {command}",
         "python3 -m venv .venv-test",
         "pip install -q -e .[test]",
         "pytest -n 2 --dist worksteal",
+        "python benchmarks/fuzz.py --seconds 60 --seed 1",
     ]

@@ -164,6 +164,13 @@ def identified():
     )
 
 
+def test_a_huge_file_is_not_read_to_its_end(monkeypatch, tmp_path):
+    monkeypatch.setattr("drake_teleop.texts._MOST_VALUES", 100)
+    path = tmp_path / "x.yaml"
+    expected = "(line 201: there are more than 100 values)"  # and not: a bracket that is not closed
+    assert expected in message(read_yaml, path, "- 1\n" * 250 + "[")
+
+
 def test_scalars_are_those_of_yaml_1_2(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text(

@@ -15,6 +15,10 @@ import numpy as np
 from drake_teleop.errors import DrakeTeleopError
 
 _INERTIAS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+# What places, shapes and masses are said with, in URDF and SDF.
+_MEASURES = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
+_MEASURES |= {"radius", "radii", "length", "scale", "mass", "inertia", *_INERTIAS}
+_LARGEST = 1e6  # of these in SI; limits may be larger, where there is none
 # How far principal moments may be from those of a body, for rounding in the file.
 _ROUNDING = 1e-3
 
@@ -27,9 +31,13 @@ def check_model(root: Element, where: str) -> list[str]:
 
     Raises:
         DrakeTeleopError: for a link with two parents, joints that form a circle, limits that are
-            no numbers or the wrong way round, a negative mass, an inertia that no body has.
+            no numbers or the wrong way round, a negative mass, an inertia that no body has, a
+            length or a mass that no arm has.
     """
     _check_tree(root, where)
+    for element in root.iter():
+        if element.tag in _MEASURES:
+            _check_measure(element, where)
     for joint in root.iter("joint"):
         for limit in joint.iter("limit"):
             _check_limit(limit, f"{where}: joint {joint.get('name', '')}")
@@ -67,6 +75,19 @@ def _check_tree(root: Element, where: str) -> None:
 def _end(joint: Element, name: str) -> str:
     element = joint.find(name)
     return "" if element is None else (element.get("link") or element.text or "").strip()
+
+
+def _check_measure(element: Element, where: str) -> None:
+    for text in (element.text or "", *element.attrib.values()):
+        for word in text.split():
+            try:
+                value = float(word)
+            except ValueError:  # a name; or Drake says that it wants a number
+                continue
+            if not abs(value) <= _LARGEST:
+                raise DrakeTeleopError(
+                    f"{element.tag} {word} is no finite number up to {_LARGEST:g}", where=where
+                )
 
 
 def _check_limit(limit: Element, where: str) -> None:

@@ -15,6 +15,7 @@ from drake_teleop.writing import write_text
 Array: TypeAlias = NDArray[np.float64]
 
 _FIELDS, _OF_JOINT = {"frequency", "joints"}, {"q0", "rho", "delta"}
+_LARGEST = 1e6  # of any number in a file: rad, and Hz
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,8 @@ class FourierTrajectory:
                 "is not a trajectory: q0 is a number, rho and delta have one for each harmonic",
                 where=str(path),
             )
+        if np.abs(numbers).max() > _LARGEST:
+            raise DrakeTeleopError(f"there are numbers beyond {_LARGEST:g}", where=str(path))
         return cls(q0, rho, delta, frequency)
 
 
