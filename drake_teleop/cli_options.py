@@ -16,7 +16,19 @@ from drake_teleop.quantities import in_short
 from drake_teleop.resources import scenarios_dir, studies_dir
 
 
-class Shipped(click.Path):
+class Named(click.Path):
+    """A path that all libraries can say: its name is UTF-8."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        path = super().convert(value, param, ctx)
+        try:
+            str(path).encode()
+        except UnicodeEncodeError:
+            self.fail(f"{click.format_filename(path)!r} is no name in UTF-8", param, ctx)
+        return path
+
+
+class Shipped(Named):
     """What is shipped by name, or a file; a shell that is asked to completes both."""
 
     def __init__(self, folder: Path, path_type: type) -> None:
@@ -31,7 +43,7 @@ class Shipped(click.Path):
         return fitting + super().shell_complete(ctx, param, incomplete)
 
 
-PATH = click.Path(path_type=Path)
+PATH = Named(path_type=Path)
 SCENARIO = Shipped(scenarios_dir(), str)
 STUDY = Shipped(studies_dir(), Path)
 

@@ -12,8 +12,6 @@ What the station knows about its load, by one rule:
 `summary.json` holds, beside what was run:
 
 =========================== =====================================================================
-load_source                 which load was used: "learnt while it ran", "identified before the run",
-                            or "cache", identified before an earlier run
 peak_measured_force_N       largest measured |f|, offsets removed; likewise peak_measured_torque_Nm;
                             this and the next two with the load estimate of the end
 peak_contact_force_N        largest calculated contact force; likewise peak_contact_torque_Nm
@@ -29,8 +27,15 @@ failure                     with a task: why it failed, in words; null if it did
 peak_force_to_master_N      largest force that the device displayed
 joint_speed_use             largest share of a joint's speed limit; likewise joint_torque_use
 mass_error_percent          of the estimate at the end; likewise com_error_mm
-real_time_factor            simulated over elapsed time, this machine, compilation included
 warnings                    what was not as it should be, and when, see `drake_teleop.run_warnings`
+=========================== =====================================================================
+
+The same scenario gives the same bytes in every file but `session.json`, which holds
+
+=========================== =====================================================================
+load_source                 which load was used: "learnt while it ran", "identified before the run",
+                            or "cache", identified before an earlier run
+real_time_factor            simulated over elapsed time, this machine, compilation included
 =========================== =====================================================================
 """
 
@@ -77,7 +82,13 @@ Array = NDArray[np.float64]
 # After a contact has ended the sensor's filter still shows it for this long [s].
 FILTER_TAIL = 0.01
 _LEARNT = "learnt while it ran"
-_WRITTEN_AT_THE_END = ("sensor_log.parquet", "identification.json", "overview.png", "replay.html")
+_WRITTEN_AT_THE_END = (
+    "sensor_log.parquet",
+    "identification.json",
+    "overview.png",
+    "replay.html",
+    "session.json",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +99,7 @@ class ScenarioRun:
         scenario: with the seed that was used.
         result: the recorded signals.
         identification: what was found beforehand; None if the scenario learnt while it ran.
-        load_source: as in summary.json.
+        load_source: as in session.json.
         real_time_factor: simulated over elapsed time.
     """
 
@@ -112,9 +123,10 @@ def run_command(
 
     Writes log.parquet, sensor_log.parquet (canonical, for `drake-teleop identify`), overview.png,
     replay.html (the film in 3D), scenario.yaml (all fields, as they were run), identification.json
-    (unless the scenario learnt while it ran) and summary.json into `out`. The log is a folder,
-    written while the station runs; all but the scenario follow at the end, the summary last. What
-    an earlier run left there is removed first; a run that fails before it begins leaves nothing.
+    (unless the scenario learnt while it ran), session.json and summary.json into `out`. The log is
+    a folder, written while the station runs; all but the scenario follow at the end, the summary
+    last. What an earlier run left there is removed first; a run that fails before it begins leaves
+    nothing.
 
     Args:
         scenario: the name of a shipped one, or a YAML file.
@@ -125,7 +137,7 @@ def run_command(
         progress: False for no progress bars alone.
 
     Returns:
-        The summary.
+        The summary, and what is in session.json.
 
     Raises:
         DrakeTeleopError: if the scenario cannot be used, a joint leaves its range, or a file cannot
@@ -139,15 +151,17 @@ def run_command(
         with show_progress(progress and not quiet) as stage:
             run = _logged(setup, out, stage, fresh)
         summary = {"scenario": str(scenario)} | summarise(run)
+        session = {"load_source": run.load_source, "real_time_factor": run.real_time_factor}
         write_table(out / "sensor_log.parquet", run.result.sensor_log())
         if run.identification is not None:
             run.identification.save(out / "identification.json")
         write_picture(out / "overview.png", overview(run.result))
         write_replay(out / "replay.html", run.result, run.scenario)
+        write_json(out / "session.json", session)
         write_json(out / "summary.json", summary)
     if not quiet:
-        _print(summary, out)
-    return summary
+        _print(summary | session, out)
+    return summary | session
 
 
 def _logged(setup: Scenario, out: Path, stage: Stage, fresh: bool) -> ScenarioRun:
@@ -251,7 +265,6 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         "seed": run.scenario.simulation.seed,
         "duration_s": round(float(result.t[-1]), 6),
         "samples": len(result.t),
-        "load_source": run.load_source,
         **_peaks("peak_measured", "", measured),
         **_peaks("peak_contact", "", calculated),
         **_peaks("residual", "_max", calculated[free]),
@@ -260,7 +273,6 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         "joint_torque_use": _use(result["joint_torque"], arm.effort_limit),
         "mass_error_percent": 100 * abs(mass / true_mass - 1),
         "com_error_mm": 1e3 * float(np.linalg.norm(com - true_com)),
-        "real_time_factor": run.real_time_factor,
     }
     if "force_to_master" in result:
         summary |= _peaks("peak", "_to_master", result["force_to_master"])

@@ -89,6 +89,9 @@ def test_no_command_shows_the_help(capsys):
     "arguments",
     [
         ["idntify", "log.csv"],
+        ["identify", "log\udcff.csv"],
+        ["identify", "log.csv", "--out", "out\udcff"],
+        ["run", "mine\udcff.yaml"],
         ["identify"],
         ["identify", "log.csv", "--delay", "soon"],
         ["identify", "log.csv", "--delay", "nan"],

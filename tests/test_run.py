@@ -75,7 +75,9 @@ def test_the_contact_is_run_with_an_identified_load(contact):
 @pytest.mark.slow
 def test_everything_is_written(contact):
     summary, out = contact
-    assert json.loads((out / "summary.json").read_text()) == summary
+    session = json.loads((out / "session.json").read_text())
+    assert set(session) == {"load_source", "real_time_factor"}
+    assert json.loads((out / "summary.json").read_text()) | session == summary
     result = SimulationResult.read_parquet(out / "log.parquet")
     assert len(result.t) == summary["samples"] == 801
     assert {"measured_wrench_S", "sheet_state", "force_to_master"} <= set(result)

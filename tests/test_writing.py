@@ -156,7 +156,7 @@ def sample_log(out: Path) -> None:
 
 
 COMMANDS: dict[str, tuple[Callable[[Path], None], int, str]] = {
-    "run": (run, 6, "keeps log.parquet, scenario.yaml"),
+    "run": (run, 7, "keeps log.parquet, scenario.yaml"),
     "study": (study, 6, "keeps 1 of 2 runs; the same command goes on"),
     "sample-log": (sample_log, 8, "keeps free.yaml, free_wrench.csv"),
 }

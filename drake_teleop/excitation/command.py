@@ -7,7 +7,8 @@ trajectory.csv      one period at 1 kHz: t [s], then by joint q_NAME, qd_NAME, q
 excitation.yaml     the coefficients of Eqs. (9)-(10), for `FourierTrajectory.load`
 excitation.png      joint angles, wrench against the sensor's range, how the criterion fell
 excitation.html     the motion as a film in 3D, to be watched before a robot runs it
-summary.json        the figures
+session.json        design_s, the optimiser's CPU time [s]
+summary.json        the figures; it and all above but session.json are the same bytes every time
 =================== ============================================================================
 
 `summary.json` holds the criterion that was minimised and the value of every criterion (what each
@@ -83,7 +84,7 @@ def excite_command(
         progress: False for no progress bars alone.
 
     Returns:
-        The summary.
+        The summary, and what is in session.json.
 
     Raises:
         DrakeTeleopError: if the input cannot be used, or nothing respects all limits.
@@ -123,15 +124,17 @@ def excite_command(
             progress=stage,
         )
     summary = summarise(found) | {"seed": seed}
+    session = {"design_s": found.seconds}
     with output_folder(out):
         write_table(out / "trajectory.csv", table(found))
         found.trajectory.save(out / "excitation.yaml", robot.arm.joint_names)
         write_picture(out / "excitation.png", draw(found))
         write_motion_film(out / "excitation.html", found)
+        write_json(out / "session.json", session)
         write_json(out / "summary.json", summary)
     if not quiet:
         _print(summary, out)
-    return summary
+    return summary | session
 
 
 def _refuse(*options: object) -> None:
@@ -152,7 +155,6 @@ def summarise(found: Excitation) -> dict[str, Any]:
         "meaning": {name: _words(name, robot) for name in found.values},
         "period_s": trajectory.period,
         "harmonics": trajectory.rho.shape[1],
-        "design_s": float(found.history[-1, 0]),
         "limit_use": {
             use.limit: {"share": use.share, "where": use.what, "t": use.time} for use in found.uses
         },
@@ -192,7 +194,7 @@ def draw(found: Excitation) -> Figure:
         progress.step(*found.history.T, where="post", color=BLUE)
         progress.set(
             title=f"{found.criterion} on the way to {found.values[found.criterion]:.4g}",
-            xlabel="CPU time [s]",
+            xlabel="evaluations",
             yscale="log",
         )
     return figure

@@ -45,12 +45,14 @@ class Iterate:
 
     Attributes:
         seconds: thread CPU time since the design began, without compilation.
+        evaluations: of the criterion, since the design began.
         start: the candidate that it came from, counted from 0.
         value: the criterion on the grid.
         trajectory: itself.
     """
 
     seconds: float
+    evaluations: int
     start: int
     value: float
     trajectory: FourierTrajectory
@@ -110,7 +112,7 @@ class _Search:
         self.start = 0
         self.found: list[Iterate] = []
         self._best = self._best_of_start = float("inf")
-        self._evaluations = 0
+        self._evaluations = self._of_all_starts = 0
         self._key = b""
         from scipy.optimize import minimize
 
@@ -185,10 +187,12 @@ class _Search:
             self._best_of_start = value
             self._best = min(value, self._best)
             seconds = time.thread_time() - self._began
-            self.found.append(Iterate(seconds, self.start, value, self._problem.trajectory(x)))
+            trajectory = self._problem.trajectory(x)
+            self.found.append(Iterate(seconds, self._of_all_starts, self.start, value, trajectory))
 
     def _tick(self) -> None:
         self._evaluations += 1
+        self._of_all_starts += 1
         done = self.start / self._starts
         if self._seconds is not None:
             done = (time.thread_time() - self._began) / self._seconds

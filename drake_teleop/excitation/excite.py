@@ -44,7 +44,8 @@ class Excitation:
         deviations: (16,) predicted standard deviations of offsets and phi of the heaviest load,
             see `predicted_deviations`.
         uses: of every limit, as checked, the largest first.
-        history: (K, 2) thread CPU time [s] and best value of the criterion until then.
+        history: (K, 2) evaluations of the criterion, and its best value until then.
+        seconds: thread CPU time until the last of them, which no two designs have the same [s].
     """
 
     robot: Robot
@@ -54,6 +55,7 @@ class Excitation:
     deviations: Array
     uses: list[Use]
     history: Array
+    seconds: float
 
 
 def excite(
@@ -105,7 +107,8 @@ def excite(
         criteria_of(robot, trajectory),
         _deviations(robot, trajectory),
         uses,
-        np.array([(it.seconds, value) for it, value in zip(found, best, strict=True)]),
+        np.array([(it.evaluations, value) for it, value in zip(found, best, strict=True)]),
+        found[-1].seconds,
     )
 
 

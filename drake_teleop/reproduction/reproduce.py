@@ -119,7 +119,8 @@ def reproduce_command(
     """Repeats the paper's experiments and writes what they show into `out`.
 
     summary.json, table.md (the paper against this run), fig6.png, fig7.png, fig8.png, replay.html,
-    report.html, identification.json, and in logs/ the records, each with its scenario.
+    report.html, identification.json, and in logs/ the records, each with its scenario; all of them
+    the same bytes every time. What is not, the speed, is in session.json.
 
     Args:
         out: the folder.
@@ -128,8 +129,8 @@ def reproduce_command(
         progress: False for no progress bars alone.
 
     Returns:
-        The summary: an object of figures for free_force, free_torque, contact, identification and
-        speed.
+        An object of figures for free_force, free_torque, contact, identification and speed; all
+        but the last are the summary.
     """
     seed = seed or 0
     make_folder(out)  # before the work: a bad path costs no time
@@ -154,16 +155,18 @@ def reproduce_command(
             "free_torque": free_figures(torque_run, ideal[1], _TORQUE_X, "Nm"),
             "contact": contact_figures(contact_run),
             "identification": identification_figures(load, force),
-            "speed": _speed(stage("Measure the speed")),
         }
+        session = {"speed": _speed(stage("Measure the speed"))}
         pictures = draw(force_run, torque_run, contact_run, summary)
         written = stage("Write figures, replay and report")
         with output_folder(out):
             _write(out, seed, summary, load, (force_run, torque_run, contact_run), pictures)
+            write_json(out / "session.json", session)
+            write_json(out / "summary.json", summary)
         written(1.0)
     if not quiet:
         _print(compare_with_paper(flat(summary)), out)
-    return summary
+    return summary | session
 
 
 def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
@@ -418,7 +421,6 @@ def _write(
         ),
         replay="replay.html",
     )
-    write_json(out / "summary.json", summary)
 
 
 def _captioned(pictures: dict[str, Figure], figures: Figures) -> list[ReportFigure]:

@@ -98,7 +98,9 @@ def test_everything_is_as_accepted(run):
 @pytest.mark.slow
 def test_everything_is_written(run):
     summary, out = run
-    assert json.loads((out / "summary.json").read_text(encoding="utf-8")) == summary
+    written = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert written | json.loads((out / "session.json").read_text()) == summary
+    assert "speed" not in written
     for name in ("fig6", "fig7", "fig8"):
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     table = (out / "table.md").read_text(encoding="utf-8")

@@ -1,0 +1,164 @@
+"""Do the commands write the same bytes, whatever surrounds them?
+
+`python benchmarks/bytes.py [--all] [--json FILE]` has drake-teleop run, reproduce, sample-log,
+identify, eliminate, study and excite write into new folders, under combinations of BLAS threads,
+hash seeds, time zones, folders and locales: so many that each two values of different kinds meet,
+or with --all every combination (an hour). Compared are the files of each but `session.json`, by
+their SHA-256, with those of the first combination. The baseline is that one once more: what
+differs there has other causes. Each combination identifies its loads anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import itertools
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+SURROUNDINGS = {
+    "threads": ("1", "2", "4"),
+    "hash_seed": ("0", "4242"),
+    "time_zone": ("UTC", "Pacific/Auckland"),
+    "folder": ("plain", "mit Käse überbacken"),
+    "locale": ("C.UTF-8", "POSIX"),
+}
+Combination: TypeAlias = tuple[str, ...]
+"""One value of each of the surroundings, in their order."""
+Command: TypeAlias = Sequence[str]
+
+STUDY = """
+scenario: reach
+factors:
+  - {field: force_scaling.sigma, low: 0.0, high: 1.0}
+  - {field: wrist_sensor.preset, words: [ideal, ati_gamma_imu]}
+  - {field: simulation.duration, values: [0.5]}
+"""
+COMMANDS: dict[str, Command] = {
+    "run": ("run", "contact_transition"),
+    "run_task": ("run", "insert"),
+    "reproduce": ("reproduce",),
+    "sample_log": ("sample-log",),
+    "identify": ("identify", "out/sample_log/free.yaml"),
+    "eliminate": (
+        *("eliminate", "out/sample_log/touched.yaml"),
+        *("--load", "out/identify/identification.json"),
+    ),
+    "study": ("study", "study.yaml", "--jobs", "2"),
+    "excite": ("excite",),
+}
+IN_ONE_PROCESS = """
+import json, sys
+from drake_teleop.cli import main
+for words in json.loads(sys.argv[1]):
+    try:
+        main(words)
+    except SystemExit as stop:
+        if stop.code:
+            raise
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--all", action="store_true", help="every combination")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    arguments = parser.parse_args()
+    everything = list(itertools.product(*SURROUNDINGS.values()))
+    combinations = everything if arguments.all else pairwise(everything)
+    with tempfile.TemporaryDirectory() as folder:
+        figures = compared([combinations[0], *combinations], COMMANDS, Path(folder))
+    for name, figure in figures.items():
+        print(f"{name:22s} {figure}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def pairwise(everything: Sequence[Combination]) -> list[Combination]:
+    """Combinations in which each two values of different surroundings are together once."""
+    left = set().union(*map(pairs, everything))
+    chosen: list[Combination] = []
+    while left:
+        chosen.append(max(everything, key=lambda each: len(pairs(each) & left)))
+        left -= pairs(chosen[-1])
+    return chosen
+
+
+def pairs(combination: Combination) -> set[object]:
+    """Each two values of a combination, with their places."""
+    return set(itertools.combinations(enumerate(combination), 2))
+
+
+def compared(
+    combinations: Sequence[Combination], commands: dict[str, Command], folder: Path
+) -> dict[str, object]:
+    """How many files were written, and of each command those that were not always the same."""
+    reference: dict[str, str] = {}
+    differ: dict[str, set[str]] = {name: set() for name in commands}
+    start = time.monotonic()
+    for number, combination in enumerate(combinations):
+        found = written(combination, commands, folder / str(number))
+        reference = reference or found
+        for file in found.keys() | reference.keys():
+            if found.get(file) != reference.get(file):
+                differ[file.split("/")[0]].add(f"{file} ({', '.join(combination)})")
+    return {
+        "combinations": len(combinations),
+        "files": len(reference),
+        **{f"{name}_differ": sorted(files) for name, files in differ.items()},
+        "minutes": round((time.monotonic() - start) / 60, 1),
+    }
+
+
+def written(
+    combination: Combination,
+    commands: dict[str, Command],
+    folder: Path,
+    program: str = IN_ONE_PROCESS,
+) -> dict[str, str]:
+    """`digests` of what the commands write in a process with these surroundings."""
+    threads, hash_seed, time_zone, name, locale = combination
+    place = folder / name
+    place.mkdir(parents=True)
+    (place / "study.yaml").write_text(STUDY)
+    surroundings = {
+        "OPENBLAS_NUM_THREADS": threads,
+        "OMP_NUM_THREADS": threads,
+        "PYTHONHASHSEED": hash_seed,
+        "TZ": time_zone,
+        "LC_ALL": locale,
+        "DRAKE_TELEOP_CACHE_DIR": str(place / "cache"),
+        "PYTHONPATH": str(Path(__file__).parents[1]),
+    }
+    subprocess.run(
+        [sys.executable, "-c", program, json.dumps(typed(commands))],
+        cwd=place,
+        env={**os.environ, **surroundings},
+        check=True,
+    )
+    return digests(place / "out")
+
+
+def typed(commands: dict[str, Command]) -> list[list[str]]:
+    """The words of each command, with a folder for what it writes."""
+    return [[*words, "--out", f"out/{name}", "--quiet"] for name, words in commands.items()]
+
+
+def digests(out: Path) -> dict[str, str]:
+    """SHA-256 of each file in a folder, by its name, but for those of a session."""
+    return {
+        file.relative_to(out).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in out.rglob("*")
+        if file.is_file() and file.name != "session.json"
+    }
+
+
+if __name__ == "__main__":
+    main()
