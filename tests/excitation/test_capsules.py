@@ -39,6 +39,13 @@ def test_a_capsule_around_a_rod_is_hardly_thicker():
     assert np.ptp(capsule.ends[:, 2]) <= 0.8
 
 
+@pytest.mark.parametrize(("aside", "radius", "held"), [(0, 0.09, True), (0, 0.11, False),
+                         (0.05, 0.04, True), (0.05, 0.06, False), (0.15, 0.0, False)])  # fmt: skip
+def test_a_capsule_holds_another_with_all_of_its_thickness(aside, radius, held):
+    ends = np.array([[0.0, 0.0, -0.2], [0.0, 0.0, 0.2]])
+    assert Capsule(ends, 0.1).holds(Capsule(0.5 * ends + [0.0, aside, 0.0], radius)) is held
+
+
 def test_what_capsules_keep_allows_for_three_quarters_of_what_they_are_too_large():
     """Shapes that nearly touch, capsules 0 to 100 mm nearer: 25 mm are allowed for."""
     touching, far = np.linspace(-0.01, 0.004, 101), np.full(101, 0.2)

@@ -10,6 +10,7 @@ import polars as pl
 import pytest
 from arms import execute, write_sdf, write_urdf
 from numba import njit
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 
 from drake_teleop.cli import main
@@ -17,6 +18,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.check import check, check_motion
 from drake_teleop.excitation.excite import excite, sensor_motion
 from drake_teleop.excitation.limits import LIMITS, empty_motions, motions_of, sensor_vectors
+from drake_teleop.excitation.models import ParseModel
 from drake_teleop.excitation.motion_film import write_motion_film
 from drake_teleop.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
@@ -397,6 +399,14 @@ def test_an_sdf_is_checked_too(tmp_path):
     path.write_text(path.read_text().replace("<izz>0.04</izz>", "<izz>4</izz>", 1))
     with pytest.raises(DrakeTeleopError, match="link l0: no body has this inertia"):
         RobotFromModel(path, "wrist", WristSensorConfig())
+
+
+def test_elements_of_drakes_own_are_read_whatever_address_they_have(tmp_path):
+    path, plant = write_sdf(tmp_path), MultibodyPlant(0.0)
+    path.write_text(path.read_text().replace('"drake.mit.edu"', f'"{tmp_path}"'))
+    ParseModel(plant, path, "wrist")
+    plant.Finalize()
+    np.testing.assert_array_equal(plant.GetAccelerationUpperLimits(), 10.0 + 2.0 * np.arange(7))
 
 
 def test_limits_and_inertias_of_nothing_are_assumptions(urdf):

@@ -1,0 +1,81 @@
+"""The four channels against the equations of their docstring."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drake_teleop.passivity.four_channel import FourChannelConfig
+from drake_teleop.passivity.memory import DAMPING, LIMIT, STIFFNESS
+from drake_teleop.passivity.methods import (
+    METHODS,
+    PassivityConfig,
+    initial_memory,
+    master_step,
+    parameters,
+    slave_step,
+)
+from drake_teleop.passivity.packet import PACKET_SIZE, difference_into, moved_into
+
+T, FOUR = 1e-3, METHODS.index("four_channel")
+START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
+
+
+def test_motion_and_force_of_both_ends_with_local_feedback():
+    own = FourChannelConfig([70.0, 0.7], [4.0, 0.03], slave_feedback=0.3, hand_feedback=-0.4)
+    p = parameters(
+        PassivityConfig("four_channel", force_limit=1e6, torque_limit=1e6, four_channel=own)
+    )
+    rng, zero = np.random.default_rng(0), np.zeros(6)
+    memory = [initial_memory("four_channel", p, START) for _ in range(2)]
+    packets = np.zeros((2, PACKET_SIZE))
+    moved, twist, (hand, contact) = (
+        0.1 * rng.normal(size=6),
+        rng.normal(size=(2, 6)),
+        rng.normal(size=(2, 6)),
+    )
+    pose, wrench, command = START.copy(), np.zeros(6), np.zeros(13)
+    moved_into(START, moved, pose)  # the hand's; the slave is at the start
+
+    slave_step(
+        FOUR,
+        np.zeros(PACKET_SIZE),
+        False,
+        START,
+        twist[1],
+        zero,
+        contact,
+        T,
+        p,
+        memory[1],
+        command,
+        packets[1],
+    )
+    master_step(
+        FOUR,
+        packets[1],
+        True,
+        pose,
+        twist[0],
+        zero,
+        hand,
+        p[LIMIT],
+        T,
+        p,
+        memory[0],
+        wrench,
+        packets[0],
+    )
+    K, D = (np.repeat(x, 3) for x in (own.stiffness, own.damping))
+    behind = np.empty(6)
+    difference_into(START, pose, behind)
+    expected = 0.6 * contact - 0.4 * hand + K * behind + D * (twist[1] - twist[0])
+    np.testing.assert_allclose(wrench, expected, rtol=1e-12)
+
+    slave_step(
+        FOUR, packets[0], True, START, twist[1], zero, contact, T, p, memory[1], command, packets[1]
+    )
+    K, D = (np.repeat(p[x], 3) for x in (STIFFNESS, DAMPING))
+    shift = np.empty(6)
+    difference_into(command[:7], pose, shift)
+    np.testing.assert_allclose(K * shift, 1.3 * hand + 0.3 * contact + D * twist[0], rtol=1e-9)
+    np.testing.assert_array_equal(command[7:], twist[0])
