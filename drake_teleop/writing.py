@@ -167,11 +167,12 @@ def _try_to_remove(path: Path) -> None:
 
 
 def _states(folder: Path) -> dict[str, tuple[int, int]]:
-    """What tells each file of a folder from one that is written in its place."""
+    """What tells each file from one that is written in its place; an empty folder is none."""
     found = {}
     for path in sorted(folder.iterdir()):
-        state = path.lstat()
-        found[path.name] = (state.st_mtime_ns, state.st_ino)
+        if not path.is_dir() or any(path.iterdir()):
+            state = path.lstat()
+            found[path.name] = (state.st_mtime_ns, state.st_ino)
     return found
 
 

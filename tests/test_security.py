@@ -170,9 +170,8 @@ def test_a_pickle_that_is_planted_in_a_study_is_not_run(tmp_path, monkeypatch):
     names = [file.relative_to(out) for file in out.rglob("*") if file.is_file()]
     assert Path("runs.parquet/run_00000000.parquet") in names
     names += [Path("loads") / f"{key}.pickle" for key in ("0", "a" * 64)]
-    names += map(
-        Path, ("running/0", "runs.parquet.unfinished", "runs.parquet/run_00000001.parquet")
-    )
+    names += map(Path, ("running/0", "running/x", "runs.parquet.unfinished"))
+    names += [Path("runs.parquet") / f"run_{key}.parquet" for key in ("00000001", "abcdefgh")]
     for name in names:
         file = out / name
         earlier = file.read_bytes() if file.exists() else None

@@ -122,7 +122,7 @@ def test_the_last_file_says_that_all_is_there(tmp_path):
         write_text(out / "b", "b")
         (out / "c").mkdir()
         write_text(out / "c", "c")
-    message = f"{out / 'c'}: cannot be written (Is a directory); {out} keeps a, b, c, earlier"
+    message = f"{out / 'c'}: cannot be written (Is a directory); {out} keeps a, b, earlier"
     assert str(error.value) == message
     assert sorted(path.name for path in out.iterdir()) == ["a", "b", "c", "earlier"]
 

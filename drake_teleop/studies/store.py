@@ -36,7 +36,7 @@ class Store:
 
     def finished(self) -> set[int]:
         """The first runs of the chunks that are complete."""
-        pattern = _PART.format(0).replace("0", "?")
+        pattern = _PART.format(0).replace("0", "[0-9]")
         return {int(part.stem.removeprefix("run_")) for part in self.folder.glob(pattern)}
 
     def write(self, rows: pl.DataFrame) -> None:
@@ -57,7 +57,8 @@ class Store:
 
     def marked(self, times: int) -> set[int]:
         """The first runs of the chunks that were so often under way when their process ended."""
-        return {int(mark.name) for mark in self._marks.glob("*") if mark.stat().st_size >= times}
+        marks = (mark for mark in self._marks.glob("*") if mark.name.isdecimal())
+        return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
 
     @property
     def _marks(self) -> Path:

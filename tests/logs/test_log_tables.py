@@ -72,3 +72,24 @@ def test_columns_of_different_length(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", a=np.zeros(3), b=np.zeros(4))
     with pytest.raises(DrakeTeleopError, match=r"'b' of x\.npz has 4 rows where 3 are needed"):
         read_table(tmp_path / "x.npz").numbers(["a", "b"], 2, "here")
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [(pl.exceptions.PanicException("a bug\nof theirs"), DrakeTeleopError),
+     (MemoryError(), DrakeTeleopError), (KeyboardInterrupt(), KeyboardInterrupt)],
+)  # fmt: skip
+def test_a_panic_in_polars_is_one_line_and_ctrl_c_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, raised: type
+) -> None:
+    """A panic is no Exception."""
+
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(pl, "read_csv", fail)
+    with pytest.raises(raised) as found:
+        read_table(write(tmp_path / "x.csv", "a\n1\n"))
+    assert "\n" not in str(found.value)
+    if raised is DrakeTeleopError:
+        assert "x.csv: cannot be read: " in str(found.value)
