@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydrake.math import RollPitchYaw
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import NetworkConfig
@@ -15,7 +16,7 @@ from drake_teleop.operator import decision
 from drake_teleop.operator.decision import DONE, OVER, PHASE, SEEKING, STOPPING
 from drake_teleop.operator.minimum_jerk import add_plan_into, plan_move
 from drake_teleop.operator.perception import NOTICED, Perception, perceive
-from drake_teleop.operator.task import Insert, Press, Reach, Touch, check_task
+from drake_teleop.operator.task import Insert, Movement, Press, Reach, Touch, check_task
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
@@ -86,6 +87,23 @@ def test_the_hand_knows_how_its_base_lies_and_how_motion_is_scaled():
     assert measures["success"] == 1.0
     way = result["pose_master"][-1, 4:] - result["pose_master"][0, 4:]
     assert np.linalg.norm(way) == pytest.approx(0.1 / 1.5, rel=0.1)
+
+
+def test_a_felt_force_is_split_along_and_across_the_tasks_axis(monkeypatch):
+    """Felt at a base that is turned about all axes, and less than it is."""
+    R_WB = RollPitchYaw(0.4, -0.9, 1.3).ToRotationMatrix().matrix()
+    task = Press(translation=[0.03, -0.02, -0.06])
+    training = decision.Training(R_WB, 1.5, 0.3, 0.0, 0.0, 0)
+    person = decision.pack_person(training, Perception(), Movement())
+    # As Python, so that nothing else is compiled.
+    monkeypatch.setattr(decision, "_pressed_force", decision._pressed_force.py_func)
+    force_W, across = np.array([3.0, -5.0, 8.0]), np.zeros(3)
+    packed, felt = decision.pack_task(task), 0.3 * R_WB.T @ force_W
+    axis = np.array(task.translation) / np.linalg.norm(task.translation)
+    assert decision._pressed_force(packed, person, felt) == pytest.approx(-force_W @ axis)
+    size = decision._sideways_into.py_func(packed, person, felt, across)
+    np.testing.assert_allclose(across, force_W - (force_W @ axis) * axis, atol=1e-12)
+    assert size == pytest.approx(np.linalg.norm(across))
 
 
 def test_what_happens_is_the_seeds(reach):
