@@ -31,6 +31,7 @@ import os
 import random
 import re
 import resource
+import shutil
 import signal
 import sys
 import tempfile
@@ -250,7 +251,6 @@ def fuzzed(targets: list[Target], arguments: argparse.Namespace, folder: Path) -
     second = arguments.seconds * arguments.jobs / sum(target.share for target in targets)
     states = []
     for target in sorted(targets, key=lambda target: -target.share):
-        (folder / target.name).mkdir()
         counts = context.Array("q", 2, lock=False)
         seconds = math.inf if arguments.cases else second * target.share
         states.append(State(target, folder / target.name, seconds, counts))
@@ -261,6 +261,8 @@ def fuzzed(targets: list[Target], arguments: argparse.Namespace, folder: Path) -
         while waiting or running:
             while waiting and len(running) < arguments.jobs:
                 state = waiting.pop(0)
+                shutil.rmtree(state.folder, ignore_errors=True)  # of a process that has died
+                state.folder.mkdir()
                 here, there = context.Pipe(duplex=False)
                 options = (state, arguments.seed, most, there)
                 process = context.Process(target=work, args=options, daemon=True)

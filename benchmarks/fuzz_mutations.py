@@ -7,6 +7,7 @@ keep the grammar, so that the readers behind the parser are reached; some are of
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import random
@@ -289,7 +290,7 @@ def _edit_element(rng: random.Random, root: ElementTree.Element, more: ElementTr
     elif kind == 1:
         parent.insert(rng.randrange(len(parent) + 1), element)
     elif kind == 2:
-        rng.choice([*parents, root]).append(rng.choice(list(more.iter())))
+        rng.choice([*parents, root]).append(copy.deepcopy(rng.choice(list(more.iter()))))
     elif kind == 3 and element.attrib:
         del element.attrib[rng.choice(list(element.attrib))]
     elif kind == 4:

@@ -1,4 +1,4 @@
-"""What `fuzz.py` feeds: every reader of a file that people write or are handed, and the options.
+"""What `fuzz.py` feeds: readers of files that people are handed, and options (long: all of them).
 
 A target has good inputs to begin with, a way to damage them, and what is done with the result. A
 case is good if that returns, or raises a DrakeTeleopError of one line.
@@ -12,6 +12,7 @@ import io
 import json
 import math
 import random
+import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -236,32 +237,35 @@ def _inspected(path: Path) -> None:
 
 
 def _bags(suffix: str) -> Callable[[Path], list[bytes]]:
-    """A bag of one file with wrenches, an IMU and transforms, 30 messages each."""
-
     def bags(_: Path) -> list[bytes]:
-        from rosbags import rosbag1, rosbag2
-        from rosbags.typesys import Stores, get_typestore
-
-        old = suffix == ".bag"
-        store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_JAZZY)
-        plugin = rosbag2.StoragePlugin.MCAP if suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"x{suffix if old else ''}"
-            with (
-                rosbag1.Writer(path)
-                if old
-                else rosbag2.Writer(path, version=9, storage_plugin=plugin) as bag
-            ):
-                for topic, kind, message in _messages(store.types, old):
-                    links = {link.topic: link for link in bag.connections}
-                    link = links.get(topic) or bag.add_connection(topic, kind, typestore=store)
-                    raw = (store.serialize_ros1 if old else store.serialize_cdr)(message, kind)
-                    stamp = (message.transforms[0] if topic == "/tf" else message).header.stamp
-                    bag.write(link, stamp.sec * 10**9 + stamp.nanosec + 10**6, raw)
-            (file,) = [path] if old else path.glob(f"*{suffix}")
-            return [file.read_bytes()]
+            bag = _write_bag(Path(folder) / "x", suffix)
+            return [(bag if bag.is_file() else next(bag.glob(f"*{suffix}"))).read_bytes()]
 
     return bags
+
+
+def _write_bag(path: Path, suffix: str) -> Path:
+    """Wrenches, an IMU and transforms, 30 messages each: in a file, or of ROS 2 in a folder."""
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    old = suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_JAZZY)
+    kind = rosbag2.StoragePlugin.MCAP if suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
+    writer = rosbag1.Writer(path) if old else rosbag2.Writer(path, version=9, storage_plugin=kind)
+    with writer as bag:
+        for topic, name, message in _messages(store.types, old):
+            links = {link.topic: link for link in bag.connections}
+            link = links.get(topic) or bag.add_connection(topic, name, typestore=store)
+            raw = (store.serialize_ros1 if old else store.serialize_cdr)(message, name)
+            stamp = (message.transforms[0] if topic == "/tf" else message).header.stamp
+            bag.write(link, stamp.sec * 10**9 + stamp.nanosec + 10**6, raw)
+    return path
+
+
+def _metadata(folder: Path) -> list[bytes]:
+    return _contents(_write_bag(folder / "bag", ".mcap"), "metadata.yaml")
 
 
 def _messages(types: Any, old: bool) -> Any:
@@ -297,6 +301,11 @@ def _bag(path: Path) -> None:
     topics = topics_of(path)
     for topic in topics[:5]:
         read_topic(path, topic.name)
+
+
+def _bag_folder(path: Path) -> None:
+    shutil.copy(path, path.parent / "bag" / "metadata.yaml")
+    _bag(path.parent / "bag")
 
 
 _SPECS = [Signal("wrench", ("f_x", "f_y"), "N", "a force"), Signal("mode", ("mode",), "1", "")]
@@ -355,6 +364,25 @@ def _urdfs(_: Path) -> list[bytes]:
     axes = ("0 0 1", "0 1 0", "1 0 0")
     joints = (_JOINT.format(j=k, k=k + 1, axis=axis) for k, axis in enumerate(axes))
     return [(_URDF % (links + "".join(joints))).encode()]
+
+
+_MJCF = b"""<mujoco model="arm"><worldbody><body name="l1" pos="0 0 0.1">
+<inertial pos="0 0 0.1" mass="2" diaginertia="0.02 0.02 0.01"/>
+<joint name="j1" type="hinge" axis="0 0 1" range="-100 100" damping="0.1"/>
+<geom type="capsule" size="0.03 0.1" pos="0 0 0.1"/><body name="sensor" pos="0 0 0.3">
+<joint name="j2" axis="0 1 0" limited="true" range="-90 90"/>
+<geom type="box" size="0.1 0.1 0.1" mass="1"/></body></body></worldbody>
+<actuator><motor joint="j1" ctrlrange="-10 10"/></actuator></mujoco>
+"""
+
+
+def _directives(folder: Path) -> list[bytes]:
+    (folder / "parts").mkdir()
+    for name in ("rx90", "tool"):
+        shutil.copy(models_dir() / f"{name}.sdf", folder / "parts")
+    (text,) = _contents(models_dir(), "slave.dmd.yaml")
+    text = text.replace(b"package://drake_teleop", b"package://parts")
+    return [text[: text.index(b"- add_model:\n    name: sheet_spring")]]
 
 
 def _sdfs(_: Path) -> list[bytes]:
@@ -480,8 +508,8 @@ TARGETS = (
     Target(
         "scenario", ".yaml", 5, lambda _: _contents(scenarios_dir(), "*.yaml"), _yaml, _scenario
     ),
-    Target("study", ".yaml", 2, lambda _: _contents(studies_dir(), "*.yaml"), _yaml, _study),
-    Target("load", ".json", 2, _load_files, _json, _load),
+    Target("study", ".yaml", 1.5, lambda _: _contents(studies_dir(), "*.yaml"), _yaml, _study),
+    Target("load", ".json", 3, _load_files, _json, _load),
     Target("trajectory", ".yaml", 1, _trajectories, _yaml, _trajectory),
     Target("description", ".yaml", 3, _descriptions, _yaml, read_log),
     *(
@@ -490,22 +518,25 @@ TARGETS = (
         for change in [mutations.table(f".{suffix}")]
     ),
     Target("identify", ".npz", 3, _tables(".npz"), mutations.table(".npz"), _processed),
-    Target("inspect", ".csv", 2, _tables(".csv"), mutations.table(".csv"), _inspected),
+    Target("inspect", ".npz", 1.5, _tables(".npz"), mutations.table(".npz"), _inspected),
     *(
         Target(f"bag_{suffix}", f".{suffix}", 1, _bags(f".{suffix}"), mutations.damaged, _bag)
         for suffix in ("mcap", "db3", "bag")
     ),
-    Target("result", ".parquet", 1, _results, _result_mutation, _result),
+    Target("metadata", ".yaml", 0.5, _metadata, _yaml, _bag_folder),
+    Target("result", ".parquet", 2, _results, _result_mutation, _result),
     Target("urdf", ".urdf", 1.5, _urdfs, mutations.xml, _model),
-    Target("sdf", ".sdf", 1.5, _sdfs, mutations.xml, _model),
+    Target("sdf", ".sdf", 1, _sdfs, mutations.xml, _model),
+    Target("mjcf", ".xml", 1, lambda _: [_MJCF], mutations.xml, _model),
+    Target("dmd", ".dmd.yaml", 0.5, _directives, _yaml, _model),
     Target("robot", ".urdf", 2, _urdfs, mutations.xml, _robot),
     *(
-        Target(f"trace_{suffix}", f".{suffix}", 0.5, _traces(f".{suffix}"), change, _trace)
+        Target(f"trace_{suffix}", f".{suffix}", 1, _traces(f".{suffix}"), change, _trace)
         for suffix in ("csv", "npz")
         for change in [mutations.table(f".{suffix}")]
     ),
-    Target("packets", ".json", 1, _exchanges, _json, _exchange),
-    Target("options", ".json", 1, _commands, mutations.arguments, _command_line),
+    Target("packets", ".json", 2, _exchanges, _json, _exchange),
+    Target("options", ".json", 2, _commands, mutations.arguments, _command_line),
 )
 
 

@@ -192,12 +192,10 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
 
     table = read_table(path)
     time = table.numbers(["time"], 1, str(path))[:, 0]
-    delay = table.raw("delay", str(path))
-    if delay.shape != (len(time), 1):
-        raise DrakeTeleopError(
-            f"has shape {delay.shape}, needs {(len(time), 1)}", where=f"{path}:delay"
-        )
-    delay = delay[:, 0]
+    delay = table.single("delay", str(path))
+    if len(delay) != len(time):
+        what = f"has {len(delay)} rows, and time {len(time)}"
+        raise DrakeTeleopError(what, where=f"{path}:delay")
     lost, age = np.isnan(delay), time - time[0]
     for column, bad, what in (
         ("time", np.diff(time, prepend=-np.inf) <= 0, "does not increase"),

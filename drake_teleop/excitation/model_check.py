@@ -64,12 +64,17 @@ def _check_tree(root: Element, where: str) -> None:
         while link in parents:
             link = parents[link][0]
             if link in passed:
-                raise DrakeTeleopError(
-                    f"its joints form a circle through {link}",
-                    where=where,
-                    remedy="an arm is a tree: cut the loop, or model the chain to the sensor alone",
-                )
+                raise circle(link, where)
             passed.add(link)
+
+
+def circle(link: str, where: str) -> DrakeTeleopError:
+    """The error for joints that form a circle, in which this link is."""
+    return DrakeTeleopError(
+        f"its joints form a circle through {link}",
+        where=where,
+        remedy="an arm is a tree: cut the loop, or model the chain to the sensor alone",
+    )
 
 
 def _end(joint: Element, name: str) -> str:

@@ -17,8 +17,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.excitation.model_check import check_model
+from drake_teleop.excitation.model_check import check_model, circle
 from drake_teleop.silence import silent_stderr
+from drake_teleop.texts import read_yaml
 
 # Of meshes that Drake can use as collision shapes.
 _READABLE = (".obj", ".gltf", ".vtk")
@@ -75,6 +76,8 @@ def ParseModel(
     converted = TemporaryDirectory(prefix="drake_teleop_")
     try:
         root = _xml(path) if kind in ("urdf", "sdf") else None
+        if kind == "yaml":
+            read_yaml(path, tagged=True)  # Drake's parser overflows its stack over many brackets
         if root is None:
             with _drakes_errors_raised():
                 instances = parser.AddModels(str(path))
@@ -151,8 +154,10 @@ def _xml(path: Path) -> ElementTree.Element | None:
 def _weld_base(plant: MultibodyPlant, frame: Frame, peculiar: dict[str, str], where: str) -> None:
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     inboard = {joint.child_body().index(): joint for joint in joints}
-    body, chain = frame.body(), []
+    body, chain = frame.body(), list[str]()
     while body.index() in inboard:
+        if len(chain) > len(inboard):
+            raise circle(body.name(), where)
         chain.append(inboard[body.index()].name())
         body = inboard[body.index()].parent_body()
     for name in (*chain, body.name()):

@@ -91,7 +91,7 @@ def _norm(table: Table, names: Sequence[str]) -> NDArray[np.float64]:
 
 def _time_unit(table: Table, column: str) -> str:
     """The unit in which the median step is between 50 us and 1 s, the longest such step."""
-    step = float(np.median(np.abs(np.diff(table.raw(column, column)[:, 0]))))
+    step = float(np.median(np.abs(np.diff(table.single(column, column)))))
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if step * scale <= 0.3:
             return unit

@@ -281,7 +281,7 @@ def _clock(
     if time.column is None:
         figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
         return []
-    t = table.raw(time.column, at)[:, 0] * description.scale(time.unit)
+    t = table.single(time.column, at) * description.scale(time.unit)
     t = t[np.isfinite(t)]
     steps = np.diff(t)
     forward = steps[steps > 0]
@@ -359,7 +359,7 @@ def _finite(table: Table, names: Sequence[str]) -> Table:
 
 def _increasing(table: Table, column: str) -> Table:
     """The table's rows whose time stamps are later than all before."""
-    t = table.raw(column, column)[:, 0]
+    t = table.single(column, column)
     later = np.ones(len(t), bool)
     later[1:] = t[1:] > np.maximum.accumulate(t)[:-1]
     if later.all():

@@ -59,8 +59,8 @@ class LogData:
         """When the stream's first row was taken, on the common clock [s]."""
         if stream.time.column is None:
             return float(stream.time.offset)
-        t = self._tables[stream.source].raw(stream.time.column, "time")
-        return float(t[0, 0]) * description.scale(stream.time.unit) + stream.time.offset
+        t = self._tables[stream.source].single(stream.time.column, "time")
+        return float(t[0]) * description.scale(stream.time.unit) + stream.time.offset
 
     def _stride(self, description: Description, stream: Any) -> int:
         """Rows that become one; an odd number, so that one of them is in the middle."""
@@ -70,7 +70,9 @@ class LogData:
         if time.rate is not None:
             rate = time.rate
         else:
-            t = self._tables[stream.source].raw(str(time.column), "time")[:, 0]
+            t = self._tables[stream.source].single(str(time.column), "time")
+            if len(t) < 2:  # read_log says what is wrong
+                return 1
             rate = 1 / max(1e-12, float(np.median(np.diff(t))) * description.scale(time.unit))
         # So that enough are left of a short record.
         most = min(rate / _RATE, self._tables[stream.source].rows / MINIMUM_SAMPLES)

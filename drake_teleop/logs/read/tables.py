@@ -99,6 +99,25 @@ class Table:
         self.check_size(numbers, LARGEST, "", f"{self.path}:{name}")
         return numbers
 
+    def single(self, name: str | int, where: str) -> NDArray[np.float64]:
+        """(N,) numbers of a column that is one wide, whatever they are: NaN and infinity included.
+
+        Args:
+            name: of the column.
+            where: the field that names it, for messages.
+
+        Raises:
+            DrakeTeleopError: if the column is absent, wider, or a cell is no number.
+        """
+        numbers = self.raw(name, where)
+        if numbers.shape[1] != 1:
+            raise DrakeTeleopError(
+                f"{str(name)!r} of {self.path.name} has {numbers.shape[1]} numbers in a row",
+                where=where,
+                remedy="name a column that has one",
+            )
+        return numbers[:, 0]
+
     def check_size(
         self, values: NDArray[np.float64], largest: float, unit: str, where: str
     ) -> None:
