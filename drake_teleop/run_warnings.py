@@ -2,6 +2,7 @@
 
 ============== =================================================================================
 saturated      the wrist sensor says so
+fault          numbers in the loop that cannot be, see `drake_teleop.fault`
 unreachable    the inverse kinematics say so
 clipped        a joint asks for its largest speed, or its motor gives its largest torque; the device
                displays its largest force or torque
@@ -13,7 +14,7 @@ hunting        the hand, the command that leaves the channel or a joint goes to 
                it was asked for does not
 ============== =================================================================================
 
-The first four are said however short they were, the others if they last for longer than 0.2 s.
+The first five are said however short they were, the others if they last for longer than 0.2 s.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.channel.network import longest_delay
+from drake_teleop.fault import MEANINGS, Fault
+from drake_teleop.load.sample import LOST
 from drake_teleop.master.phantom import FORCE_LIMIT, WRIST_TORQUE_LIMIT, jacobian_into
 from drake_teleop.pages.style import contact_spans
 from drake_teleop.result import SimulationResult
@@ -65,7 +68,7 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
     """
     return [
         f"{what} {_when(spans)}"
-        for found in (_limits(result, scenario, arm), _channel(result, scenario),
+        for found in (_faults(result), _limits(result, scenario, arm), _channel(result, scenario),
                       _joints(result, scenario), _hand(result))
         for what, spans in found
         if spans
@@ -153,11 +156,25 @@ def hunts(t: Array, command: Array, actual: Array, swing: float, near: float = N
     return hunting
 
 
+def _faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+    """Of the slave; and of the hand what does not come from there."""
+    t = result.t
+    slave = hand = np.zeros(len(t))
+    if "fault" in result:
+        slave = result["fault"][:, 0]
+    if "fault_at_hand" in result:
+        hand = result["fault_at_hand"][:, 0]
+    for fault, meaning in MEANINGS.items():
+        if fault != Fault.RESUMING:
+            happened = (slave == fault) | ((hand == fault) & (slave == 0))
+            yield f"a fault: {meaning},", spans_of(t, happened)
+
+
 def _limits(
     result: SimulationResult, scenario: Scenario, arm: ArmModel
 ) -> Iterator[tuple[str, Spans]]:
     t = result.t
-    yield "the wrist sensor saturates", spans_of(t, result["saturated"][:, 0] > 0)
+    yield "the wrist sensor saturates", spans_of(t, _saturated(result))
     if "ik_status" in result:
         for status in list(IkStatus)[1:]:
             happened = result["ik_status"][:, 0] == status
@@ -181,6 +198,11 @@ def _limits(
             f"the leaf bends by more than {1e3 * bent:.0f} mm, where its model is no longer good,",
             spans_of(t, np.abs(result["sheet_state"][:, 0]) > bent),
         )
+
+
+def _saturated(result: SimulationResult) -> Flags:
+    flag: Array = result["saturated"][:, 0]
+    return (flag > 0) & (flag < LOST)
 
 
 def _channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:

@@ -82,6 +82,11 @@ class Simulation:
     end_with_task: bool = plain(
         False, "end the run within 20 ms when the operator has done its task or given up"
     )
+    on_fault: str = choice(
+        "continue",
+        ("continue", "stop"),
+        "after a fault (docs/station.md) the run goes on in its safe state, or ends with an error",
+    )
 
 
 @settings

@@ -30,7 +30,13 @@ SIGNALS = {
         _signal(
             "angular_acceleration_S", "alpha_x alpha_y alpha_z", "rad/s^2", "of S, at sample_time"
         ),
-        _signal("saturated", "saturated", "1", "1 if a channel of the sensor was, at sample_time"),
+        _signal(
+            "saturated",
+            "saturated",
+            "1",
+            "1 if a channel of the sensor was, above that for a while if a reading was lost, at"
+            " sample_time",
+        ),
         _signal("joint_position", _JOINTS, "rad", "the slave's encoders' reading, at sample_time"),
         _signal(
             "sample_time",
@@ -64,7 +70,9 @@ SIGNALS = {
         _signal("ik_status", "status", "1", "of the inverse kinematics, 0 = fine"),
         _signal("scaled_wrench_S", *_WRENCH, "F' of Fig. 2, before the scale to the master"),
         _signal("contact_wrench_S", *_WRENCH, "Eq. (13), calculated contact wrench"),
+        _signal("fault", "fault", "1", "of sample or load estimate, 0 = none: fault.py"),
         _signal("force_to_master", *_WRENCH, "what the device displays, within its limits"),
+        _signal("fault_at_hand", "fault", "1", "of what the device shall display: fault.py"),
         _signal(
             "task_state",
             "phase outcome noticed threshold trust",

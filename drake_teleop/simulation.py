@@ -10,7 +10,8 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.errors import expect
+from drake_teleop.errors import DrakeTeleopError, expect
+from drake_teleop.fault import MEANINGS, Fault
 from drake_teleop.operator.decision import DONE
 from drake_teleop.pages.progress import Progress, show_progress
 from drake_teleop.quantities import check_ranges
@@ -48,8 +49,8 @@ def simulate(
         when they are asked for.
 
     Raises:
-        DrakeTeleopError: if an argument cannot be used, a joint of the slave leaves its range, or
-            the folder holds other files.
+        DrakeTeleopError: if an argument cannot be used, a joint of the slave leaves its range,
+            the folder holds other files, or at a fault (`Simulation.on_fault`).
     """
     expect(Diagram, diagram, "diagram", "make one: MakeTeleopStation(scenario)")
     expect(Simulation, simulation, "simulation", "pass scenario.simulation")
@@ -61,6 +62,7 @@ def simulate(
     simulator = MakeSimulator(diagram, simulation)
     end = simulation.settle + simulation.duration
     on_disk = None if log is None else _LogOnDisk(Path(log), simulator, simulation.settle)
+    stops, rows = simulation.on_fault == "stop", 0
     simulator.Initialize()
     try:
         # Products, as Drake's event times are: what differs by rounding alone would be a step of
@@ -68,8 +70,11 @@ def simulate(
         milliseconds = np.arange(_PROGRESS_STEP, 1e3 * end - 1, _PROGRESS_STEP)
         for time in np.append(1e-3 * milliseconds, end):
             advance(simulator, time)
+            if stops:
+                rows = _stop_at_fault(simulator, simulation.settle, rows)
             if on_disk is not None and on_disk.waiting() >= _PART_ROWS:
                 on_disk.take()
+                rows = 0
             over = simulation.end_with_task and _task_is_over(simulator)
             progress(1.0 if over else time / end)
             if over:
@@ -87,6 +92,34 @@ def _task_is_over(simulator: Simulator) -> bool:
     if not station.HasOutputPort("task_state"):
         return False
     return bool(station.GetOutputPort("task_state").Eval(simulator.get_context())[DONE] != 0.0)
+
+
+def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
+    """Looks at what was recorded after so many rows; returns how many there are now.
+
+    Raises:
+        DrakeTeleopError: for the first fault among them.
+    """
+    station = simulator.get_system()
+    log = station.GetSubsystemByName(LOG).FindLog(simulator.get_context())
+    for name, column in _columns(station).items():
+        if name not in ("fault", "fault_at_hand"):
+            continue
+        for k in np.flatnonzero(log.data()[column][0, rows:])[:1] + rows:
+            what = MEANINGS[Fault(int(log.data()[column][0, k]))]
+            raise DrakeTeleopError(
+                f"at {log.sample_times()[k] - start:.3f} s {what}",
+                where="simulation.on_fault",
+                remedy="set it to continue, and the run goes on in its safe state",
+            )
+    return int(log.num_samples())
+
+
+def _columns(station: Diagram) -> dict[str, slice]:
+    """Where the station's signals stand in its log, by name."""
+    ports = [station.get_output_port(index) for index in range(station.num_output_ports())]
+    ends = np.cumsum([port.size() for port in ports])
+    return {p.get_name(): slice(e - p.size(), e) for p, e in zip(ports, ends, strict=True)}
 
 
 class _LogOnDisk:
@@ -146,10 +179,8 @@ def read_log(simulator: Simulator, start: float) -> SimulationResult:
     log = diagram.GetSubsystemByName(LOG).FindLog(simulator.get_context())
     t = log.sample_times() - start
     kept = t > -1e-9
-    ports = [diagram.get_output_port(index) for index in range(diagram.num_output_ports())]
-    ends = np.cumsum([port.size() for port in ports])
-    columns = np.split(log.data().T[kept], ends[:-1], axis=1)
-    signals = dict(zip((port.get_name() for port in ports), columns, strict=True))
+    data = log.data().T[kept]
+    signals = {name: data[:, column] for name, column in _columns(diagram).items()}
     if "sample_time" in signals:
         signals["sample_time"] -= start
     return SimulationResult(t[kept], signals, [SIGNALS[name] for name in signals])

@@ -44,6 +44,7 @@ from drake_teleop.environment.point_contact import FRICTION
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import checked
 from drake_teleop.master import phantom
+from drake_teleop.master.force_display import initial_display
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.scenario import Scenario, check_scenario, replace
@@ -439,6 +440,8 @@ class _Period:
             whole("master_device", 0, np.full(6, _ANGLE), np.full(6, _RATE)),
             whole("master_device", 1, np.full(7, _ANGLE)),
             whole("master_device", 2, np.full(6, _RATE)),
+            # The angles again, for the display; what else it remembers acts after faults alone.
+            _States("master_device", 3, slice(0, 6), np.full(6, _ANGLE)),
             whole("joint_control", 0, np.full(6, _OTHER)),
             _States("slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE], joints)),
             _States("wrist_sensor", 0, self._sensor.remembered, remembered),
@@ -514,7 +517,8 @@ class _Period:
         pose_B[4:] += displacement
         q = phantom.inverse_kinematics(pose_B)
         context = self._context("master_device")
-        for group, value in enumerate((np.append(q, np.zeros(6)), pose_B, np.zeros(6))):
+        rest = (np.append(q, np.zeros(6)), pose_B, np.zeros(6), initial_display(q))
+        for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
         target = self._eval("kinematic_scaling", "pose_command")
         ramp = round(_RAMP / self.dt) if displacement.any() else 0

@@ -24,6 +24,7 @@ from drake_teleop._compiled import njit
 from drake_teleop.channel import network
 from drake_teleop.channel.network import PRESETS, NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fault import sound
 from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.passivity import methods
@@ -35,7 +36,6 @@ from drake_teleop.passivity.packet import (
     PACKET_SIZE,
     difference_into,
     dot,
-    finite,
 )
 from drake_teleop.passivity.safe_state import (
     MASTER_WATCH,
@@ -193,7 +193,7 @@ def channel_step(
     for g in range(2):
         work_M[g] -= dot(held_M, dx, g)
     hand[:] = 0.0
-    if finite(hand_B):
+    if sound(hand_B):
         _to_world(hand_B, frame, hand)
     else:
         good = False
@@ -217,7 +217,7 @@ def channel_step(
         twist[i] = dx[i] / T
     for g in range(2):
         work_S[g] += dot(held_S, dx, g)
-    if not finite(wrench_B):
+    if not sound(wrench_B):
         good = False
         ends[_TRUSTED] = 0.0
     elif saturated:
@@ -258,7 +258,7 @@ def _moved(pose, before, dx):
     Returns:
         Whether the pose is finite.
     """
-    good = finite(pose)
+    good = sound(pose)
     if good:
         difference_into(pose, before, dx)
         before[:7] = pose

@@ -12,17 +12,20 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop._compiled import njit
+from drake_teleop.fault import sound
 from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.load.compensation import scaled_wrench_into
 from drake_teleop.load.contact.detection import ContactDetector, flag_update
+from drake_teleop.load.contact.memory import FLAG
 from drake_teleop.load.contact.noise_floor import MARGIN, STATISTICS, NoiseFloor
 from drake_teleop.load.sample import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
-    JOINT_POSITION,
+    BEFORE_JOINTS,
     SATURATED,
     SPECIFIC_FORCE,
+    TIME,
     WRENCH,
     sample_size,
 )
@@ -50,12 +53,14 @@ class ContactDetectionConfig:
 
 @njit(cache=True)
 def _detected(memory, sample, estimate, arm, settings):
-    """Takes one sample; whether there is contact."""
+    """Takes one sample; whether there is contact, as before if there is a fault."""
+    if not (sound(sample) and sound(estimate)):
+        return memory[FLAG] != 0.0
     contact, acceleration = np.empty(6), np.empty(3)
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
     wrench, offset, phi = sample[WRENCH], estimate[:6], estimate[6:]
     scaled_wrench_into(wrench, offset, s, omega, alpha, phi, np.zeros(10), 0.0, 0.0, 1.0, contact)
-    acceleration_into(arm, sample[JOINT_POSITION], s, acceleration)
+    acceleration_into(arm, sample[BEFORE_JOINTS:TIME], s, acceleration)
     return flag_update(memory, contact, s, omega, alpha, acceleration, *settings)
 
 
@@ -98,7 +103,7 @@ class ContactDetection(LeafSystem):
             hold=round(config.hold / period),
             following=period / config.drift_time,
         ).settings
-        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints))
+        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         self._flag = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(ContactDetector.initial_memory())

@@ -9,8 +9,10 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fault import sound
 from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT
+from drake_teleop.master.force_display import initial_display
 from drake_teleop.master.phantom import (
     FRICTION_SPEED,
     HOME,
@@ -22,6 +24,7 @@ from drake_teleop.master.phantom import (
     twist_into,
 )
 from drake_teleop.quantities import quantity
+from drake_teleop.vectors import put
 
 _LARGEST_PERIOD = 1e-3  # s, slower than any haptic device
 # The Runge-Kutta step is stable up to 2.8 for (friction's slope / inertia) * period.
@@ -42,11 +45,18 @@ class JointFriction:
 
 
 @njit(cache=True)
-def _advance(state, pose, twist, hand_wrench, motor_torque, parameters, period, work, stages):
-    """`step`, and the pose and twist that follow: one call of compiled code instead of three."""
-    step(state, hand_wrench, motor_torque, parameters, period, work, stages)
-    pose_into(state[:6], pose)
-    twist_into(state[:6], state[6:], work[0], twist)
+def _advance(state, pose, twist, display, hand_wrench, drive, parameters, period, work, stages):
+    """`step`, and the pose and twist that follow: one call of compiled code instead of three.
+
+    What the display remembers (`display`, `drive[6:]`) is kept for it, beside the angles. A device
+    that is pushed by what is no force stays where it is.
+    """
+    put(display, 6, drive, 6, drive.shape[0] - 6)
+    if sound(hand_wrench) and sound(drive[:6]):
+        step(state, hand_wrench, drive[:6], parameters, period, work, stages)
+        pose_into(state[:6], pose)
+        twist_into(state[:6], state[6:], work[0], twist)
+    put(display, 0, state, 0, 6)
 
 
 def _check_friction(friction: JointFriction, M: NDArray[np.float64], period: float) -> None:
@@ -73,11 +83,12 @@ class MasterDevice(LeafSystem):
         name: MasterDevice
         input_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
-        - motor_torque: (6,) at the joints [N m]
+        - drive: from the force display: torque at the joints (6) [N m], what it remembers
         output_ports:
         - state: (12,) [q; qdot] [rad, rad/s]
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
+        - for_display: the angles (6) [rad], and what the force display remembers
 
     Args:
         period: [s], at most 1 ms.
@@ -120,13 +131,16 @@ class MasterDevice(LeafSystem):
         self._work = np.zeros((2, 6, 6))
         self._stages = np.zeros((3, 12))
         self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
-        self._motor_torque = self.DeclareVectorInputPort("motor_torque", 6)
+        # A port of its own for what the display remembers would be a call of its own.
+        display = initial_display(q_initial)
+        self._drive = self.DeclareVectorInputPort("drive", len(display))
         # Pose and twist are kept beside the state: they are read more often than they change.
         state = np.concatenate([q_initial, np.zeros(6)])
         for name, start in (
             ("state", state),
             ("pose_master", forward_kinematics(q_initial)),
             ("twist_master", np.zeros(6)),
+            ("for_display", display),
         ):
             self.DeclareStateOutputPort(name, self.DeclareDiscreteState(start))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -136,8 +150,9 @@ class MasterDevice(LeafSystem):
             discrete_state.get_mutable_value(0),
             discrete_state.get_mutable_value(1),
             discrete_state.get_mutable_value(2),
+            discrete_state.get_mutable_value(3),
             self._hand_wrench.Eval(context),
-            self._motor_torque.Eval(context),
+            self._drive.Eval(context),
             self._parameters,
             self._period,
             self._work,

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop._compiled import njit
+from drake_teleop.fault import Fault, sound
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.master.phantom import (
     FORCE_LIMIT,
@@ -15,6 +17,34 @@ from drake_teleop.master.phantom import (
     gravity_torque_into,
     jacobian_into,
 )
+from drake_teleop.passivity.memory import Slots
+from drake_teleop.passivity.packet import limit
+from drake_teleop.passivity.safe_state import (
+    MASTER_WATCH,
+    STOP,
+    initial_master_watch,
+    master_limits_into,
+)
+from drake_teleop.vectors import put
+
+# What comes from the device: its angles, and what is remembered of the last period: angles that
+# were numbers, the wrench that was displayed, whether that was changed after a fault, for how long
+# there has been none [s], the watch. What goes to it: the motors' torque, and what to remember.
+_places = Slots(6 + 6 + 6 + 1 + 1 + MASTER_WATCH)
+_ANGLES = _places.vector(6)
+_LAST_ANGLES, _LAST = _places.vector(6), _places.vector(6)
+_CHANGED, _SOUND, _WATCH = _places.number(), _places.number(), _places.vector(MASTER_WATCH)
+# Of force and torque; from the limits on the device's own hold, motor by motor.
+_FULL = np.array([FORCE_LIMIT, WRIST_TORQUE_LIMIT.max()])
+_NONE, _WRENCH, _HAND, _RESUMING = map(int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING))
+
+
+def initial_display(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What the display is told before the first period, at the device's angles q (6,) [rad]."""
+    display = np.zeros(_WATCH.stop)
+    display[_ANGLES] = display[_LAST_ANGLES] = q
+    display[_WATCH] = initial_master_watch(_FULL)
+    return display
 
 
 @njit(cache=True)
@@ -43,59 +73,128 @@ def limit_wrench_into(wrench, J, displayed):
 
 
 @njit(cache=True)
-def motor_torque_into(wrench, state, J, displayed, torque):
-    """Writes J_M^T F + gravity compensation (6,); `displayed` (6,) becomes F after the limits.
-
-    `state` is [q; qdot]; if q is not finite everything is zero. `J` (6, 6) is scratch.
-    """
-    for k in range(6):
-        if not math.isfinite(state[k]):
-            displayed[:] = 0.0
-            torque[:] = 0.0
-            return
-    jacobian_into(state, J)
-    limit_wrench_into(wrench, J, displayed)
-    gravity_torque_into(state, torque)
+def motor_torque_into(displayed, q, J, torque):
+    """Writes J_M^T F + gravity compensation (6,) for a wrench F `displayed` (6,), J (6, 6) of q."""
+    gravity_torque_into(q, torque)
     for i in range(6):
         for k in range(6):
             torque[i] += J[k, i] * displayed[k]
 
 
+@njit(cache=True)
+def display_into(wrench, device, period, J, shown, drive):
+    """One period of the display; see `ForceDisplay` for its safe state.
+
+    Args:
+        wrench: (6,) F_E_B that the hand shall feel.
+        device: (26,) of `MasterDevice`.
+        period: [s].
+        J: (6, 6) scratch.
+        shown: (7,) written: F that is displayed, and a `Fault`.
+        drive: (26,) written, for `MasterDevice`.
+    """
+    displayed, q, shown[6] = shown[:6], device[_ANGLES], _NONE
+    put(drive, 6, device, 6, _WATCH.stop - 6)
+    if sound(q):
+        put(drive, _LAST_ANGLES.start, q, 0, 6)
+    else:
+        q, shown[6] = device[_LAST_ANGLES], _HAND
+    if not sound(wrench):
+        shown[6] = _WRENCH
+    jacobian_into(q, J)
+    limit_wrench_into(wrench, J, displayed)
+    if shown[6] != _NONE or device[_CHANGED] != 0.0:
+        _change(device, period, shown, drive)
+    put(drive, _LAST.start, displayed, 0, 6)
+    motor_torque_into(displayed, q, J, drive[:6])
+
+
+@njit(cache=True)
+def _change(device, period, shown, drive):
+    """Of a fault, and after one: fades what was displayed, and goes over to what is wanted.
+
+    Arguments as of `display_into`; `shown` has what is wanted and the fault, and is changed.
+    """
+    displayed, last, limits = shown[:6], device[_LAST], np.empty(2)
+    fault = shown[6] != _NONE
+    drive[_SOUND] = 0.0 if fault else device[_SOUND] + period
+    # All of the way within STOP, so that it does not turn at once either.
+    share = 0.0 if fault else period / max(STOP + period - drive[_SOUND], period)
+    for i in range(6):
+        displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
+    master_limits_into(not fault, fault, period, 0.0, _FULL, last, drive[_WATCH], limits)
+    drive[_CHANGED] = 0.0
+    for g in range(2):
+        limit(displayed, g, limits[g])
+        if limits[g] < _FULL[g]:
+            drive[_CHANGED] = 1.0
+    if not fault:
+        shown[6] = _RESUMING
+
+
 class ForceDisplay(LeafSystem):
     """Turns the wrench that the hand shall feel into motor torques of the master.
 
-    Safe state: a command that is not finite is displayed as zero force while the gravity
-    compensation goes on; a state that is not finite switches the motors off.
+    Safe state: while the command is no wrench, or the device's angles are no numbers, what was
+    displayed fades to zero in 50 ms, and the gravity compensation goes on, of the last good angles.
+    Afterwards the wrench comes back as after silence in a channel
+    (`drake_teleop.passivity.safe_state`). What has to be remembered for that stands in the device's
+    state: this block has no event of its own, which would cost time.
 
     .. pydrake_system::
 
         name: ForceDisplay
         input_ports:
         - wrench_command: (6,) F_E_B, [f; tau] that the hand shall feel at E, in B [N, N m]
-        - master_state: (12,) [q; qdot] of the device
+        - for_display: from the device: its angles (6) [rad], and what was remembered
         output_ports:
-        - motor_torque: (6,) J_M^T F + gravity compensation [N m]
+        - drive: for the device: J_M^T F + gravity compensation (6) [N m], what to remember
         - force_to_master: (6,) F, what is displayed within the device's limits [N, N m]
+        - fault_at_hand: a `Fault`
+        - displayed_and_fault: the last two, one after the other, for a log
+
+    Args:
+        period: of the device [s].
     """
 
     __slots__ = ONE_DICT
 
-    def __init__(self) -> None:
+    def __init__(self, period: float = 5e-4) -> None:
         super().__init__()
+        self._period = period
         self._jacobian = np.zeros((6, 6))
-        self._unused = np.zeros(6)
+        self._unused, self._shown = np.zeros(_WATCH.stop), np.zeros(7)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
-        self._state = self.DeclareVectorInputPort("master_state", 12)
+        self._device = self.DeclareVectorInputPort("for_display", _WATCH.stop)
         inputs = {self.all_input_ports_ticket()}
-        self.DeclareVectorOutputPort("motor_torque", 6, weak_callback(self._calc_torque), inputs)
-        self.DeclareVectorOutputPort("force_to_master", 6, weak_callback(self._calc_force), inputs)
+        for name, size, calc in (
+            ("drive", _WATCH.stop, self._calc_drive),
+            ("force_to_master", 6, self._calc_force),
+            ("fault_at_hand", 1, self._calc_fault),
+            ("displayed_and_fault", 7, self._calc_both),
+        ):
+            self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
 
-    def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        self._calc(context, self._unused, output.get_mutable_value())
+    def _calc_drive(self, context: Context, output: BasicVector) -> None:
+        self._calc(context, self._shown, output.get_mutable_value())
 
-    def _calc_force(self, context: Context, output: BasicVector) -> None:
+    def _calc_both(self, context: Context, output: BasicVector) -> None:
         self._calc(context, output.get_mutable_value(), self._unused)
 
-    def _calc(self, context: Context, displayed: np.ndarray, torque: np.ndarray) -> None:
-        command, state = self._command.Eval(context), self._state.Eval(context)
-        motor_torque_into(command, state, self._jacobian, displayed, torque)
+    def _calc_force(self, context: Context, output: BasicVector) -> None:
+        self._calc(context, self._shown, self._unused)
+        output.SetFromVector(self._shown[:6])
+
+    def _calc_fault(self, context: Context, output: BasicVector) -> None:
+        self._calc(context, self._shown, self._unused)
+        output[0] = self._shown[6]
+
+    def _calc(self, context: Context, shown: np.ndarray, drive: np.ndarray) -> None:
+        display_into(
+            self._command.Eval(context),
+            self._device.Eval(context),
+            self._period,
+            self._jacobian,
+            shown,
+            drive,
+        )

@@ -1,7 +1,9 @@
 """The safe state of both ends: what happens in silence and with faulty data, and when it is over.
 
 An end is *silent* when no new packet of a healthy sender has come for the time `timeout`. It is so
-at once when its own data are not finite, or when the newest packet says so of the sender's.
+at once when its own data are not finite, or when the newest packet says so of the sender's; what is
+beyond 1e6 in SI units counts as not finite. Without a channel the force display alone keeps the
+watch of the master.
 
 * Master. The wrench that the hand feels fades to zero, in 50 ms from where it was. When packets
   come again, for 0.5 s the wrench grows at most at the rate that would take it to the device's
@@ -62,10 +64,13 @@ _VELOCITY = _places.vector(6)  # velocity there
 _LAST, _BEFORE = _places.vector(7), _places.vector(7)  # the last command, the one before
 
 
-def initial_master_watch() -> NDArray[np.float64]:
-    """(MASTER_WATCH,) before the first packet."""
+def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """(MASTER_WATCH,) before the first packet; or, with the limits `full` (2,), in normal state."""
     watch = np.zeros(MASTER_WATCH)
-    watch[SILENT] = np.inf
+    if full is None:
+        watch[SILENT] = np.inf
+    else:
+        watch[_LIMIT], watch[_HEARD] = full, RESUME
     return watch
 
 

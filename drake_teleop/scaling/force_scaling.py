@@ -10,6 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fault import Fault, sound
 from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.compensation import scaled_wrench_into, scales_from_eta
@@ -17,8 +18,12 @@ from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.load.sample import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
-    JOINT_POSITION,
+    BEFORE_JOINTS,
+    LOST,
+    MOTION,
+    SATURATED,
     SPECIFIC_FORCE,
+    TIME,
     WRENCH,
     sample_size,
 )
@@ -28,6 +33,12 @@ from drake_teleop.slave.arm import ArmModel, forward_kinematics
 
 #: sigma_gripper, sigma_object, gamma that leave the contact wrench alone, Eq. (13).
 _ELIMINATION = np.array([0.0, 0.0, 1.0])
+
+#: A sample that is older is none [s]; so is one that is younger than now by as much.
+OLDEST = 0.05
+_NONE, _STALE, _READING, _JOINTS, _LOAD = map(
+    int, (Fault.NONE, Fault.STALE, Fault.READING, Fault.JOINTS, Fault.LOAD)
+)
 
 
 @settings
@@ -94,6 +105,28 @@ def _scaled_into(sample, estimate, gripper, scales, out):
 
 
 @njit(cache=True)
+def fault_of(sample, estimate, time, believed):
+    """What is wrong with the numbers that a wrench is to be made of, as a plain `Fault`.
+
+    Args:
+        sample: of the wrist sensor, see `drake_teleop.load.sample`.
+        estimate: (16,) [offsets; phi].
+        time: now [s].
+        believed: (7,) the largest wrench that is a reading [N, N m], the largest age [s].
+    """
+    if not abs(time - sample[TIME]) <= believed[6]:
+        return _STALE
+    reading = sample[SATURATED] < LOST and sound(sample[MOTION])
+    for i in range(6):
+        reading = reading and abs(sample[i]) <= believed[i]
+    if not reading:
+        return _READING
+    if not sound(sample[BEFORE_JOINTS:TIME]):
+        return _JOINTS
+    return _NONE if sound(estimate) else _LOAD
+
+
+@njit(cache=True)
 def _scaled_now_into(sample, estimate, gripper, change, time, out):
     """F' of one sample with the scales of this time, see `scales_at`."""
     scales = np.empty(4)
@@ -102,19 +135,23 @@ def _scaled_now_into(sample, estimate, gripper, change, time, out):
 
 
 @njit(cache=True)
-def _both_into(sample, estimate, gripper, change, time, elimination, out):
-    """F' with the scales of this time, and the contact wrench."""
+def _all_into(sample, estimate, gripper, change, time, elimination, believed, out):
+    """F' with the scales of this time, the contact wrench, and the fault."""
     _scaled_now_into(sample, estimate, gripper, change, time, out[:6])
-    _scaled_into(sample, estimate, gripper, elimination, out[6:])
+    _scaled_into(sample, estimate, gripper, elimination, out[6:12])
+    out[12] = fault_of(sample, estimate, time, believed)
 
 
 @njit(cache=True)
-def _felt_into(sample, estimate, gripper, change, time, arm, R_WB, out):
+def _felt_into(sample, estimate, gripper, change, time, arm, R_WB, believed, out):
     """What the hand shall feel of F'; the orientation of S comes from the same sample."""
+    if fault_of(sample, estimate, time, believed) != _NONE:
+        out[:] = np.nan
+        return
     scales, scaled_S, R_WS, p_WS = np.empty(4), np.empty(6), np.empty((3, 3)), np.empty(3)
     scales_at(change, time, scales)
     _scaled_into(sample, estimate, gripper, scales, scaled_S)
-    forward_kinematics(arm, sample[JOINT_POSITION], R_WS, p_WS)
+    forward_kinematics(arm, sample[BEFORE_JOINTS:TIME], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
 
 
@@ -134,22 +171,33 @@ class ForceScaling(LeafSystem):
         output_ports:
         - scaled_wrench_S: F' of Fig. 2
         - contact_wrench_S: Eq. (13)
-        - scaled_and_contact_S: both of them, one after the other, for a log
+        - fault: what is wrong with sample or estimate, a `Fault`
+        - scaled_contact_and_fault: the last three, one after the other, for a log
         - non_contact_wrench_S: Eq. (12)
-        - wrench_B: F_E_B, what the hand shall feel: -force_scale F', in the master's base B
+        - wrench_B: F_E_B, what the hand shall feel: -force_scale F', in the master's base B; not a
+          number while there is a fault
 
     Args:
         config: the scales.
         arm: the slave's kinematics.
         R_WB: (3, 3) alignment of the master's base with the world.
+        largest_wrench: (6,) beyond which a reading is none [N, N m]; None for no end.
+        oldest: a sample that is older is none [s].
     """
 
     __slots__ = ONE_DICT
 
     def __init__(
-        self, config: ForceScalingConfig, arm: ArmModel, R_WB: NDArray[np.float64]
+        self,
+        config: ForceScalingConfig,
+        arm: ArmModel,
+        R_WB: NDArray[np.float64],
+        largest_wrench: NDArray[np.float64] | None = None,
+        oldest: float = OLDEST,
     ) -> None:
         super().__init__()
+        largest = np.full(6, np.inf) if largest_wrench is None else largest_wrench
+        self._believed = np.append(largest, oldest)
         self._gripper: NDArray[np.float64] | None = None
         if config.gripper_phi is not None:
             self._gripper = np.concatenate([np.zeros(6), config.gripper_phi])
@@ -157,7 +205,7 @@ class ForceScaling(LeafSystem):
         # Old and new scales, start and length of the change; see `scales_at`.
         scales = [*config.scales(), config.force_scale]
         self._change = self.DeclareNumericParameter(BasicVector([*scales, *scales, 0.0, 0.0]))
-        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints))
+        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         # Not time: a change of scales goes on with each new sample, which is soon enough.
         inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
@@ -168,8 +216,9 @@ class ForceScaling(LeafSystem):
             ("wrench_B", self._calc_wrench_B),
         ):
             self.DeclareVectorOutputPort(name, 6, weak_callback(calc), inputs)
+        self.DeclareVectorOutputPort("fault", 1, weak_callback(self._calc_fault), inputs)
         self.DeclareVectorOutputPort(
-            "scaled_and_contact_S", 12, weak_callback(self._calc_both), inputs
+            "scaled_contact_and_fault", 13, weak_callback(self._calc_all), inputs
         )
 
     def SetScales(
@@ -203,8 +252,13 @@ class ForceScaling(LeafSystem):
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
         _scaled_now_into(*self._inputs(context), output.get_mutable_value())
 
-    def _calc_both(self, context: Context, output: BasicVector) -> None:
-        _both_into(*self._inputs(context), _ELIMINATION, output.get_mutable_value())
+    def _calc_all(self, context: Context, output: BasicVector) -> None:
+        inputs = self._inputs(context)
+        _all_into(*inputs, _ELIMINATION, self._believed, output.get_mutable_value())
+
+    def _calc_fault(self, context: Context, output: BasicVector) -> None:
+        sample, estimate, _, _, time = self._inputs(context)
+        output[0] = fault_of(sample, estimate, time, self._believed)
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
         _scaled_into(*self._inputs(context)[:3], _ELIMINATION, output.get_mutable_value())
@@ -220,7 +274,8 @@ class ForceScaling(LeafSystem):
         )
 
     def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
-        _felt_into(*self._inputs(context), self._arm, self._R_WB, output.get_mutable_value())
+        inputs = self._inputs(context)
+        _felt_into(*inputs, self._arm, self._R_WB, self._believed, output.get_mutable_value())
 
     def _inputs(self, context: Context) -> tuple[Any, ...]:
         """The sample, the estimate, the gripper's part of it, and of the scales: change, time."""

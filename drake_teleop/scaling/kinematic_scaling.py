@@ -84,7 +84,8 @@ class KinematicScaling(LeafSystem):
 
     While the clutch is open the command stays where it is; when it closes, motion goes on from
     there with the master's pose of that instant as its new reference (re-indexing). Neither makes
-    a jump. A clutch that is engaged at the start is closed before the first sample.
+    a jump. A clutch that is engaged at the start is closed before the first sample. It neither
+    opens nor closes while the master's pose is no pose.
 
     .. pydrake_system::
 
@@ -130,6 +131,8 @@ class KinematicScaling(LeafSystem):
         if engage == (references[14] > 0.5):
             return
         pose = self._pose.Eval(context)
+        if not np.isfinite(pose).all():  # it would be the reference for good
+            return
         _command_into(pose, references, *self._scaling, references[:7])
         references[7:14] = pose
         references[14] = float(engage)

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.fault import LARGEST
 from drake_teleop.fields import settings
 from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
 from drake_teleop.quantities import choice, plain, quantity
@@ -50,6 +51,10 @@ _PRESET_NAMES = ("ideal", "jr3_85m35a3", "ati_gamma_imu")
 _LOW_PASS = ("none", "before_noise", "after_converter")
 _SECTIONS = 2  # second-order sections of the fourth-order low-pass
 _ROTATION_ERROR = 1e-6
+# No sensor survives this many ranges of its own.
+_OVERLOAD = 10.0
+# A low-pass overshoots what saturates: by 11 % of a step, which may be from one end to the other.
+_OVERSHOOT = 1.5
 
 
 @settings
@@ -158,6 +163,11 @@ class WristSensorConfig:
                 np.full(3, self.angular_acceleration_range),
             ]
         )
+
+    def largest_wrench(self) -> NDArray[np.float64]:
+        """(6,) beyond which a reading is none [N, N m]."""
+        share = _OVERSHOOT if self.saturates and not self.ideal else _OVERLOAD
+        return share * self.ranges()[:6]
 
     def wrench_std(self) -> NDArray[np.float64]:
         """(6,) weights for an estimator: noise and quantisation, never quite zero [N, N m].
@@ -405,7 +415,7 @@ _LOW_PASS_PLACE = _FILTER + 5 * _SECTIONS
 _LATENCIES = _LOW_PASS_PLACE + 1  # (3,)
 _ENCODER = _LATENCIES + 3
 _IDEAL = _ENCODER + 1
-_CONSTANTS = _IDEAL + 1
+_OVERLOADS = _IDEAL + 1  # (6,)
 _BEFORE, _AFTER = 1.0, 2.0  # as in _LOW_PASS
 # Memory: samples taken, 12 random walks, the filter (2, 2, 12), then the delay line, a row for each
 # of the last samples: 12 channels, whether force or acceleration is saturated, angles.
@@ -452,10 +462,26 @@ def sensor_chain(
             p_SoAo_S,
             sections.ravel(),
             [_LOW_PASS.index(config.low_pass), *latencies, config.encoder_resolution, config.ideal],
+            _OVERLOAD * config.ranges()[:6],
         ]
     )
     rows = 0 if config.ideal else latencies.max() + 1
     return constants, np.zeros(_LINE + rows * (_ROW + num_joints))
+
+
+@njit(cache=True)
+def believable(constants, truth):
+    """Whether there is something to read: finite, and nothing that would have broken the sensor.
+
+    Args:
+        constants, truth: of `read_into`. The offset counts: NaN in it is a dead channel.
+    """
+    good = True
+    for i in range(6):
+        good = good and abs(truth[i] + constants[i]) <= constants[_OVERLOADS + i]
+    for i in range(6, truth.shape[0]):
+        good = good and abs(truth[i]) <= LARGEST
+    return good
 
 
 @njit(cache=True)

@@ -38,6 +38,7 @@ from drake_teleop.load.sample import (
     ANGULAR_VELOCITY,
     BEFORE_JOINTS,
     JOINT_POSITION,
+    LOST,
     MOTION,
     SATURATED,
     SPECIFIC_FORCE,
@@ -58,6 +59,7 @@ from drake_teleop.sensor.sensor_chain import (
     OFFSET,
     TRUE_ANGLES,
     WristSensorConfig,
+    believable,
     read_into,
     sensor_chain,
 )
@@ -75,6 +77,8 @@ _LONGEST = 16
 #: How often the plant is asked whether it moves as the dynamics here say [s], and how alike they
 #: have to be: rounding is 1e-12, in a stiff contact 1e-9.
 _CHECK_PERIOD, _ALIKE = 0.05, 1e-6
+#: For so many samples a lost one shows, so that no log misses it.
+_SHOWS = 40
 
 
 @njit(cache=True)
@@ -151,13 +155,19 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
     size = BEFORE_JOINTS + n
     sample = memory[:size]
     put(memory, size, memory, 0, size)
+    if not believable(constants, truth):  # filters would remember it for long
+        sample[SATURATED] = LOST + _SHOWS
+        return
+    lost = sample[SATURATED] - 1.0
     if ideal:
         sample[WRENCH_AND_MOTION], sample[SATURATED] = truth[WRENCH_AND_MOTION], 0.0
         sample[JOINT_POSITION] = truth[TRUE_ANGLES]
-        return
-    reading = np.empty(13 + n)
-    read_into(constants, memory[2 * size : middle], noise, truth, reading)
-    estimate_into(motion_constants, memory[middle:end], arm, reading, sample)
+    else:
+        reading = np.empty(13 + n)
+        read_into(constants, memory[2 * size : middle], noise, truth, reading)
+        estimate_into(motion_constants, memory[middle:end], arm, reading, sample)
+    if lost >= LOST:
+        sample[SATURATED] = lost
 
 
 @njit(cache=True)
@@ -450,6 +460,8 @@ class WristSensor(LeafSystem):
         n = self._n
         x, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2)
         _join(self._state.Eval(context), self._sheet_state(context), x)
+        if not np.isfinite(x).all():  # nothing is known; the samples say so
+            return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)
         _accelerations(self._physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
@@ -494,7 +506,7 @@ def AddWristSensor(
         q_start: (n,) where the arm rests before the first sample [rad].
 
     Returns:
-        The ports by name: "sample", each of its parts, see `sample_parts`, and "sample_time".
+        The ports by name: "sample", with each of its parts, see `sample_parts`, and "sample_time".
     """
     sensor = WristSensor(slave, config, motion, period, held, q_start)
     builder.AddNamedSystem("wrist_sensor", sensor)
@@ -516,7 +528,7 @@ def AddWristSensor(
     sizes = list(parts.values())
     step = sensor.GetOutputPort("step")
     rest = step.size() - sum(sizes)
-    whole = builder.AddNamedSystem("wrist_sample", Demultiplexer([sum(sizes), rest]))
+    whole = builder.AddNamedSystem("wrist_sample", Demultiplexer([sum(sizes) + 1, rest - 1]))
     divided = builder.AddNamedSystem("sample_parts", Demultiplexer([*sizes, 1, rest - 1]))
     for splitter in (whole, divided):
         builder.Connect(step, splitter.get_input_port())

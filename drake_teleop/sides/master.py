@@ -38,7 +38,8 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
         output_ports:
         - pose_command: (7,) X_WS, setpoint of the slave
         - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m]
-        - intent, master_state, pose_master, twist_master, force_to_master: signals
+        - intent, master_state, pose_master, twist_master, force_to_master, fault_at_hand: signals
+        - displayed_and_fault: the last two side by side, for the log
         - task_state: signal (with a task)
 
     Raises:
@@ -81,11 +82,11 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
     builder.ExportInput(kinematic_scaling.GetInputPort("clutch"), "clutch")
     export(builder, kinematic_scaling, "pose_command")
 
-    display = builder.AddNamedSystem("force_display", ForceDisplay())
-    builder.Connect(device.GetOutputPort("state"), display.GetInputPort("master_state"))
-    builder.Connect(display.GetOutputPort("motor_torque"), device.GetInputPort("motor_torque"))
+    display = builder.AddNamedSystem("force_display", ForceDisplay(1 / scenario.rates.hand_hz))
+    builder.Connect(device.GetOutputPort("for_display"), display.GetInputPort("for_display"))
+    builder.Connect(display.GetOutputPort("drive"), device.GetInputPort("drive"))
     builder.ExportInput(display.GetInputPort("wrench_command"), "wrench_command")
-    export(builder, display, "force_to_master")
+    export(builder, display, "force_to_master", "fault_at_hand", "displayed_and_fault")
     return builder.Build()
 
 

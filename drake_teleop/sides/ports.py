@@ -15,8 +15,9 @@ from drake_teleop.signals import LOG, SIGNALS
 #: Ports that hold several signals side by side, in the order of `SIGNALS`: to read one port takes
 #: less time than to read its parts.
 TOGETHER = {
-    "sample": tuple(sample_parts(0)),
-    "scaled_and_contact_S": ("scaled_wrench_S", "contact_wrench_S"),
+    "sample": (*sample_parts(0), "sample_time"),
+    "scaled_contact_and_fault": ("scaled_wrench_S", "contact_wrench_S", "fault"),
+    "displayed_and_fault": ("force_to_master", "fault_at_hand"),
 }
 
 

@@ -15,7 +15,7 @@ from drake_teleop.estimation.load_estimator import LoadEstimator
 from drake_teleop.load.arrays import checked, learnt
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.scaling.force_scaling import ForceScaling
+from drake_teleop.scaling.force_scaling import OLDEST, ForceScaling
 from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.sensor.wrist_sensor import AddWristSensor
@@ -49,16 +49,17 @@ def MakeSlaveSide(
         input_ports:
         - pose_command: (7,) X_WS that it shall follow
         output_ports:
-        - wrench_B: (6,) F_E_B, what the hand should feel, in the master's base [N, N m]
+        - wrench_B: (6,) F_E_B, what the hand should feel, in the master's base [N, N m]; not a
+          number while there is a fault
         - pose_slave: (7,) X_WS, actual, of the joint angles now (over a network)
         - saturated: (1,) 1 while the wrench is not to be trusted; a signal too
         - contact: (1,) 1 in contact; a signal too (with contact detection)
         - the parts of a sample (`sample_parts`), slave_state, joint_torque, joint_command,
-          ik_status, scaled_wrench_S: signals
+          ik_status, scaled_wrench_S, fault: signals
         - load_estimate, contact_wrench_S (if the load is known or learnt): signals
         - load_state (if the load is watched), true_contact_wrench_W (with something to touch),
           sheet_state (with a sheet spring): signals
-        - sample, scaled_and_contact_S: several of these side by side, for the log
+        - sample, scaled_contact_and_fault: several of these side by side, for the log
 
     Args:
         scenario, load_estimate, load_covariance, noise_floor: as for `MakeTeleopStation`.
@@ -87,14 +88,21 @@ def MakeSlaveSide(
 
     R_WB = RollPitchYaw(scenario.kinematic_scaling.alignment).ToRotationMatrix().matrix()
     force_scaling = builder.AddNamedSystem(
-        "force_scaling", ForceScaling(scenario.force_scaling, arm, R_WB)
+        "force_scaling",
+        ForceScaling(
+            scenario.force_scaling,
+            arm,
+            R_WB,
+            scenario.wrist_sensor.largest_wrench(),
+            max(OLDEST, 2 / scenario.rates.sensor_hz),
+        ),
     )
     estimate = body.load_estimator.GetOutputPort("load_estimate")
     builder.Connect(body.sample["sample"], force_scaling.GetInputPort("sample"))
     builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
-    export(builder, force_scaling, "wrench_B", "scaled_wrench_S")
+    export(builder, force_scaling, "wrench_B", "scaled_wrench_S", "fault")
     if _is_known(scenario, load_estimate):
-        export(builder, force_scaling, "contact_wrench_S", "scaled_and_contact_S")
+        export(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
 
     if not scenario.is_direct:
         kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))

@@ -53,7 +53,8 @@ class IkStatus(IntEnum):
     JOINT_LIMIT = 4
     """Each branch breaks a joint limit: the reference is held, put within the limits."""
     BAD_POSE = 5
-    """The pose is not finite or its quaternion is zero: the reference is held, within limits."""
+    """The pose is not finite or its quaternion is zero: the reference is held, within limits.
+    Or the reference is not finite: the answer is not either."""
 
 
 # Compiled code knows plain integers only.
@@ -145,6 +146,9 @@ def _nearest_branch(
     R: Array, p: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
 ) -> int:
     """`nearest_branch` into q (6,)."""
+    if not np.isfinite(reference.sum()):
+        q[:] = np.nan
+        return _BAD_POSE
     for i in range(6):
         q[i] = min(max(reference[i], lower[i]), upper[i])
     if not np.isfinite(R.sum() + p.sum()):
@@ -227,16 +231,16 @@ def nearest_branch(
 ) -> tuple[Array, IkStatus]:
     """The solution within the joint limits that is nearest to a reference (Euclidean, in rad).
 
-    Joints that may turn by more than 360 degrees take the turn nearest to the reference. The
-    result is always finite and within the limits, see `IkStatus`: out of reach, the wrist's centre
-    is drawn towards the shoulder onto the boundary (the arm stretches, the orientation stays);
-    singular, the undetermined joint keeps its reference; without an admissible branch the
-    reference itself is held.
+    Joints that may turn by more than 360 degrees take the turn nearest to the reference. Of a
+    finite reference the result is always finite and within the limits, see `IkStatus`: out of
+    reach, the wrist's centre is drawn towards the shoulder onto the boundary (the arm stretches,
+    the orientation stays); singular, the undetermined joint keeps its reference; without an
+    admissible branch the reference itself is held.
 
     Args:
         R_WS: (3, 3) rotation of the sensor frame in the world.
         p_WS: (3,) its origin [m].
-        q_reference: (6,) finite [rad], normally where the arm is.
+        q_reference: (6,) [rad], normally where the arm is.
         lower: (6,) joint limits [rad].
         upper: (6,) joint limits [rad].
         max_step: branches with any joint further than this from the reference are not admitted

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop._compiled import njit
+from drake_teleop.fault import sound
 from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.quantities import quantity
 from drake_teleop.slave.arm import ArmModel, inverse_dynamics
+from drake_teleop.vectors import put
 
 
 @settings
@@ -33,21 +35,32 @@ def joint_control_torque(
 ):  # fmt: skip
     """tau = ID(q, v, kv (clip(kp (q_command - q)) - v)), within the motors' torque.
 
-    `state` is [q; v], all other arrays (n,), rad, rad/s, N m; gains in 1/s. `torque` is written.
+    `state` is [q; v], `scratch` (3 n,), all other arrays (n,), rad, rad/s, N m; gains in 1/s.
+    `torque` is written: while the encoders give no numbers, what carries the arm at rest at the
+    command. If that gives none it stays as it is.
     """
+    if not sound(command):
+        return
     n = torque.shape[0]
-    q, v = state[:n], state[n:]
+    q, v, wanted = scratch[:n], scratch[n : 2 * n], scratch[2 * n :]
+    put(scratch, 0, state, 0, 2 * n)
+    if not sound(state):
+        put(q, 0, command, 0, n)
+        v[:] = 0.0
     for i in range(n):
         setpoint = position_gain * (command[i] - q[i])
         setpoint = min(max(setpoint, -velocity_limit[i]), velocity_limit[i])
-        scratch[i] = velocity_gain * (setpoint - v[i])
-    inverse_dynamics(arm, q, v, scratch, torque)
+        wanted[i] = velocity_gain * (setpoint - v[i])
+    inverse_dynamics(arm, q, v, wanted, torque)
     for i in range(n):
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 
 
 class JointControl(LeafSystem):
     """Sampled joint position controller.
+
+    While the encoders give no numbers the motors carry the arm's weight, and it drifts on, for it
+    has no brakes.
 
     .. pydrake_system::
 
@@ -82,7 +95,7 @@ class JointControl(LeafSystem):
             2 * np.pi * config.velocity_bandwidth_hz,
             arm.velocity_limit,
             arm.effort_limit,
-            np.zeros(n),
+            np.zeros(3 * n),
         )
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)

@@ -53,7 +53,7 @@ def test_the_block_says_what_the_detector_of_logs_says(arm, statistic):
     saturated[200:220] = 1.0
     wrench[210, 0] = wrench[224, 0] = 1e5
     q = rng.normal(size=(n, 6))
-    samples = np.column_stack([wrench, s, omega, alpha, saturated, q])
+    samples = np.column_stack([wrench, s, omega, alpha, saturated, q, np.zeros(n)])
 
     config = ContactDetectionConfig(
         statistic=statistic, margin=1.5, hold=0.05, drift_time=2.0, recovery=0.005

@@ -11,6 +11,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.master import device, phantom
+from drake_teleop.master.force_display import initial_display
 
 NO_FRICTION = device.JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
 
@@ -325,7 +326,7 @@ def simulate(q_initial, duration, motor_torque):
     master = builder.AddSystem(
         device.MasterDevice(5e-4, hand_mass=0.1, hand_inertia=1e-4, q_initial=q_initial)
     )
-    for port in ("hand_wrench_E", "motor_torque"):
+    for port in ("hand_wrench_E", "drive"):
         builder.ExportInput(master.GetInputPort(port), port)
     for port in ("state", "pose_master", "twist_master"):
         builder.ExportOutput(master.GetOutputPort(port), port)
@@ -333,7 +334,8 @@ def simulate(q_initial, duration, motor_torque):
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
     diagram.GetInputPort("hand_wrench_E").FixValue(context, np.zeros(6))
-    diagram.GetInputPort("motor_torque").FixValue(context, motor_torque)
+    drive = np.append(motor_torque, initial_display(q_initial)[6:])
+    diagram.GetInputPort("drive").FixValue(context, drive)
     simulator.AdvanceTo(duration)
     return {
         port: diagram.GetOutputPort(port).Eval(context).copy()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drake_teleop.fault import Fault
 from drake_teleop.master import phantom
-from drake_teleop.master.force_display import ForceDisplay
+from drake_teleop.master.force_display import ForceDisplay, display_into, initial_display
+from drake_teleop.passivity.safe_state import RESUME, STOP
 
 POSTURES = [
     np.zeros(6),
@@ -15,14 +17,14 @@ POSTURES = [
 ]
 
 
-def display(wrench, q, v=(0,) * 6) -> tuple[np.ndarray, np.ndarray]:
+def display(wrench, q) -> tuple[np.ndarray, np.ndarray]:
     """The block's outputs (motor torque, displayed wrench)."""
     block = ForceDisplay()
     context = block.CreateDefaultContext()
     block.GetInputPort("wrench_command").FixValue(context, np.asarray(wrench, dtype=float))
-    block.GetInputPort("master_state").FixValue(context, np.array([*q, *v], dtype=float))
+    block.GetInputPort("for_display").FixValue(context, initial_display(np.array(q, dtype=float)))
     return (
-        block.GetOutputPort("motor_torque").Eval(context).copy(),
+        block.GetOutputPort("drive").Eval(context)[:6].copy(),
         block.GetOutputPort("force_to_master").Eval(context).copy(),
     )
 
@@ -86,13 +88,45 @@ def test_a_command_that_is_not_finite_displays_nothing(bad, index):
     np.testing.assert_allclose(torque, phantom.gravity_torque(POSTURES[1]), atol=1e-15)
 
 
-def test_a_huge_command_is_limited_too():
-    _, displayed = display([1e308, 1e308, 0, 0, 0, 1e308], phantom.HOME)
+def test_a_huge_command_is_limited_too_and_one_that_is_no_wrench_is_none():
+    _, displayed = display([1e6, 1e6, 0, 0, 0, 1e6], phantom.HOME)
     assert np.linalg.norm(displayed[:3]) == pytest.approx(37.5)
     assert displayed[5] == pytest.approx(0.515)
+    np.testing.assert_array_equal(display([1e9, 0, 0, 0, 0, 0], phantom.HOME)[1], 0)
 
 
-def test_a_state_that_is_not_finite_switches_the_motors_off():
-    torque, displayed = display(np.ones(6), [0, np.nan, 0, 0, 0, 0])
-    np.testing.assert_array_equal(torque, 0)
-    np.testing.assert_array_equal(displayed, 0)
+PERIOD = 5e-4
+WRENCH = np.array([3.0, -2.0, 5.0, 0.05, -0.02, 0.03])
+
+
+def displayed_over(commands, angles) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 7) displayed wrench and fault, (N, 6) torque, one period after the other."""
+    device, J, drive = initial_display(POSTURES[1]), np.empty((6, 6)), np.empty(26)
+    shown, torque = np.empty((len(commands), 7)), np.empty((len(commands), 6))
+    for k, (command, q) in enumerate(zip(commands, angles, strict=True)):
+        device[:6] = q
+        display_into(command, device, PERIOD, J, shown[k], drive)
+        torque[k] = drive[:6]
+        device[6:] = drive[6:]
+    return shown, torque
+
+
+@pytest.mark.parametrize("part", ["wrench", "angles"])
+def test_what_was_displayed_fades_and_comes_back_without_a_step(part):
+    """From 20 to 80 ms one number is none; the hand is pushed by 6 N, held up all the time."""
+    n, bad = 2600, slice(40, 160)
+    commands, angles = np.tile(WRENCH, (n, 1)), np.tile(POSTURES[1], (n, 1))
+    {"wrench": commands, "angles": angles}[part][bad, 2] = np.nan
+    shown, torque = displayed_over(commands, angles)
+    force, fault = np.linalg.norm(shown[:, :3], axis=1), shown[:, 6]
+    np.testing.assert_array_equal(shown[:40, :6], commands[:40])
+    np.testing.assert_allclose(np.diff(force[39:140]), -force[0] * PERIOD / STOP, rtol=1e-9)
+    np.testing.assert_allclose(shown[140:160, :6], 0.0, atol=1e-12)
+    held = phantom.gravity_torque(POSTURES[1])
+    np.testing.assert_allclose(torque[140:160], np.tile(held, (20, 1)), atol=1e-12)
+    growth = np.diff(force[159:])
+    assert 0.0 < growth.max() <= 37.5 * PERIOD / RESUME * (1 + 1e-9)
+    np.testing.assert_array_equal(shown[2400:, :6], commands[2400:])
+    expected = Fault.WRENCH if part == "wrench" else Fault.HAND
+    assert (fault[bad] == expected).all() and not fault[:40].any() and not fault[2400:].any()
+    assert (fault[160:1160] == Fault.RESUMING).all()

@@ -166,10 +166,10 @@ def test_hand_gives_way_to_the_displayed_force(grip):
         (master, operator, "pose_master"),
         (master, operator, "twist_master"),
         (operator, master, "hand_wrench_E"),
-        (display, master, "motor_torque"),
+        (display, master, "drive"),
+        (master, display, "for_display"),
     ):
         builder.Connect(source.GetOutputPort(port), sink.GetInputPort(port))
-    builder.Connect(master.GetOutputPort("state"), display.GetInputPort("master_state"))
     diagram = builder.Build()
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()

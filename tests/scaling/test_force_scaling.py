@@ -32,16 +32,17 @@ def outputs(
     block = ForceScaling(config, arm, np.eye(3))
     context = block.CreateDefaultContext()
     q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
-    sample = np.concatenate([measured, *motion, [0.0], q])
+    sample = np.concatenate([measured, *motion, [0.0], q, [0.0]])
     block.GetInputPort("sample").FixValue(context, sample)
     block.GetInputPort("load_estimate").FixValue(context, np.concatenate([offsets, arm.phi_load]))
     if scales is not None:
         block.SetScales(context, **scales, duration=0.0)
     names = ("scaled_wrench_S", "contact_wrench_S", "non_contact_wrench_S", "wrench_B")
     found = {name: block.GetOutputPort(name).Eval(context) for name in names}
-    both = block.GetOutputPort("scaled_and_contact_S").Eval(context)
+    both = block.GetOutputPort("scaled_contact_and_fault").Eval(context)
     np.testing.assert_array_equal(both[:6], found["scaled_wrench_S"])
-    np.testing.assert_array_equal(both[6:], found["contact_wrench_S"])
+    np.testing.assert_array_equal(both[6:12], found["contact_wrench_S"])
+    assert both[12] == block.GetOutputPort("fault").Eval(context)[0] == 0.0
     found["of_gripper"] = non_contact_wrench(*motion, np.array(GRIPPER))
     return found
 

@@ -24,6 +24,7 @@ from drake_teleop.sensor.sensor_chain import (
     PARTS,
     PRESETS,
     WristSensorConfig,
+    believable,
     calibration_matrices,
     preset_of,
     read_into,
@@ -260,6 +261,38 @@ def test_saturation_clips_and_says_so_with_the_latency_of_its_path():
     assert np.count_nonzero(found[:, :12]) == 2
     free = readings(dataclasses.replace(config, saturates=False), truths)
     assert free[5, 0] == -1.5 * config.force_range[0] and not free[:, 12].any()
+
+
+@pytest.mark.parametrize("low_pass", ["none", "before_noise", "after_converter"])
+def test_the_offset_counts_in_the_saturation(low_pass):
+    """150 N with an offset of 60 N are beyond the range of 200 N, with -60 N they are not."""
+    truths = np.zeros((400, 15 + JOINTS))
+    truths[:, 0] = 150.0
+    for offset, reads, saturated in ((60.0, 200.0, True), (-60.0, 90.0, False)):
+        config = part(
+            saturates=True, offset=[offset, 0, 0, 0, 0, 0], low_pass=low_pass, bandwidth_hz=500.0
+        )
+        found = readings(config, truths)
+        assert found[-1, 0] == pytest.approx(reads, rel=1e-9)
+        assert found[:, 12].all() == found[:, 12].any() == saturated
+
+
+def test_what_no_sensor_survives_is_not_read_and_its_offset_counts():
+    constants, _ = sensor_chain(part(saturates=True), JOINTS, PERIOD)
+    truth, largest = np.zeros(15 + JOINTS), 10 * part().ranges()[0]
+    assert believable(constants, truth)
+    truth[0] = 0.99 * largest
+    assert believable(constants, truth)
+    constants[0] = 0.02 * largest  # of the offset
+    assert not believable(constants, truth)
+    truth[0] = 0.0
+    assert believable(constants, truth)
+    constants[0] = np.nan
+    assert not believable(constants, truth)
+    constants[0] = 0.0
+    for place in range(len(truth)):
+        for bad in (np.nan, -np.inf, 1e9):
+            assert not believable(constants, np.where(np.arange(len(truth)) == place, bad, truth))
 
 
 # Latency

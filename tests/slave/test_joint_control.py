@@ -26,7 +26,7 @@ def torque(arm, command, q, v):
         2 * np.pi * config.velocity_bandwidth_hz,
         arm.velocity_limit,
         arm.effort_limit,
-        np.zeros(6),
+        np.zeros(18),
         out,
     )
     return out
