@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +15,14 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.environment.point_contact import ContactPairs, contact_force, indentation
-from drake_teleop.environment.slot import PEG_RADIUS, TIP_BALL, UPPER_BALL, Slot, TouchAsSlot
+from drake_teleop.environment.slot import (
+    PEG_RADIUS,
+    TIP_BALL,
+    UPPER_BALL,
+    Slot,
+    TouchAsSlot,
+    _boxes,
+)
 from drake_teleop.replay import ReplayScene
 from drake_teleop.scenario import LoadScenario, replace
 from drake_teleop.simulation import simulate
@@ -56,6 +65,17 @@ def test_the_peg_is_the_tools_ball_and_another_of_its_size():
         assert isinstance(inspector.GetShape(ball), Sphere)
         assert inspector.GetShape(ball).radius() == PEG_RADIUS
     assert plant.get_body(tool).default_mass() == mass
+
+
+def test_the_stand_reaches_from_the_ground_to_the_lowest_of_the_boxes():
+    slot = Slot(position=[0.5, -0.2, 0.4], depth=0.03, chamfer=0.004, yaw=0.3)
+    corners = np.array(list(product([-0.5, 0.5], repeat=3)))
+    lowest = min(
+        (slot.X_WM @ pose @ (corners * box.size()).T)[2].min()
+        for pose, box in _boxes(slot).values()
+    )
+    assert slot.foot == pytest.approx(lowest, abs=1e-12)
+    assert slot.stand[2:] == (0.5, -0.2, slot.foot)
 
 
 def test_both_sides_of_a_contact_together_are_what_the_slot_says():
