@@ -193,6 +193,22 @@ def test_the_best_candidates_within_the_limits_are_followed_first():
     assert [int(next(followed)[0]) for _ in range(8)] == list(range(1, 9))
 
 
+def test_what_is_better_is_noted_with_its_start_and_its_evaluations():
+    values = iter([3.0, 2.0, 2.5, 1.5])
+    problem = SimpleNamespace(
+        candidate=lambda rng, near_home: np.zeros(1),
+        evaluate=lambda x, *sharpness: SimpleNamespace(largest_use=0.5),
+        value=lambda: next(values),
+        trajectory=lambda x: int(x[0]),
+    )
+    search = _Search(problem, 9, None, lambda *_: None)
+    search.start = 7
+    for k in range(4):
+        search._at(np.array([float(k)]), 3.0, 5.0)
+    noted = [(x.evaluations, x.start, x.value, x.trajectory) for x in search.found]
+    assert noted == [(1, 7, 3.0, 0), (2, 7, 2.0, 1), (4, 7, 1.5, 3)]
+
+
 def test_distances_of_capsules():
     """Crossing lines, parallel segments, end to end, and points."""
     ends = np.array(
