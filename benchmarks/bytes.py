@@ -1,11 +1,11 @@
 """Do the commands write the same bytes, whatever surrounds them?
 
 `python benchmarks/bytes.py [--all] [--json FILE]` has drake-teleop run, reproduce, sample-log,
-identify, eliminate, study and excite write into new folders, under combinations of BLAS threads,
-hash seeds, time zones, folders and locales: so many that each two values of different kinds meet,
-or with --all every combination (an hour). Compared are the files of each but `session.json`, by
-their SHA-256, with those of the first combination. The baseline is that one once more: what
-differs there has other causes. Each combination identifies its loads anew.
+identify, eliminate, detect, inspect, study, excite and analyze write into new folders, under
+combinations of BLAS threads, hash seeds, time zones, folders and locales: so many that each two
+values of different kinds meet, or with --all every combination (hours). Compared are the files of
+each but `session.json`, by their SHA-256, with those of the first combination. The baseline is that
+one once more: what differs there has other causes. Each combination identifies its loads anew.
 """
 
 from __future__ import annotations
@@ -51,8 +51,11 @@ COMMANDS: dict[str, Command] = {
         *("eliminate", "out/sample_log/touched.yaml"),
         *("--load", "out/identify/identification.json"),
     ),
+    "detect": ("detect", "out/sample_log/touched.yaml"),
+    "inspect": ("inspect", "out/sample_log/free.yaml"),
     "study": ("study", "study.yaml", "--jobs", "2"),
     "excite": ("excite",),
+    "analyze": ("analyze", "contact_transition"),
 }
 IN_ONE_PROCESS = """
 import json, sys

@@ -60,6 +60,7 @@ from drake_teleop.analysis.two_port import absorb, hybrid
 from drake_teleop.analysis.verdict import verdict
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import slave_arm
+from drake_teleop.one_thread import one_blas_thread
 from drake_teleop.operator.operator import GRIPS
 from drake_teleop.pages.progress import Stage, show_progress
 from drake_teleop.passivity.methods import PassivityConfig
@@ -120,7 +121,7 @@ def analyze(
     Raises:
         DrakeTeleopError: see `analyze_command`.
     """
-    with show_progress(progress) as stage:
+    with show_progress(progress) as stage, one_blas_thread():
         return _analyze(scenario, direction, stage)
 
 
