@@ -109,6 +109,13 @@ def test_bursts_are_spread_to_what_they_were(
     np.testing.assert_allclose(found - late, true[kept], atol=1e-6 + burst / 50 / rate)
 
 
+def test_a_burst_between_gaps_is_spread_about_its_stamp() -> None:
+    stamps = np.concatenate([np.arange(20) * 0.1, [5.0], 8.0 + np.arange(20) * 0.1]).repeat(4)
+    found = spread(stamps)
+    np.testing.assert_allclose(found[80:84], 5.0 + 0.025 * np.array([-1.5, -0.5, 0.5, 1.5]))
+    assert (np.diff(found) > 0).all()
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     rate=st.floats(300, 3000),

@@ -106,6 +106,27 @@ def test_a_felt_force_is_split_along_and_across_the_tasks_axis(monkeypatch):
     assert size == pytest.approx(np.linalg.norm(across))
 
 
+@pytest.mark.parametrize(("length", "duration"), [(0.3, None), (1e-4, 0.2)])
+def test_a_submovement_keeps_to_the_acceleration_and_to_a_least_duration(
+    monkeypatch, length, duration
+):
+    training = decision.Training(np.eye(3), 1.5, 0.3, 0.0, 0.0, 0)
+    movement = Movement(acceleration=2.0, shortest=0.2, noise=0.0)
+    person, plans = decision.pack_person(training, Perception(), movement), []
+    monkeypatch.setattr(decision, "_to_hand", decision._to_hand.py_func)
+    monkeypatch.setattr(decision, "_random", lambda *_: 0.0)
+    monkeypatch.setattr(decision, "plan_move", lambda *plan: plans.append(plan))
+    took = decision._submovement.py_func(person, None, 0, 1.0, np.array([0.0, 1.5 * length, 0.0]))
+    _, time, planned, change, _ = plans[0]
+    np.testing.assert_allclose(change, [0.0, length, 0.0])
+    # x = L (10 u^3 - 15 u^4 + 6 u^5), of which the second derivative has this maximum.
+    u = np.linspace(0.0, 1.0, 10001)
+    peak = length / took**2 * np.max(60 * u - 180 * u**2 + 120 * u**3)
+    assert (time, planned) == (1.0, took)
+    assert peak <= 2.0 + 1e-6
+    assert took == duration if duration else peak == pytest.approx(2.0, rel=1e-6)
+
+
 def test_what_happens_is_the_seeds(reach):
     again, _ = run("reach")
     other, _ = run("reach", simulation__seed=5)
