@@ -53,9 +53,10 @@ Array = NDArray[np.float64]
 Change = Callable[[Array, float], None]
 
 STATIONS = ("no channel", *METHODS)
-BEFORE, END = 0.6, 1.4  # s: all runs of a station are one until then, and end there
+BEFORE, END = 0.6, 1.25  # s: all runs of a station are one until then, and end there
 DELAY, TIMEOUT = 0.005, 0.1  # s
 STEP = 0.5  # N
+RANGE = 60.0  # N, of the sensor: so it saturates at what a hand still bears
 LATE = 2 * DELAY + 0.01  # s, for a packet there and back, and steps
 STATE = ("slave_plant", "rx90_state")
 #: Wires (system, port, system) by what they carry.
@@ -142,6 +143,7 @@ def pressing(name: str, trace: Path | None = None) -> Scenario:
         ],
         kinematic_scaling__rotation_scale=0.1,
         sheet_spring__thickness=0.001,
+        wrist_sensor__force_range=[RANGE] * 3,
     )
     if name == "no channel":
         return scenario
@@ -234,13 +236,13 @@ def change_of(fault: Fault, station: Diagram) -> Change:
     held: list[Array] = []
     sensor = GetBlock(station, "wrist_sensor")
     offset = np.array(sensor.offset)
-    limit = np.repeat([200.0, 12.0], 3)[fault.index] * fault.size
+    limit = RANGE * fault.size
 
     def change(x: Array, time: float) -> None:
         if fault.kind == "saturated":  # there and back, as quickly as a push grows
             u = np.clip(min(time - fault.start, fault.end - time) / 0.05, 0.0, 1.0)
             sensor.offset[:] = offset
-            sensor.offset[fault.index] += u * limit
+            sensor.offset[fault.index % 3] += u * limit
         elif fault.kind == "wrong load":
             x[6:] *= 1.0 + (fault.size - 1.0) * np.clip((time - fault.start) / 0.1, 0.0, 1.0)
         elif not fault.now(time):

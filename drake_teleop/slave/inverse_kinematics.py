@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop._compiled import njit
+from drake_teleop.fault import sound
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.vectors import put
 
@@ -53,8 +54,8 @@ class IkStatus(IntEnum):
     JOINT_LIMIT = 4
     """Each branch breaks a joint limit: the reference is held, put within the limits."""
     BAD_POSE = 5
-    """The pose is not finite or its quaternion is zero: the reference is held, within limits.
-    Or the reference is not finite: the answer is not either."""
+    """The pose is not finite, beyond 1e6 m, or its quaternion is zero: the reference is held, within
+    limits. Or the reference is not finite: the answer is not either."""
 
 
 # Compiled code knows plain integers only.
@@ -151,7 +152,7 @@ def _nearest_branch(
         return _BAD_POSE
     for i in range(6):
         q[i] = min(max(reference[i], lower[i]), upper[i])
-    if not np.isfinite(R.sum() + p.sum()):
+    if not (np.isfinite(R.sum()) and sound(p)):
         return _BAD_POSE
     branches = np.empty((8, 6))
     status = _branches(R, p, reference[0], reference[3], True, branches)

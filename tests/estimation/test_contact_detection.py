@@ -43,7 +43,7 @@ def floor() -> NoiseFloor:
 
 @pytest.mark.parametrize("statistic", ["level", "glr"])
 def test_the_block_says_what_the_detector_of_logs_says(arm, statistic):
-    """Samples of a load that moves, and is pushed; some of them saturated, which change nothing."""
+    """Of a load that moves, and is pushed; samples that are saturated, or none, change nothing."""
     rng, n = np.random.default_rng(4), 400
     s, omega, alpha = (5.0 * rng.normal(size=(n, 3)) for _ in range(3))
     wrench = OFFSETS + non_contact_wrench(s, omega, alpha, arm.phi_load)
@@ -52,6 +52,7 @@ def test_the_block_says_what_the_detector_of_logs_says(arm, statistic):
     saturated = np.zeros(n)
     saturated[200:220] = 1.0
     wrench[210, 0] = wrench[224, 0] = 1e5
+    wrench[230, 0] = np.nan
     q = rng.normal(size=(n, 6))
     samples = np.column_stack([wrench, s, omega, alpha, saturated, q, np.zeros(n)])
 
@@ -70,7 +71,8 @@ def test_the_block_says_what_the_detector_of_logs_says(arm, statistic):
         flags.append(block.GetOutputPort("contact").Eval(context)[0] > 0)
 
     good = np.ones(n, bool)
-    good[200:225] = False
+    good[200:225] = good[230] = False
+    wrench[230, 0] = 0.0  # not used
     contact = contact_wrench(wrench, OFFSETS, s, omega, alpha, arm.phi_load)
     detector = ContactDetector(
         floor(),

@@ -171,6 +171,17 @@ def test_clutch_holds_the_command_and_re_indexes_without_a_jump():
     np.testing.assert_allclose(path[1200, 4:] - start[4:], moved, atol=1e-12)
 
 
+def test_the_clutch_waits_for_a_pose():
+    """It would keep one that is none as its reference."""
+    system = KinematicScaling(KinematicScalingConfig(), 1e-3, np.arange(1.0, 8.0))
+    context = system.CreateDefaultContext()
+    for pose, closed in ((np.full(7, np.nan), 0.0), (np.array(IDENTITY), 1.0)):
+        system.GetInputPort("pose_master").FixValue(context, pose)
+        context.SetDiscreteState(system.EvalUniquePeriodicDiscreteUpdate(context))
+        references = context.get_discrete_state_vector().value()
+        assert references[14] == closed and np.isfinite(references).all()
+
+
 def test_an_open_clutch_at_the_start_commands_the_start():
     system = KinematicScaling(KinematicScalingConfig(), 1e-3, np.arange(1.0, 8.0))
     simulator = Simulator(system)

@@ -191,12 +191,18 @@ def test_branches_further_than_max_step_are_not_taken(arm):
     np.testing.assert_array_equal(held, reference)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e9])
 def test_a_pose_that_is_no_number_holds_the_reference(arm, bad):
     p = P_HOME + np.array([0, bad, 0])
     q, status = nearest_branch(R_DOWN, p, Q_HOME, arm.lower, arm.upper)
     assert status == IkStatus.BAD_POSE
     np.testing.assert_array_equal(q, Q_HOME)
+
+
+def test_of_a_reference_that_is_no_number_nothing_follows(arm):
+    reference = np.where(np.arange(6) == 3, np.nan, Q_HOME)
+    q, status = nearest_branch(R_DOWN, P_HOME, reference, arm.lower, arm.upper)
+    assert status == IkStatus.BAD_POSE and np.isnan(q).all()
 
 
 def test_whatever_is_asked_the_answer_is_finite_and_within_the_limits(arm):

@@ -39,6 +39,16 @@ def test_at_the_setpoint_it_holds_the_arm_against_gravity(arm):
     np.testing.assert_allclose(torque(arm, q, q, np.zeros(6)), gravity, rtol=1e-12)
 
 
+@pytest.mark.parametrize("bad", [np.nan, 1e9])
+def test_without_encoders_the_motors_carry_the_arm_and_without_a_command_they_hold(arm, bad):
+    q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
+    one = np.where(np.arange(6) == 2, bad, 0.0)
+    gravity = torque(arm, q, q, np.zeros(6))
+    np.testing.assert_array_equal(torque(arm, q, q + one, np.ones(6)), gravity)
+    np.testing.assert_array_equal(torque(arm, q, q + 0.1, one), gravity)
+    np.testing.assert_array_equal(torque(arm, q + one, q, np.zeros(6)), 0.0)  # what stood there
+
+
 def test_the_joints_do_not_disturb_each_other(arm):
     """Computed torque: an error of one joint accelerates that joint alone."""
     q, error = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0]), np.zeros(6)
