@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from sockets import open_to_others
 
 # One thread of BLAS in each process: the matrices are small, and threads that wait for a core which
 # another worker has take longer than the work. numpy is not imported yet, so it will see this.
@@ -32,6 +35,27 @@ def pytest_configure(config: pytest.Config) -> None:
         folder = tempfile.TemporaryDirectory(prefix="drake_teleop-")
         config.add_cleanup(folder.cleanup)
         os.environ["DRAKE_TELEOP_CACHE_DIR"] = folder.name
+
+
+@pytest.fixture(scope="session", autouse=True)
+def nothing_listens_to_other_machines() -> Iterator[None]:
+    """Whatever command or function a test calls; see docs/security.md.
+
+    Looked at now and then: Linux takes 8 ms to tell, and many tests write a film or start a cluster.
+    """
+    found: set[str] = set()
+    over = threading.Event()
+
+    def look() -> None:
+        while not over.wait(2.0):
+            found.update(open_to_others())
+
+    watch = threading.Thread(target=look, daemon=True)
+    watch.start()
+    yield
+    over.set()
+    watch.join()
+    assert not found
 
 
 @pytest.hookimpl(trylast=True)  # what is not run shall not count

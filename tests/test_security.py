@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sockets import THIS_MACHINE, listening
+import sockets
+from sockets import THIS_MACHINE, listening, open_to_others
 
 from drake_teleop import identified_load
 from drake_teleop.errors import DrakeTeleopError
@@ -199,7 +200,14 @@ def test_a_film_is_made_for_this_machine_alone(tmp_path):
 def test_a_socket_for_all_is_seen():
     import socket
 
-    with socket.create_server(("0.0.0.0", 0)):
+    with socket.socket() as server:
+        server.bind(("0.0.0.0", 0))
+        sockets.on_purpose.add(server.getsockname()[1])
+        server.listen()
         assert not listening() <= THIS_MACHINE
+        assert not open_to_others()
+        sockets.on_purpose.clear()
+        assert open_to_others()
+        sockets.on_purpose.add(server.getsockname()[1])
     with socket.create_server(("127.0.0.1", 0)):
         assert listening() <= THIS_MACHINE
