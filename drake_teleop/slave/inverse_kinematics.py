@@ -54,8 +54,8 @@ class IkStatus(IntEnum):
     JOINT_LIMIT = 4
     """Each branch breaks a joint limit: the reference is held, put within the limits."""
     BAD_POSE = 5
-    """The pose is not finite, beyond 1e6 m, or its quaternion is zero: the reference is held, within
-    limits. Or the reference is not finite: the answer is not either."""
+    """The pose is not finite, beyond 1e6 m, or its quaternion is zero: the reference is held,
+    within limits. Or the reference is not finite: the answer is not either."""
 
 
 # Compiled code knows plain integers only.
