@@ -27,7 +27,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop import cli
 from drake_teleop.channel import network
-from drake_teleop.errors import LONGEST_LINE
+from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
 from drake_teleop.excitation.models import ParseModel
 from drake_teleop.excitation.robot import RobotFromModel
 from drake_teleop.load.identification import Identification
@@ -499,7 +499,9 @@ def _command_line(path: Path) -> None:
         status = cli._run(words)
     line = said.getvalue().rstrip("\n")
     refused = line.startswith("error: ") and len(line) <= LONGEST_LINE and "\n" not in line
-    if not refused and (line or status not in (None, 0, 2)):
+    if refused:
+        raise DrakeTeleopError(line.removeprefix("error: "))
+    if line or status not in (None, 0, 2):  # 2: the help, for want of words
         raise AssertionError(f"exit status {status}, said {line!r}")
 
 

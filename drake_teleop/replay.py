@@ -11,6 +11,7 @@ writes, or the YAML file of the log's own name, as in the folder `logs` of `repr
 
 from __future__ import annotations
 
+import os
 from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
@@ -165,7 +166,7 @@ def _norm(vectors: Array) -> Array:
 
 def _logs(run: Path) -> list[Path]:
     """The logs with a scenario beside them in a folder, or the log itself."""
-    if not run.exists():
+    if not os.path.exists(run):
         raise DrakeTeleopError("there is no such folder", where=str(run))
     if run.suffix == ".parquet":
         return [run]

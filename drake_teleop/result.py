@@ -274,9 +274,9 @@ class SimulationResult:
 
         expect((str, Path), path, "result")
         path = Path(path)
-        part = min(path.glob(_PART_NAMES), default=path)
         remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
         with reading(path, remedy, "is not a simulation result"):
+            part = min(path.glob(_PART_NAMES), default=path)
             text = pl.read_parquet_metadata(part)[_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]
             t = _columns_of_numbers(path, ["t"])[:, 0]

@@ -6,6 +6,7 @@ message that names file and field. Times are in s, rates in Hz, lengths in m.
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -213,7 +214,7 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
     path, names = scenarios_dir() / f"{name_or_path}.yaml", ScenarioNames()
     if str(name_or_path) not in names:
         path = Path(name_or_path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # nor for a name that no file can have
         raise DrakeTeleopError(
             f"there is no scenario '{name_or_path}'",
             remedy=meant(name_or_path, names, f"give a YAML file or one of {', '.join(names)}"),

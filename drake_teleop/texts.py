@@ -69,7 +69,7 @@ def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
     Raises:
         DrakeTeleopError: naming file and field (and line), see the top of this module.
     """
-    return yaml_data(_text(path), str(path), tagged=tagged)
+    return yaml_data(read_text(path), str(path), tagged=tagged)
 
 
 def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
@@ -94,7 +94,7 @@ def read_json(path: str | Path) -> Any:
     Raises:
         DrakeTeleopError: naming the file, if it cannot be read, is no JSON, or holds a field twice.
     """
-    where, text = str(path), _text(path)
+    where, text = str(path), read_text(path)
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -116,7 +116,12 @@ def read_json(path: str | Path) -> Any:
         raise DrakeTeleopError("is nested too deeply", where=str(path)) from None
 
 
-def _text(path: str | Path) -> str:
+def read_text(path: str | Path) -> str:
+    """The text of a file.
+
+    Raises:
+        DrakeTeleopError: naming the file, if it cannot be read or is not in UTF-8.
+    """
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

@@ -19,12 +19,14 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 CASES = Path(__file__).parent / "fuzz_cases"
 SAID = {
     "description-frame_nan.yaml": "imu.frame: must be sensor, base, or a 3x3 rotation",
+    "description-long_name.yaml": "no such file",
     "dmd-circle.dmd.yaml": "its joints form a circle through",
     "dmd-own_alias.dmd.yaml": "is nested too deeply",
     "inspect-backwards.npz": "",
     "load-negative_variance.json": "covariance: has a negative variance",
     "load-no_mass.json": "phi: has no mass",
     "log_parquet-panic.parquet": "cannot be read: it is damaged",
+    "mjcf-latin_1.xml": "is no text in UTF-8 (byte ",
     "result-absent_column.parquet": "cannot be read: unable to find column",
     "result-dates.parquet": "cannot be read: wrench.f_x, wrench.f_y hold no numbers",
     "result-metadata_panic.parquet": "is not a simulation result",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ from pydrake.multibody.tree import Frame, ModelInstanceIndex
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.model_check import check_model, circle
 from drake_teleop.silence import silent_stderr
-from drake_teleop.texts import read_yaml
+from drake_teleop.texts import read_text, read_yaml
 
 # Of meshes that Drake can use as collision shapes.
 _READABLE = (".obj", ".gltf", ".vtk")
@@ -63,7 +64,7 @@ def ParseModel(
         DrakeTeleopError: if the file cannot be read, has no such frame, or says what cannot be
             true of an arm, see `check_model`.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path))
     packages = _Packages(path, package_paths)
     parser = Parser(plant)
@@ -78,6 +79,8 @@ def ParseModel(
         root = _xml(path) if kind in ("urdf", "sdf") else None
         if kind == "yaml":
             read_yaml(path, tagged=True)  # Drake's parser overflows its stack over many brackets
+        elif root is None and kind in ("urdf", "sdf", "xml"):
+            read_text(path)  # or names cannot be said
         if root is None:
             with _drakes_errors_raised():
                 instances = parser.AddModels(str(path))
@@ -207,7 +210,7 @@ class _Packages:
             path = None if folder is None else folder / match[3]
         else:
             path = self._folder / address.removeprefix("file://")
-        return path if path is not None and path.is_file() else None
+        return path if path is not None and os.path.isfile(path) else None
 
 
 def _without_lost_meshes(

@@ -15,6 +15,7 @@ estimator gives numbers for the rest too. Two steps decide what `Identification.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -286,7 +287,7 @@ def natural_scale(phi: Array) -> Array:
 def _read_json(path: str | Path) -> dict[str, Any]:
     from drake_teleop.texts import read_json  # PyYAML takes its time to start
 
-    if not Path(path).exists():
+    if not os.path.exists(path):
         raise DrakeTeleopError(
             "cannot be read (no such file)", where=str(path), remedy="run `identify` first"
         )

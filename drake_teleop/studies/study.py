@@ -41,6 +41,7 @@ process is a failed run; only if there is one process for all does it end the st
 from __future__ import annotations
 
 import copy
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -160,8 +161,8 @@ def study_file(name_or_path: str | Path) -> Path:
     """
     expect((str, Path), name_or_path, "study")
     shipped = studies_dir() / f"{name_or_path}.yaml"
-    path = shipped if shipped.is_file() else Path(name_or_path)
-    if not path.is_file():
+    path = shipped if os.path.isfile(shipped) else Path(name_or_path)
+    if not os.path.isfile(path):
         names = sorted(file.stem for file in studies_dir().glob("*.yaml"))
         raise DrakeTeleopError(
             f"there is no study '{name_or_path}'",

@@ -90,7 +90,7 @@ class Topic:
 
 def is_bag(path: Path) -> bool:
     """Whether the path looks like a bag: a folder with metadata.yaml, or one of `SUFFIXES`."""
-    return (path / "metadata.yaml").is_file() or path.suffix.lower() in SUFFIXES
+    return os.path.isfile(path / "metadata.yaml") or path.suffix.lower() in SUFFIXES
 
 
 def topics_of(path: Path) -> list[Topic]:
@@ -209,7 +209,7 @@ def topic_missing(path: Path) -> DrakeTeleopError:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[AnyReader]:
-    if not path.exists():
+    if not os.path.exists(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     if not is_bag(path):
         raise DrakeTeleopError(

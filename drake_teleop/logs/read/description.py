@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
 import types
 import typing
 from collections.abc import Iterator, Sequence
@@ -381,7 +382,7 @@ def load_description(path: str | Path) -> Description:
         DrakeTeleopError: naming file and field, if it is absent, no YAML, or does not fit.
     """
     path = Path(path)
-    if not path.exists():
+    if not os.path.exists(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     data = read_yaml(path)
     if not isinstance(data, dict):

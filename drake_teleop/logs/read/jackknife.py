@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 _BLOCKS = 20
 # Singular values of the scaled Jacobian below this share of the largest: nothing determines them.
 RANK = 1e-5
+_STEPS = 100  # of the solver at most; most records take fewer than ten
 
 
 def solve(
@@ -29,7 +30,9 @@ def solve(
         errors = residual(x)
         power = errors.reshape(len(errors), -1, 3).var(axis=(0, 2))
         sigma = np.repeat(np.sqrt(power + 1e-12 * power.max() + 1e-30), 3)
-        found = least_squares(lambda z, s=sigma: (residual(z) / s).ravel(), x, x_scale="jac")
+        found = least_squares(
+            lambda z, s=sigma: (residual(z) / s).ravel(), x, x_scale="jac", max_nfev=_STEPS
+        )
         x = found.x
     width = len(sigma) * (len(errors) // _BLOCKS)
     return x, jackknife(found.jac, found.fun, width)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -202,7 +203,7 @@ def read_table(path: Path, *, header: bool = True) -> Table:
             where=str(path),
             remedy=f"convert it to one of {', '.join(FORMATS)}",
         )
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     with reading(path, f"check that it is a valid {path.suffix} file"):
         table = _read_npz(path) if path.suffix.lower() == ".npz" else _read_frame(path, header)
