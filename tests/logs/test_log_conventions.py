@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,15 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.logs.check import conventions
+from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.commands import identify_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.tables import Table
 
 Tables = dict[str, pl.DataFrame]
 Data = dict[str, Any]
@@ -282,3 +289,45 @@ def test_the_clock_of_a_ur5_imu(
         identified = identify_log(tmp_path / "log.yaml")
         assert any(finding.name == "payload" for finding in identified.findings)
         assert not identified.identification.identifiable[6:].any()
+
+
+@pytest.mark.parametrize("time", [{"column": "t"}, {"rate": 1000.0}, None])
+def test_for_comparisons_a_log_is_thinned_to_means_whatever_tells_its_time(
+    time: dict[str, Any] | None,
+) -> None:
+    t = np.arange(900) * 1e-3
+    rise, still = np.outer(t, [1.0, 2.0, 3.0]), np.tile([0.0, 0.0, 9.8], (900, 1))
+    table = Table(Path("w"), {"t": t, "f": rise, "m": -rise, "s": still, "o": 0 * rise})
+    file: dict[str, Any] = {"file": "w"} if time is None else {"file": "w", "time": time}
+    wrench = file | {"force": {"columns": ["f"]}, "torque": {"columns": ["m"]}}
+    motion = {"specific_force": {"columns": ["s"]}, "angular_velocity": {"columns": ["o"]}}
+    streams = {"wrench": wrench, "imu": file | motion}
+    if time is None:
+        streams = {"static": wrench | {"gravity": {"columns": ["s"]}}}
+    description = Description.model_validate(streams)
+    log = LogData(description, "log.yaml", {Path("w"): table}).thin(description)
+    if time is None:  # of poses there are few, and none follows another
+        assert log.static and len(log) == 900
+    else:
+        np.testing.assert_allclose(np.diff(log.t), 0.009, atol=1e-12)
+        np.testing.assert_allclose(np.diff(log.wrench[:, 2]), 0.027, atol=1e-12)
+        assert log.wrench[0, 0] == pytest.approx(0.004)
+
+
+@pytest.mark.parametrize(("left", "refused"), [(0.45, False), (0.55, True)])
+def test_a_load_that_explains_less_than_half_is_refused_if_there_is_a_reason(
+    monkeypatch: pytest.MonkeyPatch, left: float, refused: bool
+) -> None:
+    rng = np.random.default_rng(0)
+    wrench, still = rng.normal(size=(200, 6)), np.tile([0.0, 0.0, 9.8], (200, 1))
+    log = Log(np.arange(200) * 0.01, wrench, still, 0 * still, 0 * still)
+    reason = Finding("axes", "two axes of the wrench are exchanged")
+    monkeypatch.setattr(conventions, "check_log", lambda path: SimpleNamespace(findings=(reason,)))
+    load: Any = SimpleNamespace(mass=1.0, identifiable=np.ones(16, bool))
+    # Of a residual that is this share of the wrench's standard deviation everywhere.
+    predicted = (1 - np.sqrt(left)) * wrench
+    if refused:
+        with pytest.raises(DrakeTeleopError, match="55 % of the wrench's variance are left"):
+            conventions.question_fit(Path("log"), log, load, predicted, 0.0)
+    else:
+        assert conventions.question_fit(Path("log"), log, load, predicted, 0.0) == (reason,)

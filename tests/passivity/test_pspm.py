@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.passivity.memory import LEDGER, LIMIT, LOST, RECEIVED, SENT
+from drake_teleop.passivity import pspm
+from drake_teleop.passivity.memory import COMMAND_POSE, HELD, LEDGER, LIMIT, LOST, RECEIVED, SENT
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -90,3 +91,21 @@ def test_stored_energy_is_what_was_put_in(end):
         np.testing.assert_allclose(left, put_in, rtol=0, atol=1e-9)
         largest = max(largest, np.abs(work).max())
     assert largest > 0.01, "nothing happened"
+
+
+def test_a_command_that_was_held_back_is_pulled_at_as_it_left(monkeypatch):
+    """The servo's wrench, and what the spring has more of is paid for; groups unlike each other."""
+    monkeypatch.setattr(pspm, "dot", pspm.dot.py_func)
+    config = PassivityConfig(method="pspm", servo_stiffness=[300.0, 5.0], servo_damping=[2.0, 0.02])
+    p, rng = parameters(config), np.random.default_rng(1)
+    memory, before = initial_memory("pspm", p, START), initial_memory("pspm", p, START)[LEDGER]
+    pose, wanted, command = np.empty(7), np.empty(7), np.empty(7)
+    moved_into(START, 0.1 * rng.normal(size=6), pose)
+    asked, left, twist = 0.2 * rng.normal(size=6), 0.1 * rng.normal(size=6), rng.normal(size=6)
+    moved_into(pose, asked, wanted)
+    moved_into(pose, left, command)
+    pspm.command_left.py_func(wanted, command, pose, twist, p, memory)
+    np.testing.assert_allclose(memory[HELD], K * left - D * twist, rtol=1e-9)
+    np.testing.assert_array_equal(memory[COMMAND_POSE], command)
+    more = groups(0.5 * K * (left**2 - asked**2))
+    np.testing.assert_allclose(memory[LEDGER], before - more, rtol=1e-9)
