@@ -264,7 +264,7 @@ def trace_of(fault: Fault, folder: Path) -> Path:
     during = {"lost": "", "delayed": late, "out of order": late}[fault.kind]
     rows = [f"0,{DELAY}", f"{fault.start:.4f},{during}", f"{fault.end:.4f},{DELAY}", f"60,{DELAY}"]
     if fault.kind == "out of order":  # every other millisecond is late
-        times = np.arange(fault.start, fault.end, 1e-3)
+        times = np.arange(fault.start, fault.end - 5e-4, 1e-3)
         pairs = [f"{t:.4f},{(late, DELAY)[k % 2]}" for k, t in enumerate(times)]
         rows[1:2] = pairs
     path = folder / "trace.csv"
