@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drake_teleop.analysis.sampled_wall import (
+    _largest,
     energy_damping,
     friction_stiffness,
     passive_damping,
@@ -68,6 +69,16 @@ def test_sum_of_cosines_is_the_condition(K, B, delay):
     np.testing.assert_allclose(
         passive_damping_of(lambda z: wall(z, K, B, delay), PERIOD), exact, rtol=1e-8
     )
+
+
+def test_of_two_peaks_that_are_nearly_alike_the_higher_one_is_taken():
+    """cos 5 theta has peaks at 0, 2/5 pi and 4/5 pi, here with the second one 6e-6 above the third.
+
+    The grid passes it by 0.4 of a step, which costs 1e-4 there.
+    """
+    value, angle = _largest(np.array([0.0, 0.0, -5e-6, 0.0, 0.0, 1.0]))
+    assert angle == pytest.approx(0.4 * np.pi, abs=1e-5)
+    assert value == pytest.approx(1.0 - 5e-6 * np.cos(0.8 * np.pi), abs=1e-10)
 
 
 def test_a_wall_of_control():

@@ -98,6 +98,23 @@ def normalised_errors(noise_of, repetitions=60, samples=4000):
     return squares / repetitions
 
 
+def test_variances_follow_from_what_the_fit_leaves_of_each_channels_noise():
+    """Weights are not those of the noise, so that channels leave some of theirs in others."""
+    rng, n = np.random.default_rng(7), 90
+    weights, variances = rng.uniform(0.5, 2.0, 6), rng.uniform(2.0, 3.0, 6)
+    A = rng.normal(size=(6, n, 16))
+    grams = np.einsum("cni,cnj->cij", A, A)
+    inverse = np.linalg.inv(np.einsum("c,cij->ij", weights, grams))
+    # What each channel's noise leaves in each channel's residual: r = (1 - A (A^T W A)^-1 A^T W) e.
+    rows = A.reshape(6 * n, 16)
+    left = np.eye(6 * n) - rows @ inverse @ rows.T * np.repeat(weights, n)
+    power = (left**2).reshape(6, n, 6, n).sum(axis=(1, 3)) @ variances
+    equations = NormalEquations(weights**-0.5)
+    found, degrees = equations._unbiased(power, n, grams, grams, inverse)
+    np.testing.assert_allclose(found, variances, rtol=1e-9)
+    assert degrees.sum() == pytest.approx(6 * n - 16)
+
+
 def test_stated_deviations_hold_for_white_noise():
     errors = normalised_errors(lambda rng, n: rng.normal(size=(n, 6)))
     # 1 would be perfect; each is the mean of 60 squares and scatters by 0.18.
