@@ -17,11 +17,21 @@ from drake_teleop.excitation.criteria import (
     characteristic_length,
 )
 from drake_teleop.excitation.design import _Search
-from drake_teleop.excitation.limits import LIMITS, Limits, capsule_distances, empty_motions
-from drake_teleop.excitation.prediction import SensorNoise, predicted_deviations
+from drake_teleop.excitation.limits import (
+    CLEARANCE_SCALE,
+    LIMITS,
+    Limits,
+    capsule_distances,
+    empty_motions,
+    limit_uses,
+    motions_of,
+)
+from drake_teleop.excitation.prediction import SensorNoise, _correction, predicted_deviations
 from drake_teleop.excitation.problem import Problem, Task
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import regressor
+from drake_teleop.sensor.motion_estimation import MotionEstimationConfig, motion_gains
+from drake_teleop.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.slave.plant import AddSlavePlant
 
 PHI = phi_from_mass_com_inertia(3.0, [0.01, -0.02, 0.08], np.diag([0.012, 0.0115, 0.0045]))
@@ -93,6 +103,20 @@ def test_predicted_deviations_are_those_of_white_noise():
     assert value("D16", samples, 0.2) == pytest.approx(mean_axis, rel=1e-6)
 
 
+def test_what_the_filter_leaves_of_an_accelerations_noise_has_the_filters_poles():
+    """Of the station's filter, a step of which predicts by (1, T, T^2 / 2) and then corrects."""
+    T = 1 / 32000  # so short that the filter is nearly the continuous one
+    for filter_ in motion_gains(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
+        numerator, denominator = _correction(filter_, T)
+        predict = np.array([[1.0, T, T**2 / 2], [0.0, 1.0, T], [0.0, 0.0, 1.0]])
+        correct = np.eye(3) - np.outer(filter_.gains, [1.0, 0.0, 0.0])
+        poles = np.sort_complex(np.log(np.linalg.eigvals(correct @ predict).astype(complex)) / T)
+        found = np.sort_complex(np.roots(denominator).astype(complex))
+        np.testing.assert_allclose(found, poles, rtol=0.015)
+        # All of it at high frequencies, nothing at rest: there the encoders are believed.
+        assert numerator[0] == denominator[0] and numerator[-1] == 0.0
+
+
 def test_the_length_is_never_above_the_radius_of_gyration():
     assert characteristic_length(PHI) == pytest.approx(0.1, rel=0.05)
     far = phi_from_mass_com_inertia(2.0, [0, 0, 0.3], 0.01 * np.eye(3))
@@ -153,6 +177,32 @@ def test_gradients_of_criterion_and_limits(arm, name):
         of_criterion = ahead.log_criterion - behind.log_criterion
         numeric = np.array([of_criterion, *(ahead.uses - behind.uses)]) / (2 * step)
         np.testing.assert_allclose(gradients[:, k] / scale, numeric / scale, rtol=0, atol=2e-5)
+
+
+def test_the_largest_use_of_each_limit_is_that_of_its_definition(arm):
+    limits, rng = limits_of(arm), np.random.default_rng(3)
+    q = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0]) + 0.3 * rng.normal(size=(30, 6))
+    qd, qdd = rng.normal(size=(2, 30, 6))
+    motions = empty_motions(30, 6)
+    motions_of(arm.table, q, qd, qdd, motions)
+    smooth, largest, gradient = np.empty(7), np.empty(7), np.empty((7, 3, 30, 6))
+    limit_uses(arm.table, q, qd, qdd, motions, limits, 20.0, smooth, largest, gradient)
+    assert np.all(smooth >= largest)
+    R_WS, p_WS = motions[:, -1, 12:].reshape(-1, 3, 3), motions[:, -1, 9:12]
+    points = p_WS[:, None] + np.einsum("tij,kj->tki", R_WS, limits.points_S)
+    capsules = limits.capsule_row, limits.capsule_ends, limits.capsule_radius, limits.pairs
+    distances = capsule_distances(motions, *capsules)
+    found = dict(zip(LIMITS, largest, strict=True))
+    for name, expected in {
+        "position": np.abs(q - limits.q_middle) / limits.q_half,
+        "velocity": np.abs(qd) / limits.velocity,
+        "acceleration": np.abs(qdd) / limits.acceleration,
+        "workspace": np.abs(points - limits.box_middle) / limits.box_half,
+        "clearance": 1.0 - (distances - limits.distances) / CLEARANCE_SCALE,
+    }.items():
+        assert found[name] == pytest.approx(expected.max(), rel=1e-12), name
+    # 1 is where two capsules keep just what they have to.
+    assert (found["clearance"] > 1.0) == (distances < limits.distances).any()
 
 
 def test_candidates_begin_all_over_the_middle_of_the_range(arm):
