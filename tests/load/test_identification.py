@@ -274,7 +274,7 @@ def hole(document):
         (put("offsets", ["a"] * 6), "json:offsets: holds no numbers"),
         (put("covariance", [[1.0] * 16] * 15), "json:covariance: is not a"),
         (put("covariance", [[1.0] * 16] * 15 + [[1.0]]), "json:covariance: is not a"),
-        (hole, "json:covariance: is not finite"),
+        (hole, "json:covariance: holds no numbers"),
         (put("identifiable", [True] * 15), "json:identifiable: is not a list"),
         (put("identifiable", ["yes"] * 16), "json:identifiable: is not a list"),
         (put("mass", 99.0), "json:mass: does not follow from phi"),
