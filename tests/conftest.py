@@ -41,7 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def nothing_listens_to_other_machines() -> Iterator[None]:
     """Whatever command or function a test calls; see docs/security.md.
 
-    Looked at now and then: Linux takes 8 ms to tell, and many tests write a film or start a cluster.
+    Looked at now and then: Linux takes 8 ms to tell, and many tests make a film or a cluster.
     """
     found: set[str] = set()
     over = threading.Event()

@@ -323,7 +323,7 @@ def test_a_rotation_that_the_data_do_not_determine_is_an_error(
 
 
 def test_a_late_clock_does_not_hide_that_axes_are_mirrored() -> None:
-    recorder = Recorder(a_rotation(3), np.zeros(3), lag=0.5)
+    recorder = Recorder(a_rotation(3), np.zeros(3), seconds=3.0, lag=0.4)
     tables = recorder.tables()
     columns = tables[Path("i")].columns
     columns |= {"s": columns["s"][:, [1, 0, 2]], "omega": columns["omega"][:, [1, 0, 2]]}
