@@ -28,12 +28,14 @@ from drake_teleop.passivity.safe_state import (
 from drake_teleop.vectors import put
 
 # What comes from the device: its angles, and what is remembered of the last period: angles that
-# were numbers, the wrench that was displayed, whether that was changed after a fault, for how long
-# there has been none [s], the watch. What goes to it: the motors' torque, and what to remember.
-_places = Slots(6 + 6 + 6 + 1 + 1 + MASTER_WATCH)
-_ANGLES = _places.vector(6)
-_LAST_ANGLES, _LAST = _places.vector(6), _places.vector(6)
-_CHANGED, _SOUND, _WATCH = _places.number(), _places.number(), _places.vector(MASTER_WATCH)
+# were numbers, the wrench that was displayed and the fault, whether the wrench was changed after
+# one, for how long there has been none [s], the watch. What goes to it: the motors' torque in place
+# of the angles, and what to remember.
+_places = Slots(6 + 6 + 7 + 1 + 1 + MASTER_WATCH)
+_ANGLES, _LAST_ANGLES, _LAST = _places.vector(6), _places.vector(6), _places.vector(6)
+_FAULT, _CHANGED, _SOUND = _places.number(), _places.number(), _places.number()
+_WATCH = _places.vector(MASTER_WATCH)
+_SHOWN = slice(_LAST.start, _FAULT + 1)
 # Of force and torque; from the limits on the device's own hold, motor by motor.
 _FULL = np.array([FORCE_LIMIT, WRIST_TORQUE_LIMIT.max()])
 _NONE, _WRENCH, _HAND, _RESUMING = map(int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING))
@@ -82,41 +84,40 @@ def motor_torque_into(displayed, q, J, torque):
 
 
 @njit(cache=True)
-def display_into(wrench, device, period, J, shown, drive):
+def display_into(wrench, device, period, J, drive):
     """One period of the display; see `ForceDisplay` for its safe state.
 
     Args:
         wrench: (6,) F_E_B that the hand shall feel.
-        device: (26,) of `MasterDevice`.
+        device: (27,) of `MasterDevice`.
         period: [s].
         J: (6, 6) scratch.
-        shown: (7,) written: F that is displayed, and a `Fault`.
-        drive: (26,) written, for `MasterDevice`.
+        drive: (27,) written, for `MasterDevice`; in it what is displayed, and a `Fault`.
     """
-    displayed, q, shown[6] = shown[:6], device[_ANGLES], _NONE
+    q, fault = device[_ANGLES], _NONE
     put(drive, 6, device, 6, _WATCH.stop - 6)
     if sound(q):
         put(drive, _LAST_ANGLES.start, q, 0, 6)
     else:
-        q, shown[6] = device[_LAST_ANGLES], _HAND
+        q, fault = device[_LAST_ANGLES], _HAND
     if not sound(wrench):
-        shown[6] = _WRENCH
+        fault = _WRENCH
+    displayed, drive[_FAULT] = drive[_LAST], fault
     jacobian_into(q, J)
     limit_wrench_into(wrench, J, displayed)
-    if shown[6] != _NONE or device[_CHANGED] != 0.0:
-        _change(device, period, shown, drive)
-    put(drive, _LAST.start, displayed, 0, 6)
+    if fault != _NONE or device[_CHANGED] != 0.0:
+        _change(device, period, drive)
     motor_torque_into(displayed, q, J, drive[:6])
 
 
 @njit(cache=True)
-def _change(device, period, shown, drive):
+def _change(device, period, drive):
     """Of a fault, and after one: fades what was displayed, and goes over to what is wanted.
 
-    Arguments as of `display_into`; `shown` has what is wanted and the fault, and is changed.
+    Arguments as of `display_into`; `drive` has what is wanted and the fault, and is changed.
     """
-    displayed, last, limits = shown[:6], device[_LAST], np.empty(2)
-    fault = shown[6] != _NONE
+    displayed, last, limits = drive[_LAST], device[_LAST], np.empty(2)
+    fault = drive[_FAULT] != _NONE
     drive[_SOUND] = 0.0 if fault else device[_SOUND] + period
     # All of the way within STOP, so that it does not turn at once either.
     share = 0.0 if fault else period / max(STOP + period - drive[_SOUND], period)
@@ -129,7 +130,7 @@ def _change(device, period, shown, drive):
         if limits[g] < _FULL[g]:
             drive[_CHANGED] = 1.0
     if not fault:
-        shown[6] = _RESUMING
+        drive[_FAULT] = _RESUMING
 
 
 class ForceDisplay(LeafSystem):
@@ -163,12 +164,14 @@ class ForceDisplay(LeafSystem):
         super().__init__()
         self._period = period
         self._jacobian = np.zeros((6, 6))
-        self._unused, self._shown = np.zeros(_WATCH.stop), np.zeros(7)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._device = self.DeclareVectorInputPort("for_display", _WATCH.stop)
         inputs = {self.all_input_ports_ticket()}
+        self._drive = self.DeclareVectorOutputPort(
+            "drive", _WATCH.stop, weak_callback(self._calc_drive), inputs
+        )
+        # A log looks when the device does: for both the drive is calculated once.
         for name, size, calc in (
-            ("drive", _WATCH.stop, self._calc_drive),
             ("force_to_master", 6, self._calc_force),
             ("fault_at_hand", 1, self._calc_fault),
             ("displayed_and_fault", 7, self._calc_both),
@@ -176,25 +179,19 @@ class ForceDisplay(LeafSystem):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
 
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
-        self._calc(context, self._shown, output.get_mutable_value())
-
-    def _calc_both(self, context: Context, output: BasicVector) -> None:
-        self._calc(context, output.get_mutable_value(), self._unused)
-
-    def _calc_force(self, context: Context, output: BasicVector) -> None:
-        self._calc(context, self._shown, self._unused)
-        output.SetFromVector(self._shown[:6])
-
-    def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        self._calc(context, self._shown, self._unused)
-        output[0] = self._shown[6]
-
-    def _calc(self, context: Context, shown: np.ndarray, drive: np.ndarray) -> None:
         display_into(
             self._command.Eval(context),
             self._device.Eval(context),
             self._period,
             self._jacobian,
-            shown,
-            drive,
+            output.get_mutable_value(),
         )
+
+    def _calc_force(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._drive.Eval(context)[_LAST])
+
+    def _calc_fault(self, context: Context, output: BasicVector) -> None:
+        output[0] = self._drive.Eval(context)[_FAULT]
+
+    def _calc_both(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._drive.Eval(context)[_SHOWN])

@@ -101,12 +101,12 @@ WRENCH = np.array([3.0, -2.0, 5.0, 0.05, -0.02, 0.03])
 
 def displayed_over(commands, angles) -> tuple[np.ndarray, np.ndarray]:
     """(N, 7) displayed wrench and fault, (N, 6) torque, one period after the other."""
-    device, J, drive = initial_display(POSTURES[1]), np.empty((6, 6)), np.empty(26)
+    device, J, drive = initial_display(POSTURES[1]), np.empty((6, 6)), np.empty(27)
     shown, torque = np.empty((len(commands), 7)), np.empty((len(commands), 6))
     for k, (command, q) in enumerate(zip(commands, angles, strict=True)):
         device[:6] = q
-        display_into(command, device, PERIOD, J, shown[k], drive)
-        torque[k] = drive[:6]
+        display_into(command, device, PERIOD, J, drive)
+        torque[k], shown[k] = drive[:6], drive[12:19]
         device[6:] = drive[6:]
     return shown, torque
 
