@@ -76,7 +76,7 @@ _SAME = 1e-6
 _LONGEST = 16
 #: How often the plant is asked whether it moves as the dynamics here say [s], and how alike they
 #: have to be: rounding is 1e-12, in a stiff contact 1e-9.
-_CHECK_PERIOD, _ALIKE = 0.05, 1e-6
+_CHECK_PERIOD, _ALIKE = 0.1, 1e-6
 #: For so many samples a lost one shows, so that no log misses it.
 _SHOWS = 40
 
@@ -352,8 +352,12 @@ class WristSensor(LeafSystem):
         self.DeclareDiscreteState(memory)
         self._result = np.zeros(len(first) + 1 + len(memory))
         self._remains = slice(len(first) + 1, None)  # of a step: the memory
+        # Not the acceleration: whatever changes in the plant would be passed on twice.
+        seen = (self._state, self._torque, self._applied, self._sheet, self._contacts, self._noise)
+        tickets = {port.ticket() for port in seen if port is not None}
+        tickets |= {self.time_ticket(), self.xd_ticket()}
         self._step = self.DeclareVectorOutputPort(
-            "step", len(self._result), weak_callback(self._calc_step)
+            "step", len(self._result), weak_callback(self._calc_step), tickets
         )
         self.DeclarePerStepDiscreteUpdateEvent(self._update)
         self.DeclarePeriodicPublishEvent(_CHECK_PERIOD, 0.0, self._check)
