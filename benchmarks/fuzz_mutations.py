@@ -162,7 +162,7 @@ def yaml_text(rng: random.Random, content: bytes, other: bytes) -> bytes:
         _edit_node(rng, root, more or root)
     try:
         return yaml.serialize(root, allow_unicode=True, width=1000).encode()
-    except (yaml.YAMLError, RecursionError, TypeError, UnicodeEncodeError):
+    except (yaml.YAMLError, RecursionError, AttributeError, TypeError, UnicodeEncodeError):
         return text(rng, content, other)
 
 

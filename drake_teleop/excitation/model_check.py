@@ -30,9 +30,9 @@ def check_model(root: Element, where: str) -> list[str]:
         Assumptions: which links have no mass or no inertia.
 
     Raises:
-        DrakeTeleopError: for a link with two parents, joints that form a circle, limits that are
-            no numbers or the wrong way round, a negative mass, an inertia that no body has, a
-            length or a mass that no arm has.
+        DrakeTeleopError: for a link with two parents, a second root in a URDF, joints that form a
+            circle, limits that are no numbers or the wrong way round, a negative mass, an inertia
+            that no body has, a length or a mass that no arm has.
     """
     _check_tree(root, where)
     for element in root.iter():
@@ -59,6 +59,13 @@ def _check_tree(root: Element, where: str) -> None:
                 remedy="an arm is a tree: each link is the child of one joint",
             )
         parents[child] = parent, name
+    loose = [link.get("name", "") for link in root.iter("link") if link.get("name") not in parents]
+    if root.tag == "robot" and len(loose) > 1:
+        raise DrakeTeleopError(
+            f"{loose[0]} and {loose[1]} are both the child of no joint",
+            where=where,
+            remedy="a URDF has one root: fasten the rest to it by joints, or take it out",
+        )
     for start in parents:
         link, passed = start, {start}
         while link in parents:

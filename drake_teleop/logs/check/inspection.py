@@ -188,7 +188,7 @@ def _stream(
         for field in _QUANTITIES
         for column in getattr(getattr(stream, field, None), "columns", ())
     ]
-    values = np.hstack([table.raw(c, f"{source}:{name}") for c in columns])
+    values = table.all_raw(columns, f"{source}:{name}")
     good = np.asarray(np.isfinite(values).all(axis=1))
     findings: list[Finding] = []
     figures: dict[str, Any] = {"rows": len(values)}

@@ -66,6 +66,20 @@ class Table:
                 columns and rows are not these.
         """
         columns = [self._column(str(name), where) for name in names]
+        self._check_rows(names, columns, where, rows)
+        found = sum(column.shape[1] for column in columns)
+        if found != width:
+            raise DrakeTeleopError(
+                f"{found} columns where {width} are needed",
+                where=where,
+                remedy=f"list {width} columns of {self.path.name}",
+            )
+        return np.hstack(columns)
+
+    def _check_rows(
+        self, names: Sequence[str | int], columns: list[NDArray], where: str, rows: int | None
+    ) -> None:
+        """Raises an error if not all have so many rows, or None: as many as the first."""
         rows = len(columns[0]) if columns and rows is None else rows
         for name, column in zip(names, columns, strict=True):
             if len(column) != rows:
@@ -74,13 +88,15 @@ class Table:
                     where=where,
                     remedy="name columns that belong together",
                 )
-        found = sum(column.shape[1] for column in columns)
-        if found != width:
-            raise DrakeTeleopError(
-                f"{found} columns where {width} are needed",
-                where=where,
-                remedy=f"list {width} columns of {self.path.name}",
-            )
+
+    def all_raw(self, names: Sequence[str | int], where: str) -> NDArray[np.float64]:
+        """`raw` of several columns, side by side.
+
+        Raises:
+            DrakeTeleopError: as `raw`, and if they have different numbers of rows.
+        """
+        columns = [self.raw(name, where) for name in names]
+        self._check_rows(names, columns, where, None)
         return np.hstack(columns)
 
     def raw(self, name: str | int, where: str) -> NDArray[np.float64]:
