@@ -148,8 +148,8 @@ def test_a_push_that_the_sensor_is_not_told_of_is_an_error(slave):
     # S points down and carries 2 N less: f = -m g - push.
     assert sample[2] == pytest.approx(-3.13 * 9.81 + 2.0, abs=0.05)
     fixed.GetMutableData().set_value(BasicVector(np.zeros(6)))
-    with pytest.raises(DrakeTeleopError, match=r"wrist_sensor.applied_wrench_W: at 0\.2"):
-        simulator.AdvanceTo(0.3)
+    with pytest.raises(DrakeTeleopError, match=r"wrist_sensor.applied_wrench_W: at 0\.3"):
+        simulator.AdvanceTo(0.35)
 
 
 def first_harmonic(signal: np.ndarray, t: np.ndarray, frequency: float) -> complex:
