@@ -284,6 +284,7 @@ def test_a_simulation_becomes_unstable_at_the_margin(bench: ModuleType, axis: On
     assert float(delay_margin(cut_loop(axis, JR3))) == pytest.approx(simulated, abs=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 5e-3, 20e-3, 40e-3])
 def test_multipliers_predict_how_a_perturbation_grows(bench: ModuleType, delay: float) -> None:
     axis = held("medium", delay=delay)

@@ -44,16 +44,19 @@ def test_what_is_charged_by_drag_is_not_given_out_twice(least):
     assert least["charged_tdpa"]["stronger"] > 0.2, "there should have been drag"
 
 
+@pytest.mark.slow
 def test_waves_give_out_the_energy_that_came_and_no_more(least):
     assert least["wave"]["energy"] >= -1e-9
     assert least["wave_hold"]["energy"] < -1e-3, "held waves should have created energy"
 
 
+@pytest.mark.slow
 def test_a_tank_is_never_overdrawn_at_the_true_port_of_a_held_wrench(least):
     assert least["two_layer"]["true_energy"] >= -1e-9
     assert least["two_layer"]["tank"] >= -1e-9
     assert least["two_layer_no_margin"]["tank"] < -1e-5, "the margin should have mattered"
 
 
+@pytest.mark.slow
 def test_without_a_method_energy_is_created(least):
     assert least["none"]["energy"] < -1.0
