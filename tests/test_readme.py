@@ -33,6 +33,11 @@ def test_it_is_short_and_begins_with_the_scene():
     assert len(others) >= 7
 
 
+def test_limits_stand_with_what_they_assume():
+    (said,) = (text for text in README.split("\n\n") if "34.0" in text)
+    assert "without the device's Coulomb friction" in " ".join(said.split())
+
+
 def test_every_link_into_the_repository_leads_somewhere():
     targets = re.findall(r"\]\((?!https?:)([^)]+)\)", README)
     assert targets

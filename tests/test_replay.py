@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import socket
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -150,6 +151,15 @@ def test_clock_and_newtons_beside_the_film_are_the_logs(page, scenario, result):
         assert reading["unit"] == "N"
         newtons = np.linalg.norm(force[:, :3], axis=1)
         np.testing.assert_allclose(reading["values"][::5], newtons, atol=6e-4)
+
+
+def test_it_begins_anew_at_its_end(page):
+    """What the player shows next is written as Python would write it."""
+    (following,) = re.findall(r"if \(playing\) show\((.*)\);", page)
+    film = SimpleNamespace(span=0.04)
+    for now, expected in ((0.01, 0.012), (0.039, 0.001)):
+        found = eval(following, {"now": now, "passed": 0.002, "film": film})
+        assert found == pytest.approx(expected)
 
 
 def test_every_field_of_the_scenario_lies_beside_the_log(tmp_path, scenario):

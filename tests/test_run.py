@@ -23,10 +23,10 @@ from drake_teleop.scenario import LoadScenario
 # Learns while it moves, so that no identification comes first.
 QUICK = """
 simulation: {duration: 0.15, settle: 0.05, seed: 4}
+load_estimator: {enabled: true}
 operator:
   grip: firm
   intent: [!Sine {duration: 10.0, ramp: 0.1, frequency: 3.0, translation: [0.01, 0.01, 0.02]}]
-load_estimator: {enabled: true}
 """
 
 
@@ -145,13 +145,16 @@ def test_a_scenario_that_learns_needs_no_identification_before(quick):
 
 
 @pytest.mark.slow
-def test_a_saturated_sensor_is_reported_with_its_time_in_the_table_too(quick, capsys):
-    more = "wrist_sensor: {force_range: [100, 100, 31]}"
+def test_saturation_and_why_a_task_failed_are_said_in_the_table_too(quick, capsys):
+    more = "  task: !Reach {t_start: 0.1}\nwrist_sensor: {force_range: [100, 100, 31]}"
     summary, _ = quick("saturated", more, quiet=False)
+    assert summary["success"] == 0.0
+    assert summary["failure"].startswith("the simulation ended after 0.10 s of the task, while")
     (warning,) = summary["warnings"]
     assert warning.startswith("the wrist sensor saturates from 0.")
-    said = capsys.readouterr().out
+    said = " ".join(capsys.readouterr().out.split())
     assert "peak_measured_force_N" in said
+    assert f"the task failed: {summary['failure']}" in said
     assert "warning: the wrist sensor saturates" in said
     assert "written to" in said
 

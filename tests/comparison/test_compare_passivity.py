@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 
 import polars as pl
 import pytest
@@ -59,7 +60,8 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
     page = (tmp_path / "report.html").read_text()
     assert "round trip 1 ms" in page
     # All columns are seen in a window of 1200 px, of which the page takes 944: a letter has about
-    # 8.5 px, and a column 11 px to its neighbour.
+    # 8.5 px, and a column 11 px to its neighbour. Headings take as many lines as they have words.
+    assert re.search(r"\nth\.number {[^}]*white-space: normal", page)
     rows = [["charged_tdpa", "Stable", *(heading for _, heading, _, _ in COLUMNS)]]
     rows += [["four_channel", "yes", *cells(row)] for row in summary["station"]]
     words = [max(map(len, " ".join(column).split())) for column in zip(*rows, strict=True)]
