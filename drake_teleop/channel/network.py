@@ -131,7 +131,12 @@ _BAD, _ARRIVED, _RECEIVED, _SILENT, _FIRST_SLOT = range(5)
 
 
 def parameters(
-    config: NetworkConfig, seed: int, direction: int, period: float, least: int = 0
+    config: NetworkConfig,
+    seed: int,
+    direction: int,
+    period: float,
+    least: int = 0,
+    delays: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float64]:
     """The parameters of one direction of a network, for the compiled functions below.
 
@@ -141,12 +146,15 @@ def parameters(
         direction: FORWARD or BACKWARD, which are random independently of each other.
         period: time between steps [s].
         least: steps that any packet takes at least.
+        delays: (M,) steps that each packet travels, -1 where it is lost, in the place of the
+            config's trace; after its end it starts again.
 
     Raises:
         DrakeTeleopError: for a value out of range, or naming file, column and row of a bad trace.
     """
     config.check()
     trace = np.zeros(0) if config.trace is None else _read_trace(Path(config.trace), period)
+    trace = trace if delays is None else np.asarray(delays, np.float64)
     mean, playout = config.delay / period, math.floor(config.playout / period + 0.5)
     longest = math.floor(mean * (1 + _TAILS[config.distribution] * config.jitter) + 0.5)
     if trace.size:

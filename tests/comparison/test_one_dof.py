@@ -14,12 +14,15 @@ from drake_teleop.analysis.delayed_loop import delay_margin, station_loop
 from drake_teleop.analysis.one_axis import Axis, OneAxis, servo_response
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.comparison.one_dof import (
+    ACTUAL,
+    HAND,
     PERIOD,
     REFERENCE,
     OneDof,
     Task,
     figures,
     figures_of,
+    operators_intent,
     run_one_dof,
 )
 from drake_teleop.operator.operator import GRIPS
@@ -187,6 +190,81 @@ def test_the_same_seed_gives_the_same_run():
     )
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 0
+
+
+def test_the_accounts_are_those_of_spring_inertia_and_of_each_other():
+    task = Task(swing=0.1, swung=0.7, press=0.7, pressed=1.0, release=1.3, released=1.5, end=2.0)
+    intent, scale, ahead = operators_intent(task), REFERENCE.force_scale, np.full(2000, 10)
+    run = run_one_dof(REFERENCE, PassivityConfig(), NetworkConfig(delay=0.01), intent=intent)
+    spring = 0.5 * scale * REFERENCE.wall_stiffness * np.maximum(run.slave, 0.0) ** 2
+    hand, command, motor, actual = run.accounts.T
+    # A spring gives back what it has taken, to rounding; so it is not the wall that is active.
+    np.testing.assert_allclose(actual, -spring, rtol=0.0, atol=1e-14)
+    assert spring.max() > 0.01 and run.least(ACTUAL) < -0.01 and run.start_energy == 0.0
+    # The motor has given what the wall holds and what moves; v is half a step of 50 us late.
+    speed = np.gradient(run.slave, PERIOD)
+    moving = 0.5 * scale * REFERENCE.slave_mass * speed**2
+    assert moving.max() > 0.1
+    np.testing.assert_allclose(motor, actual - moving, rtol=0.0, atol=6e-4)
+    still = np.abs(speed) < 1e-4
+    np.testing.assert_allclose(motor[still], actual[still], rtol=0.0, atol=1e-6)
+    np.testing.assert_array_equal(hand, run.energy[:, 0])
+    assert run.least(HAND) == hand.min()
+    # By parts: the command's account has what the servo's lag holds besides.
+    wrench, lag = scale * run.wall, run.command - run.slave
+    sampled = np.cumsum(wrench * np.diff(run.slave, prepend=run.slave[0]))
+    held = wrench * lag - np.cumsum(np.roll(lag, 1) * np.diff(wrench, prepend=0.0))
+    np.testing.assert_allclose(command, sampled + held, rtol=0.0, atol=1e-12)
+    assert (command - actual).max() > 1e-3
+    # The packets of a network one by one, the same in a hand and before a wall that do not change.
+    given = run_one_dof(
+        REFERENCE,
+        PassivityConfig(),
+        NetworkConfig(),
+        intent=intent,
+        grip=np.tile([0.2, 5.0, 300.0], (len(intent), 1)),
+        wall=np.tile([0.0, 5100.0], (len(intent), 1)),
+        delays=(ahead, ahead),
+    )
+    np.testing.assert_array_equal(given.accounts, run.accounts)
+
+
+def test_what_changes_in_a_run_and_what_is_not_ideal():
+    steps = 900
+    intent, grip, wall = np.zeros((steps, 2)), np.zeros((steps, 3)), np.zeros((steps, 2))
+    intent[:, 0], grip[:600] = 0.019, (0.2, 5.0, 300.0)
+    wall[:, 0], wall[600:, 0], wall[750:] = 0.02, 0.005, (0.02, 0.0)
+    wall[:750, 1] = 5100.0
+    lost = np.zeros(steps, np.int64)
+    lost[800:] = -1
+    model = dataclasses.replace(
+        REFERENCE,
+        slave_friction=30.0,
+        wall_damping=300.0,
+        motor_lag=3e-3,
+        master_resolution=30e-6,
+        slave_resolution=10e-6,
+        wrench_noise=0.5,
+    )
+    run = run_one_dof(
+        model,
+        PassivityConfig(),
+        NetworkConfig(),
+        intent=intent,
+        grip=grip,
+        wall=wall,
+        delays=(lost, lost),
+        timeout=0.05,
+    )
+    # At rest before the wall; it comes nearer by 15 mm, pushes slave and free device away,
+    # is gone again; at last nobody hears anything.
+    assert run.wall[:599].min() == 0.0 == run.wall[750:].min() and run.wall[600:750].min() < -20.0
+    assert run.accounts[749, ACTUAL] == run.accounts[-1, ACTUAL]
+    noise = run.felt[50:590] / model.force_scale
+    assert noise.std() == pytest.approx(0.5, rel=0.15)
+    assert run.master[749] < 0.019 and np.all(run.silent[-1] > 0.09)
+    steps_of = np.round(run.command[600:800] / 30e-6) * 30e-6
+    np.testing.assert_allclose(run.command[600:800], steps_of, atol=1e-15)
 
 
 @pytest.mark.parametrize(
