@@ -28,7 +28,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_teleop import cli
 from drake_teleop.channel import network
 from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
-from drake_teleop.excitation.models import ParseModel
+from drake_teleop.excitation.models import ParseModel, drakes_errors_said
 from drake_teleop.excitation.robot import RobotFromModel
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -392,7 +392,8 @@ def _sdfs(_: Path) -> list[bytes]:
 def _model(path: Path) -> None:
     plant = MultibodyPlant(0.0)
     ParseModel(plant, path, "sensor")
-    plant.Finalize()
+    with drakes_errors_said(path):
+        plant.Finalize()
 
 
 def _robot(path: Path) -> None:

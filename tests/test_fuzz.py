@@ -37,6 +37,7 @@ SAID = {
     "result-panic_2.parquet": "cannot be read: it is damaged",
     "result-panic_3.parquet": "is not a simulation result",
     "result-times_in_pairs.parquet": "is not a simulation result",
+    "robot-large_shape.urdf": "a shape of l2 is 2.02e+05 m large, more than 1000 m",
     "robot-two_roots.urdf": "l0 and l2 are both the child of no joint",
     "robot-no_radius.urdf": "cannot be read as a robot",
     "robot-1e300_m.urdf": "origin 1e300 is no finite number up to 1e+06",
@@ -46,6 +47,9 @@ SAID = {
     "scenario-tag_of_nothing.yaml": "operator.task: '!!' is not known",
     "sdf-colour.sdf": "",
     "sdf-logged_error.sdf": "cannot be read as a robot",
+    "urdf-circle_in_no_xml.urdf": "is not XML (not well-formed (invalid token): line 20",
+    "urdf-long_package.urdf": "",
+    "urdf-unknown_encoding.urdf": "is not XML (unknown encoding: utf-9)",
     "trace_npz-empty_delay.npz": "'delay' of case.npz has 0 numbers in a row",
 }
 """Of each case a part of its error; empty if it is none."""

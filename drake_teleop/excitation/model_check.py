@@ -8,6 +8,7 @@ joint or link; what is merely missing is an assumption.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -18,6 +19,7 @@ _INERTIAS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 # What places, shapes and masses are said with, in URDF and SDF.
 _MEASURES = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
 _MEASURES |= {"radius", "radii", "length", "scale", "mass", "inertia", *_INERTIAS}
+WORLD = "world"  # as URDF and SDF call it
 _LARGEST = 1e6  # of these in SI; limits may be larger, where there is none
 # How far principal moments may be from those of a body, for rounding in the file.
 _ROUNDING = 1e-3
@@ -34,7 +36,8 @@ def check_model(root: Element, where: str) -> list[str]:
             circle, limits that are no numbers or the wrong way round, a negative mass, an inertia
             that no body has, a length or a mass that no arm has.
     """
-    _check_tree(root, where)
+    for scope in root.iter():
+        _check_scope(scope, where)
     for element in root.iter():
         if element.tag in _MEASURES:
             _check_measure(element, where)
@@ -45,43 +48,61 @@ def check_model(root: Element, where: str) -> list[str]:
     return [f"no inertia of {', '.join(without)}"] if without else []
 
 
-def _check_tree(root: Element, where: str) -> None:
+def check_tree(joints: Iterable[tuple[str, str, str]], where: str) -> dict[str, tuple[str, str]]:
+    """Checks that joints make a tree, or several.
+
+    Args:
+        joints: name, parent and child of each.
+        where: for the message.
+
+    Returns:
+        Of each link that hangs on a joint, its parent and the joint's name.
+
+    Raises:
+        DrakeTeleopError: for a link with two parents, a world that hangs on something, a circle.
+    """
     parents: dict[str, tuple[str, str]] = {}
-    for joint in root.iter("joint"):
-        parent, child = _end(joint, "parent"), _end(joint, "child")
-        if not parent or not child:  # of something else of this name, or Drake says what lacks
-            continue
-        name = joint.get("name", "")
-        if child in parents:
+    for name, parent, child in joints:
+        if child in parents or child == WORLD:
+            on = f"two joints, {parents[child][1]} and {name}" if child in parents else name
             raise DrakeTeleopError(
-                f"{child} hangs on two joints, {parents[child][1]} and {name}",
+                f"{child} hangs on {on}",
                 where=where,
-                remedy="an arm is a tree: each link is the child of one joint",
+                remedy="an arm is a tree: each link is the child of one joint, the world of none",
             )
         parents[child] = parent, name
-    loose = [link.get("name", "") for link in root.iter("link") if link.get("name") not in parents]
-    if root.tag == "robot" and len(loose) > 1:
-        raise DrakeTeleopError(
-            f"{loose[0]} and {loose[1]} are both the child of no joint",
-            where=where,
-            remedy="a URDF has one root: fasten the rest to it by joints, or take it out",
-        )
     for start in parents:
         link, passed = start, {start}
         while link in parents:
             link = parents[link][0]
             if link in passed:
-                raise circle(link, where)
+                raise DrakeTeleopError(
+                    f"its joints form a circle through {link}",
+                    where=where,
+                    remedy="an arm is a tree: cut the loop, or model the chain to the sensor alone",
+                )
             passed.add(link)
+    return parents
 
 
-def circle(link: str, where: str) -> DrakeTeleopError:
-    """The error for joints that form a circle, in which this link is."""
-    return DrakeTeleopError(
-        f"its joints form a circle through {link}",
-        where=where,
-        remedy="an arm is a tree: cut the loop, or model the chain to the sensor alone",
-    )
+def _check_scope(scope: Element, where: str) -> None:
+    """Checks the tree of a robot or a model; models inside it have names of their own."""
+    joints = [
+        (joint.get("name", ""), parent, child)
+        for joint in scope.findall("joint")
+        for parent, child in [(_end(joint, "parent"), _end(joint, "child"))]
+        if parent and child  # or Drake says what lacks
+    ]
+    parents = check_tree(joints, where)
+    loose = [
+        name for link in scope.findall("link") if (name := link.get("name", "")) not in parents
+    ]
+    if scope.tag == "robot" and len(loose) > 1:
+        raise DrakeTeleopError(
+            f"{loose[0]} and {loose[1]} are both the child of no joint",
+            where=where,
+            remedy="a URDF has one root: fasten the rest to it by joints, or take it out",
+        )
 
 
 def _end(joint: Element, name: str) -> str:

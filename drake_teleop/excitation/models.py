@@ -10,15 +10,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NoReturn
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame, ModelInstanceIndex
+from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.excitation.model_check import check_model, circle
+from drake_teleop.excitation.model_check import WORLD, check_model, check_tree
 from drake_teleop.silence import silent_stderr
 from drake_teleop.texts import read_text, read_yaml
 
@@ -69,18 +71,20 @@ def ParseModel(
     packages = _Packages(path, package_paths)
     parser = Parser(plant)
     for name, folder in packages.found.items():
+        if parser.package_map().Contains(name):  # Drake's own, which theirs takes the place of
+            parser.package_map().Remove(name)
         parser.package_map().Add(name, str(folder))
     kind = path.suffix.lower().removeprefix(".")
     efforts: dict[str, float] = {}
     lost: dict[str, list[str]] = {}
     assumptions: list[str] = []
     converted = TemporaryDirectory(prefix="drake_teleop_")
-    try:
-        root = _xml(path) if kind in ("urdf", "sdf") else None
-        if kind == "yaml":
-            read_yaml(path, tagged=True)  # Drake's parser overflows its stack over many brackets
-        elif root is None and kind in ("urdf", "sdf", "xml"):
-            read_text(path)  # or names cannot be said
+    root = _xml(path) if kind in ("urdf", "sdf") else None
+    if kind == "yaml":
+        read_yaml(path, tagged=True)  # Drake's parser overflows its stack over many brackets
+    elif kind == "xml":
+        read_text(path)  # or names cannot be said
+    with drakes_errors_said(path):
         if root is None:
             with _drakes_errors_raised():
                 instances = parser.AddModels(str(path))
@@ -91,15 +95,6 @@ def ParseModel(
             text = ElementTree.tostring(root, encoding="unicode")
             with _drakes_errors_raised():
                 instances = parser.AddModelsFromString(text, kind)
-    except DrakeTeleopError:
-        raise
-    except (RuntimeError, SystemExit, ValueError) as error:  # SystemExit: a condition of Drake's
-        reason = str(error).replace("<literal-string>", "")
-        raise DrakeTeleopError(
-            f"cannot be read as a robot ({reason.strip()})",
-            where=str(path),
-            remedy="give a URDF, SDF, MJCF or .dmd.yaml model, with --package-path for package://",
-        ) from None
     having = [i for i in instances if plant.HasFrameNamed(sensor_frame, i)]
     if len(having) != 1:
         frames = [
@@ -117,6 +112,23 @@ def ParseModel(
     frame = plant.GetFrameByName(sensor_frame, having[0])
     _weld_base(plant, frame, {} if root is None else _peculiar_joints(root), str(path))
     return ParsedModel(having[0], frame, efforts, lost, assumptions, converted)
+
+
+@contextmanager
+def drakes_errors_said(path: Path) -> Iterator[None]:
+    """Makes one error, with the file, of what Drake raises over a model: at parsing or later."""
+    try:
+        yield
+    except DrakeTeleopError:
+        raise
+    # SystemExit: a condition of Drake's; LookupError: of the containers of C++.
+    except (RuntimeError, SystemExit, ValueError, LookupError) as error:
+        reason = str(error).replace("<literal-string>", "")
+        raise DrakeTeleopError(
+            f"cannot be read as a robot ({reason.strip()})",
+            where=str(path),
+            remedy="give a URDF, SDF, MJCF or .dmd.yaml model, with --package-path for package://",
+        ) from None
 
 
 @contextmanager
@@ -143,24 +155,41 @@ def _drakes_errors_raised() -> Iterator[None]:
         raise RuntimeError(errors[0])
 
 
-def _xml(path: Path) -> ElementTree.Element | None:
-    """The root of an XML file; None if Drake has to read it, or to say what is wrong with it."""
+def _xml(path: Path) -> ElementTree.Element:
+    """The root of an XML file, with names as they stand there: Drake knows its own by `drake:`.
+
+    Drake's parser reads what is no XML too. That would be checked by nobody, so it is an error.
+    """
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.CharacterDataHandler = builder.data
+
+    def unread(name: str | None, *_: object) -> NoReturn:
+        raise ValueError(f"the entity {name} is not in this file")
+
+    parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = unread
     try:
-        for _, (prefix, address) in ElementTree.iterparse(path, events=["start-ns"]):
-            # Drake knows its own elements by their prefix.
-            ElementTree.register_namespace(prefix, address)
-        return ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, ValueError):
-        return None
+        parser.Parse(path.read_bytes(), True)
+        return builder.close()
+    except (expat.ExpatError, ValueError, LookupError) as error:  # the last two of its encoding
+        remedy = "give a URDF or SDF that other readers of XML take too"
+        raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
 
 
 def _weld_base(plant: MultibodyPlant, frame: Frame, peculiar: dict[str, str], where: str) -> None:
+    def name_of(body: RigidBody) -> str:
+        is_world = body.index() == plant.world_body().index()
+        return WORLD if is_world else body.scoped_name().get_full()
+
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    # Once more, because `check_model` looks neither into other files nor beyond URDF and SDF.
+    check_tree(
+        ((each.name(), name_of(each.parent_body()), name_of(each.child_body())) for each in joints),
+        where,
+    )
     inboard = {joint.child_body().index(): joint for joint in joints}
     body, chain = frame.body(), list[str]()
     while body.index() in inboard:
-        if len(chain) > len(inboard):
-            raise circle(body.name(), where)
         chain.append(inboard[body.index()].name())
         body = inboard[body.index()].parent_body()
     for name in (*chain, body.name()):
@@ -199,7 +228,7 @@ class _Packages:
         for name in set(re.findall(r"package://([^/\s\"'<]+)", text)):
             for folder in (*package_paths, self._folder, *self._folder.parents):
                 for candidate in (folder / name, folder):
-                    if candidate.is_dir() and candidate.name == name:
+                    if os.path.isdir(candidate) and candidate.name == name:
                         self.found.setdefault(name, candidate.resolve())
 
     def file(self, address: str) -> Path | None:

@@ -21,7 +21,7 @@ from pydrake.systems.framework import Diagram
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.criteria import Scales, characteristic_length
 from drake_teleop.excitation.limits import Limits
-from drake_teleop.excitation.models import ParseModel
+from drake_teleop.excitation.models import ParseModel, drakes_errors_said
 from drake_teleop.excitation.prediction import SensorNoise, sensor_noise
 from drake_teleop.excitation.scene import CLEARANCE, Parse, Scene
 from drake_teleop.load.arrays import Array
@@ -160,7 +160,8 @@ def RobotFromModel(
         return model.instance, model.sensor_frame
 
     assumptions = ["a table at z = 0"]
-    load = _arm_of(parse).phi_load
+    with drakes_errors_said(path):
+        load = _arm_of(parse).phi_load
     if payload is None and load[0] > 0:
         reserve = (_LOAD_FACTOR - 1) * load
     else:
@@ -179,7 +180,8 @@ def RobotFromModel(
                 remedy="give the mass of all that may hang there",
             )
         reserve = _payload(mass - load[0])
-    scene = Scene(parse, reserve, visuals_count=False)
+    with drakes_errors_said(path):
+        scene = Scene(parse, reserve, visuals_count=False, where=str(path))
     assumptions += [
         f"shapes are missing of {', '.join(links)}: {what}" for what, links in lost.items()
     ]

@@ -11,7 +11,9 @@ from pydrake.geometry import (
     CollisionFilterDeclaration,
     GeometryId,
     GeometrySet,
+    HalfSpace,
     ProximityProperties,
+    Role,
     SceneGraph,
     Shape,
 )
@@ -28,6 +30,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.capsules import Capsule, bounding_capsule
 from drake_teleop.excitation.limits import capsule_distances, empty_motions, motions_of
 from drake_teleop.load.arrays import Array
@@ -51,6 +54,9 @@ _FEW = 5
 _SELDOM = 0.05
 
 _TABLE = "drake_teleop_table"
+# Stands for a plane, to which Drake gives no distances, and where below it; wider than any arm.
+_PLATE, _X_PLANE_PLATE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
+_LARGEST = 1e3  # of shapes [m]; with 1e4 Drake's distances abort, or never end
 # A plane as a ball of 1 km: 2 m away it is 2 mm too low, and the check has the plane.
 _TABLE_CAPSULE = Capsule(np.full((2, 3), (0.0, 0.0, -1e3)), 1e3)
 
@@ -59,19 +65,32 @@ Parse = Callable[[MultibodyPlant], tuple[ModelInstanceIndex, Frame]]
 
 
 class Scene:
-    """Plant and scene graph of the arm with its heaviest load, and which shapes may collide."""
+    """Plant and scene graph of the arm with its heaviest load, and which shapes may collide.
 
-    def __init__(self, parse: Parse, reserve: Array, *, visuals_count: bool) -> None:
+    Args:
+        parse: adds the arm and its surroundings to a plant.
+        reserve: (10,) phi of what may hang on the sensor besides.
+        visuals_count: whether links are as large as they are seen, too.
+        where: all this is from, for messages.
+
+    Raises:
+        DrakeTeleopError: for a shape that is too large to be one of an arm.
+    """
+
+    def __init__(
+        self, parse: Parse, reserve: Array, *, visuals_count: bool, where: str = ""
+    ) -> None:
         builder = DiagramBuilder()
         self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         instance, self.sensor_frame = parse(self.plant)
         _add_load(self.plant, instance, self.sensor_frame, reserve)
         _make_solid(self.plant, self.scene_graph, visuals_count)
+        _check_sizes(self.plant, self.scene_graph, where)
         _add_shape(
             self.plant,
             self.plant.world_body(),
-            RigidTransform([0, 0, -0.5]),
-            Box(10, 10, 1),
+            RigidTransform(),
+            HalfSpace(),
             _TABLE,
         )
         finalize(self.plant)
@@ -228,10 +247,18 @@ def _add_load(
 
 
 def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool) -> None:
-    """Gives links the shapes they are seen with, if `visuals_count` or they have no other."""
+    """Gives links the shapes they are seen with, if `visuals_count` or they have no other.
+
+    Plates take the place of planes.
+    """
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         body = plant.get_body(BodyIndex(index))
+        for k, solid in enumerate(plant.GetCollisionGeometriesForBody(body)):
+            if isinstance(shape := inspector.GetShape(solid), HalfSpace):
+                X_BG = inspector.GetPoseInFrame(solid)
+                scene_graph.RemoveRole(plant.get_source_id(), solid, Role.kProximity)
+                _add_shape(plant, body, X_BG, shape, f"drake_teleop_plane_{k}")
         if plant.GetCollisionGeometriesForBody(body) and not visuals_count:
             continue
         for k, seen in enumerate(plant.GetVisualGeometriesForBody(body)):
@@ -239,7 +266,27 @@ def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: b
             _add_shape(plant, body, X_BG, shape, f"drake_teleop_solid_{k}")
 
 
+def _check_sizes(plant: MultibodyPlant, scene_graph: SceneGraph, where: str) -> None:
+    inspector = scene_graph.model_inspector()
+    for index in range(plant.num_bodies()):
+        body = plant.get_body(BodyIndex(index))
+        for solid in plant.GetCollisionGeometriesForBody(body):
+            shape = inspector.GetShape(solid)
+            if isinstance(shape, HalfSpace):  # a plate stands for it
+                continue
+            capsule = bounding_capsule(shape)
+            size = np.ptp(capsule.ends, axis=0).max() + 2 * capsule.radius
+            if not size <= _LARGEST:
+                raise DrakeTeleopError(
+                    f"a shape of {body.name()} is {size:.3g} m large, more than {_LARGEST:g} m",
+                    where=where,
+                    remedy="give all lengths in metres",
+                )
+
+
 def _add_shape(
     plant: MultibodyPlant, body: RigidBody, X_BG: RigidTransform, shape: Shape, name: str
 ) -> None:
+    if isinstance(shape, HalfSpace):
+        X_BG, shape = X_BG @ _X_PLANE_PLATE, _PLATE
     plant.RegisterCollisionGeometry(body, X_BG, shape, name, ProximityProperties())

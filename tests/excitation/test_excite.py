@@ -401,6 +401,88 @@ def test_an_sdf_is_checked_too(tmp_path):
         RobotFromModel(path, "wrist", WristSensorConfig())
 
 
+_LINKS = "".join(f"<link name='{name}'/>" for name in "abc")
+_SDF = "<sdf version='1.7'><model name='m'>{}</model></sdf>"
+
+
+def _joint(parent, child):
+    ends = f"<parent>{parent}</parent><child>{child}</child>"
+    return f"<joint name='{parent}{child[-1]}' type='fixed'>{ends}</joint>"
+
+
+@pytest.mark.parametrize(
+    ("ends", "expected"),
+    [
+        (("ab", "bc", "ca"), "a circle through m::m::b"),
+        (("ab", "cb"), "m::m::b hangs on two joints, ab and cb"),
+    ],
+)
+def test_the_tree_of_another_file_is_checked_too(tmp_path, ends, expected):
+    """Drake reads what a model includes, after `check_model`."""
+    (tmp_path / "inside.sdf").write_text(_SDF.format(_LINKS + "".join(_joint(*e) for e in ends)))
+    model = tmp_path / "model.sdf"
+    model.write_text(_SDF.format(f"<include><uri>{tmp_path.as_uri()}/inside.sdf</uri></include>"))
+    with pytest.raises(DrakeTeleopError, match=expected):
+        ParseModel(MultibodyPlant(0.0), model, "c")
+
+
+def test_models_inside_a_model_have_names_of_their_own(tmp_path):
+    inside = [f"<model name='{name}'>{_LINKS}{_joint('a', 'b')}</model>" for name in ("n", "o")]
+    model = tmp_path / "model.sdf"
+    model.write_text(_SDF.format("".join(inside) + "<link name='hand'/>" + _joint("o::b", "hand")))
+    ParseModel(MultibodyPlant(0.0), model, "hand")
+
+
+@pytest.mark.parametrize(
+    "entity", ["<!DOCTYPE robot SYSTEM 'a.dtd'>", "<!DOCTYPE robot [<!ENTITY e SYSTEM 'a.txt'>]>"]
+)
+def test_no_part_of_a_model_is_left_out_unsaid(urdf, entity):
+    urdf.write_text(entity + urdf.read_text().replace("</robot>", "&e;</robot>"))
+    with pytest.raises(DrakeTeleopError, match=r"is not XML \(the entity e is not in this file"):
+        ParseModel(MultibodyPlant(0.0), urdf, "l6")
+
+
+def test_the_world_hangs_on_nothing(urdf):
+    urdf.write_text(urdf.read_text().replace('"l6"', '"world"'))
+    with pytest.raises(DrakeTeleopError, match="world hangs on j6"):
+        ParseModel(MultibodyPlant(0.0), urdf, "l3")
+
+
+def test_what_drake_refuses_at_last_is_one_error(urdf, monkeypatch):
+    def refused(_):
+        raise RuntimeError("form one or more loops")
+
+    monkeypatch.setattr("drake_teleop.excitation.robot.finalize", refused)
+    with pytest.raises(DrakeTeleopError, match=r"arm\.urdf: cannot be read .*one or more loops"):
+        RobotFromModel(urdf, "l6", WristSensorConfig())
+
+
+def test_a_package_may_have_the_name_of_drakes_own(tmp_path):
+    (tmp_path / "drake").mkdir()
+    (tmp_path / "drake" / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    shape = "<geometry><mesh><uri>package://drake/a.obj</uri></mesh></geometry>"
+    text = _LINKS.replace("/>", f"><collision name='c'>{shape}</collision></link>", 1)
+    model = tmp_path / "model.sdf"
+    model.write_text(_SDF.format(text))
+    assert ParseModel(MultibodyPlant(0.0), model, "a").lost == {}
+
+
+def test_a_floor_without_end_is_kept_clear_of(tmp_path):
+    """A pendulum of 0.4 m above it, of which nobody knows how far it may swing."""
+    model = tmp_path / "pendulum.xml"
+    model.write_text("""<mujoco model="m"><worldbody><geom type="plane" size="0 0 1" pos="0 0 0.8"/>
+    <body name="base" pos="0 0 1"><geom type="sphere" size="0.01" mass="1"/><body name="l1">
+    <joint name="j1" axis="0 1 0" range="-180 180" limited="true"/>
+    <geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.4" mass="1"/></body></body>
+    </worldbody></mujoco>""")
+    robot = RobotFromModel(model, "l1", WristSensorConfig())
+    for angle, is_free in ((0.0, True), (np.pi, False)):
+        still = FourierTrajectory(np.array([angle]), np.zeros((1, 2)), np.zeros((1, 2)), 1.0)
+        uses = check(robot, still)
+        share = next(use for use in uses if use.limit == "clearance").share
+        assert (share <= 1) == is_free
+
+
 def test_elements_of_drakes_own_are_read_whatever_address_they_have(tmp_path):
     path, plant = write_sdf(tmp_path), MultibodyPlant(0.0)
     path.write_text(path.read_text().replace('"drake.mit.edu"', f'"{tmp_path}"'))
