@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -265,6 +267,26 @@ def test_what_changes_in_a_run_and_what_is_not_ideal():
     assert run.master[749] < 0.019 and np.all(run.silent[-1] > 0.09)
     steps_of = np.round(run.command[600:800] / 30e-6) * 30e-6
     np.testing.assert_allclose(run.command[600:800], steps_of, atol=1e-15)
+
+
+def test_the_adversary_repeats_itself_finds_a_leak_and_tells_a_cycle_from_a_creep(
+    monkeypatch,
+):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    adversary, cases = map(importlib.import_module, ("adversary", "adversary_cases"))
+    changed = cases.coordinates((28, 3), 0) != cases.coordinates((28,), 0)
+    assert 0 < changed.sum() < 0.5 * len(changed)
+    np.testing.assert_array_equal(cases.coordinates((28, 3), 0), cases.coordinates((28, 3), 0))
+    tdpa, again, pspm = (
+        adversary.run_case(name, (28,), adversary.Options()) for name in ("tdpa", "tdpa", "pspm")
+    )
+    assert tdpa == again and tdpa.actual < -1.0 and pspm.actual > 0.0
+    assert tdpa.worse(pspm).actual == tdpa.actual and tdpa.worse(pspm).speed == pspm.speed
+    t = np.arange(400) * 1e-2
+    swing = 1e-3 * np.sin(2 * np.pi * t)
+    lasting, short = swing.tolist(), np.where(t < 2.6, swing, 0.0).tolist()
+    found = [adversary._cycling(x) for x in (lasting, short, (0.1 * np.exp(-t)).tolist())]
+    assert found == pytest.approx([400, 275, 0], abs=30)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,327 @@
+"""How much energy does each method give out to an adversary, and how fast does it throw the hand?
+
+`python benchmarks/adversary.py [--runs N] [--seed S] [--method M ...] [--json FILE]` lets
+`drake_teleop.comparison.one_dof` run for 12 s, N (10 000) times in all: as often with each method.
+Random are the network (loss alone and in bursts, jitter with and without reordering, outages, a
+delay that steps or swings), the hand (light to firm, a change of grip, let go), the wall (0.5 to
+50 kN/m; it stands, vanishes, jumps or swings) and the motion (slow presses, taps of 0.7 to 3 Hz,
+circles along one axis), at last a hold. Two runs of three are drawn; the others search from there,
+by changes that are kept if they make it worse, for the least energy at the slave's actual motion,
+for the largest speed of a device that was let go, and for the longest limit cycle.
+
+Energy is counted from the start energy that the method declares, at the four places that the
+module `one_dof` describes; the least at the start itself counts too, the search begins 1.5 s later.
+Speed and travel (in 2 s) are of runs that let go before a wall that stands, a limit cycle is how
+long the hand or the slave goes on to reverse, by more than 0.5 mm, when nothing else moves.
+
+The same seed gives the same figures. The worst cases have names: 17 is the case drawn 17th,
+17.4.29 what the 4th and then the 29th change make of it. `--replay 17.4.29 --method M` runs it
+again and says all about it. `--known` runs a few cases of simple description instead, `--imperfect`
+has a servo that is not as the method believes, a slow motor, coarse encoders and noise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import multiprocessing
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from adversary_cases import FREE, STEPS, TIME, case_of, let_go_at, prepared, silences, smooth
+from numpy.typing import NDArray
+
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.comparison.one_dof import (
+    ACTUAL,
+    COMMAND,
+    HAND,
+    MOTOR,
+    PERIOD,
+    REFERENCE,
+    OneDof,
+    OneDofRun,
+    operators_intent,
+    run_one_dof,
+)
+from drake_teleop.passivity.methods import METHODS, PassivityConfig
+
+CHARGED = 1.5  # s; later, the least energy is no longer that of the start
+LEAKS = -1e-6  # J, less is more than rounding
+SWING = 0.5e-3  # m, a reversal that counts
+
+
+@dataclass(frozen=True)
+class Options:
+    """What holds for all runs: the seed of the drawing, and whether the station is imperfect."""
+
+    seed: int = 0
+    imperfect: bool = False
+
+
+@dataclass
+class Figures:
+    """Of a run, or the worst of several: least energies [J], then what is to be small."""
+
+    actual: float = math.inf
+    motor: float = math.inf
+    command: float = math.inf
+    hand: float = math.inf
+    actual_later: float = math.inf  #: at the actual motion, once it is charged
+    speed: float = 0.0  #: largest, once let go [m/s]
+    travel: float = 0.0  #: in 2 s, once let go [m]
+    cycle: float = 0.0  #: longest limit cycle [s]
+
+    def worse(self, other: Figures) -> Figures:
+        """The worse of both in each figure."""
+        a, b = dataclasses.astuple(self), dataclasses.astuple(other)
+        worst = [(min if i < 5 else max)(pair) for i, pair in enumerate(zip(a, b, strict=True))]
+        return Figures(*worst)
+
+
+AIMS: dict[str, Callable[[Figures], float]] = {
+    "actual": lambda found: -found.actual_later,
+    "speed": lambda found: found.speed,
+    "cycle": lambda found: found.cycle,
+}
+"""What the search makes as large as it can."""
+
+
+def measured(run: OneDofRun, case: dict[str, Any]) -> Figures:
+    """The figures of a run."""
+    charged = round(CHARGED / PERIOD)
+    later = (run.accounts[:, HAND] + run.accounts[:, ACTUAL])[charged:]
+    found = Figures(
+        actual=run.least(ACTUAL),
+        motor=run.least(MOTOR),
+        command=run.least(COMMAND),
+        hand=run.least(HAND),
+        actual_later=run.start_energy + float(np.nanmin(later, initial=math.inf)),
+    )
+    if case["wall"] != "stands":
+        return found
+    over = round(let_go_at(case) / PERIOD)
+    if case["end"] == "lets go":
+        free = run.master[over - 1 : over + 2000]
+        found.speed = float(np.nanmax(np.abs(np.diff(free)), initial=0.0)) / PERIOD
+        found.travel = float(np.nanmax(np.abs(free - free[0]), initial=0.0))
+    begin = round((case["until"] + 0.8) / PERIOD)
+    still = slice(begin, None if case["end"] == "holds on" else over, 10)
+    found.cycle = max(_cycling(x[still].tolist()) for x in (run.master, run.slave)) * 10 * PERIOD
+    return found
+
+
+def _cycling(x: list[float]) -> int:
+    """Samples until the last reversal by more than `SWING`; 0 for less than two cycles."""
+    last, way, extreme, turns = 0, 0, x[0], 0
+    for k, value in enumerate(x):
+        if way == 0:
+            way = int(math.copysign(1, value - x[0])) if abs(value - x[0]) > SWING else 0
+            extreme = value
+        elif (value - extreme) * way > 0.0:
+            extreme = value
+        elif (extreme - value) * way > SWING:
+            way, extreme, last, turns = -way, value, k, turns + 1
+    return last if turns >= 4 else 0
+
+
+def run_case(method: str, path: tuple[int, ...], options: Options) -> Figures:
+    """The figures of one case."""
+    case = case_of(path, options.seed)
+    passivity = PassivityConfig(method=method)
+    run = run_one_dof(passivity=passivity, **prepared(case, options.imperfect))
+    return measured(run, case)
+
+
+def _drawn(job: tuple[tuple[str, ...], range, Options]) -> list[list[Figures]]:
+    """For each case drawn, the figures of all methods."""
+    names, cases, options = job
+    found = []
+    for index in cases:
+        case = case_of((index,), options.seed)
+        arguments = prepared(case, options.imperfect)
+        runs = (run_one_dof(passivity=PassivityConfig(method=name), **arguments) for name in names)
+        found.append([measured(run, case) for run in runs])
+    return found
+
+
+Searched = tuple[str, str, tuple[int, ...], float, Figures]
+
+
+def _searched(job: tuple[str, str, int, int, Options]) -> Searched:
+    """Climbs from a case drawn: method, aim, the worst case, its value, the worst of all seen."""
+    method, aim, index, trials, options = job
+    best: tuple[int, ...] = (index,)
+    worst = run_case(method, best, options)
+    value = AIMS[aim](worst)
+    for trial in range(1, trials):
+        path = (*best, trial)
+        found = run_case(method, path, options)
+        worst = worst.worse(found)
+        if AIMS[aim](found) > value:
+            best, value = path, AIMS[aim](found)
+    return method, aim, best, value, worst
+
+
+def study(
+    names: tuple[str, ...], runs: int, options: Options, starts: int = 3, processes: int = 2
+) -> dict[str, dict[str, Any]]:
+    """Method -> its figures: after drawing, after the search, and the names of the worst cases."""
+    each = max(runs // len(names), 4)
+    trials = max(each // (3 * len(AIMS) * starts), 1)
+    drawn = max(each - trials * len(AIMS) * starts, starts)
+    blocks = [range(i, min(i + 10, drawn)) for i in range(0, drawn, 10)]
+    run_case(names[0], (0,), options)  # compiles, before the processes fork
+    with multiprocessing.get_context("fork").Pool(processes) as pool:
+        jobs = [(names, block, options) for block in blocks]
+        table = [row for part in pool.imap(_drawn, jobs) for row in part]
+        climbs = []
+        for n, name in enumerate(names):
+            for aim, of in AIMS.items():
+                order = sorted(range(drawn), key=lambda i: -of(table[i][n]))
+                climbs += [(name, aim, i, trials, options) for i in order[:starts]]
+        climbed = pool.map(_searched, climbs, chunksize=1)
+    result = {}
+    for n, name in enumerate(names):
+        random = Figures()
+        for row in table:
+            random = random.worse(row[n])
+        searched, worst = random, {}
+        for _, _, _, _, found in (one for one in climbed if one[0] == name):
+            searched = searched.worse(found)
+        for aim in AIMS:
+            _, _, path, value, _ = max(
+                (one for one in climbed if one[:2] == (name, aim)), key=lambda one: one[3]
+            )
+            worst[aim] = {"case": ".".join(map(str, path)), "value": value}
+        result[name] = {
+            "runs": drawn + trials * len(AIMS) * starts,
+            "leaking": sum(row[n].actual < LEAKS for row in table) / drawn,
+            "random": dataclasses.asdict(random),
+            "searched": dataclasses.asdict(searched),
+            "worst": worst,
+        }
+    return result
+
+
+def print_study(result: dict[str, dict[str, Any]]) -> None:
+    """The table, and the names of the worst cases."""
+    print("Least energy [J] between the hand and ...: drawn / searched. Let go: drawn / searched.")
+    ports = ("actual", "motor", "command", "hand")
+    heads = ("the actual motion", "the motor", "the command", "the hand alone")
+    print(f"{'method':<14}{'leak':>6} " + "".join(f"{head:>20}" for head in heads), end="")
+    print(f"{'speed m/s':>14}{'travel m':>14}{'cycle s':>12}")
+    for name, found in result.items():
+        random, searched = found["random"], found["searched"]
+        line = f"{name:<14}{100 * found['leaking']:5.0f} %"
+        line += "".join(f"{random[port]:10.2g} /{searched[port]:8.2g}" for port in ports)
+        for key, width in (("speed", 7), ("travel", 7), ("cycle", 6)):
+            line += f"{random[key]:{width}.2f} /{searched[key]:5.2f}"
+        print(line)
+    for name, found in result.items():
+        cases = ", ".join(f"{aim} {one['case']}" for aim, one in found["worst"].items())
+        print(f"worst of {name}: {cases}")
+
+
+def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
+    """Case of simple description -> method -> its figures, as `print_known` says."""
+    medium = dataclasses.replace(REFERENCE, hand_mass=0.25, hand_damping=8.0, hand_stiffness=250.0)
+    begun = np.clip(TIME / 0.5, 0.0, 1.0)
+    taps = begun * 0.05 * np.sin(4 * np.pi * TIME) + FREE * (1 - begun)
+    swing = 0.03 * np.sin(3 * np.pi * TIME) * (begun - smooth(2.5, 0.5))
+    press = FREE + swing + smooth(3.5, 1.0) * (0.0275 - FREE)
+    tap, push = (np.stack([x, np.gradient(x, PERIOD)], axis=1) for x in (taps, press))
+    hand = np.tile([0.2, 5.0, 300.0], (STEPS, 1))
+    hand[9000:] = 0.0
+    steady = NetworkConfig(delay=0.05)
+    bursts = NetworkConfig(delay=0.05, jitter=0.2, distribution="gamma", loss=0.3, burst=0.08)
+    usual = operators_intent()
+    times = PERIOD * np.arange(len(usual), dtype=np.float64)
+
+    def outages(seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        rng = np.random.default_rng(seed)
+        there, back = (silences(rng, times, 0.4, 0.6) for _ in range(2))
+        return np.where(there, -1, 50), np.where(back, -1, 50)
+
+    found: dict[str, dict[str, list[float]]] = {}
+
+    def least(passivity: PassivityConfig, model: OneDof, line: NetworkConfig, **more: Any) -> float:
+        return run_one_dof(model, passivity, line, **more).least(ACTUAL)
+
+    for name in names:
+        one = PassivityConfig(method=name)
+        let_go = run_one_dof(REFERENCE, one, steady, intent=push, grip=hand)
+        free = let_go.master[8999:11000]
+        rows = {
+            "taps": [least(one, REFERENCE, steady, intent=tap)],
+            "taps, bursts": [least(one, medium, bursts, seed=n, intent=tap) for n in range(10)],
+            "press, outages": [
+                least(one, medium, steady, delays=outages(n), timeout=0.1) for n in range(20)
+            ],
+            "let go": [
+                abs(float(let_go.felt[8999])),
+                float(np.abs(np.diff(free)).max()) / PERIOD,
+                float(np.abs(free - free[0]).max()),
+            ],
+        }
+        for key, values in rows.items():
+            found.setdefault(key, {})[name] = values
+    return found
+
+
+def print_known(found: dict[str, dict[str, list[float]]]) -> None:
+    """A line for each method."""
+    print("Round trip 100 ms. Taps of 50 mm at 2 Hz, the same by a medium grip with 30 % lost in")
+    print("bursts of 80 ms (10 seeds), its usual press with outages of 0.4 s (20 seeds): least")
+    print("energy at the actual motion [J], and in how many runs it is negative. Let go at 4 N.")
+    print(f"{'method':<14}{'taps':>10}{'bursts':>16}{'outages':>16}{'held':>10}{'let go':>24}")
+    for name in found["taps"]:
+        line = f"{name:<14}{found['taps'][name][0]:10.2g}"
+        for key in ("taps, bursts", "press, outages"):
+            values = found[key][name]
+            line += f"{min(values):8.2g} ({sum(e < LEAKS for e in values):2d}/{len(values)})"
+        force, speed, travel = found["let go"][name]
+        print(f"{line}{force:8.1f} N{speed:10.2f} m/s{1e3 * travel:7.0f} mm")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs what is asked for and prints it; returns 0 if no method that promises it leaks."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=10_000, help="of all methods together")
+    parser.add_argument("--seed", type=int, default=0, help="of the drawing")
+    parser.add_argument("--method", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--imperfect", action="store_true", help="servo, motor and sensors")
+    parser.add_argument("--known", action="store_true", help="cases of simple description instead")
+    parser.add_argument("--replay", metavar="CASE", help="one case by its name, such as 17.4.29")
+    parser.add_argument("--json", metavar="FILE", help="writes the figures there")
+    asked = parser.parse_args(arguments)
+    names, options = tuple(asked.method), Options(asked.seed, asked.imperfect)
+    figures: dict[str, Any]
+    began = time.monotonic()
+    if asked.replay:
+        path = tuple(int(part) for part in asked.replay.split("."))
+        figures = {name: dataclasses.asdict(run_case(name, path, options)) for name in names}
+        for part in (case_of(path, options.seed), figures):
+            print(json.dumps(part, indent=2))
+    elif asked.known:
+        figures = known(names)
+        print_known(figures)
+    else:
+        figures = study(names, asked.runs, options)
+        print_study(figures)
+        print(f"{sum(one['runs'] for one in figures.values())} runs", end=" ")
+        print(f"in {time.monotonic() - began:.0f} s, seed {asked.seed}")
+    if asked.json:
+        Path(asked.json).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
