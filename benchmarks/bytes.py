@@ -3,9 +3,10 @@
 `python benchmarks/bytes.py [--all] [--json FILE]` has drake-teleop run, reproduce, sample-log,
 identify, eliminate, detect, inspect, study, excite and analyze write into new folders, under
 combinations of BLAS threads, hash seeds, time zones, folders and locales: so many that each two
-values of different kinds meet, or with --all every combination (hours). Compared are the files of
-each but `session.json`, by their SHA-256, with those of the first combination. The baseline is that
-one once more: what differs there has other causes. Each combination identifies its loads anew.
+values of different kinds meet. With --all every combination is tried, without analyze and with
+shorter runs (`SHORTER`). Compared are the files of each but `session.json`, by their SHA-256, with
+those of the first combination. The baseline is that one once more: what differs there has other
+causes. Each combination identifies its loads anew.
 """
 
 from __future__ import annotations
@@ -34,13 +35,27 @@ Combination: TypeAlias = tuple[str, ...]
 """One value of each of the surroundings, in their order."""
 Command: TypeAlias = Sequence[str]
 
-STUDY = """
+FILES = {
+    "study.yaml": """
 scenario: reach
 factors:
   - {field: force_scaling.sigma, low: 0.0, high: 1.0}
   - {field: wrist_sensor.preset, words: [ideal, ati_gamma_imu]}
   - {field: simulation.duration, values: [0.5]}
-"""
+""",
+    "short.yaml": """
+simulation: {duration: 0.2, settle: 0.05}
+operator:
+  grip: firm
+  intent: [!Sine {duration: 10.0, ramp: 0.1, frequency: 3.0, translation: [0.01, 0.01, 0.02]}]
+load_estimator: {enabled: true}
+channel: {network: internet}
+""",
+    "short_study.yaml": """
+scenario: short.yaml
+factors: [{field: force_scaling.sigma, low: 0.0, high: 1.0}]
+""",
+}
 COMMANDS: dict[str, Command] = {
     "run": ("run", "contact_transition"),
     "run_task": ("run", "insert"),
@@ -57,6 +72,14 @@ COMMANDS: dict[str, Command] = {
     "excite": ("excite",),
     "analyze": ("analyze", "contact_transition"),
 }
+SHORTER: dict[str, Command] = {
+    **{name: words for name, words in COMMANDS.items() if name not in ("run_task", "analyze")},
+    "run": ("run", "short.yaml"),
+    "detect": (*COMMANDS["detect"], "--load", "out/identify/identification.json"),
+    "study": ("study", "short_study.yaml", "--jobs", "2"),
+    "excite": ("excite", "--period", "1", "--harmonics", "2"),
+}
+"""Of `COMMANDS`, for every combination."""
 IN_ONE_PROCESS = """
 import json, sys
 from drake_teleop.cli import main
@@ -75,9 +98,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
     everything = list(itertools.product(*SURROUNDINGS.values()))
-    combinations = everything if arguments.all else pairwise(everything)
+    combinations, commands = pairwise(everything), COMMANDS
+    if arguments.all:  # the most different first, because the others take long
+        combinations += [each for each in everything if each not in combinations]
+        commands = SHORTER
     with tempfile.TemporaryDirectory() as folder:
-        figures = compared([combinations[0], *combinations], COMMANDS, Path(folder))
+        figures = compared([combinations[0], *combinations], commands, Path(folder))
     for name, figure in figures.items():
         print(f"{name:22s} {figure}")
     if arguments.json:
@@ -109,9 +135,11 @@ def compared(
     for number, combination in enumerate(combinations):
         found = written(combination, commands, folder / str(number))
         reference = reference or found
-        for file in found.keys() | reference.keys():
-            if found.get(file) != reference.get(file):
-                differ[file.split("/")[0]].add(f"{file} ({', '.join(combination)})")
+        files = found.keys() | reference.keys()
+        others = [file for file in files if found.get(file) != reference.get(file)]
+        for file in others:
+            differ[file.split("/")[0]].add(f"{file} ({', '.join(combination)})")
+        print(f"{number}: {', '.join(combination)}: {len(others)} differ", file=sys.stderr)
     return {
         "combinations": len(combinations),
         "files": len(reference),
@@ -130,7 +158,8 @@ def written(
     threads, hash_seed, time_zone, name, locale = combination
     place = folder / name
     place.mkdir(parents=True)
-    (place / "study.yaml").write_text(STUDY)
+    for file, text in FILES.items():
+        (place / file).write_text(text)
     surroundings = {
         "OPENBLAS_NUM_THREADS": threads,
         "OMP_NUM_THREADS": threads,
