@@ -37,6 +37,9 @@ OTHER_ENERGY = _places.vector(2)
 #: 1 while the slave's detector says that something is touched.
 CONTACT = _places.number()
 
+#: What force and torque at the hand may change by without being felt as a blow [N/s, N m/s].
+GENTLE = (450.0, 4.5)
+
 
 @njit(cache=True)
 def arrived(received):

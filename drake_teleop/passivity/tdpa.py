@@ -11,10 +11,10 @@ the command that would press further than the hand has paid for; what it withhol
 later, as the energy allows (drift compensation).
 
 Three things keep the force from chopping. A shortened wrench comes back slowly (force-jump filter);
-of what the ledger holds a step may drain only a share; and the master keeps a little of what the
-hand puts in for itself. With that it can give way a little, the slave follows, and what it returns
-pays for the next little: without it a hand that pressed too deep stays there, before a wall that
-pushes at every other sample.
+of what the ledger holds a step may drain only a share, or all before the wrench falls by a blow;
+and the master keeps a little of what the hand puts in for itself. With that it can give way a
+little, the slave follows, and what it returns pays for the next little: without it a hand that
+pressed too deep stays there, before a wall that pushes at every other sample.
 
 That account is too strict for a long delay. A hand that feels nothing on its way into a wall does
 no work, so nothing is there for the slave to press with, nor to push back the hand that went in too
@@ -65,6 +65,7 @@ from drake_teleop.passivity.memory import (
 )
 from drake_teleop.passivity.packet import (
     ENERGY,
+    GENTLE,
     INTEGRAL,
     OTHER_ENERGY,
     POSE,
@@ -175,9 +176,9 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         limit(wrench, g, limits[g])
         share = min(1.0, 1.0 - withheld[g] + release)
         drained = dot(wrench, dx, g)
-        most = drain * (ledger[g] + kept[g])
-        if share * drained > most:
-            share = most / drained
+        stored = ledger[g] + kept[g]
+        if share * drained > drain * stored:
+            share = _shortened(g, drained, drain, stored, share, T, p, memory[HELD], wrench)
         withheld[g] = 1.0 - share
         memory[LOST][g] += (1.0 - share) * drained
         scale(wrench, g, share)
@@ -189,6 +190,17 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     memory[HELD] = wrench
     fill(pose, twist, wrench, packet)
     packet[_ECHO] = received[SEQUENCE]
+
+
+@njit(cache=True)
+def _shortened(g, drained, drain, stored, share, T, p, held, wrench):
+    """The share of the wrench that a step may leave, of which all would drain `drained`.
+
+    Less than `drain` of what is stored; more, even all of it, rather than a blow to the hand.
+    """
+    least, size = length(held, g) - GENTLE[g] * T / p[MOTION_SCALE][g], length(wrench, g)
+    share = min(share, max(drain * stored / drained, least / size))
+    return min(share, stored / drained)
 
 
 @njit(cache=True)

@@ -15,6 +15,9 @@ long silence leaves is corrected in free motion, where that takes no work. Uneve
 energy: the filter then becomes as slow as it must be to play all that has come out of what is in
 store. A playout buffer in the network keeps it fast.
 
+What comes after packets were missing would be a blow. Instead the wrench at the hand then goes over
+to the wave's at a bounded rate, but for what the wave does not pay for.
+
 The slave's end is matched to the line by a damper m b that its command acts against: with m = 1
 nothing is reflected in free motion, and the hand feels b v; with m = 0 it feels the mass b T of the
 line's content. In contact the slave stays behind by f (T + filter) / b. Neither a wall nor the
@@ -42,6 +45,7 @@ from drake_teleop.passivity.memory import (
     HELD,
     LEDGER,
     LOST,
+    MOTION_SCALE,
     RECEIVED,
     SENT,
     own_memory,
@@ -49,8 +53,10 @@ from drake_teleop.passivity.memory import (
 )
 from drake_teleop.passivity.packet import (
     ENERGY,
+    GENTLE,
     INTEGRAL,
     POSE,
+    SEQUENCE,
     arrived,
     difference_into,
     dot,
@@ -70,6 +76,8 @@ _PATIENCE, _DRIFT_RATE = _places.number(), _places.number()
 _places = own_memory()
 _PLAYED, _INTEGRAL, _WAVE = _places.vector(6), _places.vector(6), _places.vector(6)
 _SILENT, _DRIFT = _places.number(), _places.vector(6)
+# At the master: 1 from a step without a packet until all is made up for; number of the newest one.
+_MISSING, _NEWEST = _places.number(), _places.number()
 
 
 @settings
@@ -128,6 +136,10 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     """One step of the master's end; see `methods.master_step`."""
     wave, integral, sent = memory[_WAVE], memory[_INTEGRAL], packet[INTEGRAL]
     _play(received, T, p, memory, wave)
+    missing, newest = memory[_MISSING], received[SEQUENCE]
+    if newest > memory[_NEWEST] + 1.0:
+        missing = 1.0
+    memory[_MISSING], memory[_NEWEST] = 0.0 if fresh else 1.0, newest
     for g in range(2):
         b = p[IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
@@ -136,12 +148,39 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             integral[i] += (b * dx[i] - wrench[i] * T) / math.sqrt(2.0 * b)
             sent[i] = integral[i]
         limit(wrench, g, limits[g])
+        energy = 0.5 * T * dot(wave, wave, g)
+        if missing > 0.0:
+            most = GENTLE[g] * T / p[MOTION_SCALE][g]
+            if _approach(g, energy, dx, most, memory[HELD], wrench):
+                memory[_MISSING] = 1.0
+            limit(wrench, g, limits[g])
         # Not negative: of a wrench that was shortened even more is left than the wave going back.
-        left = 0.5 * T * dot(wave, wave, g) - dot(wrench, dx, g)
+        left = energy - dot(wrench, dx, g)
         memory[SENT][g] += max(left, 0.0)
         packet[ENERGY][g] = memory[SENT][g]
     memory[HELD] = wrench
     fill(pose, twist, wrench, packet)
+
+
+@njit(cache=True)
+def _approach(g, energy, dx, most, held, wrench):
+    """Takes the wrench to within `most` of the one held, if that drains no more than `energy`.
+
+    Returns:
+        Whether it was beyond.
+    """
+    size = 0.0
+    for i in range(3 * g, 3 * g + 3):
+        size += (wrench[i] - held[i]) ** 2
+    if size <= most * most:
+        return False
+    share = most / math.sqrt(size)
+    now, last = energy - dot(wrench, dx, g), energy - dot(held, dx, g)
+    if (1.0 - share) * last + share * now < 0.0:
+        share = last / (last - now) if now > 0.0 else 1.0
+    for i in range(3 * g, 3 * g + 3):
+        wrench[i] = held[i] + share * (wrench[i] - held[i])
+    return True
 
 
 @njit(cache=True)

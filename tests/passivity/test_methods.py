@@ -14,7 +14,7 @@ from drake_teleop.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.passivity.memory import LEDGER, LIMIT, MEMORY, SENT
+from drake_teleop.passivity.memory import HELD, LEDGER, LIMIT, MEMORY, SENT
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -27,6 +27,7 @@ from drake_teleop.passivity.packet import (
     HEALTHY,
     PACKET_SIZE,
     SEQUENCE,
+    WRENCH,
     difference_into,
     moved_into,
 )
@@ -246,6 +247,24 @@ def test_a_slave_whose_inertia_is_felt_is_not_left_behind(sigma):
     run = run_one_dof(model, PassivityConfig(method="charged_tdpa"), network)
     assert np.abs(run.slave[-1000:] - run.master[-1000:]).max() < 10e-3
     assert run.wall.min() < -10.0, "the wall should have been pressed"
+
+
+@pytest.mark.parametrize(
+    ("stored", "left"), [(2e-3, 3.0 - 0.45 / 2.0), (3e-4, 1.0), (9e-3, 3.0), (0.0, 0.0)]
+)
+def test_a_wrench_falls_by_a_blow_only_if_nothing_pays_for_less(stored, left):
+    """A hand that feels 3 N and gives way by 0.3 mm in a step, motion scaled by 2: 450 N/s."""
+    p = parameters(PassivityConfig(method="tdpa"), motion_scale=(2.0, 2.0))
+    memory, packet, wrench = initial_memory("tdpa", p, START), np.zeros(PACKET_SIZE), np.zeros(6)
+    received = packet.copy()
+    received[WRENCH][1] = memory[HELD][1] = 3.0
+    memory[LEDGER][0] = stored
+    dx = np.array([0.1e-3, 0.3e-3, 0.0, 0.0, 0.0, 0.0])
+    master_step(
+        METHODS.index("tdpa"), received, True, START, dx / T, dx, np.zeros(6), p[LIMIT], T, p,
+        memory, wrench, packet,
+    )  # fmt: skip
+    np.testing.assert_allclose(wrench, [0.0, left, 0.0, 0.0, 0.0, 0.0], rtol=1e-12, atol=0.0)
 
 
 def test_a_tank_that_sends_all_at_once_is_not_overdrawn():
