@@ -266,6 +266,23 @@ def _doubts(
     return ()
 
 
+def shifted(shift: NDArray[np.float64], threshold: float) -> tuple[str, ...]:
+    """A note if offsets have shifted by more than a threshold since the free motion.
+
+    Args:
+        shift: (6,) offsets of the record less those of the free motion [N, N m].
+        threshold: of |F_c| [N].
+    """
+    force = float(np.linalg.norm(shift[:3]))
+    if force <= threshold:
+        return ()
+    return (
+        f"the constant that most of the record agrees on is {force:.2g} N from that of the free"
+        " motion: either the sensor drifted, or most of the record is contact, which is then taken"
+        " for an offset and the rest for contact",
+    )
+
+
 def noise_floor(contact: NDArray[np.float64]) -> NDArray[np.float64]:
     """Standard deviation of the contact wrench where nothing is touched, one for all motions.
 

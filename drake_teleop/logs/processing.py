@@ -24,7 +24,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
 from drake_teleop.logs.check.conventions import check_log, question_fit
 from drake_teleop.logs.check.finding import Finding
-from drake_teleop.logs.contact import Detection, detect_contact, noise_floor, samples_of
+from drake_teleop.logs.contact import Detection, detect_contact, noise_floor, samples_of, shifted
 from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import estimate_delay
@@ -249,6 +249,9 @@ def eliminate_log(
         free=None if calm is None else (samples_of(calm.log, calm.contact, cutoff_hz), calm.log.dt),
         statistic=statistic,
     )
+    if calm is not None and tare:
+        notes = shifted(found.offsets - calm.offsets, detection.force_threshold)
+        detection = replace(detection, notes=detection.notes + notes)
     return replace(found, detection=detection)
 
 

@@ -95,6 +95,13 @@ def test_detect_and_eliminate_report_the_same_contacts_as_with_free_motion(tmp_p
     start, start_known = (t[np.argmax(found.touched)] for found in (own, known))
     assert start == pytest.approx(start_known, abs=0.03)
     assert 4.0 < start < 4.12
+    assert known.notes == ()
+    # Pressed most of the time: the record's offsets are those of the contact, and that is said.
+    pushed = pl.when((pl.col("t") > 2.0) & (pl.col("t") < 7.5)).then(6.0).otherwise(0.0)
+    most = tmp_path / "most.parquet"
+    table.with_columns(f_y=pl.col("f_y") - pushed).write_parquet(most)
+    (note,) = detect_log(most, load, free=free, delay=0.0).notes
+    assert "is 6 N from" in note
     out = tmp_path / "out"
     arguments = ["eliminate", str(log), "--load", str(load), "--free", str(free), "--delay", "0"]
     result = CliRunner().invoke(cli, [*arguments, "--out", str(out)])
