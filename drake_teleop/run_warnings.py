@@ -7,7 +7,7 @@ unreachable    the inverse kinematics say so
 clipped        a joint asks for its largest speed, or its motor gives its largest torque; the device
                displays its largest force or torque
 leaf           it bends further than its model goes
-safe state     an end of the channel has heard nothing for longer than `channel.timeout`
+safe state     an end of the channel has heard nothing for longer than the channel's timeout
 behind         the command that leaves the channel, or a joint, is not within the range of what it
                was asked for within the time that delay and bandwidth explain
 hunting        the hand, the command that leaves the channel or a joint goes to and fro, while what
@@ -208,7 +208,7 @@ def _saturated(result: SimulationResult) -> Flags:
 def _channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
     if "ports" not in result:
         return
-    t, timeout = result.t, scenario.channel.timeout
+    t, timeout = result.t, scenario.channel.silent_after(1.0 / scenario.rates.hand_hz)
     for column, end, other in ((-2, "master", "slave"), (-1, "slave", "master")):
         silent = result["ports"][:, column] > timeout
         yield (

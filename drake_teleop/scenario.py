@@ -13,7 +13,7 @@ from typing import Any
 
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
-from drake_teleop.channel.channel import Channel
+from drake_teleop.channel.channel import LONGEST_TIMEOUT, Channel
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.environment.environment import Environment
 from drake_teleop.environment.sheet_spring import SheetSpring
@@ -285,9 +285,10 @@ def _check_steps(scenario: Scenario, where: str) -> None:
 def _check_channel(scenario: Scenario, where: str) -> None:
     for line in scenario.channel.lines(f"{where}:channel"):
         line.check(f"{where}:channel")
-        if line.rate_hz is not None and scenario.channel.timeout < 2 / line.rate_hz:
+        timeout = scenario.channel.timeout or LONGEST_TIMEOUT
+        if line.rate_hz is not None and timeout < 2 / line.rate_hz:
             raise DrakeTeleopError(
-                f"{scenario.channel.timeout:g} s are less than two packets of {line.rate_hz:g} Hz",
+                f"{timeout:g} s are less than two packets of {line.rate_hz:g} Hz",
                 where=f"{where}:channel.timeout",
                 remedy="raise timeout or rate_hz, or the station is in its safe state all the time",
             )

@@ -22,7 +22,9 @@ from drake_teleop.station import MakeTeleopStation
 T = np.arange(3001) / 1000
 ARM = slave_arm(Scenario())
 OVER_NETWORK = replace(
-    Scenario(), channel=Channel(network="internet"), passivity=PassivityConfig(method="two_layer")
+    Scenario(),
+    channel=Channel(network="internet", timeout=0.1),
+    passivity=PassivityConfig(method="two_layer"),
 )
 LATE = 0.05  # s, of the recorded channel, a mean of "internet"
 

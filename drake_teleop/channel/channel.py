@@ -50,6 +50,10 @@ from drake_teleop.passivity.safe_state import (
 from drake_teleop.quantities import choice, plain, quantity
 
 _NETWORKS = ("custom", *PRESETS)
+_DIRECTIONS = (network.FORWARD, network.BACKWARD)
+#: Of a time-out that follows from the network [s], and of any.
+SHORTEST_TIMEOUT, LONGEST_TIMEOUT = 0.1, 1.0
+_AFTER = 1.5  # times the longest silence that a minute has
 
 
 @settings
@@ -61,8 +65,13 @@ class Channel(NetworkConfig):
     backward: NetworkConfig | None = plain(
         None, "from slave to master; null: as from master to slave"
     )
-    timeout: float = quantity(
-        0.1, "s", 1e-3, 0.2, "without a packet for so long, an end goes into its safe state"
+    timeout: float | None = quantity(
+        None,
+        "s",
+        1e-3,
+        LONGEST_TIMEOUT,
+        "without a packet for so long, an end goes into its safe state; null: half as much again "
+        "as the longest silence in a minute of this network, but 0.1 s at least",
     )
 
     def lines(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
@@ -82,6 +91,16 @@ class Channel(NetworkConfig):
                 remedy="leave the other fields out, or set network: custom",
             )
         return PRESETS[self.network], PRESETS[self.network]
+
+    def silent_after(self, period: float) -> float:
+        """After how long an end goes into its safe state [s], with packets each `period` [s]."""
+        if self.timeout is not None:
+            return self.timeout
+        longest = [
+            network.longest_silence(line, direction, period)
+            for line, direction in zip(self.lines(), _DIRECTIONS, strict=True)
+        ]
+        return min(max(_AFTER * max(longest), SHORTEST_TIMEOUT), LONGEST_TIMEOUT)
 
 
 # The state of both ends, one array.
@@ -351,14 +370,17 @@ class TeleopChannel(LeafSystem):
         scales = np.where(scales > 0.0, scales, 1.0)
         lines = [
             network.parameters(line, seed, direction, period, least=_LEAST_DELAY)
-            for line, direction in zip(
-                channel.lines(), (network.FORWARD, network.BACKWARD), strict=True
-            )
+            for line, direction in zip(channel.lines(), _DIRECTIONS, strict=True)
         ]
         parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
         self._method = METHODS.index(passivity.method)
         self._constants = (
-            *(period, channel.timeout, np.concatenate([R_WB.ravel(), scales]), parameters),
+            *(
+                period,
+                channel.silent_after(period),
+                np.concatenate([R_WB.ravel(), scales]),
+                parameters,
+            ),
             *lines,
         )
         self._pose = self.DeclareVectorInputPort("pose_command", 7)

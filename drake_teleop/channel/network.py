@@ -54,6 +54,7 @@ _TAILS = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
 _SILENCE = ("hold", "zero", "extrapolate")
 _ZERO, _EXTRAPOLATE = 1, 2
 _TRACE_STEP = 1e-3  # [s], as fine as a mean needs
+_MINUTE, _OTHER_SEED = 60.0, 20090101  # [s], and a seed, with which a network is looked at
 
 
 @settings
@@ -377,3 +378,16 @@ def newest_packets(
         np.maximum.at(arrived, (sent + used)[seen], sent[seen])
     newest = np.maximum.accumulate(arrived)
     return np.minimum(newest, np.maximum(sent - playout, -1)) if config.redundant else newest
+
+
+def longest_silence(config: NetworkConfig, direction: int, period: float) -> float:
+    """For how long no new packet comes, at the longest in a minute after the first [s].
+
+    Args:
+        config, direction, period: as for `parameters`. The seed is one of its own, so that nobody
+            is told what comes in a run.
+    """
+    steps = math.ceil((_MINUTE + longest_delay(config)) / period)
+    newest = newest_packets(config, _OTHER_SEED, direction, steps, period)
+    fresh = np.flatnonzero(np.diff(newest, prepend=-1) > 0)
+    return float(np.diff(fresh, append=steps).max(initial=0) * period) if len(fresh) else math.inf

@@ -249,7 +249,7 @@ def eliminate_log(
         free=None if calm is None else (samples_of(calm.log, calm.contact, cutoff_hz), calm.log.dt),
         statistic=statistic,
     )
-    if calm is not None and tare:
+    if calm is not None and tare and detection is not None:
         notes = shifted(found.offsets - calm.offsets, detection.force_threshold)
         detection = replace(detection, notes=detection.notes + notes)
     return replace(found, detection=detection)

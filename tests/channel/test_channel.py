@@ -94,7 +94,10 @@ def test_directions_may_differ():
     ("changes", "message"),
     [
         ({"channel": Channel(network="lan", delay=0.1)}, r"channel\.network.*says all"),
-        ({"channel": Channel(rate_hz=10.0)}, r"channel\.timeout.*less than two packets"),
+        (
+            {"channel": Channel(rate_hz=10.0, timeout=0.15)},
+            r"channel\.timeout.*less than two packets",
+        ),
         ({"channel": Channel(backward=NetworkConfig(loss=0.9, burst_loss=0.5))}, r"loss"),
     ],
 )
@@ -138,3 +141,15 @@ def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
     again = t > 1.1
     np.testing.assert_allclose(position[again], sound["pose_received"][again, 4:], atol=2e-3)
     assert force[again].max() > 0.1
+
+
+def test_the_timeout_follows_from_the_worse_of_both_directions():
+    """1.5 silences of a packet every 0.2 s, at least 0.1 s and at most 1 s, unless it is given."""
+    slow = NetworkConfig(rate_hz=5.0)
+    for one in (Channel(rate_hz=5.0, backward=NetworkConfig()), Channel(backward=slow)):
+        assert one.silent_after(1e-3) == pytest.approx(0.3)
+    waits = [Channel(network=name).silent_after(5e-4) for name in PRESETS]
+    assert waits[:3] == [0.1] * 3
+    assert waits == sorted(waits) and waits[-1] < 0.5
+    assert Channel(rate_hz=1.0).silent_after(1e-3) == 1.0
+    assert Channel(rate_hz=5.0, timeout=0.4).silent_after(1e-3) == 0.4

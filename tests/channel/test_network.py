@@ -528,3 +528,18 @@ def test_it_loads_from_yaml():
         delay=0.1, distribution="gamma", rate_hz=500.0, trace="net.csv", redundant=True
     )
     assert asdict(loaded) == asdict(expected)
+
+
+@pytest.mark.parametrize(
+    ("config", "direction", "longest"),
+    [
+        (NetworkConfig(delay=0.02), network.FORWARD, 1e-3),
+        (NetworkConfig(delay=0.3, rate_hz=50.0), network.BACKWARD, 0.02),
+        (NetworkConfig(loss=1.0), network.FORWARD, math.inf),
+        # The longest of the bad states of a minute, some n = 60 (0.3 / 0.08): 0.08 ln(n) and more.
+        (NetworkConfig(delay=0.05, jitter=0.5, loss=0.3, burst=0.08), network.BACKWARD, 0.49),
+    ],
+)
+def test_the_longest_silence_of_a_minute(config, direction, longest):
+    found = network.longest_silence(config, direction, 1e-3)
+    assert found == pytest.approx(longest, rel=0.15 if config.burst else 1e-9)
