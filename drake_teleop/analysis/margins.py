@@ -135,7 +135,8 @@ def _gain_margin(loop: DelayedLoop) -> tuple[float, float]:
     """The least factor above 1 that puts a single L on -1 and its frequency, inf for the tail."""
     slow, fast = break_frequencies(loop)
     # Past the last pole |L| falls, and with a delay its phase passes -pi within one turn of that.
-    turn = 2 * np.pi / max(float(loop.delay), 1e-3 / fast)
+    delay = float(loop.delay)
+    turn = 2 * np.pi / (delay if delay > 1e-9 / fast else 1e-3 / fast)
     omega = frequency_grid(loop, slow, 3 * fast + 2 * turn)
     angle = angle_of(-loop(1j * omega))
     crossed = ((angle[1:] < 0) != (angle[:-1] < 0)) & (np.abs(np.diff(angle)) < np.pi)

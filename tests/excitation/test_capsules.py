@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 from pydrake.geometry import Box, Cylinder
+from pydrake.geometry import Capsule as CapsuleShape
 
 from drake_teleop.excitation.capsules import Capsule, bounding_capsule
 from drake_teleop.excitation.scene import CLEARANCE, _kept_distance
@@ -37,6 +38,12 @@ def test_a_capsule_around_a_rod_is_hardly_thicker():
     capsule = bounding_capsule(Cylinder(0.05, 0.8))
     assert 0.05 <= capsule.radius < 0.07
     assert np.ptp(capsule.ends[:, 2]) <= 0.8
+
+
+def test_a_capsule_around_a_capsule_is_that_capsule():
+    capsule = bounding_capsule(CapsuleShape(0.05, 0.8))
+    np.testing.assert_array_equal(capsule.ends, [[0.0, 0.0, -0.4], [0.0, 0.0, 0.4]])
+    assert capsule.radius == 0.05
 
 
 @pytest.mark.parametrize(("aside", "radius", "held"), [(0, 0.09, True), (0, 0.11, False),

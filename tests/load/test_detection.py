@@ -365,6 +365,7 @@ def test_a_threshold_from_free_motion_is_the_least_that_holds(free, share):
     threshold = free_threshold(free, share)
     assert (free >= threshold).mean() <= share
     assert (free >= np.nextafter(threshold, -np.inf)).mean() > share
+    assert free_threshold(free, 1.0) == -math.inf
 
 
 def test_delays_and_missed_contacts():

@@ -55,3 +55,8 @@ def test_delay_of_a_sensor_at_rest_is_not_made_up(duration: float, phi: np.ndarr
 
 def test_delay_beyond_the_search_is_not_made_up() -> None:
     assert estimate_delay(delayed(0.4, 0.1), 30.0, PHI) is None
+    # Of a short record a tenth is searched.
+    assert estimate_delay(delayed(0.08, 0.0, duration=1.0), 30.0, PHI) == pytest.approx(
+        0.08, abs=1e-5
+    )
+    assert estimate_delay(delayed(0.12, 0.0, duration=1.0), 30.0, PHI) is None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from known_motion import motion_at
 from planted import PHI
+from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.check.load_fit import LoadFit, load_fit, white_noise
@@ -30,6 +31,15 @@ def test_samples_that_say_something_new_are_those_of_the_pass_band(start: float)
     fit = load_fit(log)
     assert fit.independent == pytest.approx(2 * 15 * 4, rel=1e-3)  # at 15 Hz, of 4 s
     assert fit.unexplained < 1e-6 and fit.mass == pytest.approx(PHI[0], rel=1e-3)
+
+
+def test_poses_at_rest_say_the_mass_and_each_says_something_new() -> None:
+    s = 9.81 * Rotation.random(30, random_state=2).apply([0.0, 0.0, 1.0])
+    rest = np.zeros((30, 3))
+    wrench = non_contact_wrench(s, rest, rest, PHI) + 3.0
+    fit = load_fit(Log(np.arange(30.0), wrench, s, rest, rest, static=True))
+    assert fit.mass == pytest.approx(PHI[0], rel=1e-6) and fit.good
+    assert fit.independent == 30 - 8
 
 
 def test_a_good_fit_explains_most_and_has_a_mass() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,9 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.check.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
+from drake_teleop.logs.read import auto_mounting
 from drake_teleop.logs.read.description import Description, load_description
-from drake_teleop.logs.read.lever_arm import lever_arm_from_wrench
+from drake_teleop.logs.read.lever_arm import LeverArm, lever_arm_from_wrench
 from drake_teleop.logs.read.mounting import Mounting, find_mounting
 from drake_teleop.logs.read.reading import read_description, read_log
 from drake_teleop.logs.read.tables import Table
@@ -183,6 +185,26 @@ def test_the_wrench_tells_the_lever_arm_without_a_pose(seed: int) -> None:
         tables=tables,
     )
     assert len(auto.notes) == 1 and "from the wrench" in auto.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("of_wrench", "taken"), [(0, "pose"), (1, "pose"), (2, "pose"), (3, "wrench")]
+)
+def test_the_wrench_is_believed_where_it_tells_more_than_the_pose(
+    monkeypatch: pytest.MonkeyPatch, of_wrench: int, taken: str
+) -> None:
+    """The pose tells two coordinates of three here."""
+    of_pose, other = (
+        LeverArm(np.zeros(3), np.where(np.arange(3) < known, 1e-3, np.inf), source)
+        for known, source in ((2, "pose"), (of_wrench, "wrench"))
+    )
+    monkeypatch.setattr(auto_mounting, "lever_arm_from_wrench", lambda _: other)
+    of_the_pose: Any = SimpleNamespace(fits=True, lever=of_pose)
+    if taken == "wrench":
+        assert auto_mounting._lever(of_the_pose, None, "here") is other
+        return
+    with pytest.raises(DrakeTeleopError, match=r"determine z of .* from the pose\)"):
+        auto_mounting._lever(of_the_pose, None, "here")
 
 
 def test_a_load_that_touches_something_tells_nothing() -> None:

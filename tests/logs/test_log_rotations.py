@@ -31,3 +31,6 @@ def test_what_leaves_no_residual_at_all_is_solved() -> None:
     x, deviations = solve(lambda x: np.outer(np.arange(60.0), [1, 1, 1]) * (x - exact).sum(), exact)
     np.testing.assert_array_equal(x, exact)
     assert np.isinf(deviations).all()  # the sum alone is determined
+    noise = np.random.default_rng(3).normal(size=(200, 3))
+    x, _ = solve(lambda x: np.hstack([x[:1] - noise, np.full((200, 3), x[1])]), np.ones(2))
+    np.testing.assert_allclose(x, [noise.mean(), 0.0], atol=1e-9)  # half leaves nothing

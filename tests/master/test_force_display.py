@@ -69,6 +69,7 @@ def test_limits_keep_the_direction(q):
     np.testing.assert_allclose(
         torque, phantom.jacobian(q).T @ displayed + phantom.gravity_torque(q), atol=1e-12
     )
+    np.testing.assert_array_equal(display(-wrench, q)[1], -displayed)
 
 
 def test_force_and_torque_are_limited_apart():

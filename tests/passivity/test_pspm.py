@@ -15,7 +15,7 @@ from drake_teleop.passivity.methods import (
     parameters,
     slave_step,
 )
-from drake_teleop.passivity.packet import PACKET_SIZE, difference_into, moved_into
+from drake_teleop.passivity.packet import PACKET_SIZE, WRENCH, difference_into, moved_into
 
 T, STEPS, START = 1e-3, 1500, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 K, D = np.repeat([300.0, 5.0], 3), np.repeat([2.0, 0.02], 3)
@@ -91,6 +91,29 @@ def test_stored_energy_is_what_was_put_in(end):
         np.testing.assert_allclose(left, put_in, rtol=0, atol=1e-9)
         largest = max(largest, np.abs(work).max())
     assert largest > 0.01, "nothing happened"
+
+
+def test_a_wrench_beyond_the_limit_is_shortened_before_the_spring_is_wound():
+    """So the damper is felt on top of the limit, and what is not shown costs no energy."""
+    p, m, rng = (
+        parameters(PassivityConfig(method="pspm")),
+        METHODS.index("pspm"),
+        np.random.default_rng(2),
+    )
+    memory, packet, wrench = initial_memory("pspm", p, START), np.zeros(PACKET_SIZE), np.empty(6)
+    memory[LEDGER] = rich = np.array([10.0, 10.0])
+    received, limits = np.zeros(PACKET_SIZE), np.array([3.0, 0.02])
+    shown = rng.normal(size=6)
+    shown /= np.sqrt(np.repeat(groups(shown**2) / limits**2, 3))
+    received[WRENCH] = 7.0 * shown
+    twist, still = 0.1 * shown, np.zeros(6)
+    master_step(m, received, True, START, twist, still, still, limits, T, p, memory, wrench, packet)
+    K_h, B = (
+        np.repeat(x, 3) for x in (PassivityConfig().pspm.stiffness, PassivityConfig().pspm.damping)
+    )
+    np.testing.assert_allclose(wrench, shown - B * twist, rtol=1e-12)
+    spent = rich - memory[LEDGER] - memory[SENT]
+    np.testing.assert_allclose(spent, groups(0.5 * shown**2 / K_h), rtol=1e-9)
 
 
 def test_a_command_that_was_held_back_is_pulled_at_as_it_left(monkeypatch):
