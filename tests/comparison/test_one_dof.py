@@ -196,16 +196,17 @@ def test_the_same_seed_gives_the_same_run():
 
 def test_the_accounts_are_those_of_spring_inertia_and_of_each_other():
     task = Task(swing=0.1, swung=0.7, press=0.7, pressed=1.0, release=1.3, released=1.5, end=2.0)
-    intent, scale, ahead = operators_intent(task), REFERENCE.force_scale, np.full(2000, 10)
-    run = run_one_dof(REFERENCE, PassivityConfig(), NetworkConfig(delay=0.01), intent=intent)
-    spring = 0.5 * scale * REFERENCE.wall_stiffness * np.maximum(run.slave, 0.0) ** 2
+    model, intent, ahead = dataclasses.replace(REFERENCE, gamma=0.8), operators_intent(task), 10
+    scale = model.gamma * model.force_scale
+    run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=0.01), intent=intent)
+    spring = 0.5 * scale * model.wall_stiffness * np.maximum(run.slave, 0.0) ** 2
     hand, command, motor, actual = run.accounts.T
     # A spring gives back what it has taken, to rounding; so it is not the wall that is active.
     np.testing.assert_allclose(actual, -spring, rtol=0.0, atol=1e-14)
     assert spring.max() > 0.01 and run.least(ACTUAL) < -0.01 and run.start_energy == 0.0
     # The motor has given what the wall holds and what moves; v is half a step of 50 us late.
     speed = np.gradient(run.slave, PERIOD)
-    moving = 0.5 * scale * REFERENCE.slave_mass * speed**2
+    moving = 0.5 * scale * model.slave_mass * speed**2
     assert moving.max() > 0.1
     np.testing.assert_allclose(motor, actual - moving, rtol=0.0, atol=6e-4)
     still = np.abs(speed) < 1e-4
@@ -220,13 +221,13 @@ def test_the_accounts_are_those_of_spring_inertia_and_of_each_other():
     assert (command - actual).max() > 1e-3
     # The packets of a network one by one, the same in a hand and before a wall that do not change.
     given = run_one_dof(
-        REFERENCE,
+        model,
         PassivityConfig(),
         NetworkConfig(),
         intent=intent,
         grip=np.tile([0.2, 5.0, 300.0], (len(intent), 1)),
         wall=np.tile([0.0, 5100.0], (len(intent), 1)),
-        delays=(ahead, ahead),
+        delays=(np.full(2000, ahead), np.full(2000, ahead)),
     )
     np.testing.assert_array_equal(given.accounts, run.accounts)
 
