@@ -55,6 +55,7 @@ from drake_teleop.passivity.methods import METHODS, PassivityConfig
 
 CHARGED = 1.5  # s; later, the least energy is no longer that of the start
 LEAKS = -1e-6  # J, less is more than rounding
+CYCLES = 1.0  # s, longer counts in the share of runs
 SWING = 0.5e-3  # m, a reversal that counts
 
 
@@ -152,22 +153,24 @@ def _drawn(job: tuple[tuple[str, ...], range, Options]) -> list[list[Figures]]:
     return found
 
 
-Searched = tuple[str, str, tuple[int, ...], float, Figures]
+Seen = dict[str, tuple[float, tuple[int, ...]]]
+"""Aim -> the worst value seen, and in which case."""
 
 
-def _searched(job: tuple[str, str, int, int, Options]) -> Searched:
-    """Climbs from a case drawn: method, aim, the worst case, its value, the worst of all seen."""
+def _searched(job: tuple[str, str, int, int, Options]) -> tuple[str, Figures, Seen]:
+    """Climbs from a case drawn towards an aim: the method, and the worst of all runs on the way."""
     method, aim, index, trials, options = job
     best: tuple[int, ...] = (index,)
     worst = run_case(method, best, options)
-    value = AIMS[aim](worst)
+    seen = {name: (of(worst), best) for name, of in AIMS.items()}
     for trial in range(1, trials):
         path = (*best, trial)
         found = run_case(method, path, options)
         worst = worst.worse(found)
-        if AIMS[aim](found) > value:
-            best, value = path, AIMS[aim](found)
-    return method, aim, best, value, worst
+        if AIMS[aim](found) > seen[aim][0]:
+            best = path
+        seen = {name: max(seen[name], (of(found), path)) for name, of in AIMS.items()}
+    return method, worst, seen
 
 
 def study(
@@ -194,16 +197,16 @@ def study(
         for row in table:
             random = random.worse(row[n])
         searched, worst = random, {}
-        for _, _, _, _, found in (one for one in climbed if one[0] == name):
+        climbs_of = [one for one in climbed if one[0] == name]
+        for _, found, _ in climbs_of:
             searched = searched.worse(found)
         for aim in AIMS:
-            _, _, path, value, _ = max(
-                (one for one in climbed if one[:2] == (name, aim)), key=lambda one: one[3]
-            )
+            value, path = max(seen[aim] for _, _, seen in climbs_of)
             worst[aim] = {"case": ".".join(map(str, path)), "value": value}
         result[name] = {
             "runs": drawn + trials * len(AIMS) * starts,
             "leaking": sum(row[n].actual < LEAKS for row in table) / drawn,
+            "cycling": sum(row[n].cycle > CYCLES for row in table) / drawn,
             "random": dataclasses.asdict(random),
             "searched": dataclasses.asdict(searched),
             "worst": worst,
@@ -217,16 +220,17 @@ def print_study(result: dict[str, dict[str, Any]]) -> None:
     ports = ("actual", "motor", "command", "hand")
     heads = ("the actual motion", "the motor", "the command", "the hand alone")
     print(f"{'method':<14}{'leak':>6} " + "".join(f"{head:>20}" for head in heads), end="")
-    print(f"{'speed m/s':>14}{'travel m':>14}{'cycle s':>12}")
+    print(f"{'speed m/s':>14}{'travel m':>14}{'cycle s':>12}{'> 1 s':>8}")
     for name, found in result.items():
         random, searched = found["random"], found["searched"]
         line = f"{name:<14}{100 * found['leaking']:5.0f} %"
         line += "".join(f"{random[port]:10.2g} /{searched[port]:8.2g}" for port in ports)
         for key, width in (("speed", 7), ("travel", 7), ("cycle", 6)):
             line += f"{random[key]:{width}.2f} /{searched[key]:5.2f}"
-        print(line)
+        print(f"{line}{100 * found['cycling']:6.0f} %")
     for name, found in result.items():
-        cases = ", ".join(f"{aim} {one['case']}" for aim, one in found["worst"].items())
+        worst = found["worst"].items()
+        cases = ", ".join(f"{aim} {one['value']:.3g} in {one['case']}" for aim, one in worst)
         print(f"worst of {name}: {cases}")
 
 

@@ -57,7 +57,7 @@ DRAWS: dict[str, Draw] = {
     "delay_change": _one_of("none", "steps", "swings"),
     "delay_by": _log(0.002, 0.4),
     "delay_pace": _log(0.05, 3.0),
-    "timeout": _log(0.05, 0.2),
+    "timeout": _log(0.05, 1.0),
     "grip": _even(0.0, 1.0),  # of the way from light to firm
     "later_grip": _even(0.0, 1.0),
     "regrip": _even(1.0, 18.0),  # when; after the end: never
