@@ -270,7 +270,7 @@ def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Ar
 def _exponential(M: Array) -> Array:
     """e^M of (..., n, n), vectorised: the Taylor series of M / 2^s, squared s times."""
     largest = float(np.abs(M).sum(axis=-1).max(initial=0.0))
-    halvings = max(0, math.ceil(math.log2(largest / 0.25))) if largest > 0.25 else 0
+    halvings = math.ceil(math.log2(largest / 0.25)) if largest > 0.25 else 0
     term = E = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
     for i in range(1, 15):  # 0.25^15 / 15! is below rounding
         term = term @ M / (i * 2.0**halvings)

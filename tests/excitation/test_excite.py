@@ -468,7 +468,10 @@ def test_a_package_may_have_the_name_of_drakes_own(tmp_path):
 
 
 def test_a_floor_without_end_is_kept_clear_of(tmp_path):
-    """A pendulum of 0.4 m above it, of which nobody knows how far it may swing."""
+    """A pendulum of 0.4 m above it, of which nobody knows how far it may swing.
+
+    While 1001 samples are looked at, it is said how far that is, now and then.
+    """
     model = tmp_path / "pendulum.xml"
     model.write_text("""<mujoco model="m"><worldbody><geom type="plane" size="0 0 1" pos="0 0 0.8"/>
     <body name="base" pos="0 0 1"><geom type="sphere" size="0.01" mass="1"/><body name="l1">
@@ -478,7 +481,9 @@ def test_a_floor_without_end_is_kept_clear_of(tmp_path):
     robot = RobotFromModel(model, "l1", WristSensorConfig())
     for angle, is_free in ((0.0, True), (np.pi, False)):
         still = FourierTrajectory(np.array([angle]), np.zeros((1, 2)), np.zeros((1, 2)), 1.0)
-        uses = check(robot, still)
+        said = []
+        uses = check(robot, still, said.append)
+        np.testing.assert_allclose(said, [0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.0], rtol=1e-2)
         share = next(use for use in uses if use.limit == "clearance").share
         assert (share <= 1) == is_free
 

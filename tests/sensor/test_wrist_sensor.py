@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +13,13 @@ from pydrake.systems.framework import BasicVector, DiagramBuilder
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
-from drake_teleop.sensor.sensor_chain import WristSensorConfig, butterworth_sections, without
+from drake_teleop.sensor.sensor_chain import (
+    NOISE_BLOCK,
+    WristSensorConfig,
+    butterworth_sections,
+    without,
+)
+from drake_teleop.sensor.wrist_sensor import WristSensor
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.plant import AddSlavePlant
 from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
@@ -184,3 +192,11 @@ def test_an_instant_that_comes_twice_has_one_sample():
     np.testing.assert_allclose(
         result["joint_position"][1:], result["slave_state"][:-1, :6], rtol=0, atol=1e-13
     )
+
+
+def test_samples_wait_in_contact_until_the_torque_or_the_noise_changes():
+    """Asked three times a period, of which five have one torque and 128 one block of noise."""
+    period, k = 1.25e-4, np.arange(3 * 1000)
+    sensor: Any = SimpleNamespace(_period=period, _holds=(5 * period, NOISE_BLOCK * period))
+    due = [WristSensor._is_due(sensor, time) for time in k * period / 3]
+    np.testing.assert_array_equal(due, (k % 15 == 0) | (k % (3 * NOISE_BLOCK) == 0))
