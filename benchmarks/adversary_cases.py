@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Draw = Callable[[float], Any]
 
 STEPS = 12000
-TIME = PERIOD * np.arange(STEPS)
+TIME = PERIOD * np.arange(STEPS, dtype=np.float64)
 FREE = -0.04  # m, where the hand begins
 LIGHT, FIRM = (0.1, 2.0, 50.0), (0.5, 20.0, 700.0)  # kg, N s/m, N/m
 LONGEST = 4000  # periods that a packet travels at most
