@@ -84,6 +84,7 @@ class OneDof(Axis):
     wrench_noise: float = 0.0  #: N, standard deviation of what the wrist measures
     believed_stiffness: float = 1.0  #: what the method is told of the servo, over what it is
     believed_damping: float = 1.0  #: likewise
+    believed_mass: float = 1.0  #: likewise, of the slave
 
 
 REFERENCE = OneDof(
@@ -191,10 +192,8 @@ def run_one_dof(
         model: masses, hand, wall.
         passivity: the method.
         forward, backward: the network; backward None: as forward.
-        seed: of the network.
-        timeout: of the safe state [s].
-        intent: (N, 2) position [m] and velocity [m/s] that the operator intends, at the periods;
-            default `operators_intent`.
+        seed, timeout: of the network; of the safe state [s].
+        intent: (N, 2) position [m], velocity [m/s] intended at the periods; default: the task's.
         grip: (N, 3) mass [kg], damping [N s/m] and stiffness [N/m] of the hand at the periods,
             zeros where it has let go; default: the model's.
         wall: (N, 2) position [m] and stiffness [N/m] of the wall at the periods. In between it
@@ -210,6 +209,7 @@ def run_one_dof(
         passivity,
         servo_stiffness=[model.believed_stiffness * model.servo_stiffness] * 2,
         servo_damping=[model.believed_damping * model.servo_damping] * 2,
+        slave_mass=[model.believed_mass * model.slave_mass] * 2,
     )
     p = methods.parameters(passivity, [scale, scale])
     intent = operators_intent() if intent is None else intent

@@ -88,7 +88,8 @@ class Ledger:
         received: of the other end's counter.
         sent: its own counter, for the other end.
         lost: it took out of the loop. `tdpa`: work that was withheld, a measure of its activity.
-            `two_layer`, `pspm`: what overflowed a store. `wave`: what the matching damper took.
+            `two_layer`, `pspm`, `ledger`: what overflowed a store. `wave`: what the matching
+            damper took.
     """
 
     stored: Array

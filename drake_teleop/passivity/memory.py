@@ -6,7 +6,7 @@ method alone needs it names at the head of its file, with `own_memory` and `own_
 
 from __future__ import annotations
 
-MEMORY = 92  #: length of the memory of one end
+MEMORY = 112  #: length of the memory of one end
 PARAMETERS = 24  #: length of the parameters, packed by `methods.parameters`
 
 
@@ -61,6 +61,8 @@ LIMIT = _parameters.vector(2)
 STIFFNESS = _parameters.vector(2)
 #: Of the slave's servo, likewise [N s/m, N m s/rad].
 DAMPING = _parameters.vector(2)
+#: Of the slave where it is moved, in the master's power units [kg, kg m^2].
+MASS = _parameters.vector(2)
 #: A wrench at the hand over one in the master's power units, of force and torque.
 MOTION_SCALE = _parameters.vector(2)
 _METHOD = _parameters.rest()

@@ -27,12 +27,14 @@ from drake_teleop.fields import settings
 from drake_teleop.passivity import none
 from drake_teleop.passivity.force_limit import ForceLimitConfig
 from drake_teleop.passivity.four_channel import FourChannelConfig
+from drake_teleop.passivity.ledger import LedgerConfig
 from drake_teleop.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
     DAMPING,
     LIMIT,
+    MASS,
     MEMORY,
     MOTION_SCALE,
     PACKET,
@@ -66,6 +68,7 @@ class Methods:
     charged_tdpa: TdpaConfig = field(default_factory=charged)
     two_layer: TwoLayerConfig = field(default_factory=TwoLayerConfig)
     pspm: PspmConfig = field(default_factory=PspmConfig)
+    ledger: LedgerConfig = field(default_factory=LedgerConfig)
     four_channel: FourChannelConfig = field(default_factory=FourChannelConfig)
     local_force_limit: ForceLimitConfig = field(
         default_factory=ForceLimitConfig, metadata={"method": "force_limit"}
@@ -93,6 +96,9 @@ class _Common:
     servo_damping: list[float] = quantity(
         [3.5e3, 117.0], "N s/m, N m s/rad", 0.0, 1e8, "D of the slave's servo, likewise (E)"
     )
+    slave_mass: list[float] = quantity(
+        [15.13, 0.5], "kg, kg m^2", 1e-6, 1e6, "of arm and tool where they are pushed, likewise (E)"
+    )
 
 
 @settings
@@ -100,8 +106,9 @@ class _Common:
 class PassivityConfig(Methods, _Common):
     """Which method keeps the station passive, and the parameters of each.
 
-    The servo is what the methods that act at the slave's motor port (`two_layer`, `pspm`) and
-    `four_channel` believe of it: it pulls the slave with K (x_command - x) - D v.
+    The servo is what the methods that act at the slave's motor port (`two_layer`, `pspm`, `ledger`)
+    and `four_channel` believe of it: it pulls the slave with K (x_command - x) - D v. The mass is
+    what `ledger` believes.
     """
 
 
@@ -126,6 +133,7 @@ def parameters(
     p[LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
     p[STIFFNESS] = np.multiply(config.servo_stiffness, power_scale)
     p[DAMPING] = np.multiply(config.servo_damping, power_scale)
+    p[MASS] = np.multiply(config.slave_mass, power_scale)
     p[MOTION_SCALE] = motion_scale
     if config.method in _FIELDS:
         getattr(config, _FIELDS[config.method].name).pack_into(p)

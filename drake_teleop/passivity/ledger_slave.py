@@ -1,0 +1,335 @@
+"""The slave's end of the method `ledger`, see `drake_teleop.passivity.ledger`.
+
+At each step, w the contact's wrench, x and v the slave's actual motion, m, K, D mass and servo as
+they are believed, all in the master's power units:
+
+S1. L_s += min(w_k . dx, w_(k-1) . dx) + what came; likewise Q, from zero at each contact's onset;
+    A = L_s - m v^2 / 2.
+S2. To the master goes what is above the reserve R_s, if it is short; in contact and nearly at rest
+    what is above 0.3 R_s, because pushing back takes energy then and moving does not.
+S3. The contact's stiffness k, along w, follows from wrench and way; of it the slave shows the share
+    rho = min(1, k_d / k), k_d = max(k_0, 2 R_m / (v_p R)^2) with the largest round trip R: a hand
+    goes v_p R deep before it feels anything, and R_m has to push it back. At a contact's onset k is
+    that of the last one, so that a bounce does not stiffen the wall. Beyond the wall x_w the
+    target is x_w + rho (x_received - x_w).
+S4. The command follows the target with bounded acceleration, and m v^2 / 2 <= L_s.
+S5. Motors that push with the motion, f . v > 0, spend at most what A holds in 4 ms; pressing on the
+    wall what was paid since the onset, Q, and a little that nobody paid. With A at its end they
+    brake. Standing still may always hold. It is done through the command, x + (f + D v) / K.
+S6. Sent: w, L_s, z = the servo's model of the received pose, k_c = rho k / (1 + k / K).
+"""
+
+from __future__ import annotations
+
+import math
+
+from drake_teleop._compiled import njit
+from drake_teleop.passivity.memory import (
+    COMMAND,
+    COMMAND_POSE,
+    COMMAND_TWIST,
+    DAMPING,
+    HELD,
+    LEDGER,
+    LOST,
+    MASS,
+    RECEIVED,
+    SENT,
+    STEPS,
+    STIFFNESS,
+    own_memory,
+    own_parameters,
+)
+from drake_teleop.passivity.packet import (
+    ENERGY,
+    INTEGRAL,
+    OTHER_ENERGY,
+    POSE,
+    VELOCITY,
+    arrived,
+    difference_into,
+    dot,
+    fill,
+    length,
+    limit,
+    moved_into,
+    scale,
+)
+from drake_teleop.vectors import put
+
+# Of translation and rotation: a length is an angle at an arm of 0.1 m, a force a torque at the
+# lever of 0.01 m that haptic devices have; a stiffness is a torque over an angle.
+ARM, LEVER, SPRING = (1.0, 10.0), (1.0, 0.01), (1.0, 0.001)
+MARGIN = 0.03  #: of the slave's reserve: never spent; more than what a step can cost
+PASSED = 0.7  #: share of the slave's reserve that the hand's end may have in contact
+
+# What servo and mass are taken for, over what was configured: so errors of 20 % brake, and do not
+# push.
+_STIFF, _DAMPED, _HEAVY = 1.15, 0.9, 1.05
+_CAPACITY = 4.0  # of the reserve: what is above is lost, or limit cycles would live on it
+_FILTER = 3e-3  # s, of velocity, wrench and way: encoders have steps
+_CALM, _CALM_RATE, _RATE = 0.05, 5.0, 50.0  # m/s, at rest; 1/s in which surplus goes, there and not
+_FORGET = 5.0  # s, of the largest round trip
+_SHOWN, _PRESS = 300.0, 0.06  # k_0 [N/m]; v_p, of a hand that presses [m/s]
+_STRETCH, _LONG, _LEARN = (
+    2e-4,
+    2e-3,
+    1e-3,
+)  # m: way for a stiffness, likewise in fast motion; memory
+_SLOW = 0.15  # m/s; an impact's wrench says less of the stiffness
+_SMOOTH = 0.02  # s, of the wall's place and of rho
+_FOLLOW = 0.01  # s, of the command's generator
+_FASTER = 30.0  # m/s^2, its acceleration
+_STOPPING = 0.7  # of the speed from which that acceleration stops in time
+_NEWS = 0.02  # s without a packet, after which the hand's velocity is not fed forward any more
+_HORIZON = 4e-3  # s, in which the motors may spend what there is
+_UNPAID = 4.0  # N, what the slave may press a wall with though nobody has paid
+_STILL = 2e-3  # m/s, at rest: standing costs nothing
+_DECELERATION = 20.0  # m/s^2, of the brake when nothing is left
+
+# In the packet: stiffness k_c (slave's), number of the newest packet (master's), ledger.
+CONTACT_STIFFNESS, LEVEL = slice(INTEGRAL.start, INTEGRAL.start + 2), OTHER_ENERGY
+ECHO = INTEGRAL.stop - 1
+
+# Parameters, in the master's power units.
+_places = own_parameters()
+INITIAL, RESERVE, HAND_RESERVE = _places.vector(2), _places.vector(2), _places.vector(2)
+DRAG, RETREAT, TOUCH = _places.vector(2), _places.vector(2), _places.vector(2)
+# Memory: filtered velocity; whether something is touched; the servo's model; the motors' pull.
+_places = own_memory()
+VELOCITY_HERE, TOUCHED = _places.vector(6), _places.vector(2)
+MODEL, _MODEL_TWIST, _PULL = _places.vector(7), _places.vector(6), _places.vector(6)
+# A, Q; k, rho, how deep the slave is in the wall.
+_ACCOUNT, _PAID = _places.vector(2), _places.vector(2)
+_STIFFNESS, _SHARE, _INSIDE = _places.vector(2), _places.vector(2), _places.vector(2)
+# Of the search for k: wrench filtered, and at the anchor; way since then; how far that is behind.
+_SMOOTHED, _ANCHOR = _places.vector(2), _places.vector(2)
+_WAY, _BEHIND = _places.vector(2), _places.vector(2)
+# Time without packets, the largest round trip, the period [s].
+_SILENT, _ROUND_TRIP, _PERIOD = _places.number(), _places.number(), _places.number()
+
+
+@njit(cache=True)
+def smooth_velocity(twist, share, memory):
+    """Filters the velocity of this end."""
+    velocity = memory[VELOCITY_HERE]
+    for i in range(6):
+        velocity[i] += share * (twist[i] - velocity[i])
+
+
+@njit(cache=True)
+def receive(g, received, memory):
+    """Adds what has come to the ledger, and returns it."""
+    more = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
+    memory[LEDGER][g] += more
+    memory[RECEIVED][g] += more
+    return more
+
+
+@njit(cache=True)
+def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
+    """One step of the slave's end; see `methods.slave_step`."""
+    gap, now, going = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
+    heard = arrived(received)
+    memory[_PERIOD] = T
+    memory[_SILENT] = 0.0 if fresh else memory[_SILENT] + T
+    trip = max((memory[STEPS] - received[ECHO]) * T, 0.0) if heard else 0.0
+    memory[_ROUND_TRIP] = max(memory[_ROUND_TRIP] * (1.0 - T / _FORGET), trip)
+    smooth_velocity(twist, min(T / _FILTER, 1.0), memory)
+    for g in range(2):
+        _account_of_slave(g, received, heard, twist, dx, wrench, T, p, memory)
+        _learn(g, dx, wrench, T, p, memory)
+    memory[HELD] = wrench
+    gap[:] = 0.0
+    if heard:
+        difference_into(received[POSE], now, gap)
+    difference_into(now, pose, memory[_PULL])
+    for g in range(2):
+        _generate(g, received, heard, wrench, T, p, memory, gap)
+    for i in range(6):
+        gap[i] = T * going[i]
+    moved_into(now, gap, now)
+    _clamp(now, pose, twist, p, memory)
+    _model(received, heard, T, p, memory, gap)
+    put(command, 0, memory, COMMAND.start, 13)
+    fill(memory[MODEL], twist, wrench, packet)
+    for g in range(2):
+        k = memory[_STIFFNESS][g]
+        packet[CONTACT_STIFFNESS][g] = (
+            memory[_SHARE][g] * k / (1.0 + k / (_STIFF * p[STIFFNESS][g]))
+        )
+        packet[ENERGY][g], packet[LEVEL][g] = memory[SENT][g], memory[LEDGER][g]
+
+
+@njit(cache=True)
+def _account_of_slave(g, received, heard, twist, dx, wrench, T, p, memory):
+    """S1, S2."""
+    # The wrench went from the last one to this one: of both works the smaller is credited.
+    work = min(dot(wrench, dx, g), dot(memory[HELD], dx, g))
+    more = receive(g, received, memory)
+    ledger, paid, reserve = memory[LEDGER], memory[_PAID], p[RESERVE][g]
+    ledger[g] += work
+    touched = length(wrench, g) > p[TOUCH][g]
+    paid[g] = (paid[g] + work if touched else 0.0) + more
+    speed = length(twist, g)
+    moving = 0.5 * _HEAVY * p[MASS][g] * speed * speed
+    # At rest in contact energy is needed to push the hand back, else for speed.
+    keep, hold, rate = reserve, p[HAND_RESERVE][g], _RATE
+    if touched and speed < _CALM * ARM[g]:
+        keep, hold, rate = (1.0 - PASSED) * reserve, hold + PASSED * reserve, _CALM_RATE
+    needed = max(hold - received[LEVEL][g], 0.0) if heard else 0.0
+    give = min(max(ledger[g] - moving - keep, 0.0), needed) * min(T * rate, 1.0)
+    lost = max(ledger[g] - give - _CAPACITY * reserve, 0.0)
+    memory[SENT][g] += give
+    memory[LOST][g] += lost
+    ledger[g] -= give + lost
+    memory[_ACCOUNT][g] = ledger[g] - moving
+
+
+@njit(cache=True)
+def _learn(g, dx, wrench, T, p, memory):
+    """S3 but for the target: stiffness, share, and how deep the slave is in the wall."""
+    size, k, share = length(wrench, g), memory[_STIFFNESS], memory[_SHARE]
+    way, behind, smoothed = memory[_WAY], memory[_BEHIND], memory[_SMOOTHED]
+    lag = 2.0 * math.sqrt(p[MASS][g] / p[STIFFNESS][g])  # of the servo
+    depth = _PRESS * ARM[g] * (memory[_ROUND_TRIP] + lag)
+    most = max(_SHOWN * SPRING[g], 2.0 * p[HAND_RESERVE][g] / (depth * depth))
+    if not size > p[TOUCH][g]:
+        memory[TOUCHED][g] = 0.0
+        way[g] = behind[g] = smoothed[g] = memory[_ANCHOR][g] = 0.0
+        share[g] = most / max(k[g], most)
+        return
+    inward, rate = -dot(wrench, dx, g) / size, min(T / _FILTER, 1.0)
+    if smoothed[g] == 0.0:
+        # From the first sample in contact: on the way to it a part was outside.
+        smoothed[g] = memory[_ANCHOR][g] = size
+        behind[g] = inward
+    follows = rate * (inward - behind[g])
+    behind[g] += follows - inward
+    way[g] += follows
+    smoothed[g] += rate * (size - smoothed[g])
+    slow = length(memory[VELOCITY_HERE], g) < _SLOW * ARM[g]
+    far = abs(way[g])
+    if far > (_STRETCH if slow else _LONG) * ARM[g]:
+        found = max((smoothed[g] - memory[_ANCHOR][g]) / way[g], 0.0)
+        k[g] += (min(far / (_LEARN * ARM[g]), 1.0) if slow else 0.5) * (found - k[g])
+        way[g], memory[_ANCHOR][g] = 0.0, smoothed[g]
+    if k[g] > SPRING[g]:  # 1 N/m: something is known
+        rate = min(T / _SMOOTH, 1.0)
+        share[g] += rate * (most / max(k[g], most) - share[g])
+        inside = memory[_INSIDE]
+        if memory[TOUCHED][g] == 0.0:
+            inside[g] = size / k[g]
+        inside[g] += inward + rate * (size / k[g] - inside[g] - inward)
+        memory[TOUCHED][g] = 1.0
+
+
+@njit(cache=True)
+def _generate(g, received, heard, wrench, T, p, memory, gap):
+    """S3, S4: the command's velocity; `gap` is from the command to the received pose, changed."""
+    going, pull, feed = memory[COMMAND_TWIST], memory[_PULL], received[VELOCITY]
+    size, yields, over, fast = length(wrench, g), 0.0, 0.0, 0.0
+    if memory[TOUCHED][g] > 0.0:
+        over = memory[_INSIDE][g] - (dot(wrench, gap, g) + dot(wrench, pull, g)) / size
+        if over > 0.0:
+            yields, fast = 1.0 - memory[_SHARE][g], -dot(wrench, feed, g) / size
+    for i in range(3 * g, 3 * g + 3):
+        if yields > 0.0:
+            gap[i] += yields * over * wrench[i] / size
+    away, most = length(gap, g), _FASTER * ARM[g]
+    rate = 1.0 / _FOLLOW
+    if away > 0.0:
+        rate = min(rate, _STOPPING * math.sqrt(2.0 * most / away))
+    for i in range(3 * g, 3 * g + 3):
+        gap[i] *= rate
+        if heard and memory[_SILENT] < _NEWS:
+            gap[i] += feed[i]
+            if yields > 0.0:
+                gap[i] += yields * fast * wrench[i] / size
+    left = max(memory[LEDGER][g] - MARGIN * p[RESERVE][g], 0.0)
+    limit(gap, g, math.sqrt(2.0 * left / (_HEAVY * p[MASS][g])))
+    for i in range(3 * g, 3 * g + 3):
+        gap[i] -= going[i]
+    limit(gap, g, most * T)
+    for i in range(3 * g, 3 * g + 3):
+        going[i] += gap[i]
+
+
+@njit(cache=True)
+def _clamp(command, pose, twist, p, memory):
+    """S5: moves the command (7,) so that the motors' pull is paid for; whether it had to.
+
+    The generator goes on from there, no faster than the slave.
+    """
+    pull, changed = memory[_PULL], False
+    difference_into(command, pose, pull)
+    for g in range(2):
+        K, D = _STIFF * p[STIFFNESS][g], _DAMPED * p[DAMPING][g]
+        for i in range(3 * g, 3 * g + 3):
+            pull[i] = K * pull[i] - D * twist[i]
+        if _hold_back(g, D, twist, p, memory):
+            changed = True
+            going = memory[COMMAND_TWIST]
+            if length(going, g) > length(twist, g) or dot(going, twist, g) < 0.0:
+                for i in range(3 * g, 3 * g + 3):
+                    going[i] = twist[i]
+        for i in range(3 * g, 3 * g + 3):
+            pull[i] = (pull[i] + D * twist[i]) / K
+    if changed:
+        moved_into(pose, pull, command)
+    return changed
+
+
+@njit(cache=True)
+def _hold_back(g, damping, twist, p, memory):
+    """Shortens the motors' pull to what is paid for, or brakes; whether it did."""
+    pull, velocity, held = memory[_PULL], memory[VELOCITY_HERE], memory[HELD]
+    size, speed, mass = length(pull, g), length(twist, g), _HEAVY * p[MASS][g]
+    still = length(velocity, g) < _STILL * ARM[g]
+    margin, account, changed = MARGIN * p[RESERVE][g], memory[_ACCOUNT][g], False
+    pushing = dot(pull, twist, g) > 0.0 or dot(pull, velocity, g) > 0.0
+    touched, room, least = length(held, g), account, 0.0
+    if touched > p[TOUCH][g] and dot(pull, held, g) < 0.0:
+        unpaid = _UNPAID * LEVER[g]
+        spring = unpaid * unpaid / (2.0 * max(memory[_STIFFNESS][g], SPRING[g]))
+        room = min(account, min(p[RESERVE][g], spring) + memory[_PAID][g])
+        if still or not pushing:
+            # Motors that are late earn a little by standing: with an empty account they give way.
+            least = touched * min(max(account / margin, 0.0), 1.0)
+    if not pushing:
+        least += mass * speed / _HORIZON  # comes to rest, and does not bounce
+    reach = _HORIZON * (speed + memory[_PERIOD] * size / mass)
+    if size * reach > max(room - margin, least * reach):
+        scale(pull, g, max(max(room - margin, 0.0) / reach, least) / size)
+        changed = True
+    if account < margin and not still:
+        brake = min(damping * speed, mass * _DECELERATION * ARM[g] * (1.0 - account / margin))
+        if -brake * speed < dot(pull, twist, g):
+            for i in range(3 * g, 3 * g + 3):
+                pull[i] = -brake * twist[i] / max(speed, 1e-12)
+            changed = True
+    return changed
+
+
+@njit(cache=True)
+def _model(received, heard, T, p, memory, gap):
+    """S6: a step of the servo's model; implicit Euler is stable with every servo."""
+    model, going = memory[MODEL], memory[_MODEL_TWIST]
+    gap[:] = 0.0
+    if heard:
+        difference_into(received[POSE], model, gap)
+    for i in range(6):
+        stiff, damped = p[STIFFNESS][i // 3] / p[MASS][i // 3], p[DAMPING][i // 3] / p[MASS][i // 3]
+        going[i] = (going[i] + T * stiff * gap[i]) / (1.0 + T * damped + T * T * stiff)
+        gap[i] = T * going[i]
+    moved_into(model, gap, model)
+
+
+@njit(cache=True)
+def command_left(wanted, command, pose, twist, p, memory):
+    """Has the last word on what the safe state has made of the command; see `methods.Methods`."""
+    for i in range(7):
+        if command[i] != wanted[i]:
+            if _clamp(command, pose, twist, p, memory):
+                memory[COMMAND_POSE] = command
+            return
