@@ -81,7 +81,7 @@ def hard_taps(seed: int, passivity: PassivityConfig, **imperfect) -> OneDofRun:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", [1, 9, 26])
+@pytest.mark.parametrize("seed", [1, 9])
 def test_no_energy_comes_out_at_the_actual_motion(seed):
     """From E_0 on, and from nothing if drag earns it.
 
@@ -94,11 +94,39 @@ def test_no_energy_comes_out_at_the_actual_motion(seed):
         assert run.wall.min() < -50.0, "the wall should have been hit"
 
 
+@pytest.mark.parametrize("delay", [5e-4, 0.15])
+def test_a_light_hand_that_has_bounced_off_a_hard_wall_comes_to_rest(delay):
+    """It swings into the wall before it presses: what was learned then must not keep it going."""
+    axis = model(LIGHT, 50e3)
+    run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT)
+    assert run.wall[run.t < 4.0].min() < -50.0, "it should have hit the wall"
+    found = figures(run, axis)
+    assert found.stable and abs(found.force_error) < 0.01
+
+
 @pytest.mark.parametrize(("servo", "damping"), [(0.8, 1.2), (1.2, 1.2), (1.2, 0.8)])
 def test_a_servo_that_is_not_as_told_and_a_slow_motor_cost_nothing(servo, damping):
     imperfect = {"believed_stiffness": servo, "believed_damping": damping, "motor_lag": 3e-3}
     for seed in (1, 9):
         assert hard_taps(seed, CHARGED_BEFORE, **imperfect).least(ACTUAL) >= -1e-6
+
+
+@pytest.mark.parametrize("seed", [4, 38])
+def test_what_the_safe_state_makes_of_the_command_is_paid_for_too(seed):
+    """Pressing hard through silences, with motors that are late: of 40 seeds, where most is lost.
+
+    In 38 if the safe state has the last word; in 4 if the motors may brake with all that it asks.
+    """
+    rng, t = np.random.default_rng(seed), times(8.0)
+    grip = rng.uniform(0.1, 0.4), 8.0, rng.uniform(200.0, 600.0)
+    imperfect = {"believed_stiffness": 1.2, "believed_damping": 1.2, "believed_mass": 1.2}
+    run = run_one_dof(
+        model(grip, 28.6e3, motor_lag=3e-3, **imperfect), CHARGED_BEFORE,
+        NetworkConfig(delay=0.063, jitter=0.44, loss=0.44, burst=0.26), seed=seed, timeout=0.1,
+        intent=charging(t, 2.0, rng.uniform(0.03, 0.06)),
+    )  # fmt: skip
+    assert run.silent.max() > 0.2 and run.wall.min() < -100.0
+    assert run.least(ACTUAL) >= -1e-6
 
 
 @pytest.mark.parametrize(
@@ -111,6 +139,7 @@ def test_a_servo_that_is_not_as_told_and_a_slow_motor_cost_nothing(servo, dampin
     ],
 )
 def test_at_rest_is_felt_what_is_pressed(grip, wall, delay, loss):
+    """With nothing in store at the start, told nothing of the hand."""
     task = Task(press=3.5, pressed=4.5, release=9.0, released=10.0, end=12.5, judged=1.0)
     network = NetworkConfig(delay=delay, jitter=0.5 if loss else 0.0, loss=loss, burst=0.08)
     pressing = operators_intent(task)
@@ -121,8 +150,6 @@ def test_at_rest_is_felt_what_is_pressed(grip, wall, delay, loss):
     assert abs(found.drift) < 1e-4 and found.chatter < 0.05 * found.felt_force
     free = np.abs(run.felt[(run.t > 0.5) & (run.t < 3.5)])
     assert 0.2 < free.max() <= 0.3, "drag should have been felt while it charged"
-    # Before the press both reserves are full; soft walls are shown as they are.
-    assert np.abs(run.felt[(run.t > 11.0)]).max() < 0.3
     if wall <= 5.1e3:
         softer = axis.force_scale * wall
         assert found.felt_force > 0.95 * 0.02 * softer * grip[2] / (softer + grip[2])
