@@ -23,7 +23,16 @@ from drake_teleop.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.passivity.ledger import LedgerConfig
-from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.passivity.memory import LEDGER, LIMIT, LOST, RECEIVED, SENT
+from drake_teleop.passivity.methods import (
+    METHODS,
+    PassivityConfig,
+    initial_memory,
+    master_step,
+    parameters,
+    slave_step,
+)
+from drake_teleop.passivity.packet import PACKET_SIZE
 
 CHARGED_BY_DRAG = PassivityConfig(method="ledger", ledger=LedgerConfig(initial=[0.0, 0.0]))
 CHARGED_BEFORE = PassivityConfig(method="ledger")
@@ -111,6 +120,38 @@ def test_a_servo_that_is_not_as_told_and_a_slow_motor_cost_nothing(servo, dampin
         assert hard_taps(seed, CHARGED_BEFORE, **imperfect).least(ACTUAL) >= -1e-6
 
 
+def test_a_ledger_is_what_came_less_what_went_and_carries_its_debt():
+    """At every step, of hand and slave: with a hand that is pushed and pays for nothing, too."""
+    p, method = parameters(CHARGED_BY_DRAG), METHODS.index("ledger")
+    start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    ends = [initial_memory("ledger", p, start) for _ in range(2)]
+    packets, still = [np.zeros(PACKET_SIZE) for _ in range(2)], np.zeros(6)
+    felt, command, wrench, work = np.zeros(6), np.zeros(13), np.zeros(6), np.zeros((2, 2))
+    rng, least = np.random.default_rng(3), 0.0
+    for k in range(600):
+        dx, before, held = 1e-4 * rng.normal(size=(2, 6)), wrench.copy(), felt.copy()
+        dx[0] += 2e-4 * np.sin(0.02 * k)
+        wrench = 3.0 * np.sin(np.arange(6) + 0.03 * k) if k % 100 > 50 else np.zeros(6)
+        given = [packet.copy() for packet in packets]
+        for end in range(2):
+            steps = (held if end == 0 else before) * dx[end], wrench * dx[end]
+            both = [np.array([part[:3].sum(), part[3:].sum()]) for part in steps]
+            work[end] += both[0] if end == 0 else -np.minimum(*both)
+        master_step(
+            method, given[1], True, start, dx[0] / 1e-3, dx[0], still, p[LIMIT], 1e-3, p, ends[0],
+            felt, packets[0],
+        )  # fmt: skip
+        slave_step(
+            method, given[0], True, start, dx[1] / 1e-3, dx[1], wrench, 1e-3, p, ends[1], command,
+            packets[1],
+        )  # fmt: skip
+        for end, memory in enumerate(ends):
+            books = memory[RECEIVED] - memory[SENT] - memory[LOST] - work[end]
+            np.testing.assert_allclose(memory[LEDGER], books, atol=1e-12)
+        least = min(least, ends[0][LEDGER].min(), ends[1][LEDGER].min())
+    assert least < 0.0, "there should have been a debt"
+
+
 @pytest.mark.parametrize("seed", [4, 38])
 def test_what_the_safe_state_makes_of_the_command_is_paid_for_too(seed):
     """Pressing hard through silences, with motors that are late: of 40 seeds, where most is lost.
@@ -132,7 +173,7 @@ def test_what_the_safe_state_makes_of_the_command_is_paid_for_too(seed):
 @pytest.mark.parametrize(
     ("grip", "wall", "delay", "loss"),
     [
-        (LIGHT, 50e3, 0.075, 0.0),
+        (MEDIUM, 50e3, 0.15, 0.0),
         (MEDIUM, 5.1e3, 0.3, 0.3),
         (FIRM, 500.0, 0.05, 0.3),
         (FIRM, 20e3, 5e-4, 0.0),
