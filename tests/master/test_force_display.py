@@ -131,3 +131,15 @@ def test_what_was_displayed_fades_and_comes_back_without_a_step(part):
     expected = Fault.WRENCH if part == "wrench" else Fault.HAND
     assert (fault[bad] == expected).all() and not fault[:40].any() and not fault[2400:].any()
     assert (fault[160:1160] == Fault.RESUMING).all()
+
+
+def test_the_torque_comes_back_to_what_the_strongest_motor_bears():
+    """0.3 N m, which the first wrist motor alone holds: no step when the last is at its limit."""
+    motors = np.array([0.3, 0.0, 0.0])
+    torque = np.linalg.solve(phantom.jacobian(POSTURES[1])[3:, 3:].T, motors)
+    commands = np.tile(np.r_[np.zeros(3), torque], (2600, 1))
+    commands[40:160, 3] = np.nan
+    shown, _ = displayed_over(commands, np.tile(POSTURES[1], (2600, 1)))
+    growth = np.diff(np.linalg.norm(shown[159:, 3:6], axis=1))
+    assert 0.0 < growth.max() <= phantom.WRIST_TORQUE_LIMIT.max() * PERIOD / RESUME * (1 + 1e-9)
+    np.testing.assert_array_equal(shown[2400:, :6], commands[2400:])
