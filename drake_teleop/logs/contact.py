@@ -57,6 +57,8 @@ _OWN_MARGIN, _LEAST = 1.6, 5.0  # 1.25 times which is about `RARE`
 _MOST = 30_000  # samples of a long record that a floor is fitted to, in spans of ten blocks
 _LOWER, _MIDDLE = (-math.log(-math.log(share)) for share in (0.25, 0.5))
 _MUCH, _LOUD = 0.4, 10.0
+# Share of a record in contact, above which offsets that differ are no drift of the sensor alone.
+_SOME = 0.2
 
 
 class Samples(NamedTuple):
@@ -266,15 +268,15 @@ def _doubts(
     return ()
 
 
-def shifted(shift: NDArray[np.float64], threshold: float) -> tuple[str, ...]:
-    """A note if offsets have shifted by more than a threshold since the free motion.
+def shifted(shift: NDArray[np.float64], found: Detection) -> tuple[str, ...]:
+    """A note if offsets and contact are as of a record that is mostly contact.
 
     Args:
         shift: (6,) offsets of the record less those of the free motion [N, N m].
-        threshold: of |F_c| [N].
+        found: in the record.
     """
     force = float(np.linalg.norm(shift[:3]))
-    if force <= threshold:
+    if force <= found.force_threshold or found.touched.mean() < _SOME:
         return ()
     return (
         f"the constant that most of the record agrees on is {force:.2g} N from that of the free"

@@ -250,7 +250,7 @@ def eliminate_log(
         statistic=statistic,
     )
     if calm is not None and tare and detection is not None:
-        notes = shifted(found.offsets - calm.offsets, detection.force_threshold)
+        notes = shifted(found.offsets - calm.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)
     return replace(found, detection=detection)
 
