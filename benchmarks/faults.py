@@ -1,7 +1,7 @@
-"""What does the hand feel of 504 faults in the running station, whatever keeps it passive?
+"""What does the hand feel of 560 faults in the running station, whatever keeps it passive?
 
 `python benchmarks/faults.py [--json FILE] [--each N]`. The tool presses on a leaf, the hand feels
-1 to 1.5 N and moves by 4 mm. Into nine stations, all methods and no channel at all, faults come at
+1 to 1.5 N and moves by 4 mm. Into ten stations, all methods and no channel at all, faults come at
 a random time, of random length (one sample to 0.35 s) and size, the same with every run: numbers
 that are none or far too large, samples that freeze or bear a wrong time, a sensor that saturates,
 packets that are lost, late or out of order, a load estimate that goes wrong, scales that are
