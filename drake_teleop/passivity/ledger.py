@@ -24,7 +24,7 @@ hand, command        none: it lies beyond the servo's
                      spring, and means no energy
 hand alone           let go, it gets no more than          the device displays what it is told
                      R_m + 0.7 R_s, and no faster than
-                     about twice `retreat`
+                     about twice `passivity.retreat`
 what is felt         at rest, what is pressed              a wall that hardly damps; a stiff one is
                                                            shown softer, by k_d of step S3
 ===================  ====================================  ========================================
@@ -44,7 +44,8 @@ M2. Of the newest packet, u = w - 1.1 k_c (x_m - z - o) along w, where k_c is th
     over a step is active by k T / 2 (Colgate and Schenkel 1997).
 M3. The wall is remembered, so that fast taps are felt: while nothing else is heard,
     u = -k_c (x_m - x_w). It is dropped when the slave was beyond it and met nothing.
-M4. A hand that moves fast along u, as one that has let go, is pushed less (`retreat`).
+M4. A hand that moves fast along u, as one that has let go, is pushed less: module `retreat`,
+    after M6. The next step counts what was held.
 M5. u may spend a share of L_m; what was shortened comes back in 20 ms.
 M6. Drag on the hand until both reserves are full, and on one that was pushed, while it is fast.
 M7. What L_m has beyond its reserve R_m (in contact R_m + 0.7 R_s) is sent.
@@ -76,7 +77,6 @@ from drake_teleop.passivity.ledger_slave import (
     MODEL,
     PASSED,
     RESERVE,
-    RETREAT,
     SPRING,
     TOUCH,
     TOUCHED,
@@ -153,13 +153,6 @@ class LedgerConfig:
     drag: list[float] = quantity(
         [0.28, 5e-3], "N, N m", 0.0, 10.0, "on the hand until both reserves are full"
     )
-    retreat: list[float] = quantity(
-        [0.1, 1.0],
-        "m/s, rad/s",
-        1e-3,
-        1e3,
-        "of the hand along the force, where that begins to fade; at twice as much it is gone",
-    )
     touch: list[float] = quantity(
         [0.01, 1e-3], "N, N m", 0.0, 1e3, "at the hand; a wrench below it is no contact"
     )
@@ -168,7 +161,6 @@ class LedgerConfig:
         """Writes the values to where the steps read them."""
         p[INITIAL], p[RESERVE], p[HAND_RESERVE] = self.initial, self.reserve, self.hand_reserve
         p[DRAG] = np.divide(self.drag, p[MOTION_SCALE])
-        p[RETREAT] = np.multiply(self.retreat, p[MOTION_SCALE])
         p[TOUCH] = np.divide(self.touch, p[MOTION_SCALE])
 
 
@@ -192,7 +184,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     for g in range(2):
         _predict(g, received, T, p, memory, ahead, wrench)
         limit(wrench, g, limits[g])
-        _retreat(g, p, memory, wrench)
         _afford(g, dx, T, p, memory, wrench)
         _drag(g, received, dx, T, p, memory, wrench)
         limit(wrench, g, limits[g])
@@ -256,15 +247,6 @@ def _predict(g, received, T, p, memory, ahead, wrench):
     inside = min(wall[g] * max(memory[_DEPTH][g], 0.0), _REMEMBERED * LEVER[g])
     for i in range(3 * g, 3 * g + 3):
         wrench[i] = -inside * inward[i]
-
-
-@njit(cache=True)
-def _retreat(g, p, memory, wrench):
-    """M4."""
-    size, start = length(wrench, g), p[RETREAT][g]
-    if size > 0.0:
-        speed = dot(wrench, memory[VELOCITY_HERE], g) / size
-        scale(wrench, g, min(max(2.0 - speed / start, 0.0), 1.0))
 
 
 @njit(cache=True)

@@ -94,7 +94,7 @@ ECHO = INTEGRAL.stop - 1
 # Parameters, in the master's power units.
 _places = own_parameters()
 INITIAL, RESERVE, HAND_RESERVE = _places.vector(2), _places.vector(2), _places.vector(2)
-DRAG, RETREAT, TOUCH = _places.vector(2), _places.vector(2), _places.vector(2)
+DRAG, TOUCH = _places.vector(2), _places.vector(2)
 # Memory: filtered velocity; whether something is touched; the servo's model; the motors' pull.
 _places = own_memory()
 VELOCITY_HERE, TOUCHED = _places.vector(6), _places.vector(2)

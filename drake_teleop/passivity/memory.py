@@ -6,8 +6,8 @@ method alone needs it names at the head of its file, with `own_memory` and `own_
 
 from __future__ import annotations
 
-MEMORY = 112  #: length of the memory of one end
-PARAMETERS = 24  #: length of the parameters, packed by `methods.parameters`
+MEMORY = 118  #: length of the memory of one end
+PARAMETERS = 26  #: length of the parameters, packed by `methods.parameters`
 
 
 class Slots:
@@ -49,6 +49,7 @@ SENT = _memory.vector(2)  #: this end's counter of energy, as sent [J]
 LOST = _memory.vector(2)  #: energy that the method took out of the loop here [J]
 HELD = _memory.vector(6)  #: the wrench at this port since the last step
 COMMAND = _memory.vector(13)  #: the slave's command since the last step, X_WS and its twist
+HAND_VELOCITY = _memory.vector(6)  #: at the master, filtered, see `retreat`
 PACKET = _memory.vector(32)  #: the last packet that was sent, see `packet`
 _OWN = _memory.rest()
 _command = Slots(COMMAND.stop, COMMAND.start)
@@ -65,6 +66,8 @@ DAMPING = _parameters.vector(2)
 MASS = _parameters.vector(2)
 #: A wrench at the hand over one in the master's power units, of force and torque.
 MOTION_SCALE = _parameters.vector(2)
+#: Speed of the hand along the wrench at which that begins to fade, in the slave's [m/s, rad/s].
+RETREAT = _parameters.vector(2)
 _METHOD = _parameters.rest()
 
 

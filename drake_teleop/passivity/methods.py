@@ -39,11 +39,13 @@ from drake_teleop.passivity.memory import (
     MOTION_SCALE,
     PACKET,
     PARAMETERS,
+    RETREAT,
     STEPS,
     STIFFNESS,
 )
 from drake_teleop.passivity.packet import HEALTHY, POSE, SEQUENCE, finite
 from drake_teleop.passivity.pspm import PspmConfig
+from drake_teleop.passivity.retreat import retreat
 from drake_teleop.passivity.tdpa import TdpaConfig, charged
 from drake_teleop.passivity.two_layer import TwoLayerConfig
 from drake_teleop.passivity.wave import WaveConfig
@@ -90,6 +92,13 @@ class _Common:
     method: str = choice("none", METHODS, "what keeps the channel passive")
     force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest force that the hand shall feel")
     torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest torque that the hand shall feel")
+    retreat: list[float] = quantity(
+        [0.1, 1.0],
+        "m/s, rad/s",
+        1e-3,
+        1e3,
+        "of the hand along the wrench, where that begins to fade; at twice as much it is gone",
+    )
     servo_stiffness: list[float] = quantity(
         [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in the slave's units (E)"
     )
@@ -135,6 +144,7 @@ def parameters(
     p[DAMPING] = np.multiply(config.servo_damping, power_scale)
     p[MASS] = np.multiply(config.slave_mass, power_scale)
     p[MOTION_SCALE] = motion_scale
+    p[RETREAT] = np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
     if config.method in _FIELDS:
         getattr(config, _FIELDS[config.method].name).pack_into(p)
     return p
@@ -237,6 +247,7 @@ def master_step(
         _master_step(
             method, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
+        retreat(twist, T, p, memory, wrench)
     _finish(healthy, memory, packet)
 
 

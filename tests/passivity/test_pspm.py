@@ -39,7 +39,12 @@ def test_stored_energy_is_what_was_put_in(end):
     Wrench and spring are found from what the end puts out, not from its memory.
     """
     rng = np.random.default_rng(4)
-    config = PassivityConfig(method="pspm", servo_stiffness=[300.0, 5.0], servo_damping=[2.0, 0.02])
+    config = PassivityConfig(
+        method="pspm",
+        servo_stiffness=[300.0, 5.0],
+        servo_damping=[2.0, 0.02],
+        retreat=[1e3, 1e3],  # else the wrench does not tell the spring
+    )
     p, m = parameters(config), METHODS.index("pspm")
     memory = initial_memory("pspm", p, START)
     first, work = memory[LEDGER].copy(), np.zeros(2)

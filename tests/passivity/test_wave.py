@@ -28,7 +28,7 @@ def line(config, motion, contact, forward, backward, missing=range(0)):
     command x of the last step; packets travel for `forward` and `backward` steps. At the steps
     `missing` none comes to the hand.
     """
-    p = parameters(PassivityConfig(method="wave", force_limit=1e3, wave=config))
+    p = parameters(PassivityConfig(method="wave", force_limit=1e3, retreat=[1e3, 1e3], wave=config))
     start = np.array([1.0, 0, 0, 0, 0, 0, 0])
     memory = [initial_memory("wave", p, start) for _ in range(2)]
     sent, command = np.zeros((2, len(motion), PACKET_SIZE)), np.zeros((len(motion), 13))

@@ -1,0 +1,59 @@
+"""A hand that lets go while it presses: what all methods but `none` make of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.comparison.one_dof import PERIOD, REFERENCE, operators_intent, run_one_dof
+from drake_teleop.passivity.memory import HELD, MEMORY
+from drake_teleop.passivity.methods import METHODS, PassivityConfig, parameters
+from drake_teleop.passivity.retreat import retreat
+
+LET_GO = 9000
+
+
+@pytest.mark.parametrize("delay", [0.05, 0.3])
+@pytest.mark.parametrize("method", [name for name in METHODS if name != "none"])
+def test_who_lets_go_is_not_thrown(method, delay):
+    """Before a wall of 5.1 kN/m, some 4 N undelayed; 1.3 and 4.4 m/s without the limit."""
+    intent = operators_intent()[:11000]
+    intent[intent[:, 0] > 0.0] *= 1.375
+    grip = np.tile([0.2, 5.0, 300.0], (len(intent), 1))
+    grip[LET_GO:] = 0.0
+    run = run_one_dof(
+        REFERENCE, PassivityConfig(method=method), NetworkConfig(delay=delay), intent=intent,
+        grip=grip, timeout=1.0,
+    )  # fmt: skip
+    speed = np.abs(np.diff(run.master[LET_GO - 1 :])) / PERIOD
+    assert speed.max() < 0.3
+
+
+def test_only_what_drives_a_fast_hand_fades():
+    """Speed and wrench of each group apart, at the hand's scale; inertia that is felt stays."""
+    config = PassivityConfig(method="tdpa", slave_mass=[2.0, 0.5])
+    p = parameters(config, motion_scale=[2.0, 1.0])
+    given = np.array([3.0, 4.0, 0.0, 0.0, 0.0, 2.0])
+    along = np.array([0.6, 0.8, 0.0, 0.0, 0.0, 1.0])
+
+    def left(before: np.ndarray, now: np.ndarray) -> np.ndarray:
+        memory, wrench = np.zeros(MEMORY), given.copy()
+        retreat(before, 1.0, p, memory, wrench)  # a long step: nothing is filtered
+        wrench[:] = given
+        retreat(now, 1e-9, p, memory, wrench)
+        np.testing.assert_array_equal(memory[HELD], wrench)
+        return np.array([wrench[:3] @ along[:3], wrench[3:] @ along[3:]])
+
+    for speed, share in ((-9.0, 1.0), (0.99, 1.0), (1.5, 0.5), (2.0, 0.0), (9.0, 0.0)):
+        twist = speed * np.repeat([0.2, 1.0], 3) * along
+        np.testing.assert_allclose(left(twist, twist), share * np.array([5.0, 2.0]), atol=1e-6)
+    # A hand that slows by 1 m/s^2 and 2 rad/s^2 within the filter's 4 ms feels a mass of 2 kg.
+    fast, slower = 9.0 * along, 9.0 * along - 4e-3 * np.repeat([1.0, 2.0], 3) * along
+    np.testing.assert_allclose(left(fast, slower), [2.0, 1.0], rtol=1e-5)
+
+
+def test_without_a_method_nothing_is_withheld():
+    memory, wrench = np.zeros(MEMORY), np.ones(6)
+    retreat(np.full(6, 50.0), 1.0, parameters(PassivityConfig()), memory, wrench)
+    np.testing.assert_array_equal(wrench, np.ones(6))
