@@ -209,8 +209,8 @@ def _channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str
     if "ports" not in result:
         return
     t, timeout = result.t, scenario.channel.silent_after(1.0 / scenario.rates.hand_hz)
-    for column, end, other in ((-2, "master", "slave"), (-1, "slave", "master")):
-        silent = result["ports"][:, column] > timeout
+    for end, other in (("master", "slave"), ("slave", "master")):
+        silent = result[f"ports.{end}_silent"] > timeout
         yield (
             f"the {end}'s end is in its safe state, as nothing comes from the {other},",
             spans_of(t, silent, LASTING),

@@ -83,10 +83,11 @@ SIGNALS = {
         _signal("pose_received", *_POSE, "of the setpoint, what comes out of the channel, X_WS"),
         _signal(
             "ports",
-            "hand hand_rotation slave slave_rotation master_silent slave_silent",
-            "J,J,J,J,s,s",
+            "hand hand_rotation slave slave_rotation master_silent slave_silent"
+            " command command_rotation",
+            "J,J,J,J,s,s,J,J",
             "energy put into the channel at its ends, in the master's power units; how long each"
-            " end has heard nothing",
+            " end has heard nothing; what the slave's wrench puts in along the command",
         ),
         _signal("contact", "contact", "1", "1 while the slave's detector notices a contact"),
         _signal("contact_at_hand", "contact", "1", "the same as it has arrived at the hand"),

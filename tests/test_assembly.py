@@ -21,6 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import BACKWARD, FORWARD, NetworkConfig, newest_packets
+from drake_teleop.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
+from drake_teleop.comparison.station_accounts import station_accounts
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.load.contact.detection import NoiseFloor
@@ -616,3 +618,36 @@ def test_the_slaves_port_counts_the_work_of_the_scaled_wrench(assembled_over_a_n
         counted = recorded.log["ports"][:, 2 + g]
         np.testing.assert_allclose(counted[2:], put_in[:-1], atol=EXACT)
         assert np.ptp(counted) > 1e-4
+
+
+def test_four_accounts_are_kept_of_the_station(assembled_over_a_network, slave):
+    """Where nothing is touched, the first two to rounding; this log is too slow for the motors'."""
+    recorded = assembled_over_a_network
+    log = recorded.log
+    accounts = station_accounts(log, recorded.scenario)
+    wrench = in_power_units(wanted_at_the_hand(recorded, slave))
+    received = steps(rotations(log["pose_received"]), log["pose_received"][:, 4:])
+    for g in (0, 1):
+        group = slice(3 * g, 3 * g + 3)
+        # What leaves at row k the log shows at row k + 1.
+        put_in = np.cumsum(np.sum(wrench[:-1, group] * received[1:, group], axis=1))
+        np.testing.assert_allclose(accounts[:-1, COMMAND, g], put_in - put_in[0], atol=EXACT)
+        assert np.ptp(put_in) > 1e-4
+        counted = log["ports"][1:, g] - log["ports"][1, g]
+        np.testing.assert_allclose(accounts[:-1, HAND, g], counted, atol=EXACT)
+    np.testing.assert_array_equal(accounts[:, ACTUAL], 0.0)
+    assert np.isnan(accounts[:, MOTOR]).all()
+
+
+def test_the_motors_account_is_the_arms_speed(finely_logged, slave):
+    """Without friction, what they do beside bearing the weight is all in the arm's motion."""
+    log, scenario = finely_logged.log, finely_logged.scenario
+    power = GAMMA * FORCE / np.array([TRANSLATION, ROTATION])
+    given = -(station_accounts(log, scenario)[:, MOTOR] / power).sum(axis=1)
+    context, rows = slave.plant.CreateDefaultContext(), slice(None, None, 16)
+    moving = []
+    for state in log["slave_state"][rows]:
+        slave.plant.SetPositionsAndVelocities(context, state)
+        moving.append(slave.plant.CalcKineticEnergy(context))
+    np.testing.assert_allclose(given[rows], moving, atol=1e-6)
+    assert max(moving) > 0.02

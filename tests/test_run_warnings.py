@@ -60,7 +60,7 @@ def recorded(**changed):
         "ik_status": np.zeros((len(T), 1)),
         "force_to_master": np.zeros((len(T), 6)),
         "pose_received": pose(-0.07 * smooth(T - LATE)),
-        "ports": np.zeros((len(T), 6)),
+        "ports": np.zeros((len(T), 8)),
     }
     for name, (column, change) in changed.items():
         signals[name] = signals[name].copy()

@@ -119,8 +119,10 @@ _places = Slots(11)
 _ROTATION = _places.vector(9)  # R_WB by rows
 _SCALES = _places.vector(2)  # of translation and rotation
 # What the station records of the channel, one array: see `channel_step`.
-_places = Slots(6)
+PORTS = 8
+_places = Slots(PORTS)
 _WORK_M, _WORK_S, _SILENCE = _places.vector(2), _places.vector(2), _places.vector(2)
+_WORK_C = _places.vector(2)
 # What the hand's end makes of the newest packet.
 _places = Slots(7)
 _FELT, _TOLD = _places.vector(6), _places.number()
@@ -189,8 +191,9 @@ def channel_step(
         forward, backward: their states, updated.
         ends: of both ends, updated.
         pose_received: (7,) X_WS that the slave shall follow, written.
-        ports: (6,) energy that hand and slave have put in, by group [J], updated; for how long
-            master and slave have heard nothing [s], written.
+        ports: (PORTS,) energy that hand and slave have put in, by group [J], updated; for how long
+            master and slave have heard nothing [s], written; what the slave's wrench would have
+            put in along the command, by group [J], updated.
         wrench_received: (7,) F_E_B that the hand shall feel, and the flag of the newest packet,
             written.
     """
@@ -202,7 +205,7 @@ def channel_step(
     memory_M, memory_S = ends[MEMORY_M], ends[MEMORY_S]
     work_M, work_S = ports[_WORK_M], ports[_WORK_S]
     dx, twist, hand, wrench = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
-    limits, command = np.empty(2), np.empty(13)
+    limits, command, left = np.empty(2), np.empty(13), pose_received.copy()
     received, packet = np.empty(PACKET_SIZE), np.empty(PACKET_SIZE)
 
     # The master's end.
@@ -262,6 +265,9 @@ def channel_step(
     fault, wanted = (fresh and not alive) or not good, command[:7]
     slave_command_into(alive, fault, T, timeout, wanted, watch_S, pose_received)
     methods.command_left(method, wanted, pose_received, before_S[:7], twist, parameters, memory_S)
+    difference_into(pose_received, left, dx)
+    for g in range(2):
+        ports[_WORK_C][g] += dot(held_S, dx, g)
     ports[_SILENCE][0], ports[_SILENCE][1] = watch_M[SILENT], watch_S[SILENT]
 
 
@@ -337,8 +343,9 @@ class TeleopChannel(LeafSystem):
         output_ports:
         - pose_received: (7,) X_WS that the slave shall follow
         - wrench_received: (6,) F_E_B that the hand shall feel [N, N m]
-        - ports: (6,) energy that the hand has put in by translation and by rotation, and what the
-          slave has [J]; for how long master and slave have heard nothing [s]
+        - ports: (8,) energy that the hand has put in by translation and by rotation, and what the
+          slave has [J]; for how long master and slave have heard nothing [s]; what the slave's
+          wrench would have put in along the command [J]
         - contact_at_hand: (1,) the flag that the master's end has received last
 
     Args:
@@ -391,7 +398,7 @@ class TeleopChannel(LeafSystem):
         self._contact = self.DeclareVectorInputPort("contact", 1)
         ends = initial_ends(passivity.method, parameters, start)
         state = [*(network.initial_state(p, np.zeros(PACKET_SIZE)) for p in lines), ends]
-        state += [np.array(start), np.zeros(6)]
+        state += [np.array(start), np.zeros(PORTS)]
         received = np.zeros(7)
         self._groups = [self.DeclareDiscreteState(part) for part in state]
         self.DeclareStateOutputPort("pose_received", self._groups[3])

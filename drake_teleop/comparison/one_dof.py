@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from drake_teleop._compiled import njit
 from drake_teleop.analysis.one_axis import Axis
 from drake_teleop.channel import network
-from drake_teleop.channel.channel import MEMORY_M, MEMORY_S, channel_step, initial_ends
+from drake_teleop.channel.channel import MEMORY_M, MEMORY_S, PORTS, channel_step, initial_ends
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.noise import random_normal
 from drake_teleop.passivity import methods
@@ -363,7 +363,7 @@ def _simulate(
     frame = np.zeros(11)
     frame[0] = frame[4] = frame[8] = frame[9] = frame[10] = 1.0
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
-    wrench, hand, felt, ports = np.zeros(6), np.zeros(6), np.zeros(7), np.zeros(6)
+    wrench, hand, felt, ports = np.zeros(6), np.zeros(6), np.zeros(7), np.zeros(PORTS)
     rows, accounts = np.empty((course.shape[0], 13)), np.zeros(4)
     x = x_s = x_before = start[4]
     v = v_s = a_s = motor = 0.0
@@ -388,9 +388,9 @@ def _simulate(
             forward_line, backward_line, forward, backward, ends, received, ports, felt,
         )  # fmt: skip
         command = received[4]
-        accounts[COMMAND] += wrench[0] * (command - before)
+        accounts[COMMAND] = ports[6]
         rows[k, :7] = np.array([x, x_s, command, felt[0], wall, ports[0], ports[2]])
-        rows[k, 7:9], rows[k, 9:] = ports[4:], accounts
+        rows[k, 7:9], rows[k, 9:] = ports[4:6], accounts
         wanted = K * (command - x_s) - D * v_s
         for i in range(_SUBSTEPS):
             share = (i + 0.5) / _SUBSTEPS

@@ -24,7 +24,7 @@ FAULTS = ("hand_pose", "hand_wrench", "slave_pose", "slave_wrench", "saturated")
 
 @dataclass
 class Run:
-    """Arrays over the steps; x along the axis of motion, ports (N, 6).
+    """Arrays over the steps; x along the axis of motion, ports (N, 8).
 
     What is felt: the wrench (6) and the flag of contact.
     """
@@ -56,9 +56,9 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
     hand = hand_position()
     start = np.array([1.0, 0, 0, 0, hand[0], 0, 0])
     ends, received, slave = initial_ends(method, p, start), start.copy(), start.copy()
-    ports, felt, velocity = np.zeros(6), np.zeros(7), 0.0
+    ports, felt, velocity = np.zeros(8), np.zeros(7), 0.0
     found = Run(
-        np.arange(STEPS) * T, hand, *(np.zeros((STEPS, n)) for n in (7, 7, 6, 2)), np.zeros(STEPS)
+        np.arange(STEPS) * T, hand, *(np.zeros((STEPS, n)) for n in (7, 7, 8, 2)), np.zeros(STEPS)
     )
     for k, x in enumerate(hand):
         wall = -7000.0 * max(slave[4], 0.0)

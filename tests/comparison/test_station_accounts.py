@@ -1,0 +1,81 @@
+"""What the environment has put into a station, of a log that is written down here."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.comparison.one_dof import ACTUAL, HAND, MOTOR
+from drake_teleop.comparison.station_accounts import start_energy, station_accounts
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identification import slave_arm
+from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.result import SimulationResult
+from drake_teleop.scaling.force_scaling import ForceScalingConfig
+from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
+from drake_teleop.scenario import Rates, Scenario, replace
+from drake_teleop.signals import SIGNALS
+from drake_teleop.slave.forward_kinematics import pose_into
+
+SCENARIO = replace(
+    Scenario(),
+    rates=Rates(log_hz=1000.0),
+    force_scaling=ForceScalingConfig(sigma=0.0, gamma=0.5, force_scale=0.1),
+    kinematic_scaling=KinematicScalingConfig(2.0, 0.25),
+)
+
+
+def logged(wrench_at_S) -> tuple[SimulationResult, np.ndarray]:
+    """A log of 21 rows in which every joint turns, and X_WS; the wrench is a function of p_WS."""
+    t, arm = np.arange(21) * 1e-3, slave_arm(SCENARIO)
+    q = np.array([0.1, -0.4, 0.9, 0.2, 0.7, -0.3]) + 4.0 * t[:, np.newaxis] * np.arange(1, 7)
+    poses = np.empty((len(t), 7))
+    for k in range(len(t)):
+        pose_into(arm.table, q[k], poses[k])
+    wrench = np.array([wrench_at_S(pose[4:]) for pose in poses])
+    wrench[:, 3:] += np.cross(poses[:, 4:], wrench[:, :3])  # about the world's origin
+    signals = {
+        "slave_state": np.hstack([q, np.zeros_like(q)]),
+        "joint_torque": np.zeros_like(q),
+        "true_contact_wrench_W": wrench,
+        "ports": np.outer(np.arange(21.0), np.arange(1, 9)),
+    }
+    return SimulationResult(t, signals, [SIGNALS[name] for name in signals]), poses
+
+
+def test_a_spring_at_the_tool_gets_back_what_it_gave():
+    middle, stiffness = np.array([0.1, 0.2, 0.3]), np.diag([1e3, 2e3, 4e3])
+    result, poses = logged(lambda p: np.hstack([-stiffness @ (p - middle), np.zeros(3)]))
+    offset = poses[:, 4:] - middle
+    stored = 0.5 * np.einsum("ni,ij,nj->n", offset, stiffness, offset)
+    actual = station_accounts(result, SCENARIO)[:, ACTUAL]
+    # Force scale times gamma over the scale of translation.
+    np.testing.assert_allclose(actual[:, 0], 0.1 * 0.5 / 2.0 * (stored[0] - stored), atol=1e-12)
+    assert np.ptp(actual[:, 0]) > 0.1
+    np.testing.assert_allclose(actual[:, 1], 0.0, atol=1e-12)
+
+
+def test_a_torque_at_the_tool_works_along_its_turns_alone():
+    result, _ = logged(lambda p: np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.1]))
+    accounts = station_accounts(result, SCENARIO)
+    np.testing.assert_allclose(accounts[:, ACTUAL, 0], 0.0, atol=1e-12)
+    assert abs(accounts[-1, ACTUAL, 1]) > 1e-3
+    # What the channel had summed up a period of 0.5 ms ago, from the first row on.
+    np.testing.assert_allclose(accounts[:-1, HAND, 1], 2.0 * np.arange(20.0), atol=1e-9)
+    assert np.isnan(accounts[:, MOTOR]).all()
+
+
+def test_what_the_stores_hold_at_the_start_is_that_of_both_ends():
+    scenario = replace(SCENARIO, passivity=PassivityConfig(method="two_layer"))
+    np.testing.assert_allclose(
+        start_energy(scenario), 2 * np.array(scenario.passivity.two_layer.initial)
+    )
+    np.testing.assert_array_equal(start_energy(SCENARIO), 0.0)
+
+
+def test_a_station_without_a_channel_has_no_accounts():
+    result, _ = logged(lambda p: np.zeros(6))
+    kept = [name for name in result if name != "ports"]
+    less = SimulationResult(result.t, {n: result[n] for n in kept}, [SIGNALS[n] for n in kept])
+    with pytest.raises(DrakeTeleopError, match=r"accounts: .*no ports; run a station over"):
+        station_accounts(less, SCENARIO)
