@@ -344,8 +344,8 @@ def compare_passivity(
 ) -> None:
     """Compare passivity methods over networks with delay.
 
-    The whole station swings freely and presses on a leaf, soft and stiff; a one-degree-of-freedom
-    reference says how long a round trip each method bears. Writes tables, pictures, report.html.
+    The whole station swings freely and presses on a leaf, soft and stiff; in one degree of freedom
+    the hand lets go and taps, and round trips grow. Writes a decision table, pictures, report.html.
     """
     from drake_teleop.comparison import compare_passivity as study
 

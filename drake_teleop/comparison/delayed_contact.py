@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop._compiled import njit
 from drake_teleop.channel.channel import Channel
-from drake_teleop.comparison.one_dof import Figures, Task, figures_of
+from drake_teleop.comparison.one_dof import ACTUAL, HAND, Figures, Task, figures_of
+from drake_teleop.comparison.station_accounts import start_energy, station_accounts
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.identification import slave_arm
 from drake_teleop.operator.operator import MinimumJerk, OperatorConfig, Sine
@@ -32,14 +33,15 @@ LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_over(round_trip: float) -> Task:
-    """The task with three more round trips [s] for each rest and hold."""
-    wait = 3 * round_trip
+    """The task; a round trip [s] before the press, three of them to hold, two to come to rest."""
     return Task(
-        press=3.5 + wait,
-        pressed=4.5 + wait,
-        release=7.5 + 2 * wait,
-        released=8.5 + 2 * wait,
-        end=11.0 + 3 * wait,
+        swing=0.3,
+        swung=1.8,
+        press=2.3 + round_trip,
+        pressed=3.1 + round_trip,
+        release=5.1 + 4 * round_trip,
+        released=5.9 + 4 * round_trip,
+        end=8.1 + 6 * round_trip,
         judged=1.0,
     )
 
@@ -59,15 +61,20 @@ def delayed_contact(
     settle = 0.5
     swing = Sine(
         t_start=settle + task.swing,
-        duration=2.0,
+        duration=task.swung - task.swing,
         ramp=0.5,
         frequency=1.5,
         translation=[0.005, 0.0, 0.02],
         rotation=[0.0, 0.05, 0.0],
     )
     reach = [0.0, 0.0, -(_GAP + _DEPTH)]
-    press = MinimumJerk(t_start=settle + task.press, duration=1.0, translation=reach)
-    back = MinimumJerk(t_start=settle + task.release, duration=1.0, translation=[-x for x in reach])
+    press, back = (
+        MinimumJerk(t_start=settle + start, duration=end - start, translation=way)
+        for start, end, way in (
+            (task.press, task.pressed, reach),
+            (task.release, task.released, [-x for x in reach]),
+        )
+    )
     x, y, z = base.slave.position
     sheet = SheetSpring(
         position=[x, y, z - _TIP - _GAP], length=0.12, width=0.05, thickness=LEAVES[leaf]
@@ -86,7 +93,10 @@ def delayed_contact(
 
 
 def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> Figures:
-    """The run in numbers: vertical motion and force, which the task is about, and the turning."""
+    """The run in numbers: vertical motion and force, which the task is about, and the turning.
+
+    Its energy is that between hand and actual motion (`energy_between`).
+    """
     heights, turned = _slave_motion(result, scenario)
     scaling = scenario.force_scaling
     return figures_of(
@@ -95,7 +105,7 @@ def station_figures(result: SimulationResult, scenario: Scenario, task: Task) ->
         slave=heights,
         felt=result["force_to_master"][:, 2],
         pressed=scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
-        energy=result["ports"][:, :4].sum(axis=1),
+        energy=energy_between(result, scenario),
         task=task,
         turned=turned,
     )
@@ -108,8 +118,18 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
         "t": result.t,
         "felt": result["force_to_master"][:, 2],
         "pressed": scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
-        "energy": result["ports"][:, :4].sum(axis=1),
+        "energy": energy_between(result, scenario),
     }
+
+
+def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
+    """(N,) that hand and environment have put in, and what the stores held at the start [J].
+
+    It never falls below zero if the station is passive between the hand, with the force that is
+    held there, and the slave's actual motion.
+    """
+    accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]]
+    return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=(1, 2)))
 
 
 def _slave_motion(

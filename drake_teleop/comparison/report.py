@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from drake_teleop.channel.network import PRESETS
+from drake_teleop.comparison.decision import BEHIND, HOLDS, LEAKS, UNSTABLE, decide
+from drake_teleop.comparison.hands import RATES
 from drake_teleop.pages.html import embedded, render
-from drake_teleop.pages.style import COLOURS, GREY, Picture, house_style
+from drake_teleop.pages.style import BLACK, COLOURS, GREY, Picture, house_style
 from drake_teleop.writing import write_picture, write_text
 
 #: Columns of the station's table: key of the row, heading, factor, decimals.
@@ -20,23 +23,33 @@ COLUMNS = (
     ("hunting", "Hunting [mm]", 1e3, 2),
     ("turning", "Turning [deg]", 180 / np.pi, 2),
     ("felt_force", "Felt [N]", 1.0, 2),
+    ("felt_share", "Felt share [%]", 1e2, 1),
     ("chatter", "Chatter [N]", 1.0, 2),
-    ("force_error", "Force error [%]", 1e2, 1),
-    ("drift", "Drift [mm]", 1e3, 2),
+    ("left_behind", "Left behind [mm]", 1e3, 2),
     ("free_force", "Free force [N]", 1.0, 2),
     ("rise_delay", "Rise delay [ms]", 1e3, 0),
-    ("least_energy", "Least energy [J]", 1.0, 3),
+    ("leaked", "Leaked [mJ]", 1e3, 1),
 )
 
-# What fits on a terminal of 80 columns, first of all what the verdict is from; the page has all.
-_TERMINAL = ("hunting", "turning", "felt_force", "force_error", "free_force", "rise_delay")
+#: Of the verdicts: mark, colour of the cell, colour of what stands in it. They differ in lightness
+#: too, and the words say the same.
+VERDICTS = {
+    HOLDS: ("✓", "#CBE4F4", BLACK),
+    LEAKS: ("⚠", "#FBEBB8", BLACK),
+    BEHIND: ("↷", "#F0B878", BLACK),
+    UNSTABLE: ("✗", "#565C66", "white"),
+}
+_MARKERS = "os^Dv"  # of the networks
+_MIDDLE: dict[str, Any] = {"ha": "center", "va": "center"}
 
 Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
 
 
 def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
-    """Writes report.html, runs.png, energy.png and limits.png into `out`."""
+    """Writes report.html and decision, hands, runs, energy and limits as PNG into `out`."""
     pictures = {
+        "decision": draw_decision(summary),
+        "hands": draw_hands(summary),
         "runs": draw_runs(summary, traces),
         "energy": draw_energy(summary, traces),
         "limits": draw_limits(summary["one_dof"]),
@@ -64,6 +77,69 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def draw_decision(summary: Mapping[str, Any]) -> Figure:
+    """What becomes of each method (a row) over each network (a column), in words."""
+    methods, networks, table = summary["methods"], summary["networks"], decide(summary)
+    with house_style():
+        figure = Picture(figsize=(1.75 * len(networks) + 1.5, 0.72 * len(methods) + 1.1))
+        axes = figure.subplots()
+        for (method, network), cell in table.items():
+            x, y = networks.index(network), methods.index(method)
+            mark, colour, ink = VERDICTS[cell.verdict]
+            axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
+            lines = [f"feels {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.forces]
+            up = 0.12 * len(lines)
+            axes.text(
+                x, y - up, f"{mark} {cell.words}", color=ink, size=9.5, weight="bold", **_MIDDLE
+            )
+            for place, line in enumerate(lines):
+                down = y - up + 0.27 * (place + 1)
+                axes.text(x, down, line, color=ink, size=8.5, **_MIDDLE)
+        axes.set_xlim(-0.5, len(networks) - 0.5)
+        axes.set_ylim(len(methods) - 0.5, -0.5)
+        names = [f"{name}\n{2e3 * PRESETS[name].delay:g} ms" for name in networks]
+        axes.set_xticks(range(len(networks)), names)
+        axes.set_yticks(range(len(methods)), methods)
+        axes.xaxis.tick_top()
+        axes.tick_params(length=0)
+        axes.grid(False)
+        for side in axes.spines.values():
+            side.set_visible(False)
+        figure.suptitle("What becomes of each method over each network", x=0.01, ha="left")
+    return figure
+
+
+def draw_hands(summary: Mapping[str, Any]) -> Figure:
+    """A hand that lets go and one that taps: a row for each method, a mark for each network."""
+    methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
+    panels = (
+        ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
+        (f"felt of taps at {RATES[0]:g} Hz [%]", "linear", lambda row: 100 * row["tap_shares"][0]),
+        (f"felt of taps at {RATES[1]:g} Hz [%]", "linear", lambda row: 100 * row["tap_shares"][1]),
+    )
+    with house_style():
+        figure = Picture(figsize=(10.0, 0.36 * len(methods) + 1.5))
+        columns = figure.subplots(1, len(panels), sharey=True)
+        for axes, (title, scale, value) in zip(columns, panels, strict=True):
+            for place, network in enumerate(networks):
+                shown = [row for row in rows if row["network"] == network]
+                # Side by side, so that none hides another.
+                y = [methods.index(row["method"]) + 0.12 * (place - 2) for row in shown]
+                marker, colour = _MARKERS[place % 5], COLOURS[place % len(COLOURS)]
+                x = [max(value(row), 0.0) for row in shown]
+                axes.plot(x, y, marker, markersize=5, color=colour, label=network)
+            axes.set_xscale(scale)
+            if scale == "log":
+                axes.xaxis.set_major_formatter("{x:g}")
+            else:
+                axes.set_xlim(left=0.0)
+            axes.set_yticks(range(len(methods)), methods)
+            axes.set_ylim(len(methods) - 0.5, -0.5)
+            axes.set_xlabel(title)
+        figure.legend(*columns[0].get_legend_handles_labels(), loc="outside upper center", ncols=6)
+    return figure
+
+
 def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
     """What the hand feels over time: a row for each method, a column for each network."""
 
@@ -77,7 +153,7 @@ def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
 
 def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """The energy that both ends have put into the channel, over time: negative is active."""
+    """What hand and environment have put in, with what was stored at the start, over time."""
 
     def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)
@@ -85,7 +161,7 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
     figure = _grid(summary, traces, draw, "energy [J]")
     figure.suptitle(
-        "Energy put into the channel by hand and slave: below 0 it gave out more than it got",
+        "Energy between hand and actual motion: below 0 more came out than went in or was stored",
         x=0.01,
         ha="left",
     )
@@ -141,31 +217,18 @@ def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def print_tables(summary: Mapping[str, Any], out: Path) -> None:
-    """The tables on the terminal."""
+    """The decision table on the terminal."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
-    from rich.text import Text
 
-    console = Console()
+    console, table = Console(), decide(summary)
+    grid = Table(title="Felt share of the contact's force", title_justify="left", box=SIMPLE_HEAD)
+    grid.add_column("Method", no_wrap=True)
     for network in summary["networks"]:
-        for leaf in dict.fromkeys(row["leaf"] for row in summary["station"]):
-            table = Table(
-                title=f"{network}, RTT {2e3 * PRESETS[network].delay:g} ms: {leaf}",
-                title_justify="left",
-                box=SIMPLE_HEAD,
-            )
-            table.add_column("Method", no_wrap=True)
-            table.add_column("Stable", justify="right")
-            for key, heading, _, _ in COLUMNS:
-                if key in _TERMINAL:
-                    word = max(map(len, heading.split()))
-                    table.add_column(Text(heading), justify="right", min_width=word)
-            for row in summary["station"]:
-                if (row["network"], row["leaf"]) == (network, leaf):
-                    verdict = "[green]yes" if row["stable"] else "[red]no"
-                    named = zip(COLUMNS, cells(row), strict=True)
-                    shown = [cell for (key, *_), cell in named if key in _TERMINAL]
-                    table.add_row(row["method"], verdict, *shown)
-            console.print(table)
+        grid.add_column(f"{network}\n{2e3 * PRESETS[network].delay:g} ms", overflow="fold")
+    for method in summary["methods"]:
+        cells = [table[method, network] for network in summary["networks"]]
+        grid.add_row(method, *(f"{cell.words} {cell.share}".strip() for cell in cells))
+    console.print(grid)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

@@ -16,7 +16,7 @@ from drake_teleop.comparison.one_dof import OneDof, Task
 from drake_teleop.comparison.report import COLUMNS, cells
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identified_load import identified_load
-from drake_teleop.scenario import LoadScenario, Rates, replace
+from drake_teleop.scenario import LoadScenario
 
 
 @pytest.mark.slow
@@ -26,13 +26,10 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "LEAVES", {"contact": study.LEAVES["contact"]})
     monkeypatch.setattr(study, "ROUND_TRIPS", (0.01, 0.02, 0.03, 0.1))
     monkeypatch.setattr(study, "_COVERED", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3))))
-    # As long as one swings, presses, holds and rests; at a study's rates, with the load that the
-    # runs of the shipped scenario have identified as well.
-    task = Task(press=2.6, pressed=3.6, release=5.1, released=6.1, end=7.6, judged=1.0)
+    # With the load that the runs of the shipped scenario have identified as well.
+    task = Task(0.1, 1.1, press=1.2, pressed=2.0, release=3.0, released=3.8, end=4.8, judged=0.6)
     monkeypatch.setattr(delayed_contact, "task_over", lambda round_trip: task)
     shipped = LoadScenario("contact_transition")
-    slower = replace(shipped, rates=Rates(2000.0, 1000.0, 1000.0))
-    monkeypatch.setattr(study, "LoadScenario", {"contact_transition": slower}.get)
     monkeypatch.setattr(study, "identified_load", lambda base, stage: identified_load(shipped))
     summary = study.compare_command(
         tmp_path, networks=["lan"], methods=["none", "tdpa"], jobs=1, quiet=True
@@ -45,9 +42,14 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
     for row in runs.values():
         assert row["hunting"] < 0.1e-3
         assert row["error"] is None
-        assert abs(row["force_error"]) < 0.01
-        assert abs(row["drift"]) < 0.5e-3
-        assert row["rise_delay"] >= 0.0
+        assert row["felt_share"] == pytest.approx(1.0, abs=0.01)
+        assert row["felt_force"] == pytest.approx(row["pressed_force"], rel=0.01)
+        assert 0.0 <= row["left_behind"] == abs(row["drift"]) < 0.5e-3
+        assert row["rise_delay"] is None or row["rise_delay"] >= 0.0
+        assert row["leaked"] == max(-row["least_energy"], 0.0)
+    assert runs["none"]["leaked"] > 0.3 > 100 * runs["tdpa"]["leaked"]
+    # The press alone leaks nothing worth the word; taps do.
+    assert [cell["verdict"] for cell in summary["decision"]] == ["unstable", "leaks"]
     limits = {row["method"]: row["longest_s"] for row in summary["one_dof"]}
     assert limits["none"] == 0.02 < limits["tdpa"]
     injected = {
@@ -67,7 +69,7 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
     words = [max(map(len, " ".join(column).split())) for column in zip(*rows, strict=True)]
     assert page.split("</thead>")[0].count("<th") - 1 == len(words)  # <thead> is one of them
     assert sum(8.5 * letters + 11 for letters in words) < 944
-    for name in ("runs", "energy", "limits"):
+    for name in ("decision", "hands", "runs", "energy", "limits"):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
 
 
@@ -86,6 +88,7 @@ def test_unknown_names_are_one_clear_error(tmp_path, arguments, message):
 def test_presets_reach_around_the_earth_and_to_the_moon():
     assert {name: round(2e3 * PRESETS[name].delay) for name in study.NETWORKS} == {
         "lan": 1,
+        "wan": 30,
         "internet": 100,
         "geostationary": 600,
         "lunar": 2600,

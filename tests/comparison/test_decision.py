@@ -1,0 +1,57 @@
+"""The words of the decision table, and what a hand that lets go or taps finds of a method."""
+
+from __future__ import annotations
+
+import pytest
+
+from drake_teleop.comparison.decision import decide
+from drake_teleop.comparison.hands import hands
+from drake_teleop.comparison.report import draw_decision
+
+
+def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, object]:
+    """One method over one network before two leaves, good but for what is said of the second."""
+    good = {"method": "tdpa", "network": "lan", "stable": True, "felt_force": 3.9}
+    good |= {"pressed_force": 4.0, "left_behind": 1e-3, "leaked": 0.0}
+    return {
+        "methods": ["tdpa"],
+        "networks": ["lan"],
+        "station": [good, good | second_leaf],
+        "hands": [{"method": "tdpa", "network": "lan", "leaked": hands_leaked}],
+    }
+
+
+@pytest.mark.parametrize(
+    ("changes", "words", "share"),
+    [
+        ({}, "holds", "98%"),
+        ({"felt_force": 6.0, "pressed_force": 8.0}, "holds", "75%"),
+        ({"leaked": 0.9e-3, "left_behind": 4.9e-3}, "holds", "98%"),
+        ({"leaked": 0.01234}, "leaks 12 mJ", "98%"),
+        ({"hands_leaked": 2.345}, "leaks 2.3 J", "98%"),
+        ({"hands_leaked": 1.0, "left_behind": 5.1e-3}, "left behind", "98%"),
+        ({"stable": False, "left_behind": 1.0, "leaked": 1.0}, "unstable", ""),
+        # A run that ended early.
+        (
+            {"stable": False, "felt_force": None, "left_behind": None, "leaked": None},
+            "unstable",
+            "",
+        ),
+    ],
+)
+def test_a_cell_says_the_first_that_is_so(changes, words, share):
+    (cell,) = decide(summary(**changes)).values()
+    assert (cell.words, cell.share) == (words, share)
+    (axes,) = draw_decision(summary(**changes)).axes
+    written = [text.get_text() for text in axes.texts]
+    assert words in written[0] and len(written) == (3 if share else 1)
+
+
+def test_a_hand_that_lets_go_is_thrown_without_a_method_and_taps_are_felt():
+    none, ledger = hands("none", "internet"), hands("ledger", "internet")
+    assert none.release_speed > 1.0 and none.leaked > 1.0 and none.release_way > 1.0
+    assert ledger.release_speed < 0.3 and ledger.leaked <= 1e-6
+    assert ledger.release_force > 2.5 and ledger.release_way < 0.1
+    # Without a method every impulse arrives, as much later as the network takes.
+    assert none.tap_shares == pytest.approx((1.0, 1.0), abs=0.01)
+    assert ledger.tap_shares == pytest.approx((1.0, 1.0), abs=0.25)
