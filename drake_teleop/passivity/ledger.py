@@ -25,8 +25,9 @@ hand, command        none: it lies beyond the servo's
 hand alone           let go, it gets no more than          the device displays what it is told
                      R_m + 0.7 R_s, and no faster than
                      about twice `passivity.retreat`
-what is felt         at rest, what is pressed              a wall that hardly damps; a stiff one is
-                                                           shown softer, by k_d of step S3
+what is felt         at rest, what is pressed              a wall that is a spring and a damper; a
+                                                           stiff one is shown softer, by k_d of
+                                                           step S3
 ===================  ====================================  ========================================
 
 Before an unknown wall a slave that moves at v can give out m v^2 / 2: its reserve R_s, which limits
@@ -38,10 +39,10 @@ At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
 
 M1. L_m -= f_(k-1) . dx; below zero it is a debt, never written off. While something is touched,
     what the hand pays is sent instead: the slave presses with it. L_m += what came.
-M2. Of the newest packet, u = w - 1.1 k_c (x_m - z - o) along w, where k_c is the wall's stiffness,
-    z where the slave would be without a wall, and o fades: how far hand and slave were apart at
-    the onset, or 0 if the wall was known. x_m is led by two steps, because a spring that is held
-    over a step is active by k T / 2 (Colgate and Schenkel 1997).
+M2. Of the newest packet, u = w - 1.1 k_c (x_m - z - o) - b (v_m - z') along w, where k_c and b are
+    the wall's stiffness and damping, z where the slave would be without a wall, and o fades: how
+    far hand and slave were apart at the onset, or 0 if the wall was known. x_m is led by two steps,
+    because a spring that is held over a step is active by k T / 2 (Colgate and Schenkel 1997).
 M3. The wall is remembered, so that fast taps are felt: while nothing else is heard,
     u = -k_c (x_m - x_w). It is dropped when the slave was beyond it and met nothing.
 M4. A hand that moves fast along u, as one that has let go, is pushed less: module `retreat`,
@@ -66,6 +67,7 @@ from drake_teleop.fields import settings
 from drake_teleop.passivity import ledger_slave
 from drake_teleop.passivity.ledger_slave import (
     ARM,
+    CONTACT_DAMPING,
     CONTACT_STIFFNESS,
     DRAG,
     ECHO,
@@ -96,6 +98,7 @@ from drake_teleop.passivity.packet import (
     ENERGY,
     POSE,
     SEQUENCE,
+    VELOCITY,
     WRENCH,
     arrived,
     difference_into,
@@ -219,7 +222,9 @@ def _predict(g, received, T, p, memory, ahead, wrench):
     size, wall = length(shown, g), memory[_WALL]
     k = min(_OVER * received[CONTACT_STIFFNESS][g], _STIFFEST * SPRING[g])
     if size > p[TOUCH][g]:
-        deep = size / max(k, _SOFTEST * SPRING[g]) - dot(shown, ahead, g) / size
+        damper, speed = received[CONTACT_DAMPING][g], dot(shown, received[VELOCITY], g) / size
+        spring = max(size + damper * speed, 0.0)
+        deep = spring / max(k, _SOFTEST * SPRING[g]) - dot(shown, ahead, g) / size
         if memory[TOUCHED][g] == 0.0:
             memory[TOUCHED][g] = 1.0
             same = wall[g] > 0.0 and -dot(shown, inward, g) > _ALIGNED * size
@@ -233,7 +238,8 @@ def _predict(g, received, T, p, memory, ahead, wrench):
         lead = _LEAD * T * dot(shown, memory[VELOCITY_HERE], g)
         further = (dot(shown, ahead, g) - dot(shown, offset, g) + lead) / size
         most = 2.0 * size + _PREDICTED * LEVER[g]
-        force = min(max(size - k * further, 0.0), most)
+        faster = dot(shown, memory[VELOCITY_HERE], g) / size - speed
+        force = min(max(size - k * further - damper * faster, 0.0), most)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = force / size * shown[i]
         if k > _SOFTEST * SPRING[g]:

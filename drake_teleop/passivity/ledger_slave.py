@@ -7,16 +7,18 @@ S1. L_s += min(w_k . dx, w_(k-1) . dx) + what came; likewise Q, from zero at eac
     A = L_s - m v^2 / 2.
 S2. To the master goes what is above the reserve R_s, if it is short; in contact and nearly at rest
     what is above 0.3 R_s, because pushing back takes energy then and moving does not.
-S3. The contact's stiffness k, along w, follows from wrench and way; of it the slave shows the share
-    rho = min(1, k_d / k), k_d = max(k_0, 2 R_m / (v_p R)^2) with the largest round trip R: a hand
-    goes v_p R deep before it feels anything, and R_m has to push it back. At a contact's onset k is
-    that of the last one, so that a bounce does not stiffen the wall. Beyond the wall x_w the
-    target is x_w + rho (x_received - x_w).
+S3. The contact's stiffness k and damping b, along w, follow from wrench, way and speed. Of it the
+    slave shows the share rho = min(1, k_d / k), k_d = max(k_0, 2 c R_m / (v_p R)^2) with the
+    largest round trip R: a hand goes v_p R deep before it feels anything, and R_m has to push it
+    back. A hand that stays feels at once how deep it goes, and in contact its end has 4.5 R_m (S2):
+    c goes from 1 to 10 in about a second, for k_d up to 1200 N/m; but not over a network that falls
+    silent. At a contact's onset k is that of the last one, so that a bounce does not stiffen the
+    wall. Beyond the wall x_w the target is x_w + rho (x_received - x_w).
 S4. The command follows the target with bounded acceleration, and m v^2 / 2 <= L_s.
 S5. Motors that push with the motion, f . v > 0, spend at most what A holds in 4 ms; pressing on the
-    wall what was paid since the onset, Q, and a little that nobody paid. With A at its end they
-    brake. Standing still may always hold. It is done through the command, x + (f + D v) / K.
-S6. Sent: w, L_s, z = the servo's model of the received pose, k_c = rho k / (1 + k / K).
+    wall what was paid since the onset, Q, and c F_u^2 / 2 k that nobody paid. With A at its end
+    they brake. Standing still may always hold. It is done through the command, x + (f + D v) / K.
+S6. Sent: w, L_s, z and z' = the servo's model of the received pose, k_c = rho k / (1 + k / K), b.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from __future__ import annotations
 import math
 
 from drake_teleop._compiled import njit
+from drake_teleop.passivity.contact_fit import SUMS, fit
 from drake_teleop.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -78,17 +81,24 @@ _STRETCH, _LONG, _LEARN = (
 )  # m: way for a stiffness, likewise in fast motion; memory
 _SLOW = 0.15  # m/s; an impact's wrench says less of the stiffness
 _SMOOTH = 0.02  # s, of the wall's place and of rho
+_SETTLED, _TIMES, _STIFFEST = (
+    0.5,
+    10.0,
+    1200.0,
+)  # s, c and N/m at most: of k_d, of a hand that stays
 _FOLLOW = 0.01  # s, of the command's generator
 _FASTER = 30.0  # m/s^2, its acceleration
 _STOPPING = 0.7  # of the speed from which that acceleration stops in time
 _NEWS = 0.02  # s without a packet, after which the hand's velocity is not fed forward any more
 _HORIZON = 4e-3  # s, in which the motors may spend what there is
-_UNPAID = 4.0  # N, what the slave may press a wall with though nobody has paid
+_UNPAID = 5.0  # N, what the slave may press a wall with though nobody has paid
 _STILL = 2e-3  # m/s, at rest: standing costs nothing
 _DECELERATION = 20.0  # m/s^2, of the brake when nothing is left
 
-# In the packet: stiffness k_c (slave's), number of the newest packet (master's), ledger.
-CONTACT_STIFFNESS, LEVEL = slice(INTEGRAL.start, INTEGRAL.start + 2), OTHER_ENERGY
+# In the packet: stiffness k_c and damping b (slave's), number of the newest packet (master's),
+# ledger.
+CONTACT_STIFFNESS = slice(INTEGRAL.start, INTEGRAL.start + 2)
+CONTACT_DAMPING, LEVEL = slice(INTEGRAL.start + 2, INTEGRAL.start + 4), OTHER_ENERGY
 ECHO = INTEGRAL.stop - 1
 
 # Parameters, in the master's power units.
@@ -99,14 +109,17 @@ DRAG, TOUCH = _places.vector(2), _places.vector(2)
 _places = own_memory()
 VELOCITY_HERE, TOUCHED = _places.vector(6), _places.vector(2)
 MODEL, _MODEL_TWIST, _PULL = _places.vector(7), _places.vector(6), _places.vector(6)
-# A, Q; k, rho, how deep the slave is in the wall.
+# A, Q; k, b; rho, c less 1; how deep the slave is in the wall.
 _ACCOUNT, _PAID = _places.vector(2), _places.vector(2)
-_STIFFNESS, _SHARE, _INSIDE = _places.vector(2), _places.vector(2), _places.vector(2)
-# Of the search for k: wrench filtered, and at the anchor; way since then; how far that is behind.
-_SMOOTHED, _ANCHOR = _places.vector(2), _places.vector(2)
-_WAY, _BEHIND = _places.vector(2), _places.vector(2)
-# Time without packets, the largest round trip, the period [s].
-_SILENT, _ROUND_TRIP, _PERIOD = _places.number(), _places.number(), _places.number()
+_STIFFNESS, _DAMPER = _places.vector(2), _places.vector(2)
+_SHARE, _STAYED, _INSIDE = _places.vector(2), _places.vector(2), _places.vector(2)
+# Of the search for k and b: wrench filtered, it and the speed at the anchor; way since then; how
+# far that is behind; the fit's sums.
+_SMOOTHED, _ANCHOR, _FAST = _places.vector(2), _places.vector(2), _places.vector(2)
+_WAY, _BEHIND, _SUMS = _places.vector(2), _places.vector(2), _places.vector(2 * SUMS)
+# Time without packets and the longest such, the largest round trip, the period [s].
+_SILENT, _GAP = _places.number(), _places.number()
+_ROUND_TRIP, _PERIOD = _places.number(), _places.number()
 
 
 @njit(cache=True)
@@ -133,6 +146,8 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     heard = arrived(received)
     memory[_PERIOD] = T
     memory[_SILENT] = 0.0 if fresh else memory[_SILENT] + T
+    silence = memory[_SILENT] if heard else 0.0
+    memory[_GAP] = max(memory[_GAP] * (1.0 - T / _FORGET), silence)
     trip = max((memory[STEPS] - received[ECHO]) * T, 0.0) if heard else 0.0
     memory[_ROUND_TRIP] = max(memory[_ROUND_TRIP] * (1.0 - T / _FORGET), trip)
     smooth_velocity(twist, min(T / _FILTER, 1.0), memory)
@@ -152,12 +167,13 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     _clamp(now, pose, twist, p, memory)
     _model(received, heard, T, p, memory, gap)
     put(command, 0, memory, COMMAND.start, 13)
-    fill(memory[MODEL], twist, wrench, packet)
+    fill(memory[MODEL], memory[_MODEL_TWIST], wrench, packet)
     for g in range(2):
         k = memory[_STIFFNESS][g]
         packet[CONTACT_STIFFNESS][g] = (
             memory[_SHARE][g] * k / (1.0 + k / (_STIFF * p[STIFFNESS][g]))
         )
+        packet[CONTACT_DAMPING][g] = memory[_DAMPER][g]
         packet[ENERGY][g], packet[LEVEL][g] = memory[SENT][g], memory[LEDGER][g]
 
 
@@ -187,23 +203,37 @@ def _account_of_slave(g, received, heard, twist, dx, wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _learn(g, dx, wrench, T, p, memory):
-    """S3 but for the target: stiffness, share, and how deep the slave is in the wall."""
-    size, k, share = length(wrench, g), memory[_STIFFNESS], memory[_SHARE]
-    way, behind, smoothed = memory[_WAY], memory[_BEHIND], memory[_SMOOTHED]
+def _shown_at_most(g, T, p, memory):
+    """k_d, of S3."""
     lag = 2.0 * math.sqrt(p[MASS][g] / p[STIFFNESS][g])  # of the servo
     depth = _PRESS * ARM[g] * (memory[_ROUND_TRIP] + lag)
-    most = max(_SHOWN * SPRING[g], 2.0 * p[HAND_RESERVE][g] / (depth * depth))
+    stayed, first = memory[_STAYED], 2.0 * p[HAND_RESERVE][g] / (depth * depth)
+    if memory[TOUCHED][g] == 0.0 or memory[_GAP] >= _NEWS:
+        stayed[g] = 0.0
+    else:
+        stayed[g] += T / _SETTLED * (_TIMES - 1.0 - stayed[g])
+    later = min((1.0 + stayed[g]) * first, _STIFFEST * SPRING[g])
+    return max(_SHOWN * SPRING[g], first, later)
+
+
+@njit(cache=True)
+def _learn(g, dx, wrench, T, p, memory):
+    """S3 but for the target: stiffness, damping, share, and how deep the slave is in the wall."""
+    size, k, share = length(wrench, g), memory[_STIFFNESS], memory[_SHARE]
+    way, behind, smoothed = memory[_WAY], memory[_BEHIND], memory[_SMOOTHED]
+    anchor, fast = memory[_ANCHOR], memory[_FAST]
+    most = _shown_at_most(g, T, p, memory)
     if not size > p[TOUCH][g]:
         memory[TOUCHED][g] = 0.0
-        way[g] = behind[g] = smoothed[g] = memory[_ANCHOR][g] = 0.0
+        way[g] = behind[g] = smoothed[g] = anchor[g] = fast[g] = 0.0
         share[g] = most / max(k[g], most)
         return
     inward, rate = -dot(wrench, dx, g) / size, min(T / _FILTER, 1.0)
+    speed = -dot(wrench, memory[VELOCITY_HERE], g) / size
     if smoothed[g] == 0.0:
         # From the first sample in contact: on the way to it a part was outside.
-        smoothed[g] = memory[_ANCHOR][g] = size
-        behind[g] = inward
+        smoothed[g] = anchor[g] = size
+        behind[g], fast[g] = inward, speed
     follows = rate * (inward - behind[g])
     behind[g] += follows - inward
     way[g] += follows
@@ -211,16 +241,18 @@ def _learn(g, dx, wrench, T, p, memory):
     slow = length(memory[VELOCITY_HERE], g) < _SLOW * ARM[g]
     far = abs(way[g])
     if far > (_STRETCH if slow else _LONG) * ARM[g]:
-        found = max((smoothed[g] - memory[_ANCHOR][g]) / way[g], 0.0)
-        k[g] += (min(far / (_LEARN * ARM[g]), 1.0) if slow else 0.5) * (found - k[g])
-        way[g], memory[_ANCHOR][g] = 0.0, smoothed[g]
+        keep = max(1.0 - far / (_LEARN * ARM[g]), 0.0) if slow else 0.5
+        sums = memory[_SUMS][SUMS * g : SUMS * (g + 1)]
+        found = fit(sums, smoothed[g] - anchor[g], way[g], speed - fast[g], keep)
+        k[g], memory[_DAMPER][g] = found
+        way[g], anchor[g], fast[g] = 0.0, smoothed[g], speed
     if k[g] > SPRING[g]:  # 1 N/m: something is known
         rate = min(T / _SMOOTH, 1.0)
         share[g] += rate * (most / max(k[g], most) - share[g])
-        inside = memory[_INSIDE]
+        inside, deep = memory[_INSIDE], max(size - memory[_DAMPER][g] * speed, 0.0) / k[g]
         if memory[TOUCHED][g] == 0.0:
-            inside[g] = size / k[g]
-        inside[g] += inward + rate * (size / k[g] - inside[g] - inward)
+            inside[g] = deep
+        inside[g] += inward + rate * (deep - inside[g] - inward)
         memory[TOUCHED][g] = 1.0
 
 
@@ -291,7 +323,12 @@ def _hold_back(g, damping, twist, p, memory):
     touched, room, least = length(held, g), account, 0.0
     if touched > p[TOUCH][g] and dot(pull, held, g) < 0.0:
         unpaid = _UNPAID * LEVER[g]
-        spring = unpaid * unpaid / (2.0 * max(memory[_STIFFNESS][g], SPRING[g]))
+        spring = (
+            (1.0 + memory[_STAYED][g])
+            * unpaid
+            * unpaid
+            / (2.0 * max(memory[_STIFFNESS][g], SPRING[g]))
+        )
         room = min(account, min(p[RESERVE][g], spring) + memory[_PAID][g])
         if still or not pushing:
             # Motors that are late earn a little by standing: with an empty account they give way.

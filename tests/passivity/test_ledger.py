@@ -196,6 +196,26 @@ def test_at_rest_is_felt_what_is_pressed(grip, wall, delay, loss):
         assert found.felt_force > 0.95 * 0.02 * softer * grip[2] / (softer + grip[2])
 
 
+@pytest.mark.parametrize(("grip", "delay"), [(LIGHT, 0.05), (MEDIUM, 0.05)])
+def test_a_wall_that_damps_and_an_arm_that_rubs_are_felt_as_they_are(grip, delay):
+    """Damping that is taken for stiffness is felt without being pressed."""
+    axis = model(grip, 2.5e3, wall_damping=300.0, slave_friction=30.0)
+    run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT)
+    found = figures(run, axis)
+    assert found.stable and abs(found.force_error) < 0.05
+    assert run.least(ACTUAL) >= -1e-6
+
+
+@pytest.mark.parametrize("grip", [MEDIUM, FIRM])
+def test_a_hard_wall_is_hard_to_a_hand_that_stays(grip):
+    """At 300 ms: 20 kN/m are 1.1 kN/m at the hand, of which the first second shows 300 N/m."""
+    axis = model(grip, 20e3)
+    run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=0.15), timeout=PATIENT)
+    found, hard = figures(run, axis), axis.force_scale * 20e3 / (1.0 + 20e3 / axis.servo_stiffness)
+    assert found.stable and abs(found.force_error) < 0.01
+    assert found.felt_force > 0.95 * 0.02 * hard * grip[2] / (hard + grip[2])
+
+
 def test_a_change_of_grip_leaves_no_motion_behind():
     t = times(9.0)
     for before, after in ((FIRM, LIGHT), (LIGHT, FIRM)):

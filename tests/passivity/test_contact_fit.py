@@ -1,0 +1,41 @@
+"""Stiffness and damping from stretches of the way into a contact."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.passivity.contact_fit import SUMS, fit
+
+
+def found(stiffness, damping, way, faster, keep=0.8):
+    sums, values = np.zeros(SUMS), (0.0, 0.0)
+    for dx, dv in zip(way, faster, strict=True):
+        values = fit(sums, stiffness * dx + damping * dv, dx, dv, keep)
+    return values
+
+
+@pytest.mark.parametrize(("stiffness", "damping"), [(290.0, 17.0), (1100.0, 3.0), (150.0, 0.0)])
+def test_spring_and_damper_are_told_apart(stiffness, damping):
+    rng = np.random.default_rng(4)
+    way, faster = 3e-4 * rng.normal(size=30), 0.01 * rng.normal(size=30)
+    k, b = found(stiffness, damping, way, faster)
+    # The ridge takes a twentieth of the damping, and gives it to the spring where they correlate.
+    assert b == pytest.approx(damping / 1.05, rel=0.02, abs=1e-9)
+    assert k == pytest.approx(stiffness, rel=0.1 * (damping > 0.0), abs=1e-9)
+
+
+def test_what_cannot_be_told_apart_is_a_spring_and_the_past_is_forgotten():
+    way = np.full(20, 2e-4)
+    k, b = found(300.0, 17.0, way, 10.0 * way)
+    assert b <= 17.0 and k + 10.0 * b == pytest.approx(470.0, rel=0.02)
+    assert found(300.0, 17.0, way[:1], 10.0 * way[:1]) == (pytest.approx(470.0), 0.0)
+    sums = np.zeros(SUMS)
+    for stiffness in (2000.0, 100.0):
+        for step in 2e-4 * np.array([1.0, -1.0, 2.0, -1.0, 1.0, 2.0] * 4):
+            k, _ = fit(sums, stiffness * step, step, 0.0, 0.5)
+    assert k == pytest.approx(100.0, rel=0.01)
+
+
+def test_neither_is_negative():
+    assert fit(np.zeros(SUMS), -1.0, 1e-3, 0.1, 0.5) == (0.0, pytest.approx(0.0, abs=1e-9))
