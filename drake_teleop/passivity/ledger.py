@@ -44,7 +44,8 @@ M2. Of the newest packet, u = w - 1.1 k_c (x_m - z - o) - b (v_m - z') along w, 
     far hand and slave were apart at the onset, or 0 if the wall was known. x_m is led by two steps,
     because a spring that is held over a step is active by k T / 2 (Colgate and Schenkel 1997).
 M3. The wall is remembered, so that fast taps are felt: while nothing else is heard,
-    u = -k_c (x_m - x_w). It is dropped when the slave was beyond it and met nothing.
+    u = -k_c (x_m - x_w). It is dropped when the slave was so deep in it that it should have met
+    1 N, 1 to 3 mm, and met nothing: a hard wall that has gone stops the hand before 3 mm.
 M4. A hand that moves fast along u, as one that has let go, is pushed less: module `retreat`,
     after M6. The next step counts what was held.
 M5. u may spend a share of L_m; what was shortened comes back in 20 ms.
@@ -117,7 +118,12 @@ _LEAD = 2.0  # steps, by which the hand is led: half a step in theory, but veloc
 _ONSET = 0.3  # s, in which o fades
 _PREDICTED = 3.0  # N, beyond twice the wrench: more is no prediction
 _REMEMBERED = 10.0  # N, the most that a remembered wall pushes with
-_SAME, _GONE = 5e-3, 3e-3  # m, between touches of one wall; the slave beyond a wall that has gone
+_SAME = 5e-3  # m, between touches of one wall
+_GONE, _EXPECTED, _SURE = (
+    3e-3,
+    1.0,
+    1e-3,
+)  # m, N, m: a slave that far in a wall met nothing; at least
 _ALIGNED = 0.7  # cosine between the wrenches of one wall
 _DRAIN = 50.0  # 1/s, share of the ledger that the wrench may spend
 _RETURN = 0.02  # s, in which a shortened wrench comes back
@@ -248,7 +254,9 @@ def _predict(g, received, T, p, memory, ahead, wrench):
                 inward[i] = -shown[i] / size
         return
     memory[TOUCHED][g] = 0.0
-    if memory[_DEPTH][g] - dot(inward, ahead, g) > _GONE * ARM[g]:
+    expected = _EXPECTED * LEVER[g] / max(wall[g], SPRING[g])
+    gone = min(_GONE * ARM[g], max(expected, _SURE * ARM[g]))
+    if memory[_DEPTH][g] - dot(inward, ahead, g) > gone:
         wall[g] = 0.0
     inside = min(wall[g] * max(memory[_DEPTH][g], 0.0), _REMEMBERED * LEVER[g])
     for i in range(3 * g, 3 * g + 3):

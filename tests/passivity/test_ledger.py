@@ -246,6 +246,21 @@ def test_a_hand_that_lets_go_is_not_thrown(delay):
     assert np.ptp(run.master[start:]) < 0.04
 
 
+@pytest.mark.parametrize("wall", [5.1e3, 20e3])
+def test_a_wall_that_has_gone_is_not_felt_for_long(wall):
+    """By taps of 1 Hz: once more, until the slave has been there; a round trip is 100 ms."""
+    t = times(10.0)
+    x = -0.01 - 0.025 * np.cos(2.0 * np.pi * t)
+    there = np.stack([np.zeros(len(t)), np.where(t < 5.05, wall, 0.0)], axis=1)
+    run = run_one_dof(
+        model(), CHARGED_BEFORE, NetworkConfig(delay=0.05), timeout=PATIENT, intent=moving(x),
+        wall=there,
+    )  # fmt: skip
+    felt = np.abs(run.felt) > 0.05
+    assert np.count_nonzero(felt[(t > 2.0) & (t < 5.0)]) > 500
+    assert 100 < np.count_nonzero(felt[t > 5.05]) < 200
+
+
 @pytest.mark.parametrize("rate", [0.7, 1.5])
 def test_taps_are_felt_from_the_second_on(rate):
     """News of each comes when the hand is out again: the remembered wall stands in for it."""
