@@ -30,13 +30,7 @@ from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.passivity import methods
 from drake_teleop.passivity.memory import LIMIT, MEMORY, Slots
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
-from drake_teleop.passivity.packet import (
-    CONTACT,
-    HEALTHY,
-    PACKET_SIZE,
-    difference_into,
-    dot,
-)
+from drake_teleop.passivity.packet import CONTACT, HEALTHY, PACKET_SIZE, difference_into, dot
 from drake_teleop.passivity.safe_state import (
     MASTER_WATCH,
     SILENT,
@@ -48,6 +42,7 @@ from drake_teleop.passivity.safe_state import (
     slave_command_into,
 )
 from drake_teleop.quantities import choice, plain, quantity
+from drake_teleop.vectors import put
 
 _NETWORKS = ("custom", *PRESETS)
 _DIRECTIONS = (network.FORWARD, network.BACKWARD)
@@ -251,7 +246,7 @@ def channel_step(
         for i in range(6):
             held_S[i] = (1.0 - share) * held_S[i] + share * wrench[i]
         ends[_TRUSTED] += T
-    wrench[:] = held_S
+    put(wrench, 0, held_S, 0, 6)
     _, fresh = network.receive(forward_parameters, forward, k + 1, received)
     alive = fresh and received[HEALTHY] > 0.5
     methods.slave_step(
@@ -286,7 +281,7 @@ def _moved(pose, before, dx):
     good = sound(pose)
     if good:
         difference_into(pose, before, dx)
-        before[:7] = pose
+        put(before, 0, pose, 0, 7)
     if not good or before[7] > 0.0:
         dx[:] = 0.0
     before[7] = 0.0 if good else 1.0

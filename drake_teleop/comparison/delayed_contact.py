@@ -24,6 +24,7 @@ from drake_teleop.quaternions import quaternion_of
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.slave.arm import forward_kinematics
+from drake_teleop.vectors import put
 
 #: m, from the ball's tip to the origin of S (models/tool.sdf).
 _TIP = 0.2
@@ -151,5 +152,5 @@ def _poses(arm, q):
         orientation = quaternion_of(R)
         for i in range(4):
             poses[k, i] = orientation[i]
-        poses[k, 4:] = p
+        put(poses[k], 4, p, 0, 3)
     return poses

@@ -46,6 +46,7 @@ from drake_teleop.passivity import methods
 from drake_teleop.passivity.memory import LEDGER
 from drake_teleop.passivity.methods import AT_THE_MOTOR, METHODS, PassivityConfig
 from drake_teleop.passivity.packet import PACKET_SIZE
+from drake_teleop.vectors import put
 
 PERIOD = 1e-3  #: s, of the channel
 _SUBSTEPS = 20
@@ -369,9 +370,8 @@ def _simulate(
     v = v_s = a_s = motor = 0.0
     dt = PERIOD / _SUBSTEPS
     for k in range(course.shape[0]):
-        following = min(k + 1, course.shape[0] - 1)
         mass, damping, stiffness = device_mass + course[k, 2], course[k, 3], course[k, 4]
-        x_w, wall_stiffness = course[k, 5], course[k, 6]
+        x_w, wall_stiffness, following = course[k, 5], course[k, 6], min(k + 1, len(course) - 1)
         v_w = (course[following, 5] - x_w) / PERIOD
         push = _push(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
         wall = -max(push, 0.0)
@@ -387,10 +387,10 @@ def _simulate(
             method, pose_m, wrench, hand, pose_s, np.bool_(False), 0.0, PERIOD, timeout, frame, p,
             forward_line, backward_line, forward, backward, ends, received, ports, felt,
         )  # fmt: skip
-        command = received[4]
-        accounts[COMMAND] = ports[6]
-        rows[k, :7] = np.array([x, x_s, command, felt[0], wall, ports[0], ports[2]])
-        rows[k, 7:9], rows[k, 9:] = ports[4:6], accounts
+        command, accounts[COMMAND] = received[4], ports[6]
+        put(rows[k], 0, (x, x_s, command, felt[0], wall, ports[0], ports[2]), 0, 7)
+        put(rows[k], 7, ports, 4, 2)
+        put(rows[k], 9, accounts, 0, 4)
         wanted = K * (command - x_s) - D * v_s
         for i in range(_SUBSTEPS):
             share = (i + 0.5) / _SUBSTEPS

@@ -17,6 +17,7 @@ from drake_teleop.passivity import none
 from drake_teleop.passivity.memory import HELD, MOTION_SCALE, own_parameters
 from drake_teleop.passivity.packet import limit
 from drake_teleop.quantities import quantity
+from drake_teleop.vectors import put
 
 _OWN_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
 
@@ -40,7 +41,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
         limit(wrench, g, p[_OWN_LIMIT][g])
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
 
 
 @njit(cache=True)

@@ -89,7 +89,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             wrench[i] += p[_DAMPER][g] * (received[VELOCITY][i] - twist[i])
     for g in range(2):
         limit(wrench, g, limits[g])
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     fill(pose, twist, hand, packet)
 
 
@@ -103,7 +103,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             force = (1.0 + p[_SLAVE]) * received[WRENCH][i] + p[_SLAVE] * wrench[i]
             shift[i] = (force + p[DAMPING][g] * received[VELOCITY][i]) / p[STIFFNESS][g]
         moved_into(received[POSE], shift, memory[COMMAND_POSE])
-        memory[COMMAND_TWIST] = received[VELOCITY]
+        put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     put(command, 0, memory, COMMAND.start, 13)
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)

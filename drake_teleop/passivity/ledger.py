@@ -110,6 +110,7 @@ from drake_teleop.passivity.packet import (
     scale,
 )
 from drake_teleop.quantities import quantity
+from drake_teleop.vectors import put
 
 _FILTER = 4e-3  # s, of velocity: encoders have steps
 _OVER = 1.1  # of k_c: a wall that is taken for too stiff is stable, for too soft is not
@@ -203,7 +204,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         memory[SENT][g] += surplus
         memory[LEDGER][g] -= surplus
         packet[ENERGY][g], packet[LEVEL][g] = memory[SENT][g], memory[LEDGER][g]
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     fill(pose, velocity, wrench, packet)
     packet[ECHO] = received[SEQUENCE]
 

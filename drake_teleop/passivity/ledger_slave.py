@@ -154,7 +154,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for g in range(2):
         _account_of_slave(g, received, heard, twist, dx, wrench, T, p, memory)
         _learn(g, dx, wrench, T, p, memory)
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     gap[:] = 0.0
     if heard:
         difference_into(received[POSE], now, gap)
@@ -368,5 +368,5 @@ def command_left(wanted, command, pose, twist, p, memory):
     for i in range(7):
         if command[i] != wanted[i]:
             if _clamp(command, pose, twist, p, memory):
-                memory[COMMAND_POSE] = command
+                put(memory, COMMAND_POSE.start, command, 0, 7)
             return

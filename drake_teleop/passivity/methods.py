@@ -43,7 +43,7 @@ from drake_teleop.passivity.memory import (
     STEPS,
     STIFFNESS,
 )
-from drake_teleop.passivity.packet import HEALTHY, POSE, SEQUENCE, finite
+from drake_teleop.passivity.packet import HEALTHY, PACKET_SIZE, POSE, SEQUENCE, finite
 from drake_teleop.passivity.pspm import PspmConfig
 from drake_teleop.passivity.retreat import retreat
 from drake_teleop.passivity.tdpa import TdpaConfig, charged
@@ -208,9 +208,9 @@ def _finish(healthy, memory, packet):
     """Numbers the packet; one of an end whose inputs are not finite repeats the last good one."""
     if healthy:
         packet[HEALTHY] = 1.0
-        memory[PACKET] = packet
+        put(memory, PACKET.start, packet, 0, PACKET_SIZE)
     else:
-        packet[:] = memory[PACKET]
+        put(packet, 0, memory, PACKET.start, PACKET_SIZE)
         packet[HEALTHY] = 0.0
     packet[SEQUENCE] = memory[STEPS]
     memory[STEPS] += 1.0

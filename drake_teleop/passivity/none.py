@@ -19,7 +19,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         wrench[i] = wanted[i]
     for g in range(2):
         limit(wrench, g, limits[g])
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
 
 
@@ -27,8 +27,8 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """One step of the slave's end; see `methods.slave_step`."""
     if arrived(received):
-        memory[COMMAND_POSE] = received[POSE]
-        memory[COMMAND_TWIST] = received[VELOCITY]
+        put(memory, COMMAND_POSE.start, received, POSE.start, 7)
+        put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     put(command, 0, memory, COMMAND.start, 13)
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)

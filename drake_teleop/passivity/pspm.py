@@ -143,7 +143,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = K[g] * offset[i] - B[g] * twist[i]
         limit(wrench, g, limits[g])
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
 
 
@@ -154,10 +154,10 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     now, held, K, D = memory[COMMAND_POSE], memory[HELD], p[STIFFNESS], p[DAMPING]
     before = dot(offset, offset, 0), dot(offset, offset, 1)
     difference_into(now, pose, offset)
-    wanted[:] = offset
+    put(wanted, 0, offset, 0, 6)
     if arrived(received):
         difference_into(received[POSE], pose, wanted)
-        memory[COMMAND_TWIST] = received[VELOCITY]
+        put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     for g in range(2):
         _modulate(received, g, K[g], dx, before[g], False, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
@@ -179,7 +179,7 @@ def command_left(wanted, command, pose, twist, p, memory):
     difference_into(wanted, pose, other)
     for i in range(6):
         held[i] = K[i // 3] * offset[i] - D[i // 3] * twist[i]
-    memory[COMMAND_POSE] = command
+    put(memory, COMMAND_POSE.start, command, 0, 7)
     for g in range(2):
         more = dot(offset, offset, g) - dot(other, other, g)
         memory[LEDGER][g] -= 0.5 * K[g] * more

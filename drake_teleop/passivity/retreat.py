@@ -16,6 +16,7 @@ from __future__ import annotations
 from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import HAND_VELOCITY, HELD, MASS, RETREAT
 from drake_teleop.passivity.packet import dot, length, scale
+from drake_teleop.vectors import put
 
 _FILTER = 4e-3  # s, of velocity: encoders have steps
 
@@ -41,4 +42,4 @@ def retreat(twist, T, p, memory, wrench):
             slowing = (along - dot(wrench, twist, g) / size) / _FILTER
             share = max(2.0 - along / p[RETREAT][g], p[MASS][g] * slowing / size, 0.0)
             scale(wrench, g, min(share, 1.0))
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)

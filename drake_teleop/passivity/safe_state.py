@@ -44,6 +44,7 @@ from numpy.typing import NDArray
 from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import Slots
 from drake_teleop.passivity.packet import difference_into, length, moved_into
+from drake_teleop.vectors import put
 
 STOP = 0.05  #: s, in which a silent end comes to rest
 RESUME = 0.5  #: s, in which it goes over to normal again
@@ -146,10 +147,10 @@ def slave_command_into(alive, fault, T, timeout, wanted, watch, command):
         difference_into(last, before, velocity)
         for i in range(6):
             velocity[i] /= T
-        start[:] = last
+        put(start, 0, last, 0, 7)
         watch[_STOPPING] = watch[_RESUMING] = 0.0
     if watch[_RESUMING] == RESUME:
-        command[:] = wanted
+        put(command, 0, wanted, 0, 7)
     else:
         # Where it stops or has stopped; and from there, with a share that rises smoothly from 0 to
         # 1, to what is wanted. So velocity is continuous even if it resumes before it has stopped.
@@ -164,5 +165,5 @@ def slave_command_into(alive, fault, T, timeout, wanted, watch, command):
             for i in range(6):
                 step[i] *= u * u * u * (10.0 + u * (6.0 * u - 15.0))
             moved_into(command, step, command)
-    before[:] = last
-    last[:] = command
+    put(before, 0, last, 0, 7)
+    put(last, 0, command, 0, 7)

@@ -187,7 +187,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         if p[_DRAG][g] > 0.0:
             _pass_on(g, p, memory)
         packet[ENERGY][g] = memory[SENT][g]
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
     packet[_ECHO] = received[SEQUENCE]
 
@@ -255,7 +255,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         packet[_SLAVES_LEDGER][g] = memory[LEDGER][g]
         _filter(g, received, dx, wrench, T, p, memory)
     put(command, 0, memory, COMMAND.start, 13)
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     fill(pose, twist, memory[_FILTERED], packet)
 
 

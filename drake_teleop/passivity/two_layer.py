@@ -157,7 +157,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         if drained > most:
             scale(wrench, g, most / drained)
         _afford(wrench, dx, g, T, p, memory)
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
 
 
@@ -188,7 +188,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (pull[i] - brake[i]) / K[g]
     moved_into(pose, spring, memory[COMMAND_POSE])
-    memory[COMMAND_TWIST] = received[VELOCITY]
+    put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     put(command, 0, memory, COMMAND.start, 13)
     fill(pose, twist, wrench, packet)
 

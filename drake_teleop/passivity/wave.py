@@ -158,7 +158,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         left = energy - dot(wrench, dx, g)
         memory[SENT][g] += max(left, 0.0)
         packet[ENERGY][g] = memory[SENT][g]
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
 
 
@@ -198,10 +198,10 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     else:
         step[:] = 0.0
         _rest(wrench, T, p, memory)
-    packet[INTEGRAL] = memory[_INTEGRAL]
-    packet[ENERGY] = memory[SENT]
+    put(packet, INTEGRAL.start, memory, _INTEGRAL.start, 6)
+    put(packet, ENERGY.start, memory, SENT.start, 2)
     put(command, 0, memory, COMMAND.start, 13)
-    memory[HELD] = wrench
+    put(memory, HELD.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
 
 

@@ -498,14 +498,15 @@ def read_into(constants, memory, noise, truth, reading):
         reading: [wrench (6) | specific force at Ao (3), angular acceleration (3) in A |
             1 if a channel is saturated, else 0 | joints' angles (n)].
     """
+    angles = truth[TRUE_ANGLES]
     if constants[_IDEAL] != 0.0:
-        reading[READ_WRENCH] = truth[WRENCH]
-        reading[READ_ACCELERATION][:3] = truth[SPECIFIC_FORCE]
-        reading[READ_ACCELERATION][3:] = truth[ANGULAR_ACCELERATION]
+        put(reading, READ_WRENCH.start, truth, WRENCH.start, 6)
+        put(reading, READ_ACCELERATION.start, truth, SPECIFIC_FORCE.start, 3)
+        put(reading, READ_ACCELERATION.start + 3, truth, ANGULAR_ACCELERATION.start, 3)
         reading[READ_SATURATED] = 0.0
-        reading[READ_ANGLES] = truth[TRUE_ANGLES]
+        put(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
         return
-    count, angles = int(memory[0]), truth[TRUE_ANGLES]
+    count = int(memory[0])
     width = _ROW + angles.shape[0]
     rows = (memory.shape[0] - _LINE) // width
     shift(memory[_LINE:], width)

@@ -160,8 +160,9 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
         return
     lost = sample[SATURATED] - 1.0
     if ideal:
-        sample[WRENCH_AND_MOTION], sample[SATURATED] = truth[WRENCH_AND_MOTION], 0.0
-        sample[JOINT_POSITION] = truth[TRUE_ANGLES]
+        put(sample, WRENCH_AND_MOTION.start, truth, WRENCH_AND_MOTION.start, WRENCH_AND_MOTION.stop)
+        sample[SATURATED] = 0.0
+        put(sample, JOINT_POSITION.start, truth, TRUE_ANGLES.start, n)
     else:
         reading = np.empty(13 + n)
         read_into(constants, memory[2 * size : middle], noise, truth, reading)

@@ -10,7 +10,7 @@ from drake_teleop._compiled import njit
 from drake_teleop.environment.point_contact import contact_force, indentation
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.slave.arm import ArmModel, forward_kinematics, jacobian
-from drake_teleop.vectors import add_into, cross, minus, plus, three
+from drake_teleop.vectors import add_into, cross, minus, plus, put, three
 
 
 @njit(cache=True)
@@ -42,7 +42,8 @@ def environment_wrench(arm, pairs, applied_W, q, v, sheet, wrench_W):
         if not has_twist:
             J = np.empty((6, q.shape[0]))
             jacobian(arm, q, J)
-            twist[:], has_twist = J @ v, True
+            put(twist, 0, J @ v, 0, 6)
+            has_twist = True
         lever = minus(three(normal, 3), p_WS)
         moving = plus(three(twist, 0), cross(three(twist, 3), lever))
         for i in range(3):

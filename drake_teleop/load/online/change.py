@@ -228,7 +228,8 @@ def _judge(memory, block, noise, window, hold, bound):
         _doubt_inertias(memory, noise, block)
         put(memory, _KNOWN, memory, _NEW, 272)
         memory[_LEARNT] = memory[_AGE] * block
-        memory[_RESIDUAL:_SQUARES] = memory[_SQUARES:_WRENCH] * (block / memory[_AGE])
+        for i in range(_SQUARES - _RESIDUAL):
+            memory[_RESIDUAL + i] = memory[_SQUARES + i] * (block / memory[_AGE])
         _restart(memory, _WATCH)
 
 

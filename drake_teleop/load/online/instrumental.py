@@ -40,6 +40,7 @@ from drake_teleop.load.online.recursive_moments import (
     weighted_right,
 )
 from drake_teleop.load.sample import INSTRUMENTS, MOTION, WRENCH
+from drake_teleop.vectors import put
 
 # Share of the instruments' own information by which M is raised, against rounding.
 _RIDGE = 1e-9
@@ -112,7 +113,7 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
         add_product(y, y, memory[38:57])
         riv_normal_equations(memory, theta, noise_std, information, index, factors, space, MRg, A)
         solve(A)
-        theta[:] = A[:, 16]
+        put(theta, 0, A[:, 16], 0, 16)
 
 
 class RecursiveInstrumentalVariables(MomentEstimator):

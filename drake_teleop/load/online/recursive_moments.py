@@ -217,7 +217,9 @@ def invert(S, A, W):
             A[c, 6 + d] = 0.0
         A[c, 6 + c] = 1.0
     solve(A)
-    W[:] = A[:, 6:]
+    for c in range(6):
+        for d in range(6):
+            W[c, d] = A[c, 6 + d]
 
 
 class MomentEstimator(RecursiveEstimator):

@@ -118,12 +118,13 @@ def _varies(memory, residual, age, period):
     low_passed = memory[_RESIDUAL : _RESIDUAL + 3]
     least, most = memory[_LEAST:_MOST], memory[_MOST:_VARIED]
     share = 1.0 if age == 0.0 else period / (_SMOOTH + period)
-    memory[_RESIDUAL : _RESIDUAL + 6] += share * (residual - memory[_RESIDUAL : _RESIDUAL + 6])
+    for i in range(_RESIDUAL, _RESIDUAL + 6):
+        memory[i] += share * (residual[i - _RESIDUAL] - memory[i])
     if age * period < 2.0 * _SMOOTH:
-        least[:] = low_passed
-        most[:] = low_passed
-    least[:] = np.minimum(least, low_passed)
-    most[:] = np.maximum(most, low_passed)
+        put(least, 0, low_passed, 0, 3)
+        put(most, 0, low_passed, 0, 3)
+    put(least, 0, np.minimum(least, low_passed), 0, 3)
+    put(most, 0, np.maximum(most, low_passed), 0, 3)
     apart = ((most - least) ** 2).sum() > VARIES**2
     memory[_VARIED] = memory[_VARIED] + 1.0 if apart else 0.0
     return memory[_VARIED] * period > EXPLAINED
@@ -161,7 +162,8 @@ def watched_update(out, memory, sample, fallback, period, block, noise, window, 
     if verdict == KNOWN:
         memory[_STATE] = SETTLED
         if rests and (np.abs(memory[_RESIDUAL : _RESIDUAL + 6]) <= LARGEST).all():
-            known[:6] += period / FOLLOW * residual
+            for i in range(6):
+                known[i] += period / FOLLOW * residual[i]
     elif memory[_STATE] != OTHER_LOAD:
         another = verdict == CHANGED and varies and _is_within_reach(known, new_load(watch))
         memory[_STATE] = OTHER_LOAD if another else DISTURBED
