@@ -243,9 +243,11 @@ def test_the_hand_feels_the_slaves_wrench_in_its_own_base(direct, slave):
     np.testing.assert_allclose(direct.log["force_to_master"], expected, atol=EXACT)
 
 
-@pytest.fixture(params=["direct", *METHODS])
-def assembled(request, direct, over_a_network) -> Recorded:
-    return direct if request.param == "direct" else over_a_network[request.param]
+@pytest.fixture(params=["direct", *(pytest.param(m, marks=pytest.mark.slow) for m in METHODS)])
+def assembled(request, direct) -> Recorded:
+    if request.param == "direct":
+        return direct
+    return request.getfixturevalue("over_a_network")[request.param]
 
 
 @pytest.fixture(params=METHODS)
@@ -292,6 +294,7 @@ def test_the_slave_goes_where_it_is_told(assembled):
     assert np.abs(error).max() < 0.1 * np.abs(turn(rotations(received)[now] @ R[0].T)).max()
 
 
+@pytest.mark.slow
 def test_without_a_method_a_network_delays_each_direction_by_its_own(over_a_network, slave):
     recorded = over_a_network["none"]
     log, now = recorded.log, np.arange(SETTLED, END + 1)
@@ -323,6 +326,7 @@ def test_each_direction_has_its_own_random_network_of_the_scenarios_seed(slave):
     np.testing.assert_allclose(log["force_to_master"][now], expected, atol=EXACT)
 
 
+@pytest.mark.slow
 def test_the_local_limit_of_force_is_the_one_at_the_hand(over_a_network, slave):
     """Whatever the scales of motion are."""
     recorded, limit = over_a_network["force_limit"], ForceLimitConfig()
@@ -515,6 +519,7 @@ def test_what_is_gripper_and_what_is_object_are_told_apart(slave):
     assert np.ptp(of_object, axis=0).max() > 1.0
 
 
+@pytest.mark.slow
 def test_a_sample_is_of_the_instant_that_the_log_says(over_a_network, slave):
     """The ideal sensor's, at 4 kHz, the last one before the row's own instant."""
     log = over_a_network["none"].log
@@ -545,6 +550,7 @@ def test_the_device_shows_what_it_can(slave):
         np.testing.assert_allclose(shown[row, 3:], share * wanted[row, 3:], atol=EXACT)
 
 
+@pytest.mark.slow
 def test_four_channels_add_force_to_motion_at_both_ends(over_a_network, slave):
     """What is sent by either method's end, in W and in the master's power units."""
     recorded, config = over_a_network["four_channel"], PassivityConfig(method="four_channel")
@@ -583,6 +589,7 @@ def test_four_channels_add_force_to_motion_at_both_ends(over_a_network, slave):
     np.testing.assert_allclose(log["force_to_master"][now], expected, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_hands_port_counts_the_work_of_the_device(assembled_over_a_network):
     """What is displayed at row k acts until row k + 1; the log shows that work at row k + 2.
 
@@ -607,6 +614,7 @@ def test_the_hands_port_counts_the_work_of_the_device(assembled_over_a_network):
     assert np.abs(work[~closed]).sum() > 1e-5
 
 
+@pytest.mark.slow
 def test_the_slaves_port_counts_the_work_of_the_scaled_wrench(assembled_over_a_network, slave):
     """In the master's power units, at the arm's own motion, which is not that of the sample."""
     recorded = assembled_over_a_network
@@ -620,6 +628,7 @@ def test_the_slaves_port_counts_the_work_of_the_scaled_wrench(assembled_over_a_n
         assert np.ptp(counted) > 1e-4
 
 
+@pytest.mark.slow
 def test_four_accounts_are_kept_of_the_station(assembled_over_a_network, slave):
     """Where nothing is touched, the first two to rounding; this log is too slow for the motors'."""
     recorded = assembled_over_a_network

@@ -60,6 +60,7 @@ def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
     return replace(scenario, **changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("touched", "at_once"),
     [

@@ -95,6 +95,7 @@ def test_the_flag_of_contact_travels_with_the_packets(method):
     np.testing.assert_array_equal(told[late:], touched[: STEPS - late])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_smooth_bounded_and_recovered_from(method, fault):

@@ -80,6 +80,7 @@ def test_drake_inverse_dynamics_need_the_same_wrench(motion, R_WS, p_WS):
     assert_close(non_contact_wrench(s, omega, alpha, TOOL), np.concatenate([f, tau]))
 
 
+@pytest.mark.slow
 @given(motions(), loads(), rotations(), vectors(3, 1.0))
 def test_the_wrench_moves_with_frame_and_point(motion, phi_B, R_AB, p_AoBo_A):
     s_B, omega_B, alpha_B = motion

@@ -74,6 +74,7 @@ def test_a_planted_error_is_named_and_no_other(
     assert says in found[name]
 
 
+@pytest.mark.slow
 def test_two_errors_at_once_are_both_named(tmp_path: Path) -> None:
     columns = good()
     planted.turned_imu(columns)
