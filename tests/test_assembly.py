@@ -116,7 +116,8 @@ def delayed(method: str, **changes: object) -> Scenario:
         "channel": Channel(
             delay=TO_SLAVE * PERIOD, backward=NetworkConfig(delay=TO_HAND * PERIOD), timeout=0.05
         ),
-        "passivity": PassivityConfig(method=method),
+        # What arrives is felt, however fast the hand is.
+        "passivity": PassivityConfig(method=method, retreat=[1e3, 1e3]),
         # Ideal, because the log shows the last sample of each block of noise differently.
         "wrist_sensor__ideal": True,
     } | changes

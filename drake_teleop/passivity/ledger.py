@@ -141,6 +141,8 @@ _WALL, _DEPTH = _places.vector(2), _places.vector(2)
 # What the force gave since it last came to rest; share of the wrench that is withheld.
 _GIVEN, _WITHHELD = _places.vector(2), _places.vector(2)
 
+AT_THE_MOTOR = True  #: the port of its account, see `methods`
+
 
 @settings
 @dataclass

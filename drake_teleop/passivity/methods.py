@@ -62,7 +62,8 @@ class Methods:
     compiled `master_step` and `slave_step`, called with the arguments of those below but for the
     first. It may hold `initialize(p, memory)`, which changes the memory of an end before its first
     step; and the compiled `command_left(wanted, command, pose, twist, p, memory)`, which tells a
-    method that acts at the motor's port how the safe state has changed what it `wanted` (7,).
+    method how the safe state has changed what it `wanted` (7,). One whose account is of the slave's
+    motors, and not of its command, says `AT_THE_MOTOR = True`.
     """
 
     wave: WaveConfig = field(default_factory=WaveConfig)
@@ -83,7 +84,7 @@ _FILES: dict[str, Any] = {"none": none} | {
 }
 METHODS = tuple(_FILES)
 """The names of all methods."""
-AT_THE_MOTOR = tuple(name for name, file in _FILES.items() if hasattr(file, "command_left"))
+AT_THE_MOTOR = tuple(name for name, file in _FILES.items() if hasattr(file, "AT_THE_MOTOR"))
 """Those that act at the port of the slave's motors."""
 
 

@@ -7,15 +7,19 @@ pay for. At the slave's end the port is that of its motors, whose pull K (x_comm
 shortened through the command.
 
 A wrench is held until the next step, so its work is f_(k-1) . (x_k - x_(k-1)): known only
-afterwards. The next step cannot differ from the last one by more than a_max T^2, so a wrench may
-cost f . dx + |f| a_max T^2 at most; this is what the tank must hold (Franken's |f| |dx| would
-forbid even a wrench that brakes). What is sent leaves the tank *before* that is asked. So the tanks
-are never overdrawn, whatever the network does, as long as |x''| <= a_max at both ends.
+afterwards. The next step cannot differ from the last one by more than a T^2, so a wrench may
+cost f . dx + |f| a T^2 at most; this is what the tank must hold (Franken's |f| |dx| would
+forbid even a wrench that brakes). At the hand a is `acceleration`; at the slave it is that, which
+walls cause, and |f| / m, which its motors cause: they pull hard at a command that has jumped.
+What is sent leaves the tank *before* that is asked. So the tanks are never overdrawn, between hand
+and slave's *motors*, whatever the network does, as long as the hand and the walls accelerate no
+more than `acceleration`, and the servo's K, D and the slave's mass m (or more) are those that were
+told. Less is then never given out at the actual motion either: what the motors give and the wall
+does not get moves the slave, or rubs. A tank that was overdrawn all the same carries its debt.
 
-A slave that is slower than a_max T might pay even for its brake: with an empty tank it would coast
+A slave that is slower than a T might pay even for its brake: with an empty tank it would coast
 on for ever. So the slave keeps a reserve that is neither sent nor spent on the spring; only the
-brake may use it. And what a servo that is pulled harder than a_max has overdrawn is written off
-when energy arrives: else that would be swallowed, and the slave would stay where it is.
+brake may use it.
 
 Where the tank of the master is below its level, a damper on the hand fills it. Of what the tank
 holds the wrench may drain only a share in a step, which takes the edge off an empty tank; small
@@ -38,6 +42,7 @@ from drake_teleop.passivity.memory import (
     HELD,
     LEDGER,
     LOST,
+    MASS,
     RECEIVED,
     SENT,
     STIFFNESS,
@@ -70,6 +75,8 @@ _RESERVE = 0.01  # share of the capacity
 # Memory of the slave: pull of the spring, pull of the damper.
 _places = own_memory()
 _SPRING, _BRAKE = _places.vector(6), _places.vector(6)
+
+AT_THE_MOTOR = True  #: the port of its account, see `methods`
 
 
 @settings
@@ -117,7 +124,7 @@ def _exchange(received, dx, T, p, memory, packet):
         level = ledger[g] - dot(held, dx, g)
         more = received[ENERGY][g] - accounted[g]
         if more > 0.0:
-            level = max(level, 0.0) + more
+            level += more
             accounted[g] += more
         sent = min(T * p[_SEND], 1.0) * max(level - _RESERVE * capacity[g], 0.0)
         level -= sent
@@ -129,15 +136,15 @@ def _exchange(received, dx, T, p, memory, packet):
 
 
 @njit(cache=True)
-def _cost(f, dx, g, T, p):
+def _cost(f, dx, g, acceleration, T):
     """The most that a wrench can cost until the next step [J]."""
-    return dot(f, dx, g) + length(f, g) * p[ACCELERATION][g] * T * T
+    return dot(f, dx, g) + length(f, g) * acceleration * T * T
 
 
 @njit(cache=True)
-def _afford(f, dx, g, T, p, memory):
+def _afford(f, dx, g, acceleration, T, memory):
     """Shortens group g of a wrench to what the tank can pay for."""
-    cost, level = _cost(f, dx, g, T, p), max(memory[LEDGER][g], 0.0)
+    cost, level = _cost(f, dx, g, acceleration, T), max(memory[LEDGER][g], 0.0)
     if cost > level:
         scale(f, g, level / cost)
 
@@ -156,7 +163,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         most = min(T * p[_DRAIN], 1.0) * max(ledger[g], 0.0)
         if drained > most:
             scale(wrench, g, most / drained)
-        _afford(wrench, dx, g, T, p, memory)
+        _afford(wrench, dx, g, p[ACCELERATION][g], T, memory)
     put(memory, HELD.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
 
@@ -178,13 +185,17 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             pull[i] = spring[i] + brake[i]
         # The spring is shortened first and leaves the reserve, so that an empty tank brakes.
         room = max(memory[LEDGER][g] - _RESERVE * p[_CAPACITY][g], 0.0)
-        if _cost(pull, dx, g, T, p) > room:
-            room -= _cost(brake, dx, g, T, p)
-            cost = _cost(spring, dx, g, T, p)
+        most = p[ACCELERATION][g] + length(pull, g) / p[MASS][g]
+        if _cost(pull, dx, g, most, T) > room:
+            most = p[ACCELERATION][g] + length(brake, g) / p[MASS][g]
+            room -= _cost(brake, dx, g, most, T)
+            most = p[ACCELERATION][g] + length(spring, g) / p[MASS][g]
+            cost = _cost(spring, dx, g, most, T)
             share = min(max(room / cost, 0.0), 1.0) if cost > 0.0 else 0.0
             for i in range(3 * g, 3 * g + 3):
                 pull[i] = share * spring[i] + brake[i]
-            _afford(pull, dx, g, T, p, memory)
+            most = p[ACCELERATION][g] + length(pull, g) / p[MASS][g]
+            _afford(pull, dx, g, most, T, memory)
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (pull[i] - brake[i]) / K[g]
     moved_into(pose, spring, memory[COMMAND_POSE])

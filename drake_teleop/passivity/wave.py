@@ -3,7 +3,8 @@
 F = -f is the force that the hand puts into the port, and F v = (u^2 - w^2) / 2: an end gives out
 the energy of the wave that it received and nothing else, so a line of constant delay is passive
 (Anderson and Spong 1989; Niemeyer and Slotine 1991). With a step's increment v = dx / T this is
-exact for the backward pair f_k . (x_k - x_(k-1)).
+exact for the backward pair f_k . (x_k - x_(k-1)) at the hand and at the slave's *command*; the
+servo between that and the actual motion is no part of it, and hard walls make it give out energy.
 
 Over a network that is not constant an end sends the integral of its wave and the energy
 e = F dx + |wave received|^2 T / 2 that is its to pass on, both cumulative. The receiver plays out

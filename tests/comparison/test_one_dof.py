@@ -281,7 +281,7 @@ def test_the_adversary_repeats_itself_finds_a_leak_and_tells_a_cycle_from_a_cree
     tdpa, again, pspm = (
         adversary.run_case(name, (28,), adversary.Options()) for name in ("tdpa", "tdpa", "pspm")
     )
-    assert tdpa == again and tdpa.actual < -1.0 and pspm.actual > 0.0
+    assert tdpa == again and tdpa.actual < -0.1 and pspm.actual > 0.0
     assert tdpa.worse(pspm).actual == tdpa.actual and tdpa.worse(pspm).speed == pspm.speed
     t = np.arange(400) * 1e-2
     swing = 1e-3 * np.sin(2 * np.pi * t)

@@ -1,0 +1,104 @@
+"""Where does each method hold a wall: how stiff, by which grip, over how long a round trip?
+
+`python benchmarks/domain.py [--method M ...] [--json FILE]` lets `drake_teleop.comparison.one_dof`
+run its usual task over a constant delay: a hand presses 20 mm into a wall, holds for 5 s, lets go.
+Grips are light, medium and firm, walls 0.5 to 50 kN/m, round trips 1 ms to 2.6 s (there the hold is
+10 s longer); nothing is told of the hand. Stable is a run at rest within 0.5 mm, holding and
+afterwards; good is one that is also quiet (the force's standard deviation below 5 %) and shows what
+is pressed within 1 %; strong one that is good and shows 95 % of what would be felt without delay.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import json
+import multiprocessing
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.comparison.one_dof import REFERENCE, Task, figures, operators_intent, run_one_dof
+from drake_teleop.passivity.methods import METHODS, PassivityConfig
+
+GRIPS = {"light": (0.1, 2.0, 50.0), "medium": (0.25, 8.0, 250.0), "firm": (0.5, 20.0, 700.0)}
+WALLS = (500.0, 2500.0, 5100.0, 10e3, 20e3, 50e3)  # N/m
+ROUND_TRIPS = (0.001, 0.01, 0.05, 0.1, 0.15, 0.3, 0.6, 1.0, 2.6)  # s
+QUIET, EXACT, STRONG, DEPTH = 0.05, 0.01, 0.95, 0.02
+
+
+def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
+    """Figures of one hold: method, grip, stiffness of the wall, round trip."""
+    method, grip, wall, round_trip = case
+    longer = 10.0 if round_trip > 2.0 else 0.0
+    task = Task(release=11.5 + longer, released=12.5 + longer, end=17.0 + longer)
+    mass, damping, stiffness = GRIPS[grip]
+    model = dataclasses.replace(
+        REFERENCE,
+        hand_mass=mass,
+        hand_damping=damping,
+        hand_stiffness=stiffness,
+        wall_stiffness=wall,
+    )
+    run = run_one_dof(
+        model, PassivityConfig(method=method), NetworkConfig(delay=round_trip / 2), timeout=1.0,
+        intent=operators_intent(task),
+    )  # fmt: skip
+    found = figures(run, model, task)
+    # The hand's spring, the wall's and the servo's, one behind the other.
+    felt = model.force_scale / (1.0 / wall + 1.0 / model.servo_stiffness)
+    undelayed = DEPTH / (1.0 / stiffness + 1.0 / felt)
+    quiet = found.chatter < QUIET * found.felt_force
+    good = found.stable and quiet and abs(found.force_error) < EXACT
+    share = found.felt_force / undelayed
+    return {"stable": found.stable, "good": good, "strong": good and share > STRONG, "felt": share}
+
+
+def reach(table: dict[tuple[str, float, float], dict[str, float]], grip: str, wall: float) -> str:
+    """The longest round trip up to which all are stable, and up to which all are good [ms]."""
+    reached = []
+    for what in ("stable", "good"):
+        held = [bool(table[grip, wall, round_trip][what]) for round_trip in ROUND_TRIPS] + [False]
+        longest = held.index(False) - 1
+        reached.append(f"{1e3 * ROUND_TRIPS[longest]:.0f}" if longest >= 0 else "-")
+    return " / ".join(reached)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs all methods over all cases and prints two tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--method", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--json", metavar="FILE", help="writes the figures there")
+    asked = parser.parse_args(arguments)
+    places = list(itertools.product(GRIPS, WALLS, ROUND_TRIPS))
+    cases = [(method, *place) for method in asked.method for place in places]
+    with multiprocessing.get_context("fork").Pool(2) as pool:
+        rows = pool.map(hold, cases, chunksize=9)
+    found = {
+        method: dict(zip(places, rows[n * len(places) :], strict=False))
+        for n, method in enumerate(asked.method)
+    }
+    print(f"| method | stable of {len(places)} | good | strong | felt of undelayed, good ones |")
+    print("|---|---|---|---|---|")
+    for method, table in found.items():
+        counts = [sum(row[key] for row in table.values()) for key in ("stable", "good", "strong")]
+        shares = [row["felt"] for row in table.values() if row["good"]]
+        share = f"{np.median(shares):.2f}" if shares else "-"
+        print(f"| `{method}` | {counts[0]} | {counts[1]} | {counts[2]} | {share} |")
+    print("\nLongest round trip [ms] up to which every one is stable / good:\n")
+    print("| method, grip | " + " | ".join(f"{wall / 1e3:g} kN/m" for wall in WALLS) + " |")
+    print("|---" * (len(WALLS) + 1) + "|")
+    for method, table in found.items():
+        for grip in GRIPS:
+            cells = [reach(table, grip, wall) for wall in WALLS]
+            print(f"| `{method}`, {grip} | " + " | ".join(cells) + " |")
+    if asked.json:
+        flat = {m: {f"{g} {w} {r}": row for (g, w, r), row in t.items()} for m, t in found.items()}
+        Path(asked.json).write_text(json.dumps(flat, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
