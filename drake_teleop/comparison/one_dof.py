@@ -407,7 +407,7 @@ def _simulate(
             else:
                 if not held:
                     wanted = K * (before + share * (command - before) - x_s) - D * v_s
-                motor = motor + dt / lag * (wanted - motor) if lag > 0.0 else wanted
+                motor = motor + dt / lag * (wanted - motor) if lag > dt else wanted
                 a_s = (motor - max(push, 0.0)) / slave_mass
                 if slave_friction > 0.0:
                     a_s -= slave_friction / slave_mass * np.tanh(v_s / _SLAVES_FRICTION_SPEED)

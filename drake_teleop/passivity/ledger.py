@@ -39,25 +39,43 @@ At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
 
 M1. L_m -= f_(k-1) . dx; below zero it is a debt, never written off. While something is touched,
     what the hand pays is sent instead: the slave presses with it. L_m += what came.
-M2. Of the newest packet, u = w - 1.1 k_c (x_m - z - o) - b (v_m - z') along w, where k_c and b are
-    the wall's stiffness and damping, z where the slave would be without a wall, and o fades: how
-    far hand and slave were apart at the onset, or 0 if the wall was known. x_m is led by two steps,
-    because a spring that is held over a step is active by k T / 2 (Colgate and Schenkel 1997).
+M2. What is touched pushes along one unit wrench n, the mean of w over two round trips and 0.3 s
+    at least: force and torque together, so that a point that is touched far from So is one spring
+    and not two. With w_n = w . n and x_n = n . x, where a torque counts as a force at 0.1 m,
+
+        u_n = w_n - 1.1 k_c (x_m - z - o)_n - b (v_m - z')_n   >= 0
+
+    of the newest packet, where k_c and b are the wall's stiffness and damping along n, z where the
+    slave would be without a wall, and o fades: how far hand and slave were apart at the onset, or 0
+    if the wall was known. x_m is led by two steps, because a spring that is held over a step is
+    active by k T / 2 (Colgate and Schenkel 1997). Across n there is friction. One that is felt late
+    drives the hand, so the hand has a friction h of its own there, as in Dahl's model (1968):
+
+        h' = -k_h v_m + (w - w_n n - h) / tau,    |h| <= h_m u_n / w_n,
+
+    at rest what is measured too; k_h = 2.5 kN/m, h_m is the largest |w - w_n n| of about a second,
+    tau six round trips, but 0.6 s at least.
 M3. The wall is remembered, so that fast taps are felt: while nothing else is heard,
-    u = -k_c (x_m - x_w). It is dropped when the slave was so deep in it that it should have met
-    1 N, 1 to 3 mm, and met nothing: a hard wall that has gone stops the hand before 3 mm.
+    u_n = -k_c (x_m - x_w)_n. It is dropped when the slave was so deep in it that it should
+    have met 1 N, 1 to 3 mm, and met nothing: a hard wall that has gone stops the hand before 3 mm.
 M4. A hand that moves fast along u, as one that has let go, is pushed less: module `retreat`,
     after M6. The next step counts what was held.
 M5. u may spend a share of L_m; what was shortened comes back in 20 ms.
 M6. Drag on the hand until both reserves are full, and on one that was pushed, while it is fast.
 M7. What L_m has beyond its reserve R_m (in contact R_m + 0.7 R_s) is sent.
 
-Translation and rotation are two groups with a ledger each; the wall's direction is the wrench's.
+Translation and rotation are two groups with a ledger each; what is touched is one for both. Where
+packets were missing the wrench goes over gradually. In a station the mass is that of its arm at the
+start, see `slave.servo`. It is 54 kg in its heaviest direction and counts as 79 kg, since it may
+turn too: with R_s = 0.1 J it goes no faster than 0.2 m/s. A task at v needs R_s = k_f m v^2 / 2.
+w is the wrench that is sent. With sigma > 0 that is not the contact's alone, and what the account
+promises is E_act of this wrench: weight and inertia of the tool give back what was put into them.
 The account is behind the safe state, on whose command the motors' clamp has the last word, and
 behind whatever else changes a command: it uses what the slave did. The packet's pose is z.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,14 +96,19 @@ from drake_teleop.passivity.ledger_slave import (
     LEVER,
     MARGIN,
     MODEL,
+    NORMAL,
     PASSED,
     RESERVE,
-    SPRING,
     TOUCH,
     TOUCHED,
+    TRIP,
     VELOCITY_HERE,
+    along,
+    find_direction,
+    over_way,
     receive,
     smooth_velocity,
+    touches,
 )
 from drake_teleop.passivity.memory import (
     COMMAND_POSE,
@@ -97,6 +120,7 @@ from drake_teleop.passivity.memory import (
 )
 from drake_teleop.passivity.packet import (
     ENERGY,
+    GENTLE,
     POSE,
     SEQUENCE,
     VELOCITY,
@@ -117,14 +141,14 @@ _OVER = 1.1  # of k_c: a wall that is taken for too stiff is stable, for too sof
 _STIFFEST, _SOFTEST = 2500.0, 50.0  # N/m that are predicted with at most; that make a wall
 _LEAD = 2.0  # steps, by which the hand is led: half a step in theory, but velocity is filtered
 _ONSET = 0.3  # s, in which o fades
+_FORGET = 1.0  # s, of the largest friction
+_PATIENCE = 6.0  # round trips, in which friction at the hand goes over to what is measured
 _PREDICTED = 3.0  # N, beyond twice the wrench: more is no prediction
 _REMEMBERED = 10.0  # N, the most that a remembered wall pushes with
 _SAME = 5e-3  # m, between touches of one wall
-_GONE, _EXPECTED, _SURE = (
-    3e-3,
-    1.0,
-    1e-3,
-)  # m, N, m: a slave that far in a wall met nothing; at least
+# m, N, m: the slave so deep in a wall without meeting it that it has gone; what it should meet at
+# least; and so deep at least.
+_GONE, _EXPECTED, _SURE = 3e-3, 1.0, 1e-3
 _ALIGNED = 0.7  # cosine between the wrenches of one wall
 _DRAIN = 50.0  # 1/s, share of the ledger that the wrench may spend
 _RETURN = 0.02  # s, in which a shortened wrench comes back
@@ -132,14 +156,20 @@ _START = 5.0  # m/s^2, by which a hand may be faster at the next step
 _FADING = 0.02  # m/s, below it drag fades
 _BRAKE, _BRAKED = 0.5, 0.1  # N and m/s: what was pushed is braked with so much, down to this speed
 
-# Memory: filtered velocity, whether something is touched; way between hand and slave at the onset;
-# the remembered wall's direction (into it), its stiffness (0: none), how deep the hand is in it.
+# Memory as at the head of `ledger_slave`: filtered velocity, whether something is touched, what it
+# pushes with and its direction. Way between hand and slave at the onset; the remembered wall's
+# direction (into it), its stiffness (0: none), how deep the hand is in it; friction that is shown,
+# the largest that was seen.
 _places = own_memory()
-_places.vector(8)  # VELOCITY_HERE, TOUCHED
+_places.vector(NORMAL.stop - VELOCITY_HERE.start)
 _OFFSET, _INWARD = _places.vector(6), _places.vector(6)
-_WALL, _DEPTH = _places.vector(2), _places.vector(2)
+_WALL, _DEPTH = _places.number(), _places.number()
+_RUBBING, _FRICTION = _places.vector(6), _places.vector(2)
 # What the force gave since it last came to rest; share of the wrench that is withheld.
 _GIVEN, _WITHHELD = _places.vector(2), _places.vector(2)
+# The newest packet; whether the wrench still goes over after some were missing; the last wrench,
+# before it was paid for.
+_NEWEST, _MISSING, _LAST = _places.number(), _places.vector(2), _places.vector(6)
 
 AT_THE_MOTOR = True  #: the port of its account, see `methods`
 
@@ -187,20 +217,27 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     """One step of the master's end; see `methods.master_step`."""
     velocity, ahead = memory[VELOCITY_HERE], wrench  # where it is, the wrench will be written
     smooth_velocity(twist, min(T / _FILTER, 1.0), memory)
+    memory[_DEPTH] += over_way(memory[_INWARD], dx)
+    inside = memory[_WALL] > 0.0 and memory[_DEPTH] > 0.0
     for g in range(2):
-        _account_of_hand(g, dx, memory)
+        _account_of_hand(g, dx, inside or memory[TOUCHED] > 0.0, memory)
         receive(g, received, memory)
     ahead[:] = 0.0
     if arrived(received):
         difference_into(pose, received[POSE], ahead)
+    _predict(received, dx, T, p, memory, ahead, wrench)
+    newest = received[SEQUENCE]
+    if newest > memory[_NEWEST] + 1.0:
+        memory[_MISSING] = 1.0
+    memory[_NEWEST] = newest
     for g in range(2):
-        _predict(g, received, T, p, memory, ahead, wrench)
+        _approach(g, T, p, memory, wrench)
         limit(wrench, g, limits[g])
         _afford(g, dx, T, p, memory, wrench)
         _drag(g, received, dx, T, p, memory, wrench)
         limit(wrench, g, limits[g])
         level = p[HAND_RESERVE][g]
-        if memory[TOUCHED][g] > 0.0:
+        if memory[TOUCHED] > 0.0:
             level += PASSED * p[RESERVE][g]
         surplus = max(memory[LEDGER][g] - level, 0.0)
         memory[SENT][g] += surplus
@@ -212,58 +249,94 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 
 @njit(cache=True)
-def _account_of_hand(g, dx, memory):
+def _account_of_hand(g, dx, touched, memory):
     """M1, but for what came."""
     work, ledger = dot(memory[HELD], dx, g), memory[LEDGER]
     memory[_GIVEN][g] = max(memory[_GIVEN][g] + work, 0.0)
-    memory[_DEPTH][g] += dot(memory[_INWARD], dx, g)
-    inside = memory[_WALL][g] > 0.0 and memory[_DEPTH][g] > 0.0
-    if work < 0.0 < ledger[g] and (inside or memory[TOUCHED][g] > 0.0):
+    if work < 0.0 < ledger[g] and touched:
         memory[SENT][g] -= work
     else:
         ledger[g] -= work
 
 
 @njit(cache=True)
-def _predict(g, received, T, p, memory, ahead, wrench):
+def _predict(received, dx, T, p, memory, ahead, wrench):
     """M2, M3: the wrench is written, to where x_m - z is."""
-    shown, inward, offset = received[WRENCH], memory[_INWARD], memory[_OFFSET]
-    size, wall = length(shown, g), memory[_WALL]
-    k = min(_OVER * received[CONTACT_STIFFNESS][g], _STIFFEST * SPRING[g])
-    if size > p[TOUCH][g]:
-        damper, speed = received[CONTACT_DAMPING][g], dot(shown, received[VELOCITY], g) / size
-        spring = max(size + damper * speed, 0.0)
-        deep = spring / max(k, _SOFTEST * SPRING[g]) - dot(shown, ahead, g) / size
-        if memory[TOUCHED][g] == 0.0:
-            memory[TOUCHED][g] = 1.0
-            same = wall[g] > 0.0 and -dot(shown, inward, g) > _ALIGNED * size
-            near = abs(deep - memory[_DEPTH][g]) < _SAME * ARM[g]
-            known = same and (near or memory[_DEPTH][g] < 0.0)
-            for i in range(3 * g, 3 * g + 3):
-                offset[i] = 0.0 if known else ahead[i]
-        fade = 1.0 - min(T / _ONSET, 1.0)
-        for i in range(3 * g, 3 * g + 3):
-            offset[i] *= fade
-        lead = _LEAD * T * dot(shown, memory[VELOCITY_HERE], g)
-        further = (dot(shown, ahead, g) - dot(shown, offset, g) + lead) / size
-        most = 2.0 * size + _PREDICTED * LEVER[g]
-        faster = dot(shown, memory[VELOCITY_HERE], g) / size - speed
-        force = min(max(size - k * further - damper * faster, 0.0), most)
-        for i in range(3 * g, 3 * g + 3):
-            wrench[i] = force / size * shown[i]
-        if k > _SOFTEST * SPRING[g]:
-            wall[g], memory[_DEPTH][g] = k, deep
-            for i in range(3 * g, 3 * g + 3):
-                inward[i] = -shown[i] / size
+    shown, normal, inward = received[WRENCH], memory[NORMAL], memory[_INWARD]
+    k = min(_OVER * received[CONTACT_STIFFNESS], _STIFFEST)
+    if not touches(shown, p):
+        memory[TOUCHED] = 0.0
+        gone = min(_GONE, max(_EXPECTED / max(memory[_WALL], 1.0), _SURE))
+        if memory[_DEPTH] - over_way(inward, ahead) > gone:
+            memory[_WALL] = 0.0
+        inside = min(memory[_WALL] * max(memory[_DEPTH], 0.0), _REMEMBERED)
+        for i in range(6):
+            wrench[i] = -inside * inward[i]
         return
-    memory[TOUCHED][g] = 0.0
-    expected = _EXPECTED * LEVER[g] / max(wall[g], SPRING[g])
-    gone = min(_GONE * ARM[g], max(expected, _SURE * ARM[g]))
-    if memory[_DEPTH][g] - dot(inward, ahead, g) > gone:
-        wall[g] = 0.0
-    inside = min(wall[g] * max(memory[_DEPTH][g], 0.0), _REMEMBERED * LEVER[g])
+    offset, onset = memory[_OFFSET], memory[TOUCHED] == 0.0
+    size = find_direction(shown, received[TRIP], T, memory)
+    damper, speed = received[CONTACT_DAMPING], over_way(normal, received[VELOCITY])
+    deep = max(size + damper * speed, 0.0) / max(k, _SOFTEST) - over_way(normal, ahead)
+    if onset:
+        same = memory[_WALL] > 0.0 and -along(normal, inward) > _ALIGNED
+        near = abs(deep - memory[_DEPTH]) < _SAME
+        if same and (near or memory[_DEPTH] < 0.0):
+            offset[:] = 0.0
+        else:
+            put(offset, 0, ahead, 0, 6)
+        memory[TOUCHED] = 1.0
+        memory[_FRICTION][:] = 0.0
+        memory[_RUBBING][:] = 0.0
+    fade = 1.0 - min(T / _ONSET, 1.0)
+    for i in range(6):
+        offset[i] *= fade
+        ahead[i] -= offset[i]
+    fast = over_way(normal, memory[VELOCITY_HERE])
+    further = over_way(normal, ahead) + _LEAD * T * fast
+    force = size
+    if size > 0.0:
+        change = k * further + damper * (fast - speed)
+        force = min(max(size - change, 0.0), 2.0 * size + _PREDICTED)
+    pressed = min(max(force, 0.0) / max(size, 1e-12), 1.0)
+    for g in range(2):
+        _rub(g, T, size, pressed, shown, received, dx, memory)
+    for i in range(6):
+        wrench[i] = force * normal[i] + memory[_RUBBING][i]
+    if k > _SOFTEST:
+        memory[_WALL], memory[_DEPTH] = k, deep
+        for i in range(6):
+            inward[i] = -normal[i]
+
+
+@njit(cache=True)
+def _rub(g, T, size, pressed, shown, received, dx, memory):
+    """M2, h: what there is across the contact's direction."""
+    normal, rubbing, most = memory[NORMAL], memory[_RUBBING], memory[_FRICTION]
+    spring, way, total = _STIFFEST / ARM[g] ** 2, over_way(normal, dx), 0.0
+    share = min(T / max(2.0 * _ONSET, _PATIENCE * received[TRIP]), 1.0)
     for i in range(3 * g, 3 * g + 3):
-        wrench[i] = -inside * inward[i]
+        part = shown[i] - size * normal[i]
+        total += part * part
+        rubbing[i] += share * (part - rubbing[i])
+        rubbing[i] -= spring * (dx[i] - way * ARM[g] ** 2 * normal[i])
+    most[g] = max(most[g] * (1.0 - min(T / _FORGET, 1.0)), math.sqrt(total))
+    limit(rubbing, g, pressed * most[g])
+
+
+@njit(cache=True)
+def _approach(g, T, p, memory, wrench):
+    """After missing packets the wrench goes over from the last one, without a blow."""
+    last, missing = memory[_LAST], memory[_MISSING]
+    for i in range(3 * g, 3 * g + 3):
+        wrench[i] -= last[i]
+    size, most = length(wrench, g), GENTLE[g] * T / p[MOTION_SCALE][g]
+    if missing[g] > 0.0 and size > most:
+        scale(wrench, g, most / size)
+    else:
+        missing[g] = 0.0
+    for i in range(3 * g, 3 * g + 3):
+        last[i] += wrench[i]
+        wrench[i] = last[i]
 
 
 @njit(cache=True)
@@ -287,7 +360,7 @@ def _afford(g, dx, T, p, memory, wrench):
 def _drag(g, received, dx, T, p, memory, wrench):
     """M6: adds drag."""
     velocity, drag = memory[VELOCITY_HERE], 0.0
-    speed, touched = length(velocity, g), memory[TOUCHED][g] > 0.0
+    speed, touched = length(velocity, g), memory[TOUCHED] > 0.0
     poor = received[LEVEL][g] < p[RESERVE][g] and not touched
     if memory[LEDGER][g] < p[HAND_RESERVE][g] or poor:
         drag = p[DRAG][g]

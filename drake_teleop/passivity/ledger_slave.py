@@ -7,18 +7,22 @@ S1. L_s += min(w_k . dx, w_(k-1) . dx) + what came; likewise Q, from zero at eac
     A = L_s - m v^2 / 2.
 S2. To the master goes what is above the reserve R_s, if it is short; in contact and nearly at rest
     what is above 0.3 R_s, because pushing back takes energy then and moving does not.
-S3. The contact's stiffness k and damping b, along w, follow from wrench, way and speed. Of it the
-    slave shows the share rho = min(1, k_d / k), k_d = max(k_0, 2 c R_m / (v_p R)^2) with the
-    largest round trip R: a hand goes v_p R deep before it feels anything, and R_m has to push it
-    back. A hand that stays feels at once how deep it goes, and in contact its end has 4.5 R_m (S2):
-    c goes from 1 to 10 in about a second, for k_d up to 1200 N/m; but not over a network that falls
+S3. The contact's direction n is the mean of w, as in M2; its stiffness k and damping b follow from
+    w_n, way and speed along n, over the last 1 to 10 mm of way since the onset. Of k the slave
+    shows the share rho = min(1, k_d / k), k_d = max(k_0, 2 c R_m / (v_p R)^2) with the largest
+    round trip R: a hand goes v_p R deep before it feels anything, and R_m has to push it back. A
+    hand that stays feels at once how deep it goes, and in contact its end has 4.5 R_m (S2): c goes
+    from 1 to 10 in about a second, for k_d up to 1200 N/m; but not over a network that falls
     silent. At a contact's onset k is that of the last one, so that a bounce does not stiffen the
-    wall. Beyond the wall x_w the target is x_w + rho (x_received - x_w).
+    wall. Beyond the wall x_w the target is x_w + rho (x_received - x_w), along n. rho is left alone
+    while it would change by less than a tenth: it moves the slave, and friction makes a new k of
+    that.
 S4. The command follows the target with bounded acceleration, and m v^2 / 2 <= L_s.
 S5. Motors that push with the motion, f . v > 0, spend at most what A holds in 4 ms; pressing on the
     wall what was paid since the onset, Q, and c F_u^2 / 2 k that nobody paid. With A at its end
     they brake. Standing still may always hold. It is done through the command, x + (f + D v) / K.
-S6. Sent: w, L_s, z and z' = the servo's model of the received pose, k_c = rho k / (1 + k / K), b.
+S6. Sent: w, L_s, z and z' = the servo's model of the received pose, k_c = rho k / (1 + k / K) along
+    n, b, R.
 """
 
 from __future__ import annotations
@@ -61,8 +65,9 @@ from drake_teleop.passivity.packet import (
 from drake_teleop.vectors import put
 
 # Of translation and rotation: a length is an angle at an arm of 0.1 m, a force a torque at the
-# lever of 0.01 m that haptic devices have; a stiffness is a torque over an angle.
-ARM, LEVER, SPRING = (1.0, 10.0), (1.0, 0.01), (1.0, 0.001)
+# lever of 0.01 m that haptic devices have. What is touched is known along one wrench of force and
+# torque together, where a torque counts as a force at the same arm.
+ARM, LEVER = (1.0, 10.0), (1.0, 0.01)
 MARGIN = 0.03  #: of the slave's reserve: never spent; more than what a step can cost
 PASSED = 0.7  #: share of the slave's reserve that the hand's end may have in contact
 
@@ -74,18 +79,14 @@ _FILTER = 3e-3  # s, of velocity, wrench and way: encoders have steps
 _CALM, _CALM_RATE, _RATE = 0.05, 5.0, 50.0  # m/s, at rest; 1/s in which surplus goes, there and not
 _FORGET = 5.0  # s, of the largest round trip
 _SHOWN, _PRESS = 300.0, 0.06  # k_0 [N/m]; v_p, of a hand that presses [m/s]
-_STRETCH, _LONG, _LEARN = (
-    2e-4,
-    2e-3,
-    1e-3,
-)  # m: way for a stiffness, likewise in fast motion; memory
+_STRETCH, _LONG = 2e-4, 2e-3  # m, way for a stiffness; likewise in fast motion
+_LEARN, _KNOWN = 1e-3, 1e-2  # m, way that a stiffness is the mean of at least, and at most
 _SLOW = 0.15  # m/s; an impact's wrench says less of the stiffness
 _SMOOTH = 0.02  # s, of the wall's place and of rho
-_SETTLED, _TIMES, _STIFFEST = (
-    0.5,
-    10.0,
-    1200.0,
-)  # s, c and N/m at most: of k_d, of a hand that stays
+_SURE = 0.1  # of rho, by which it is not changed: it moves the slave, which changes k
+_DIRECTION = 0.3  # s, of the contact's direction at least: friction comes and goes
+_SETTLED, _TIMES = 0.5, 10.0  # s and c, of a hand that stays
+_STIFFEST = 1200.0  # N/m, of its k_d
 _FOLLOW = 0.01  # s, of the command's generator
 _FASTER = 30.0  # m/s^2, its acceleration
 _STOPPING = 0.7  # of the speed from which that acceleration stops in time
@@ -95,10 +96,10 @@ _UNPAID = 5.0  # N, what the slave may press a wall with though nobody has paid
 _STILL = 2e-3  # m/s, at rest: standing costs nothing
 _DECELERATION = 20.0  # m/s^2, of the brake when nothing is left
 
-# In the packet: stiffness k_c and damping b (slave's), number of the newest packet (master's),
-# ledger.
-CONTACT_STIFFNESS = slice(INTEGRAL.start, INTEGRAL.start + 2)
-CONTACT_DAMPING, LEVEL = slice(INTEGRAL.start + 2, INTEGRAL.start + 4), OTHER_ENERGY
+# In the packet: stiffness k_c, damping b and round trip (slave's), number of the newest packet
+# (master's), ledger.
+CONTACT_STIFFNESS, CONTACT_DAMPING, TRIP = range(INTEGRAL.start, INTEGRAL.start + 3)
+LEVEL = OTHER_ENERGY
 ECHO = INTEGRAL.stop - 1
 
 # Parameters, in the master's power units.
@@ -107,19 +108,20 @@ INITIAL, RESERVE, HAND_RESERVE = _places.vector(2), _places.vector(2), _places.v
 DRAG, TOUCH = _places.vector(2), _places.vector(2)
 # Memory: filtered velocity; whether something is touched; the servo's model; the motors' pull.
 _places = own_memory()
-VELOCITY_HERE, TOUCHED = _places.vector(6), _places.vector(2)
+VELOCITY_HERE, TOUCHED = _places.vector(6), _places.number()
+#: What the contact pushes with, smoothed: its direction is the contact's.
+PUSHED, NORMAL = _places.vector(6), _places.vector(6)
 MODEL, _MODEL_TWIST, _PULL = _places.vector(7), _places.vector(6), _places.vector(6)
-# A, Q; k, b; rho, c less 1; how deep the slave is in the wall.
-_ACCOUNT, _PAID = _places.vector(2), _places.vector(2)
-_STIFFNESS, _DAMPER = _places.vector(2), _places.vector(2)
-_SHARE, _STAYED, _INSIDE = _places.vector(2), _places.vector(2), _places.vector(2)
-# Of the search for k and b: wrench filtered, it and the speed at the anchor; way since then; how
-# far that is behind; the fit's sums.
-_SMOOTHED, _ANCHOR, _FAST = _places.vector(2), _places.vector(2), _places.vector(2)
-_WAY, _BEHIND, _SUMS = _places.vector(2), _places.vector(2), _places.vector(2 * SUMS)
+_ACCOUNT, _PAID = _places.vector(2), _places.vector(2)  # A, Q
+# k, b; rho and where it goes to, c less 1, how deep the slave is in the wall.
+_STIFFNESS, _DAMPER = _places.number(), _places.number()
+_SHARE, _GOAL, _STAYED, _INSIDE = (_places.number() for _ in range(4))
+# Of the search for k and b: wrench filtered, it and the speed at the anchor; way since then, how
+# far that is behind; way since the onset; the fit's sums.
+_SMOOTHED, _ANCHOR, _FAST = (_places.number() for _ in range(3))
+_WAY, _BEHIND, _LEARNT, _SUMS = *(_places.number() for _ in range(3)), _places.vector(SUMS)
 # Time without packets and the longest such, the largest round trip, the period [s].
-_SILENT, _GAP = _places.number(), _places.number()
-_ROUND_TRIP, _PERIOD = _places.number(), _places.number()
+_SILENT, _GAP, _ROUND_TRIP, _PERIOD = (_places.number() for _ in range(4))
 
 
 @njit(cache=True)
@@ -128,6 +130,37 @@ def smooth_velocity(twist, share, memory):
     velocity = memory[VELOCITY_HERE]
     for i in range(6):
         velocity[i] += share * (twist[i] - velocity[i])
+
+
+@njit(cache=True)
+def touches(wrench, p):
+    """Whether a wrench is a contact's."""
+    return length(wrench, 0) > p[TOUCH][0] or length(wrench, 1) > p[TOUCH][1]
+
+
+@njit(cache=True)
+def along(a, b):
+    """What there is of the wrench a along the wrench b [N]; of b along itself its size."""
+    return dot(a, b, 0) + ARM[1] * ARM[1] * dot(a, b, 1)
+
+
+@njit(cache=True)
+def over_way(wrench, way):
+    """The work of a wrench over a way; of a unit wrench it is the way along it [m]."""
+    return dot(wrench, way, 0) + dot(wrench, way, 1)
+
+
+@njit(cache=True)
+def find_direction(wrench, trip, T, memory):
+    """The contact's direction, a unit wrench, from its wrench; and what there is along it [N]."""
+    pushed, normal = memory[PUSHED], memory[NORMAL]
+    rate = 1.0 if memory[TOUCHED] == 0.0 else min(T / max(_DIRECTION, 2.0 * trip), 1.0)
+    for i in range(6):
+        pushed[i] += rate * (wrench[i] - pushed[i])
+    size = max(math.sqrt(along(pushed, pushed)), 1e-12)
+    for i in range(6):
+        normal[i] = pushed[i] / size
+    return along(wrench, normal)
 
 
 @njit(cache=True)
@@ -151,16 +184,16 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     trip = max((memory[STEPS] - received[ECHO]) * T, 0.0) if heard else 0.0
     memory[_ROUND_TRIP] = max(memory[_ROUND_TRIP] * (1.0 - T / _FORGET), trip)
     smooth_velocity(twist, min(T / _FILTER, 1.0), memory)
+    touched = touches(wrench, p)
     for g in range(2):
-        _account_of_slave(g, received, heard, twist, dx, wrench, T, p, memory)
-        _learn(g, dx, wrench, T, p, memory)
+        _account_of_slave(g, received, heard, touched, twist, dx, wrench, T, p, memory)
+    _learn(touched, dx, wrench, T, p, memory)
     put(memory, HELD.start, wrench, 0, 6)
     gap[:] = 0.0
     if heard:
         difference_into(received[POSE], now, gap)
     difference_into(now, pose, memory[_PULL])
-    for g in range(2):
-        _generate(g, received, heard, wrench, T, p, memory, gap)
+    _generate(received, heard, T, p, memory, gap)
     for i in range(6):
         gap[i] = T * going[i]
     moved_into(now, gap, now)
@@ -168,24 +201,23 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     _model(received, heard, T, p, memory, gap)
     put(command, 0, memory, COMMAND.start, 13)
     fill(memory[MODEL], memory[_MODEL_TWIST], wrench, packet)
+    k, yields = memory[_STIFFNESS], 0.0
     for g in range(2):
-        k = memory[_STIFFNESS][g]
-        packet[CONTACT_STIFFNESS][g] = (
-            memory[_SHARE][g] * k / (1.0 + k / (_STIFF * p[STIFFNESS][g]))
-        )
-        packet[CONTACT_DAMPING][g] = memory[_DAMPER][g]
+        size = length(memory[NORMAL], g)
+        yields += size * size / (_STIFF * p[STIFFNESS][g])
         packet[ENERGY][g], packet[LEVEL][g] = memory[SENT][g], memory[LEDGER][g]
+    packet[CONTACT_DAMPING], packet[TRIP] = memory[_DAMPER], memory[_ROUND_TRIP]
+    packet[CONTACT_STIFFNESS] = memory[_SHARE] * k / (1.0 + k * yields)
 
 
 @njit(cache=True)
-def _account_of_slave(g, received, heard, twist, dx, wrench, T, p, memory):
+def _account_of_slave(g, received, heard, touched, twist, dx, wrench, T, p, memory):
     """S1, S2."""
     # The wrench went from the last one to this one: of both works the smaller is credited.
     work = min(dot(wrench, dx, g), dot(memory[HELD], dx, g))
     more = receive(g, received, memory)
     ledger, paid, reserve = memory[LEDGER], memory[_PAID], p[RESERVE][g]
     ledger[g] += work
-    touched = length(wrench, g) > p[TOUCH][g]
     paid[g] = (paid[g] + work if touched else 0.0) + more
     speed = length(twist, g)
     moving = 0.5 * _HEAVY * p[MASS][g] * speed * speed
@@ -203,88 +235,92 @@ def _account_of_slave(g, received, heard, twist, dx, wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _shown_at_most(g, T, p, memory):
+def _shown_at_most(T, p, memory):
     """k_d, of S3."""
-    lag = 2.0 * math.sqrt(p[MASS][g] / p[STIFFNESS][g])  # of the servo
-    depth = _PRESS * ARM[g] * (memory[_ROUND_TRIP] + lag)
-    stayed, first = memory[_STAYED], 2.0 * p[HAND_RESERVE][g] / (depth * depth)
-    if memory[TOUCHED][g] == 0.0 or memory[_GAP] >= _NEWS:
-        stayed[g] = 0.0
+    lag = 2.0 * math.sqrt(p[MASS][0] / p[STIFFNESS][0])  # of the servo
+    depth, first = _PRESS * (memory[_ROUND_TRIP] + lag), math.inf
+    for g in range(2):
+        part = ARM[g] * length(memory[NORMAL], g) * depth
+        first = min(first, 2.0 * p[HAND_RESERVE][g] / max(part * part, 1e-300))
+    if memory[TOUCHED] == 0.0 or memory[_GAP] >= _NEWS:
+        memory[_STAYED] = 0.0
     else:
-        stayed[g] += T / _SETTLED * (_TIMES - 1.0 - stayed[g])
-    later = min((1.0 + stayed[g]) * first, _STIFFEST * SPRING[g])
-    return max(_SHOWN * SPRING[g], first, later)
+        memory[_STAYED] += T / _SETTLED * (_TIMES - 1.0 - memory[_STAYED])
+    return max(_SHOWN, first, min((1.0 + memory[_STAYED]) * first, _STIFFEST))
 
 
 @njit(cache=True)
-def _learn(g, dx, wrench, T, p, memory):
-    """S3 but for the target: stiffness, damping, share, and how deep the slave is in the wall."""
-    size, k, share = length(wrench, g), memory[_STIFFNESS], memory[_SHARE]
-    way, behind, smoothed = memory[_WAY], memory[_BEHIND], memory[_SMOOTHED]
-    anchor, fast = memory[_ANCHOR], memory[_FAST]
-    most = _shown_at_most(g, T, p, memory)
-    if not size > p[TOUCH][g]:
-        memory[TOUCHED][g] = 0.0
-        way[g] = behind[g] = smoothed[g] = anchor[g] = fast[g] = 0.0
-        share[g] = most / max(k[g], most)
+def _learn(touched, dx, wrench, T, p, memory):
+    """S3 but for the target: direction, stiffness, damping, share, how deep the slave is."""
+    if not touched:
+        memory[TOUCHED] = memory[_SMOOTHED] = 0.0
         return
-    inward, rate = -dot(wrench, dx, g) / size, min(T / _FILTER, 1.0)
-    speed = -dot(wrench, memory[VELOCITY_HERE], g) / size
-    if smoothed[g] == 0.0:
+    normal, k = memory[NORMAL], memory[_STIFFNESS]
+    size = find_direction(wrench, memory[_ROUND_TRIP], T, memory)
+    most = _shown_at_most(T, p, memory)
+    inward, rate = -over_way(normal, dx), min(T / _FILTER, 1.0)
+    speed = -over_way(normal, memory[VELOCITY_HERE])
+    if memory[_SMOOTHED] == 0.0:
         # From the first sample in contact: on the way to it a part was outside.
-        smoothed[g] = anchor[g] = size
-        behind[g], fast[g] = inward, speed
-    follows = rate * (inward - behind[g])
-    behind[g] += follows - inward
-    way[g] += follows
-    smoothed[g] += rate * (size - smoothed[g])
-    slow = length(memory[VELOCITY_HERE], g) < _SLOW * ARM[g]
-    far = abs(way[g])
-    if far > (_STRETCH if slow else _LONG) * ARM[g]:
-        keep = max(1.0 - far / (_LEARN * ARM[g]), 0.0) if slow else 0.5
-        sums = memory[_SUMS][SUMS * g : SUMS * (g + 1)]
-        found = fit(sums, smoothed[g] - anchor[g], way[g], speed - fast[g], keep)
-        k[g], memory[_DAMPER][g] = found
-        way[g], anchor[g], fast[g] = 0.0, smoothed[g], speed
-    if k[g] > SPRING[g]:  # 1 N/m: something is known
-        rate = min(T / _SMOOTH, 1.0)
-        share[g] += rate * (most / max(k[g], most) - share[g])
-        inside, deep = memory[_INSIDE], max(size - memory[_DAMPER][g] * speed, 0.0) / k[g]
-        if memory[TOUCHED][g] == 0.0:
-            inside[g] = deep
-        inside[g] += inward + rate * (deep - inside[g] - inward)
-        memory[TOUCHED][g] = 1.0
+        memory[_SMOOTHED] = memory[_ANCHOR] = size
+        memory[_BEHIND], memory[_FAST] = inward, speed
+        memory[_WAY] = memory[_LEARNT] = 0.0
+        memory[_SHARE] = memory[_GOAL] = most / max(k, most)
+    follows = rate * (inward - memory[_BEHIND])
+    memory[_BEHIND] += follows - inward
+    memory[_WAY] += follows
+    memory[_SMOOTHED] += rate * (size - memory[_SMOOTHED])
+    fastest = math.hypot(
+        length(memory[VELOCITY_HERE], 0), length(memory[VELOCITY_HERE], 1) / ARM[1]
+    )
+    slow, far = fastest < _SLOW, abs(memory[_WAY])
+    if far > (_STRETCH if slow else _LONG):
+        memory[_LEARNT] = min(memory[_LEARNT] + far, _KNOWN)
+        keep = max(1.0 - far / max(memory[_LEARNT], _LEARN), 0.0) if slow else 0.5
+        more = memory[_SMOOTHED] - memory[_ANCHOR]
+        k, damper = fit(memory[_SUMS], more, memory[_WAY], speed - memory[_FAST], keep)
+        memory[_STIFFNESS], memory[_DAMPER] = k, damper
+        memory[_WAY], memory[_ANCHOR], memory[_FAST] = 0.0, memory[_SMOOTHED], speed
+    if k > 1.0:  # N/m: something is known
+        rate, goal = min(T / _SMOOTH, 1.0), most / max(k, most)
+        if abs(goal - memory[_GOAL]) > _SURE * memory[_GOAL]:
+            memory[_GOAL] = goal
+        memory[_SHARE] += rate * (memory[_GOAL] - memory[_SHARE])
+        deep = max(size - memory[_DAMPER] * speed, 0.0) / k
+        if memory[TOUCHED] == 0.0:
+            memory[_INSIDE] = deep
+        memory[_INSIDE] += inward + rate * (deep - memory[_INSIDE] - inward)
+        memory[TOUCHED] = 1.0
 
 
 @njit(cache=True)
-def _generate(g, received, heard, wrench, T, p, memory, gap):
+def _generate(received, heard, T, p, memory, gap):
     """S3, S4: the command's velocity; `gap` is from the command to the received pose, changed."""
-    going, pull, feed = memory[COMMAND_TWIST], memory[_PULL], received[VELOCITY]
-    size, yields, over, fast = length(wrench, g), 0.0, 0.0, 0.0
-    if memory[TOUCHED][g] > 0.0:
-        over = memory[_INSIDE][g] - (dot(wrench, gap, g) + dot(wrench, pull, g)) / size
+    going, normal, feed = memory[COMMAND_TWIST], memory[NORMAL], received[VELOCITY]
+    yields, over, fast = 0.0, 0.0, 0.0
+    if memory[TOUCHED] > 0.0:
+        over = memory[_INSIDE] - over_way(normal, gap) - over_way(normal, memory[_PULL])
         if over > 0.0:
-            yields, fast = 1.0 - memory[_SHARE][g], -dot(wrench, feed, g) / size
-    for i in range(3 * g, 3 * g + 3):
-        if yields > 0.0:
-            gap[i] += yields * over * wrench[i] / size
-    away, most = length(gap, g), _FASTER * ARM[g]
-    rate = 1.0 / _FOLLOW
-    if away > 0.0:
-        rate = min(rate, _STOPPING * math.sqrt(2.0 * most / away))
-    for i in range(3 * g, 3 * g + 3):
-        gap[i] *= rate
-        if heard and memory[_SILENT] < _NEWS:
-            gap[i] += feed[i]
-            if yields > 0.0:
-                gap[i] += yields * fast * wrench[i] / size
-    left = max(memory[LEDGER][g] - MARGIN * p[RESERVE][g], 0.0)
-    limit(gap, g, math.sqrt(2.0 * left / (_HEAVY * p[MASS][g])))
-    for i in range(3 * g, 3 * g + 3):
-        gap[i] -= going[i]
-    limit(gap, g, most * T)
-    for i in range(3 * g, 3 * g + 3):
-        going[i] += gap[i]
+            yields, fast = 1.0 - memory[_SHARE], -over_way(normal, feed)
+    feeds = heard and memory[_SILENT] < _NEWS
+    for g in range(2):
+        for i in range(3 * g, 3 * g + 3):
+            gap[i] += yields * over * ARM[g] * ARM[g] * normal[i]
+        away, most = length(gap, g), _FASTER * ARM[g]
+        rate = 1.0 / _FOLLOW
+        if away > 0.0:
+            rate = min(rate, _STOPPING * math.sqrt(2.0 * most / away))
+        for i in range(3 * g, 3 * g + 3):
+            gap[i] *= rate
+            if feeds:
+                gap[i] += feed[i] + yields * fast * ARM[g] * ARM[g] * normal[i]
+        left = max(memory[LEDGER][g] - MARGIN * p[RESERVE][g], 0.0)
+        limit(gap, g, math.sqrt(2.0 * left / (_HEAVY * p[MASS][g])))
+        for i in range(3 * g, 3 * g + 3):
+            gap[i] -= going[i]
+        limit(gap, g, most * T)
+        for i in range(3 * g, 3 * g + 3):
+            going[i] += gap[i]
 
 
 @njit(cache=True)
@@ -321,14 +357,9 @@ def _hold_back(g, damping, twist, p, memory):
     margin, account, changed = MARGIN * p[RESERVE][g], memory[_ACCOUNT][g], False
     pushing = dot(pull, twist, g) > 0.0 or dot(pull, velocity, g) > 0.0
     touched, room, least = length(held, g), account, 0.0
-    if touched > p[TOUCH][g] and dot(pull, held, g) < 0.0:
-        unpaid = _UNPAID * LEVER[g]
-        spring = (
-            (1.0 + memory[_STAYED][g])
-            * unpaid
-            * unpaid
-            / (2.0 * max(memory[_STIFFNESS][g], SPRING[g]))
-        )
+    if touches(held, p) and dot(pull, held, g) < 0.0:
+        unpaid = _UNPAID * LEVER[g] * ARM[g]
+        spring = (1.0 + memory[_STAYED]) * unpaid * unpaid / (2.0 * max(memory[_STIFFNESS], 1.0))
         room = min(account, min(p[RESERVE][g], spring) + memory[_PAID][g])
         if still or not pushing:
             # Motors that are late earn a little by standing: with an empty account they give way.

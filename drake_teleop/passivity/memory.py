@@ -6,7 +6,7 @@ method alone needs it names at the head of its file, with `own_memory` and `own_
 
 from __future__ import annotations
 
-MEMORY = 132  #: length of the memory of one end
+MEMORY = 140  #: length of the memory of one end
 PARAMETERS = 26  #: length of the parameters, packed by `methods.parameters`
 
 

@@ -88,6 +88,9 @@ AT_THE_MOTOR = tuple(name for name, file in _FILES.items() if hasattr(file, "AT_
 """Those that act at the port of the slave's motors."""
 
 
+_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
+
+
 @dataclass
 class _Common:
     method: str = choice("none", METHODS, "what keeps the channel passive")
@@ -106,8 +109,13 @@ class _Common:
     servo_damping: list[float] = quantity(
         [3.5e3, 117.0], "N s/m, N m s/rad", 0.0, 1e8, "D of the slave's servo, likewise (E)"
     )
-    slave_mass: list[float] = quantity(
-        [15.13, 0.5], "kg, kg m^2", 1e-6, 1e6, "of arm and tool where they are pushed, likewise (E)"
+    slave_mass: list[float] | None = quantity(
+        None,
+        "kg, kg m^2",
+        1e-6,
+        1e6,
+        "of arm and tool where they are pushed, likewise; null: 15.13, 0.5 (E), but with ledger"
+        " mass and servo of the station's arm at the start",
     )
 
 
@@ -143,7 +151,7 @@ def parameters(
     p[LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
     p[STIFFNESS] = np.multiply(config.servo_stiffness, power_scale)
     p[DAMPING] = np.multiply(config.servo_damping, power_scale)
-    p[MASS] = np.multiply(config.slave_mass, power_scale)
+    p[MASS] = np.multiply(config.slave_mass or _SLAVE_MASS, power_scale)
     p[MOTION_SCALE] = motion_scale
     p[RETREAT] = np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
     if config.method in _FIELDS:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
 from drake_teleop.channel.channel import TeleopChannel
+from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sides.ports import export
-from drake_teleop.slave.plant import R_WS_HOME
+from drake_teleop.slave.plant import R_WS_HOME, NominalSlave, home_position
+from drake_teleop.slave.servo import servo_at_tool
 
 
 def MakeChannel(scenario: Scenario) -> Diagram:
@@ -50,7 +54,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            scenario.passivity,
+            _told_of_the_arm(scenario),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
             scenario.force_scaling.force_scale,
@@ -73,3 +77,19 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         wrench_to_master="wrench_received",
     )
     return builder.Build()
+
+
+def _told_of_the_arm(scenario: Scenario) -> PassivityConfig:
+    """The method's parameters; `ledger`, whose promise rests on the mass, is told the arm's."""
+    passivity = scenario.passivity
+    if passivity.method != "ledger" or passivity.slave_mass is not None:
+        return passivity
+    arm = NominalSlave(scenario.slave.payload).arm
+    start = home_position(arm, scenario.slave.position)
+    servo = servo_at_tool(arm, start, scenario.joint_control)
+    return dataclasses.replace(
+        passivity,
+        servo_stiffness=servo.stiffness,
+        servo_damping=servo.damping,
+        slave_mass=servo.mass,
+    )

@@ -1,0 +1,124 @@
+"""The energy ledger in six degrees of freedom: a contact is one wrench, with friction across it.
+
+Both ends are stepped by themselves, with packets that are written here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.passivity.ledger import LedgerConfig
+from drake_teleop.passivity.ledger_slave import CONTACT_STIFFNESS, TRIP
+from drake_teleop.passivity.memory import LEDGER, LIMIT
+from drake_teleop.passivity.methods import (
+    METHODS,
+    PassivityConfig,
+    initial_memory,
+    master_step,
+    parameters,
+    slave_step,
+)
+from drake_teleop.passivity.packet import GENTLE, PACKET_SIZE, POSE, SEQUENCE, WRENCH
+
+T = 1e-3
+METHOD = METHODS.index("ledger")
+START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+RICH = PassivityConfig(
+    method="ledger", ledger=LedgerConfig(initial=[2.0, 2.0], drag=[0.0, 0.0]), torque_limit=1.0
+)
+
+
+class Hand:
+    """The master's end, and the packet that it has received last."""
+
+    def __init__(self, wrench: np.ndarray, stiffness: float) -> None:
+        self.p = parameters(RICH)
+        self.memory = initial_memory("ledger", self.p, START)
+        self.memory[LEDGER] = 0.2  # more than it needs, and no more than it keeps in contact
+        self.pose, self.felt, self.packet = START.copy(), np.zeros(6), np.zeros(PACKET_SIZE)
+        self.packet[POSE], self.packet[WRENCH] = START, wrench
+        self.packet[CONTACT_STIFFNESS], self.packet[TRIP] = stiffness / 1.1, 0.1
+
+    def step(self, dx: np.ndarray | None = None) -> np.ndarray:
+        """Moves by dx (6,), translation and small turn; what it feels then."""
+        dx = np.zeros(6) if dx is None else np.asarray(dx)
+        self.pose[4:] += dx[:3]
+        self.pose[1:4] += 0.5 * dx[3:]
+        self.packet[SEQUENCE] += 1.0
+        sent, still = np.zeros(PACKET_SIZE), np.zeros(6)
+        master_step(
+            METHOD, self.packet, True, self.pose, dx / T, dx, still, self.p[LIMIT], T, self.p,
+            self.memory, self.felt, sent,
+        )  # fmt: skip
+        return self.felt.copy()
+
+    def rest(self, steps: int) -> np.ndarray:
+        """What it feels after standing still."""
+        for _ in range(steps):
+            felt = self.step()
+        return felt
+
+
+def test_a_point_that_is_touched_far_from_the_reference_is_one_spring():
+    """As deep as the point itself goes, whether the hand moves or turns; the torque goes along."""
+    arm, k = np.array([0.0, 0.1, 0.0]), 200.0
+    normal = np.array([0.0, 0.0, 1.0, *np.cross(arm, [0.0, 0.0, 1.0])])
+    along = 1.0 + (0.1 / 0.1) ** 2  # of `normal`, a torque being a force at 0.1 m
+    depth = 1e-3
+    for way in ([0, 0, -depth, 0, 0, 0], [0, 0, 0, -depth / 0.1, 0, 0]):
+        hand = Hand(2.0 * normal, k * along)
+        np.testing.assert_allclose(hand.rest(2500), 2.0 * normal, atol=1e-9)
+        for _ in range(50):
+            hand.step(np.array(way) / 50)
+        np.testing.assert_allclose(hand.rest(50), (2.0 + k * depth) * normal, rtol=0.01, atol=1e-4)
+
+
+def test_friction_is_of_the_hands_own_motion_and_at_rest_what_is_measured():
+    """News of friction come late: shown as they come they would push a hand that has turned."""
+    wrench = np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
+    hand = Hand(wrench, 200.0)
+    hand.rest(1500)
+    hand.packet[WRENCH][1] = -0.6  # slides, as the hand did a while ago
+    assert abs(hand.rest(20)[1]) < 0.1
+    for sign in (1.0, -1.0):
+        for _ in range(20):
+            felt = hand.step([0.0, sign * 5e-5, 0.0, 0.0, 0.0, 0.0])
+        assert felt[1] == pytest.approx(-sign * 0.6, rel=0.3)
+        assert felt[2] == pytest.approx(3.0, rel=0.1)
+    np.testing.assert_allclose(hand.rest(4000)[:3], [0.0, -0.6, 3.0], atol=0.01)
+    hand.packet[POSE][6] = -0.1  # the hand is far out again, before the slave's news are
+    np.testing.assert_allclose(hand.rest(400), np.zeros(6), atol=1e-9)
+
+
+def test_after_missing_packets_the_wrench_goes_over_gradually():
+    hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0)
+    hand.rest(100)
+    hand.packet[WRENCH][2] = 1.0
+    assert hand.step()[2] == pytest.approx(1.0), "nothing is missing"
+    hand.packet[WRENCH][2] = 3.0
+    hand.packet[SEQUENCE] += 3.0
+    course = [hand.step()[2] for _ in range(10)]
+    assert course[0] == pytest.approx(1.0 + GENTLE[0] * T)
+    assert np.diff(course).max() <= GENTLE[0] * T + 1e-12 and course[-1] == pytest.approx(3.0)
+
+
+def test_friction_that_changes_its_sign_does_not_soften_the_wall():
+    """The tool slides to and fro on a wall of 200 N/m while it is pressed."""
+    p, packet, command = parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
+    memory, received = initial_memory("ledger", p, START), np.zeros(PACKET_SIZE)
+    pose, before = START.copy(), START.copy()
+    received[POSE] = START
+    for k in range(3000):
+        t = k * T
+        pose[4:] = 2e-3 * np.sin(40.0 * t), 0.0, -0.01 * min(t, 1.0) - 1e-4 * np.sin(31.0 * t)
+        force = -200.0 * pose[6]
+        dx = np.concatenate([pose[4:] - before[4:], np.zeros(3)])
+        rub = -0.3 * force * np.sign(dx[0])
+        wrench = np.array([rub, 0.0, force, 0.0, 0.2 * rub, 0.0])
+        received[POSE] = pose
+        received[POSE][6] -= 0.005
+        received[SEQUENCE] += 1.0
+        slave_step(METHOD, received, True, pose, dx / T, dx, wrench, T, p, memory, command, packet)
+        before[:] = pose
+    assert 180.0 < packet[CONTACT_STIFFNESS] < 350.0, "too stiff is stable, too soft is not"

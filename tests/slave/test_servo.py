@@ -1,0 +1,71 @@
+"""The arm as one servo at the tool: energy, and who is told of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.channel import channel
+from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.scenario import Scenario, replace
+from drake_teleop.sides.channel import MakeChannel
+from drake_teleop.slave.arm import inverse_dynamics, jacobian
+from drake_teleop.slave.plant import NominalSlave, home_position
+from drake_teleop.slave.servo import operational_inertia, servo_at_tool
+
+SCENARIO = Scenario()
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return NominalSlave(SCENARIO.slave.payload).arm
+
+
+@pytest.fixture(scope="module")
+def home(arm):
+    return home_position(arm, SCENARIO.slave.position)
+
+
+def test_operational_inertia_is_the_arms_kinetic_energy(arm, home):
+    """Against the joints' mass matrix, column by column from the inverse dynamics."""
+    still, weight, J = np.zeros(6), np.empty(6), np.empty((6, 6))
+    inverse_dynamics(arm.table, home, still, still, weight)
+    mass = np.empty((6, 6))
+    for i, column in enumerate(np.eye(6)):
+        inverse_dynamics(arm.table, home, still, column, mass[i])
+    jacobian(arm.table, home, J)
+    found = J.T @ operational_inertia(arm, home) @ J
+    np.testing.assert_allclose(found, mass - weight, rtol=1e-9, atol=1e-9)
+
+
+def test_nothing_moves_with_more_energy_than_its_mass_says(arm, home):
+    """And some motion has all of it."""
+    config = SCENARIO.joint_control
+    told = servo_at_tool(arm, home, config)
+    mass = np.diag(np.repeat(told.mass, 3))
+    spare = np.linalg.eigvalsh(mass - operational_inertia(arm, home))
+    assert spare[0] == pytest.approx(0.0, abs=1e-9) and told.mass[0] < 1e2
+    kp, kv = 2 * np.pi * config.position_bandwidth_hz, 2 * np.pi * config.velocity_bandwidth_hz
+    np.testing.assert_allclose(np.divide(told.stiffness, told.mass), kp * kv)
+    np.testing.assert_allclose(np.divide(told.damping, told.mass), kv)
+
+
+def test_the_ledger_of_a_station_is_told_of_its_arm_unless_somebody_says_another(
+    arm, home, monkeypatch
+):
+    told, parameters = [], channel.methods.parameters
+    monkeypatch.setattr(
+        channel.methods,
+        "parameters",
+        lambda config, *more: told.append(config) or parameters(config, *more),
+    )
+    for passivity in (
+        PassivityConfig(method="ledger"),
+        PassivityConfig(method="ledger", slave_mass=[20.0, 0.5]),
+        PassivityConfig(method="pspm"),
+    ):
+        MakeChannel(replace(SCENARIO, passivity=passivity))
+    expected = servo_at_tool(arm, home, SCENARIO.joint_control)
+    assert (told[0].servo_stiffness, told[0].servo_damping, told[0].slave_mass) == expected
+    assert told[1].slave_mass == [20.0, 0.5] and told[2].slave_mass is None
+    assert told[1].servo_stiffness == told[2].servo_stiffness == PassivityConfig().servo_stiffness
