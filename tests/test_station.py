@@ -122,7 +122,7 @@ def test_samples_between_the_steps_are_those_of_short_steps(name, most):
     scenario = replace(
         LoadScenario(name),
         wrist_sensor__ideal=True,
-        simulation__duration=0.4,
+        simulation__duration=0.28,  # the contact ends at 0.275 s
         force_scaling__sigma=1.0,  # the hand feels the tool: no load need be known
     )
     tight = replace(scenario, simulation__accuracy=1e-9, simulation__max_step=4e-5)
