@@ -39,7 +39,7 @@ At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
 
 M1. L_m -= f_(k-1) . dx; below zero it is a debt, never written off. While something is touched,
     what the hand pays is sent instead: the slave presses with it. L_m += what came.
-M2. What is touched pushes along one unit wrench n, the mean of w over two round trips and 0.3 s
+M2. What is touched pushes along one unit wrench n, the mean of w over two round trips and 0.8 s
     at least: force and torque together, so that a point that is touched far from So is one spring
     and not two. With w_n = w . n and x_n = n . x, where a torque counts as a force at 0.1 m,
 
@@ -54,7 +54,7 @@ M2. What is touched pushes along one unit wrench n, the mean of w over two round
         h' = -k_h v_m + (w - w_n n - h) / tau,    |h| <= h_m u_n / w_n,
 
     at rest what is measured too; k_h = 2.5 kN/m, h_m is the largest |w - w_n n| of about a second,
-    tau six round trips, but 0.6 s at least.
+    tau ten round trips, but 0.6 s at least.
 M3. The wall is remembered, so that fast taps are felt: while nothing else is heard,
     u_n = -k_c (x_m - x_w)_n. It is dropped when the slave was so deep in it that it should
     have met 1 N, 1 to 3 mm, and met nothing: a hard wall that has gone stops the hand before 3 mm.
@@ -142,7 +142,7 @@ _STIFFEST, _SOFTEST = 2500.0, 50.0  # N/m that are predicted with at most; that 
 _LEAD = 2.0  # steps, by which the hand is led: half a step in theory, but velocity is filtered
 _ONSET = 0.3  # s, in which o fades
 _FORGET = 1.0  # s, of the largest friction
-_PATIENCE = 6.0  # round trips, in which friction at the hand goes over to what is measured
+_PATIENCE = 10.0  # round trips, in which friction at the hand goes over to what is measured
 _PREDICTED = 3.0  # N, beyond twice the wrench: more is no prediction
 _REMEMBERED = 10.0  # N, the most that a remembered wall pushes with
 _SAME = 5e-3  # m, between touches of one wall

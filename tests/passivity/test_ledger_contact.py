@@ -86,7 +86,7 @@ def test_friction_is_of_the_hands_own_motion_and_at_rest_what_is_measured():
             felt = hand.step([0.0, sign * 5e-5, 0.0, 0.0, 0.0, 0.0])
         assert felt[1] == pytest.approx(-sign * 0.6, rel=0.3)
         assert felt[2] == pytest.approx(3.0, rel=0.1)
-    np.testing.assert_allclose(hand.rest(4000)[:3], [0.0, -0.6, 3.0], atol=0.01)
+    np.testing.assert_allclose(hand.rest(7000)[:3], [0.0, -0.6, 3.0], atol=0.01)
     hand.packet[POSE][6] = -0.1  # the hand is far out again, before the slave's news are
     np.testing.assert_allclose(hand.rest(400), np.zeros(6), atol=1e-9)
 
