@@ -154,7 +154,11 @@ def over_way(wrench, way):
 def find_direction(wrench, trip, T, memory):
     """The contact's direction, a unit wrench, from its wrench; and what there is along it [N]."""
     pushed, normal = memory[PUSHED], memory[NORMAL]
-    rate = 1.0 if memory[TOUCHED] == 0.0 else min(T / max(_DIRECTION, 2.0 * trip), 1.0)
+    rate = 1.0
+    if memory[TOUCHED] > 0.0:
+        # What is far more than was there, noise say, is found at once.
+        more = 1.0 - 3.0 * math.sqrt(along(pushed, pushed) / max(along(wrench, wrench), 1e-300))
+        rate = max(min(T / max(_DIRECTION, 2.0 * trip), 1.0), more)
     for i in range(6):
         pushed[i] += rate * (wrench[i] - pushed[i])
     size = max(math.sqrt(along(pushed, pushed)), 1e-12)
