@@ -65,7 +65,8 @@ M6. Drag on the hand until both reserves are full, and on one that was pushed, w
 M7. What L_m has beyond its reserve R_m (in contact R_m + 0.7 R_s) is sent.
 
 Translation and rotation are two groups with a ledger each; what is touched is one for both. Where
-packets were missing the wrench goes over gradually. In a station the mass is that of its arm at the
+packets were missing, or it has changed, the wrench goes over gradually. A wrench against n is
+another contact. In a station the mass is that of its arm at the
 start, see `slave.servo`. It is 54 kg in its heaviest direction and counts as 79 kg, since it may
 turn too: with R_s = 0.1 J it goes no faster than 0.2 m/s. A task at v needs R_s = k_f m v^2 / 2.
 w is the wrench that is sent. With sigma > 0 that is not the contact's alone, and what the account
@@ -95,9 +96,11 @@ from drake_teleop.passivity.ledger_slave import (
     LEVEL,
     LEVER,
     MARGIN,
+    METRIC,
     MODEL,
     NORMAL,
     PASSED,
+    PUSHED,
     RESERVE,
     TOUCH,
     TOUCHED,
@@ -167,8 +170,8 @@ _WALL, _DEPTH = _places.number(), _places.number()
 _RUBBING, _FRICTION = _places.vector(6), _places.vector(2)
 # What the force gave since it last came to rest; share of the wrench that is withheld.
 _GIVEN, _WITHHELD = _places.vector(2), _places.vector(2)
-# The newest packet; whether the wrench still goes over after some were missing; the last wrench,
-# before it was paid for.
+# The newest packet; whether the wrench still goes over, after some were missing or what is touched
+# has changed; the last wrench, before it was paid for.
 _NEWEST, _MISSING, _LAST = _places.number(), _places.vector(2), _places.vector(6)
 
 AT_THE_MOTOR = True  #: the port of its account, see `methods`
@@ -204,6 +207,7 @@ class LedgerConfig:
         p[INITIAL], p[RESERVE], p[HAND_RESERVE] = self.initial, self.reserve, self.hand_reserve
         p[DRAG] = np.divide(self.drag, p[MOTION_SCALE])
         p[TOUCH] = np.divide(self.touch, p[MOTION_SCALE])
+        p[METRIC] = np.square(np.divide(ARM * p[MOTION_SCALE], p[MOTION_SCALE][0]))
 
 
 def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
@@ -265,6 +269,8 @@ def _predict(received, dx, T, p, memory, ahead, wrench):
     shown, normal, inward = received[WRENCH], memory[NORMAL], memory[_INWARD]
     k = min(_OVER * received[CONTACT_STIFFNESS], _STIFFEST)
     if not touches(shown, p):
+        if memory[TOUCHED] > 0.0:
+            memory[_MISSING][:] = 1.0
         memory[TOUCHED] = 0.0
         gone = min(_GONE, max(_EXPECTED / max(memory[_WALL], 1.0), _SURE))
         if memory[_DEPTH] - over_way(inward, ahead) > gone:
@@ -274,11 +280,13 @@ def _predict(received, dx, T, p, memory, ahead, wrench):
             wrench[i] = -inside * inward[i]
         return
     offset, onset = memory[_OFFSET], memory[TOUCHED] == 0.0
-    size = find_direction(shown, received[TRIP], T, memory)
+    if onset or not along(shown, memory[PUSHED], p) > 0.0:
+        memory[_MISSING][:] = 1.0
+    size = find_direction(shown, received[TRIP], T, p, memory)
     damper, speed = received[CONTACT_DAMPING], over_way(normal, received[VELOCITY])
     deep = max(size + damper * speed, 0.0) / max(k, _SOFTEST) - over_way(normal, ahead)
     if onset:
-        same = memory[_WALL] > 0.0 and -along(normal, inward) > _ALIGNED
+        same = memory[_WALL] > 0.0 and -along(normal, inward, p) > _ALIGNED
         near = abs(deep - memory[_DEPTH]) < _SAME
         if same and (near or memory[_DEPTH] < 0.0):
             offset[:] = 0.0
@@ -299,7 +307,7 @@ def _predict(received, dx, T, p, memory, ahead, wrench):
         force = min(max(size - change, 0.0), 2.0 * size + _PREDICTED)
     pressed = min(max(force, 0.0) / max(size, 1e-12), 1.0)
     for g in range(2):
-        _rub(g, T, size, pressed, shown, received, dx, memory)
+        _rub(g, T, size, pressed, shown, received, dx, p, memory)
     for i in range(6):
         wrench[i] = force * normal[i] + memory[_RUBBING][i]
     if k > _SOFTEST:
@@ -309,23 +317,25 @@ def _predict(received, dx, T, p, memory, ahead, wrench):
 
 
 @njit(cache=True)
-def _rub(g, T, size, pressed, shown, received, dx, memory):
+def _rub(g, T, size, pressed, shown, received, dx, p, memory):
     """M2, h: what there is across the contact's direction."""
     normal, rubbing, most = memory[NORMAL], memory[_RUBBING], memory[_FRICTION]
-    spring, way, total = _STIFFEST / ARM[g] ** 2, over_way(normal, dx), 0.0
+    # A torque's share of the metric is 0 where rotation is not passed on.
+    metric, way, total = max(p[METRIC][g], 1e-12), over_way(normal, dx), 0.0
+    spring = _STIFFEST / metric
     share = min(T / max(2.0 * _ONSET, _PATIENCE * received[TRIP]), 1.0)
     for i in range(3 * g, 3 * g + 3):
         part = shown[i] - size * normal[i]
         total += part * part
         rubbing[i] += share * (part - rubbing[i])
-        rubbing[i] -= spring * (dx[i] - way * ARM[g] ** 2 * normal[i])
+        rubbing[i] -= spring * (dx[i] - way * metric * normal[i])
     most[g] = max(most[g] * (1.0 - min(T / _FORGET, 1.0)), math.sqrt(total))
     limit(rubbing, g, pressed * most[g])
 
 
 @njit(cache=True)
 def _approach(g, T, p, memory, wrench):
-    """After missing packets the wrench goes over from the last one, without a blow."""
+    """The wrench goes over from the last one, without a blow."""
     last, missing = memory[_LAST], memory[_MISSING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]

@@ -66,7 +66,8 @@ from drake_teleop.vectors import put
 
 # Of translation and rotation: a length is an angle at an arm of 0.1 m, a force a torque at the
 # lever of 0.01 m that haptic devices have. What is touched is known along one wrench of force and
-# torque together, where a torque counts as a force at the same arm.
+# torque together, where a torque counts as a force at the same arm: at the slave, so in the
+# master's power units it depends on the scales of both.
 ARM, LEVER = (1.0, 10.0), (1.0, 0.01)
 MARGIN = 0.03  #: of the slave's reserve: never spent; more than what a step can cost
 PASSED = 0.7  #: share of the slave's reserve that the hand's end may have in contact
@@ -106,6 +107,7 @@ ECHO = INTEGRAL.stop - 1
 _places = own_parameters()
 INITIAL, RESERVE, HAND_RESERVE = _places.vector(2), _places.vector(2), _places.vector(2)
 DRAG, TOUCH = _places.vector(2), _places.vector(2)
+METRIC = _places.vector(2)  #: of wrenches: what a squared force counts, and a squared torque
 # Memory: filtered velocity; whether something is touched; the servo's model; the motors' pull.
 _places = own_memory()
 VELOCITY_HERE, TOUCHED = _places.vector(6), _places.number()
@@ -139,9 +141,9 @@ def touches(wrench, p):
 
 
 @njit(cache=True)
-def along(a, b):
-    """What there is of the wrench a along the wrench b [N]; of b along itself its size."""
-    return dot(a, b, 0) + ARM[1] * ARM[1] * dot(a, b, 1)
+def along(a, b, p):
+    """What there is of the wrench a along the unit wrench b [N]; of any with itself its square."""
+    return p[METRIC][0] * dot(a, b, 0) + p[METRIC][1] * dot(a, b, 1)
 
 
 @njit(cache=True)
@@ -151,20 +153,24 @@ def over_way(wrench, way):
 
 
 @njit(cache=True)
-def find_direction(wrench, trip, T, memory):
+def find_direction(wrench, trip, T, p, memory):
     """The contact's direction, a unit wrench, from its wrench; and what there is along it [N]."""
     pushed, normal = memory[PUSHED], memory[NORMAL]
     rate = 1.0
     if memory[TOUCHED] > 0.0:
         # What is far more than was there, noise say, is found at once.
-        more = 1.0 - 3.0 * math.sqrt(along(pushed, pushed) / max(along(wrench, wrench), 1e-300))
+        more = 1.0 - 3.0 * math.sqrt(
+            along(pushed, pushed, p) / max(along(wrench, wrench, p), 1e-300)
+        )
         rate = max(min(T / max(_DIRECTION, 2.0 * trip), 1.0), more)
+        if not along(wrench, pushed, p) > 0.0:  # another contact
+            rate = 1.0
     for i in range(6):
         pushed[i] += rate * (wrench[i] - pushed[i])
-    size = max(math.sqrt(along(pushed, pushed)), 1e-12)
+    size = max(math.sqrt(along(pushed, pushed, p)), 1e-12)
     for i in range(6):
         normal[i] = pushed[i] / size
-    return along(wrench, normal)
+    return along(wrench, normal, p)
 
 
 @njit(cache=True)
@@ -260,7 +266,7 @@ def _learn(touched, dx, wrench, T, p, memory):
         memory[TOUCHED] = memory[_SMOOTHED] = 0.0
         return
     normal, k = memory[NORMAL], memory[_STIFFNESS]
-    size = find_direction(wrench, memory[_ROUND_TRIP], T, memory)
+    size = find_direction(wrench, memory[_ROUND_TRIP], T, p, memory)
     most = _shown_at_most(T, p, memory)
     inward, rate = -over_way(normal, dx), min(T / _FILTER, 1.0)
     speed = -over_way(normal, memory[VELOCITY_HERE])
@@ -309,7 +315,7 @@ def _generate(received, heard, T, p, memory, gap):
     feeds = heard and memory[_SILENT] < _NEWS
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
-            gap[i] += yields * over * ARM[g] * ARM[g] * normal[i]
+            gap[i] += yields * over * p[METRIC][g] * normal[i]
         away, most = length(gap, g), _FASTER * ARM[g]
         rate = 1.0 / _FOLLOW
         if away > 0.0:
@@ -317,7 +323,7 @@ def _generate(received, heard, T, p, memory, gap):
         for i in range(3 * g, 3 * g + 3):
             gap[i] *= rate
             if feeds:
-                gap[i] += feed[i] + yields * fast * ARM[g] * ARM[g] * normal[i]
+                gap[i] += feed[i] + yields * fast * p[METRIC][g] * normal[i]
         left = max(memory[LEDGER][g] - MARGIN * p[RESERVE][g], 0.0)
         limit(gap, g, math.sqrt(2.0 * left / (_HEAVY * p[MASS][g])))
         for i in range(3 * g, 3 * g + 3):

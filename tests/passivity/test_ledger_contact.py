@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from drake_teleop.passivity.ledger import LedgerConfig
-from drake_teleop.passivity.ledger_slave import CONTACT_STIFFNESS, TRIP
+from drake_teleop.passivity.ledger_slave import (
+    CONTACT_STIFFNESS,
+    NORMAL,
+    TOUCHED,
+    TRIP,
+    along,
+    find_direction,
+)
 from drake_teleop.passivity.memory import LEDGER, LIMIT
 from drake_teleop.passivity.methods import (
     METHODS,
@@ -122,3 +129,21 @@ def test_friction_that_changes_its_sign_does_not_soften_the_wall():
         slave_step(METHOD, received, True, pose, dx / T, dx, wrench, T, p, memory, command, packet)
         before[:] = pose
     assert 180.0 < packet[CONTACT_STIFFNESS] < 350.0, "too stiff is stable, too soft is not"
+
+
+def test_a_contact_is_the_same_whatever_the_scales_are_and_one_against_it_is_another():
+    """At the slave 18 N at a lever of 40 mm, in the master's power units at three scales."""
+    config = PassivityConfig(method="ledger")
+    contact = np.array([0.0, 0.0, 18.0, 0.0, 0.7, 0.0])
+    sizes = []
+    for motion in ((1.0, 1.0), (1.0, 0.1), (0.5, 1.5)):
+        p = parameters(config, motion_scale=motion)
+        memory = initial_memory("ledger", p, START)
+        wrench = contact / 17.5 / np.repeat(motion, 3)
+        size = find_direction(wrench, 0.01, 1e-3, p, memory)
+        sizes.append(size * motion[0])
+        memory[TOUCHED] = 1.0
+        turned = wrench * np.repeat([-1.0, 0.5], 3)
+        assert find_direction(turned, 0.01, 1e-3, p, memory) > 0.9 * size
+        assert along(memory[NORMAL], wrench, p) < 0.0
+    np.testing.assert_allclose(sizes, np.hypot(18.0, 7.0) / 17.5, rtol=1e-12)
