@@ -210,6 +210,8 @@ def tested(
     """The record of each mutant, from the file of records or new."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends the forks too, see below
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    # Byte code goes by whole seconds and length: what is changed and changed back would be old.
+    os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
     for library in _LIBRARIES.split():
         import_module(library)
     tree, path = folder / "tree", folder / "records.jsonl"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -16,10 +15,6 @@ from sockets import open_to_others
 # One thread of BLAS in each process: the matrices are small, and threads that wait for a core which
 # another worker has take longer than the work. numpy is not imported yet, so it will see this.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-# To rewrite the asserts of all tests takes each worker 5 s. What comes of it is kept beside the
-# compiled code in `__pycache__`, even where Python is told to write nothing there.
-sys.dont_write_bytecode = False
 
 # Tests are never timed (the first call of a compiled function takes seconds) and the same on
 # every machine and day.
