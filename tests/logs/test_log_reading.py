@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 import yaml
 from known_motion import GRAVITY_W, Motion, motion_at, quaternions
+from scipy.spatial.transform import Rotation
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.read.alignment import low_pass
@@ -348,6 +349,7 @@ def test_static_poses_from_gravity_or_orientation(tmp_path: Path) -> None:
         f_W=wrench_W,
         tau=0 * gravity,
         g=gravity,
+        s=-gravity,
         in_g=gravity / np.linalg.norm(GRAVITY_W) + bias,
         R=motion.R_WS,
     )
@@ -355,6 +357,7 @@ def test_static_poses_from_gravity_or_orientation(tmp_path: Path) -> None:
     for force, extra in (
         ("f", {"gravity": {"columns": ["g"]}}),
         ("f", {"gravity": {"columns": ["in_g"], "unit": "g", "bias": bias}}),
+        ("f", {"specific_force": {"columns": ["s"]}}),
         ("f", {"orientation": orientation}),
         ("f_W", {"orientation": orientation, "frame": "base"}),
     ):
@@ -366,6 +369,46 @@ def test_static_poses_from_gravity_or_orientation(tmp_path: Path) -> None:
         np.testing.assert_allclose(log.specific_force, -gravity, atol=1e-9)
         np.testing.assert_allclose(log.wrench[:, :3], -2 * gravity, atol=1e-9)
         assert not log.angular_velocity.any() and not log.angular_acceleration.any()
+
+
+@pytest.mark.parametrize("columns", [["s"], ["q"], ["s", "omega"], ["q", "p"]])
+@pytest.mark.parametrize("rate", [None, 1.0, 0.2])
+@pytest.mark.parametrize("rows_a_pose", [1, 4])
+def test_a_canonical_table_of_poses_at_rest(
+    tmp_path: Path, columns: list[str], rate: float | None, rows_a_pose: int
+) -> None:
+    R_WS = Rotation.random(12, np.random.default_rng(2)).as_matrix().repeat(rows_a_pose, axis=0)
+    g_S = GRAVITY_W @ R_WS
+    rest = np.zeros_like(g_S)
+    groups = {
+        "s": (SPECIFIC_FORCE, -g_S),
+        "omega": (ANGULAR_VELOCITY, rest),
+        "q": (ORIENTATION, quaternions(R_WS)),
+        "p": (POSITION, rest),
+    }
+    values = dict(zip(WRENCH, np.hstack([-2 * g_S, rest]).T, strict=True))
+    for group in columns:
+        values |= dict(zip(groups[group][0], groups[group][1].T, strict=True))
+    if rate is not None:
+        values["t"] = np.arange(len(g_S)) / rate
+    pl.DataFrame(values).write_csv(tmp_path / "log.csv")
+    log = read_log(tmp_path / "log.csv")
+    assert log.static and log.notes == ("each row is taken for a pose at rest",)
+    assert log.gravity is not None
+    np.testing.assert_allclose(log.gravity, g_S, atol=1e-9)
+    np.testing.assert_allclose(log.wrench[:, :3], -2 * g_S, atol=1e-9)
+
+
+def test_a_moving_log_in_ms_is_no_table_of_poses(tmp_path: Path) -> None:
+    for columns in (("s", "omega"), ("q", "p")):
+        frame = canonical(*columns).with_columns(t=1e3 * pl.col("t"))
+        frame.write_csv(tmp_path / "log.csv")
+        with pytest.raises(DrakeTeleopError, match=r"probably `unit: ms`; if each row is a pose"):
+            read_log(tmp_path / "log.csv")
+    # Without a clock, but moving.
+    canonical("s", "omega").drop("t").write_csv(tmp_path / "log.csv")
+    with pytest.raises(DrakeTeleopError, match=r"no column 't'"):
+        read_log(tmp_path / "log.csv")
 
 
 @pytest.mark.parametrize("kind", ["wrench", "static"])

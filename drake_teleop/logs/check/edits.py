@@ -18,7 +18,10 @@ from drake_teleop.logs.read.rotations import right_angled_rotations
 def _gravity_field(description: Description) -> str | None:
     if description.imu is not None and description.imu.specific_force is not None:
         return "imu.specific_force"
-    return "static.gravity" if description.static and description.static.gravity else None
+    for field in ("gravity", "specific_force"):
+        if getattr(description.static, field, None) is not None:
+            return f"static.{field}"
+    return None
 
 
 def unit_findings(description: Description, log: Log) -> Iterator[Finding]:

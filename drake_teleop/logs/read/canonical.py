@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.read.clocks import SLOWEST
 from drake_teleop.logs.read.description import (
     Acceleration,
     AngularAcceleration,
@@ -22,10 +23,12 @@ from drake_teleop.logs.read.description import (
     Orientation,
     Pose,
     Position,
+    Static,
     Time,
     Torque,
     Wrench,
 )
+from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.logs.read.tables import Table
 from drake_teleop.writing import write_table
 
@@ -35,6 +38,8 @@ ANGULAR_VELOCITY = ("omega_x", "omega_y", "omega_z")
 ANGULAR_ACCELERATION = ("alpha_x", "alpha_y", "alpha_z")
 ORIENTATION = ("q_w", "q_x", "q_y", "q_z")
 POSITION = ("p_x", "p_y", "p_z")
+_REST = 0.05  # rad/s
+_TURN = np.radians(10.0)
 _ARRAYS = (
     "t",
     "wrench",
@@ -163,6 +168,9 @@ def write_log(log: Log, path: str | Path) -> None:
 def describe_canonical(path: Path, table: Table) -> Description:
     """The description of a canonical table, so that there is one way of reading.
 
+    Rows at rest are understood as static poses: those without `t`, or slower than any log of motion
+    and with gravity in S turned by more than 10 deg from row to row, at least once in five rows.
+
     Args:
         path: the table's file.
         table: what is in it.
@@ -183,9 +191,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
             where=str(path),
             remedy="describe it in a YAML file (docs/logs.md); `drake-teleop inspect` drafts one",
         )
-    table.raw("t", str(path))
     table.numbers(WRENCH, 6, str(path))
-    time = Time(column="t")
     s, omega, alpha, q, p = (
         present(names)
         for names in (
@@ -196,6 +202,12 @@ def describe_canonical(path: Path, table: Table) -> Description:
             POSITION,
         )
     )
+    force, torque = Force(columns=WRENCH[:3]), Torque(columns=WRENCH[3:])
+    orientation = Orientation(columns=ORIENTATION, form="quaternion_wxyz") if q else None
+    specific_force = Acceleration(columns=SPECIFIC_FORCE) if s else None
+    if _at_rest(table, s, omega, q):
+        kinematics = {"orientation": orientation} if q else {"specific_force": specific_force}
+        return Description(static=Static(file=path, force=force, torque=torque, **kinematics))
     if not q and not (s and omega):
         missing = "s_x s_y s_z" if not s else "omega_x omega_y omega_z"
         raise DrakeTeleopError(
@@ -203,28 +215,48 @@ def describe_canonical(path: Path, table: Table) -> Description:
             where=str(path),
             remedy="add them, or the pose q_w q_x q_y q_z (and p_x p_y p_z)",
         )
+    table.raw("t", str(path))
+    time = Time(column="t")
     imu = pose = None
     if s or omega:
         imu = Imu(
             file=path,
             time=time,
-            specific_force=Acceleration(columns=SPECIFIC_FORCE) if s else None,
+            specific_force=specific_force,
             angular_velocity=AngularVelocity(columns=ANGULAR_VELOCITY) if omega else None,
             angular_acceleration=AngularAcceleration(columns=ANGULAR_ACCELERATION)
             if alpha
             else None,
         )
-    if q:
+    if orientation is not None:
         pose = Pose(
             file=path,
             time=time,
-            orientation=Orientation(columns=ORIENTATION, form="quaternion_wxyz"),
+            orientation=orientation,
             position=Position(columns=POSITION) if p else None,
         )
-    wrench = Wrench(
-        file=path,
-        time=time,
-        force=Force(columns=WRENCH[:3]),
-        torque=Torque(columns=WRENCH[3:]),
-    )
+    wrench = Wrench(file=path, time=time, force=force, torque=torque)
     return Description(wrench=wrench, imu=imu, pose=pose)
+
+
+def _at_rest(table: Table, s: bool, omega: bool, q: bool) -> bool:
+    """Whether the rows of a canonical table are poses at rest, see `describe_canonical`."""
+    where = str(table.path)
+    if not (s or q):
+        return False
+    if omega:
+        speed = table.numbers(ANGULAR_VELOCITY, 3, where)
+        if np.median(np.linalg.norm(speed, axis=1)) > _REST:
+            return False
+    if "t" not in table.columns:
+        return True
+    steps = np.diff(table.single("t", where))
+    if not len(steps) or not np.median(steps) > 1 / SLOWEST:
+        return False
+    if q:
+        up = rotation_matrices(table.numbers(ORIENTATION, 4, where), "quaternion_wxyz")[:, 2]
+    else:
+        up = table.numbers(SPECIFIC_FORCE, 3, where)
+    up = up / (np.linalg.norm(up, axis=1, keepdims=True) + 1e-300)
+    turned = np.arccos(np.clip((up[1:] * up[:-1]).sum(axis=1), -1.0, 1.0))
+    return bool(np.quantile(turned, 0.8) > _TURN)

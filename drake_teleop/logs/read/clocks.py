@@ -224,10 +224,13 @@ def _check_rate(t: NDArray[np.float64], time: Time, where: str) -> None:
     counts = step / UNITS[time.unit]
     # Rates of a sensor that are most likely: 20 Hz to 10 kHz.
     likely = [unit for unit in ("s", "ms", "us", "ns") if 1e-4 <= counts * UNITS[unit] <= 0.05]
+    remedy = f"probably `unit: {likely[0]}`" if likely else "check the unit, or give time.rate"
+    if step > 1 / SLOWEST:
+        remedy += "; if each row is a pose at rest, describe them as `static:`"
     raise DrakeTeleopError(
         f"the median step of the time stamps is {step:.3g} s, a rate of {1 / step:.3g} Hz",
         where=f"{where}.unit",
-        remedy=f"probably `unit: {likely[0]}`" if likely else "check the unit, or give time.rate",
+        remedy=remedy,
     )
 
 

@@ -302,12 +302,15 @@ class Static(_Stream):
     sign: Literal[1, -1] = 1
     frame: Frame = "sensor"
     gravity: Acceleration | None = Field(default=None, description="g_S in S")
+    specific_force: Acceleration | None = Field(
+        default=None, description="what an accelerometer reads at rest, -g_S, in S"
+    )
     orientation: Orientation | None = None
 
     @model_validator(mode="after")
     def _one_of(self) -> Static:
-        if (self.gravity is None) == (self.orientation is None):
-            raise ValueError("give either gravity (in S) or orientation")
+        if sum(x is not None for x in (self.gravity, self.specific_force, self.orientation)) != 1:
+            raise ValueError("give one of gravity (in S), specific_force (in S), orientation")
         return self
 
 

@@ -78,8 +78,7 @@ def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
     if path.suffix.lower() in FORMATS:
         table = read_table(path)
         description = describe_canonical(path, table)
-        reader = _Reader(description, str(path), bandwidth_hz, {path: table})
-        return reader.log(keep_origin=True)
+        return _Reader(description, str(path), bandwidth_hz, {path: table}).log(keep_origin=True)
     if is_bag(path):
         raise topic_missing(path)
     raise DrakeTeleopError(
@@ -127,6 +126,8 @@ class _Reader:
 
     def log(self, *, keep_origin: bool = False) -> Log:
         if self._description.static is not None:
+            if keep_origin:
+                self._notes.append("each row is taken for a pose at rest")
             return self._static(self._description.static)
         assert self._description.wrench is not None
         if self._description.imu is not None and self._description.imu.automatic:
@@ -272,9 +273,12 @@ class _Reader:
     def _static(self, stream: Static) -> Log:
         table = self._table(stream)
         wrench = self._forces("static", stream, table, table.rows)
+        R_SW = None
         if stream.gravity is not None:
             gravity = self._vectors("static", "gravity", stream.gravity, table, table.rows)
-            R_SW = None
+        elif stream.specific_force is not None:
+            s = self._vectors("static", "specific_force", stream.specific_force, table, table.rows)
+            gravity = -s
         else:
             assert stream.orientation is not None
             R_WS = self._rotations("static", stream.orientation, table, table.rows)
@@ -285,7 +289,7 @@ class _Reader:
                 raise DrakeTeleopError(
                     "base axes cannot be turned to S without an orientation",
                     where=f"{self._source}:static.frame",
-                    remedy="give static.orientation instead of static.gravity",
+                    remedy="give static.orientation instead of gravity or specific_force",
                 )
             wrench = turned_wrench(R_SW, wrench)
         n = len(wrench)
@@ -296,12 +300,10 @@ class _Reader:
                 remedy=f"record at least {MINIMUM_POSES}, better 12, with different orientations",
             )
         rest = np.zeros((n, 3))
-        return Log(
-            *(np.arange(float(n)), wrench, -gravity, rest, rest),
-            gravity=gravity,
-            static=True,
-            source=self._source,
-        )
+        motion = (-gravity, rest, rest)
+        notes = tuple(self._notes)
+        index = np.arange(float(n))
+        return Log(index, wrench, *motion, gravity, True, notes=notes, source=self._source)
 
     def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
         """Strictly increasing times of a stream, and the rows of the table that they belong to."""
