@@ -10,11 +10,14 @@ leaf           it bends further than its model goes
 safe state     an end of the channel has heard nothing for longer than the channel's timeout
 behind         the command that leaves the channel, or a joint, is not within the range of what it
                was asked for within the time that delay and bandwidth explain
+reserve        the command that leaves a `ledger` is behind a hand that is faster than the ledger's
+               reserve pays for
 hunting        the hand, the command that leaves the channel or a joint goes to and fro, while what
                it was asked for does not
 ============== =================================================================================
 
-The first five are said however short they were, the others if they last for longer than 0.2 s.
+The first five are said however short they were, the others if they last for longer than 0.2 s; the
+reserve's in all, because a hand that swings overtakes what is behind it.
 """
 
 from __future__ import annotations
@@ -24,13 +27,15 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.channel.network import longest_delay
+from drake_teleop.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.fault import MEANINGS, Fault
 from drake_teleop.load.sample import LOST
 from drake_teleop.master.phantom import FORCE_LIMIT, WRIST_TORQUE_LIMIT, jacobian_into
 from drake_teleop.pages.style import contact_spans
+from drake_teleop.passivity.ledger import fastest
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario
+from drake_teleop.sides.channel import power_scale, told_of_the_arm
 from drake_teleop.slave.arm import ArmModel
 from drake_teleop.slave.inverse_kinematics import IkStatus
 
@@ -46,6 +51,9 @@ _GAP = 0.05
 _AT_LIMIT = 1 - 1e-9
 # How far behind is behind: command [m], its turn [rad], joint [rad], 3 mm at a reach of 1 m.
 _FAR, _TURNED, _JOINT_FAR = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
+# After so long a ledger's command is where it was told to be [s], if energy is not short.
+_GENERATOR = 0.05
+_DEGREES = 180 / np.pi
 # To and fro by more than this is hunting: hand and command [m], their turn [rad], joint [rad].
 _SWING, _TURN_SWING, _JOINT_SWING = 5e-4, np.deg2rad(0.5), np.deg2rad(0.1)
 NEAR = 0.25
@@ -223,7 +231,7 @@ def _channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str
     by = f"{scenario.passivity.method}, network {scenario.channel.network}"
     for values, least, unit, scale in (
         (far, _FAR, "mm", 1e3),
-        (turned, _TURNED, "degrees", 180 / np.pi),
+        (turned, _TURNED, "degrees", _DEGREES),
     ):
         spans = spans_of(t, values > least, LASTING)
         yield (
@@ -231,8 +239,54 @@ def _channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str
             f" {scale * _largest_in(t, values, spans):.1f} {unit} more than its delay explains,",
             spans,
         )
+    yield from _reserve(result, scenario)
     hunting = _sways(t, sent, received, NEAR + window)
     yield f"the channel ({by}) lets the slave hunt, to and fro", spans_of(t, hunting, LASTING)
+
+
+def _reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
+    """Where `ledger` lets the slave go slower than the hand, for lack of energy."""
+    if scenario.passivity.method != "ledger" or len(result.t) < 2:
+        return
+    t, sent, received = result.t, result["pose_command"], result["pose_received"]
+    config, row = scenario.passivity.ledger, t[1] - t[0]
+    mass = np.array(told_of_the_arm(scenario).slave_mass) * power_scale(scenario)
+    limit = fastest(config, mass)
+    then = t - _ages(t, scenario)
+    window = longest_delay(scenario.channel.lines()[0]) + _GENERATOR
+    for g, per_s, command, actual, least, unit, scale in (
+        (0, "m/s", sent[:, 4:], received[:, 4:], _FAR, "mm", 1e3),
+        (1, "rad/s", _turned(sent, sent), _turned(received, sent), _TURNED, "degrees", _DEGREES),
+    ):
+        asked = np.column_stack([np.interp(then, t, x) for x in command.T])
+        far = behind(t, asked, actual, _GENERATOR)
+        way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
+        speed = _largest_of_last(way[:, np.newaxis], round(window / row) + 1)[:, 0] / row
+        held = (then >= t[0]) & (speed > limit[g]) & (far > least)
+        if held.sum() * row < LASTING:
+            continue
+        enough = np.array(config.reserve)
+        enough[g] *= (speed[held].max() / limit[g]) ** 2
+        yield (
+            f"the ledger's reserve lets the slave go at {limit[g]:.2g} {per_s}, and the hand wants"
+            f" up to {speed[held].max():.2g}: {100 * held.mean():.0f} % of the time the slave's"
+            f" command is up to {scale * far[held].max():.1f} {unit} from what it was told (move"
+            f" more slowly, or declare the energy: passivity.ledger.reserve {_listed(enough)} and"
+            f" initial {_listed(enough + config.hand_reserve)}),",
+            spans_of(t, held),
+        )
+
+
+def _ages(t: Array, scenario: Scenario) -> Array:
+    """(N,) how old the newest packet was at the slave's end, for this network is the run's [s]."""
+    period = 1.0 / scenario.rates.hand_hz
+    step = np.rint((t + scenario.simulation.settle) / period).astype(int)
+    line, seed = scenario.channel.lines()[0], scenario.simulation.seed
+    return (step - newest_packets(line, seed, FORWARD, step[-1] + 1, period)[step]) * period
+
+
+def _listed(values: Array) -> str:
+    return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
 def _joints(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:

@@ -22,7 +22,7 @@ def test_its_scenarios_load(tmp_path):
         path.write_text(block)
         scenario = LoadScenario(str(path))
         scenario.check()
-        assert scenario.passivity.method == "two_layer"
+        assert scenario.passivity.method == "ledger"
         assert scenario.channel.lines()[0].delay == 0.05
 
 

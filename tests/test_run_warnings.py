@@ -10,6 +10,7 @@ from drake_teleop.channel.network import NetworkConfig, longest_delay
 from drake_teleop.identification import slave_arm
 from drake_teleop.master.phantom import FORCE_LIMIT, HOME, WRIST_TORQUE_LIMIT, jacobian_into
 from drake_teleop.operator.operator import MinimumJerk, OperatorConfig
+from drake_teleop.passivity.ledger import LedgerConfig
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.result import SimulationResult
 from drake_teleop.run_warnings import behind, hunts, run_warnings, spans_of, turns
@@ -117,6 +118,29 @@ def test_what_is_over_soon_or_small_is_not_said(name, change):
 
 def test_a_run_that_went_well_has_no_warnings():
     assert run_warnings(recorded(), OVER_NETWORK, ARM) == []
+
+
+def test_a_ledger_says_that_its_reserve_holds_the_slave_back_and_what_would_pay():
+    """The hand moves at 0.164 m/s at most; 0.02 J let the slave go at 0.091 m/s."""
+    scenario = replace(
+        Scenario(),
+        channel=Channel(delay=LATE),
+        passivity=PassivityConfig(method="ledger", ledger=LedgerConfig(reserve=[0.02, 0.01])),
+    )
+    assert run_warnings(recorded(), scenario, ARM) == []
+    held = np.clip(0.0904 * (T - 0.7 - LATE), 0.0, 0.07) - 0.07 * smooth(T - LATE)
+    slower = {"pose_received": (6, -held)}
+    found = [x for x in run_warnings(recorded(**slower), scenario, ARM) if "reserve" in x]
+    (warning,) = found
+    assert warning.startswith("the ledger's reserve lets the slave go at 0.091 m/s, and the hand")
+    assert "wants up to 0.16: " in warning
+    # What it was told within the last 50 ms is no further away than this.
+    far = float(warning.split("command is up to ")[1].split(" mm")[0])
+    assert 0.0 < 1e3 * np.abs(held).max() - far < 50 * 0.164
+    # (0.164 / 0.0905)^2 of it; the hand's reserve of 0.02 J comes to what is there at the start.
+    assert "passivity.ledger.reserve [0.066, 0.01] and initial [0.086, 0.011]" in warning
+    quiet = replace(scenario, passivity__ledger=LedgerConfig())
+    assert not any("reserve" in x for x in run_warnings(recorded(**slower), quiet, ARM))
 
 
 def test_a_wrist_motor_at_its_limit_is_found_with_the_axes_of_the_device():

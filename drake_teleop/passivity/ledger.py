@@ -92,6 +92,7 @@ from drake_teleop.passivity.ledger_slave import (
     DRAG,
     ECHO,
     HAND_RESERVE,
+    HEAVY,
     INITIAL,
     LEVEL,
     LEVER,
@@ -214,6 +215,17 @@ def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
     """Half of the initial energy for each end; the servo's model rests where the slave does."""
     memory[LEDGER] = p[INITIAL] / 2.0
     memory[MODEL] = memory[COMMAND_POSE]
+
+
+def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2,) what full reserves let the slave go at most, as S4 says [m/s, rad/s].
+
+    Args:
+        config: with the reserves, which grow with the square of the speed.
+        mass: (2,) of the slave, in the master's power units [kg, kg m^2].
+    """
+    left = (1.0 - MARGIN) * np.asarray(config.reserve)
+    return np.sqrt(2.0 * left / (HEAVY * mass))
 
 
 @njit(cache=True)

@@ -74,7 +74,7 @@ PASSED = 0.7  #: share of the slave's reserve that the hand's end may have in co
 
 # What servo and mass are taken for, over what was configured: so errors of 20 % brake, and do not
 # push.
-_STIFF, _DAMPED, _HEAVY = 1.15, 0.9, 1.05
+_STIFF, _DAMPED, HEAVY = 1.15, 0.9, 1.05
 _CAPACITY = 4.0  # of the reserve: what is above is lost, or limit cycles would live on it
 _FILTER = 3e-3  # s, of velocity, wrench and way: encoders have steps
 _CALM, _CALM_RATE, _RATE = 0.05, 5.0, 50.0  # m/s, at rest; 1/s in which surplus goes, there and not
@@ -230,7 +230,7 @@ def _account_of_slave(g, received, heard, touched, twist, dx, wrench, T, p, memo
     ledger[g] += work
     paid[g] = (paid[g] + work if touched else 0.0) + more
     speed = length(twist, g)
-    moving = 0.5 * _HEAVY * p[MASS][g] * speed * speed
+    moving = 0.5 * HEAVY * p[MASS][g] * speed * speed
     # At rest in contact energy is needed to push the hand back, else for speed.
     keep, hold, rate = reserve, p[HAND_RESERVE][g], _RATE
     if touched and speed < _CALM * ARM[g]:
@@ -325,7 +325,7 @@ def _generate(received, heard, T, p, memory, gap):
             if feeds:
                 gap[i] += feed[i] + yields * fast * p[METRIC][g] * normal[i]
         left = max(memory[LEDGER][g] - MARGIN * p[RESERVE][g], 0.0)
-        limit(gap, g, math.sqrt(2.0 * left / (_HEAVY * p[MASS][g])))
+        limit(gap, g, math.sqrt(2.0 * left / (HEAVY * p[MASS][g])))
         for i in range(3 * g, 3 * g + 3):
             gap[i] -= going[i]
         limit(gap, g, most * T)
@@ -362,7 +362,7 @@ def _clamp(command, pose, twist, p, memory):
 def _hold_back(g, damping, twist, p, memory):
     """Shortens the motors' pull to what is paid for, or brakes; whether it did."""
     pull, velocity, held = memory[_PULL], memory[VELOCITY_HERE], memory[HELD]
-    size, speed, mass = length(pull, g), length(twist, g), _HEAVY * p[MASS][g]
+    size, speed, mass = length(pull, g), length(twist, g), HEAVY * p[MASS][g]
     still = length(velocity, g) < _STILL * ARM[g]
     margin, account, changed = MARGIN * p[RESERVE][g], memory[_ACCOUNT][g], False
     pushing = dot(pull, twist, g) > 0.0 or dot(pull, velocity, g) > 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import PassThrough
@@ -15,6 +16,8 @@ from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sides.ports import export
 from drake_teleop.slave.plant import R_WS_HOME, NominalSlave, home_position
 from drake_teleop.slave.servo import servo_at_tool
+
+Array = NDArray[np.float64]
 
 
 def MakeChannel(scenario: Scenario) -> Diagram:
@@ -54,7 +57,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            _told_of_the_arm(scenario),
+            told_of_the_arm(scenario),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
             scenario.force_scaling.force_scale,
@@ -79,8 +82,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _told_of_the_arm(scenario: Scenario) -> PassivityConfig:
-    """The method's parameters; `ledger`, whose promise rests on the mass, is told the arm's."""
+def told_of_the_arm(scenario: Scenario) -> PassivityConfig:
+    """A scenario's method; `ledger`, whose promise rests on the mass, is told the arm's."""
     passivity = scenario.passivity
     if passivity.method != "ledger" or passivity.slave_mass is not None:
         return passivity
@@ -93,3 +96,13 @@ def _told_of_the_arm(scenario: Scenario) -> PassivityConfig:
         servo_damping=servo.damping,
         slave_mass=servo.mass,
     )
+
+
+def power_scale(scenario: Scenario) -> Array:
+    """(2,) the master's power units over the slave's, of translation and rotation.
+
+    Where motion is scaled to zero there is no energy, and any unit will do.
+    """
+    scaling = scenario.kinematic_scaling
+    scales = np.array([scaling.translation_scale, scaling.rotation_scale])
+    return scenario.force_scaling.force_scale / np.where(scales > 0.0, scales, 1.0)
