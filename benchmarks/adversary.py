@@ -17,7 +17,8 @@ long the hand or the slave goes on to reverse, by more than 0.5 mm, when nothing
 The same seed gives the same figures. The worst cases have names: 17 is the case drawn 17th,
 17.4.29 what the 4th and then the 29th change make of it. `--replay 17.4.29 --method M` runs it
 again and says all about it. `--known` runs a few cases of simple description instead, `--imperfect`
-has a servo that is not as the method believes, a slow motor, coarse encoders and noise.
+has a servo and a mass that are not as the method believes, a slow motor, coarse encoders and noise.
+`--drag` lets `ledger` begin with nothing, E_0 = 0: drag on the hand has to earn its reserves.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ from drake_teleop.comparison.one_dof import (
     operators_intent,
     run_one_dof,
 )
+from drake_teleop.passivity.ledger import LedgerConfig
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
 
 CHARGED = 1.5  # s; later, the least energy is no longer that of the start
@@ -63,10 +65,23 @@ SWING = 0.5e-3  # m, a reversal that counts
 
 @dataclass(frozen=True)
 class Options:
-    """What holds for all runs: the seed of the drawing, and whether the station is imperfect."""
+    """What holds for all runs.
+
+    Args:
+        seed: of the drawing.
+        imperfect: whether the station is.
+        drag: whether `ledger` begins with nothing.
+    """
 
     seed: int = 0
     imperfect: bool = False
+    drag: bool = False
+
+    def told(self, method: str) -> PassivityConfig:
+        """The method with its parameters."""
+        if method == "ledger" and self.drag:
+            return PassivityConfig(method=method, ledger=LedgerConfig(initial=[0.0, 0.0]))
+        return PassivityConfig(method=method)
 
 
 @dataclass
@@ -138,8 +153,7 @@ def _cycling(x: list[float]) -> int:
 def run_case(method: str, path: tuple[int, ...], options: Options) -> Figures:
     """The figures of one case."""
     case = case_of(path, options.seed)
-    passivity = PassivityConfig(method=method)
-    run = run_one_dof(passivity=passivity, **prepared(case, options.imperfect))
+    run = run_one_dof(passivity=options.told(method), **prepared(case, options.imperfect))
     return measured(run, case)
 
 
@@ -150,7 +164,7 @@ def _drawn(job: tuple[tuple[str, ...], range, Options]) -> list[list[Figures]]:
     for index in cases:
         case = case_of((index,), options.seed)
         arguments = prepared(case, options.imperfect)
-        runs = (run_one_dof(passivity=PassivityConfig(method=name), **arguments) for name in names)
+        runs = (run_one_dof(passivity=options.told(name), **arguments) for name in names)
         found.append([measured(run, case) for run in runs])
     return found
 
@@ -304,11 +318,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the drawing")
     parser.add_argument("--method", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--imperfect", action="store_true", help="servo, motor and sensors")
+    parser.add_argument("--drag", action="store_true", help="ledger begins with nothing")
     parser.add_argument("--known", action="store_true", help="cases of simple description instead")
     parser.add_argument("--replay", metavar="CASE", help="one case by its name, such as 17.4.29")
     parser.add_argument("--json", metavar="FILE", help="writes the figures there")
     asked = parser.parse_args(arguments)
-    names, options = tuple(asked.method), Options(asked.seed, asked.imperfect)
+    names, options = tuple(asked.method), Options(asked.seed, asked.imperfect, asked.drag)
     figures: dict[str, Any]
     broken: list[str] = []
     began = time.monotonic()

@@ -4,9 +4,10 @@ Bare plant: arm and tool under a constant torque, nothing around them, in steps 
 second-order Runge-Kutta method. All run interleaved in this process; times are thread CPU time, so
 a busy machine matters little. "contact" is the mean over the whole of the shipped scenario, in
 which the tool bounces on the leaf; "pressed" never leaves it. "in_slot" is the tool as a peg that
-slides down into the slot and stands there, with up to four contacts at once.
+slides down into the slot and stands there, with up to four contacts at once. What `ledger` costs is
+over the same station with the method `none`, both over the network `lan`.
 
-    python benchmarks/station.py [--json FILE]
+    python benchmarks/station.py [--ledger] [--json FILE]
 """
 
 from __future__ import annotations
@@ -15,13 +16,17 @@ import argparse
 import json
 import multiprocessing
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
+from drake_teleop.channel.channel import Channel
 from drake_teleop.operator.operator import MinimumJerk
+from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.reproduction.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import advance, simulate
@@ -34,22 +39,34 @@ _TOGETHER = 12.0  # simulated seconds, long enough for two processes to start at
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--ledger", action="store_true", help="only what ledger costs")
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
     free, contact = LoadScenario("free_motion_force"), LoadScenario("contact_transition")
+    if arguments.ledger:
+        finish(ledger_over_none(free, contact.simulation.duration), arguments.json)
+        return
     slot = replace(LoadScenario("peg_in_slot"), simulation__settle=1.1, simulation__duration=0.8)
     figures = (
-        costs(free, contact, slot) | rates(free) | {"two_processes_throughput": two_processes()}
+        costs(free, contact, slot)
+        | ledger_over_none(free, contact.simulation.duration)
+        | rates(free)
+        | {"two_processes_throughput": two_processes()}
     )
     for name, scenario in (("free_motion", free), ("contact", contact), ("in_slot", slot)):
         figures[f"{name}_wrench_against_reaction_port_n"] = against_the_port(scenario)
         figures[f"{name}_wrench_against_tight_run_n"] = against_a_tight_run(scenario)
     old = {"simulation__integrator": "runge_kutta2", "simulation__max_step": 1.25e-4}
     figures["contact_wrench_with_runge_kutta2_125_us_n"] = against_a_tight_run(contact, **old)
+    finish(figures, arguments.json)
+
+
+def finish(figures: dict[str, float], file: Path | None) -> None:
+    """Prints the figures, and writes them if they are wanted."""
     for name, figure in figures.items():
         print(f"{name:50s} {figure:10.4g}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+    if file:
+        file.write_text(json.dumps(figures, indent=2) + "\n")
 
 
 def pressed(contact: Scenario) -> Scenario:
@@ -70,19 +87,41 @@ def costs(free: Scenario, contact: Scenario, slot: Scenario) -> dict[str, float]
         "in_slot": slot,
         "free_motion_joint_control_10_khz": replace(free, rates__joint_control_hz=10000.0),
     }
-    best = {name: np.full(_PIECES, np.inf) for name in (*scenarios, "bare")}
-    for _ in range(_REPEATS):
-        simulators = {name: MakeMovingStation(s) for name, s in scenarios.items()}
-        simulators["bare"] = MakeBarePlant(free)
-        for piece in range(_PIECES):
-            for name, simulator in simulators.items():
-                spent = _cpu(simulator, contact.simulation.duration / _PIECES)
-                best[name][piece] = min(best[name][piece], spent)
-    whole = {name: pieces.sum() / contact.simulation.duration for name, pieces in best.items()}
+    makes = {name: partial(MakeMovingStation, s) for name, s in scenarios.items()}
+    whole = fastest(makes | {"bare": partial(MakeBarePlant, free)}, contact.simulation.duration)
     figures = {"bare_us_per_step": whole["bare"] / free.rates.sensor_hz * 1e6}
     for name in scenarios:
         figures[f"{name}_over_bare"] = whole[name] / whole["bare"]
     return figures
+
+
+def ledger_over_none(free: Scenario, duration: float) -> dict[str, float]:
+    """CPU time with `ledger` over that with `none`, in free motion on the same network.
+
+    In contact both move otherwise: with `none` the tool slides to and fro on the leaf, with `ledger`
+    it rests there, and friction that sticks takes the integrator three times as many steps.
+    """
+    makes = {
+        method: partial(
+            MakeMovingStation,
+            replace(free, channel=Channel(network="lan"), passivity=PassivityConfig(method=method)),
+        )
+        for method in ("none", "ledger")
+    }
+    whole = fastest(makes, duration)
+    return {"free_motion_ledger_over_none": whole["ledger"] / whole["none"]}
+
+
+def fastest(makes: dict[str, Callable[[], Simulator]], duration: float) -> dict[str, float]:
+    """CPU time of a simulated second, each piece of the motion at its fastest repeat."""
+    best = {name: np.full(_PIECES, np.inf) for name in makes}
+    for _ in range(_REPEATS):
+        simulators = {name: make() for name, make in makes.items()}
+        for piece in range(_PIECES):
+            for name, simulator in simulators.items():
+                spent = _cpu(simulator, duration / _PIECES)
+                best[name][piece] = min(best[name][piece], spent)
+    return {name: pieces.sum() / duration for name, pieces in best.items()}
 
 
 def _cpu(simulator: Simulator, span: float) -> float:

@@ -24,6 +24,7 @@ from drake_teleop.passivity.methods import (
     slave_step,
 )
 from drake_teleop.passivity.packet import (
+    ENERGY,
     HEALTHY,
     PACKET_SIZE,
     SEQUENCE,
@@ -277,3 +278,13 @@ def test_a_tank_that_sends_all_at_once_is_not_overdrawn():
         _exchange(np.zeros(PACKET_SIZE), np.zeros(6), step, p, memory, packet)
         assert np.all(memory[LEDGER] >= 0.0)
         np.testing.assert_allclose(memory[LEDGER] + memory[SENT], full, rtol=1e-12)
+
+
+def test_a_tank_that_was_overdrawn_carries_its_debt():
+    """What comes repays it first; where it was written off, energy came from nothing."""
+    p = parameters(PassivityConfig(method="two_layer"))
+    memory, received = initial_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
+    memory[LEDGER] = -1e-3
+    received[ENERGY] = 4e-4
+    _exchange(received, np.zeros(6), T, p, memory, np.zeros(PACKET_SIZE))
+    np.testing.assert_allclose(memory[LEDGER], -6e-4, rtol=1e-12)
