@@ -98,8 +98,8 @@ def costs(free: Scenario, contact: Scenario, slot: Scenario) -> dict[str, float]
 def ledger_over_none(free: Scenario, duration: float) -> dict[str, float]:
     """CPU time with `ledger` over that with `none`, in free motion on the same network.
 
-    In contact both move otherwise: on the leaf the tool slides to and fro with `none` and rests with
-    `ledger`, and friction that sticks takes the integrator three times as many steps.
+    In contact both move otherwise: on the leaf the tool slides to and fro with `none`, with
+    `ledger` it rests, and friction that sticks takes the integrator three times as many steps.
     """
     makes = {
         method: partial(
