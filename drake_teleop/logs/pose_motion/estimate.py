@@ -1,0 +1,316 @@
+"""The load, the delay and the pose's frame from a wrench and poses: the whole estimate.
+
+1. Splines with knots of a middle distance; a first delay; stretches in which something else acts.
+2. Distance of the knots and delay by the wrench (`saturated`), then splines of all poses.
+3. What the saturated model says (`read_off`), and a rigid load twice: with the frame as described,
+   and with the transform between pose and sensor free (`rigid`).
+
+A record longer than `SEARCHED` is searched in its liveliest part only, and fitted as a whole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array, checked
+from drake_teleop.logs.pose_motion.noise import noise_moments
+from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
+from drake_teleop.logs.pose_motion.rejection import disturbed
+from drake_teleop.logs.pose_motion.rigid import (
+    LEVER,
+    LOAD,
+    PARAMETERS,
+    TURN,
+    RigidFit,
+    State,
+    fit_rigid,
+)
+from drake_teleop.logs.pose_motion.saturated import (
+    REACH,
+    Spectra,
+    best_spacing,
+    first_guess,
+    spectra_of,
+)
+from drake_teleop.logs.pose_motion.spectra import TOP, Grid, end_taper, without
+from drake_teleop.logs.pose_motion.splines import Poses, PoseSplines
+from drake_teleop.logs.read.alignment import widened
+from drake_teleop.vectors import cross_matrix
+
+SEARCHED = 120.0
+"""Longer records are searched in a part of this length [s]."""
+SHIFT, SHIFT_KNOWN = 0.01, 0.02
+"""A lever arm is told from 10 mm on, and known if its deviation is below 20 mm [m]."""
+TURNED_DEG, TURN_KNOWN_DEG = 5.0, 1.0
+"""The same of a turn [deg]."""
+_WALD, _DEVIATIONS = 50.0, 5.0
+_SHARE_OF_RATE = 0.45
+# Gaps of the poses that splines cannot bridge, and how far from them accelerations are wrong [s].
+_GAP, _BESIDE = 0.1, 0.4
+_FEWEST = 100
+_NOTHING = 1e-3
+_UNTURNED = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Where the frame P of the poses is, from S, as far as the data tell.
+
+    Attributes:
+        p_SoPo_S: (3,) its origin [m].
+        R_SP: (3, 3) its rotation.
+        position_deviations: (3,) standard deviations [m]; inf where nothing tells.
+        turn_deviations_deg: (3,) of a turn about the axes of S [deg].
+        wald: of the shift and turn from what was described; chi-square of 6 if there are none.
+        shifted: whether the origin is elsewhere than described.
+        turned: whether the axes are.
+    """
+
+    p_SoPo_S: Array
+    R_SP: Array
+    position_deviations: Array
+    turn_deviations_deg: Array
+    wald: float
+    shifted: bool
+    turned: bool
+
+    @property
+    def position_known(self) -> NDArray[np.bool_]:
+        """(3,) whether each coordinate is observable."""
+        return np.asarray(self.position_deviations < SHIFT_KNOWN)
+
+    @property
+    def rotation_known(self) -> NDArray[np.bool_]:
+        """(3,) whether the turn about each axis of S is."""
+        return np.asarray(self.turn_deviations_deg < TURN_KNOWN_DEG)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """What a wrench and poses say.
+
+    Attributes:
+        fit: the load with the frame as described, or as estimated if it was left to the data.
+        delay_s: of the motion behind the wrench [s].
+        delay_deviation: its standard deviation [s].
+        frame: of the poses, from the fit in which it is free.
+        free: that fit.
+        seen: what the saturated model says.
+        spacing: distance of the knots [s].
+        splines: of the poses.
+        t: (M,) about 100 Hz [s].
+        rejected: (M,) where something else acts than the load.
+        note: what a user has to know; mostly empty.
+    """
+
+    fit: RigidFit
+    delay_s: float
+    delay_deviation: float
+    frame: Frame
+    free: RigidFit
+    seen: ReadOff
+    spacing: float
+    splines: PoseSplines
+    t: Array
+    rejected: NDArray[np.bool_]
+    note: str
+
+    @property
+    def theta(self) -> Array:
+        """(16,) [offsets; phi]."""
+        return self.fit.state.theta
+
+    @property
+    def covariance(self) -> Array:
+        """(16, 16) of theta."""
+        return self.fit.covariance[LOAD, LOAD]
+
+
+def estimate_from_poses(
+    t: ArrayLike,
+    wrench: ArrayLike,
+    poses: Poses,
+    gravity_W: ArrayLike,
+    *,
+    p_SoPo_S: ArrayLike | None = (0.0, 0.0, 0.0),
+    R_SP: ArrayLike | None = _UNTURNED,
+    delay: float | None = None,
+    gain: float = 0.0,
+    lost: NDArray[np.bool_] | None = None,
+) -> PoseEstimate:
+    """Load and offsets, delay, and the frame of the poses.
+
+    Args:
+        t: (N,) evenly spaced [s].
+        wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
+        poses: of the frame P, on the same clock but for a delay.
+        gravity_W: (3,) in the world [m/s^2].
+        p_SoPo_S: (3,) where Po is in S [m]; None: the data tell.
+        R_SP: (3, 3) how P is turned; None: the data tell.
+        delay: of the poses behind the wrench, if known [s]; None: found within 0.1 s.
+        gain: standard deviation of the sensor's gains, such as 0.01; it enters the covariance.
+        lost: (N,) samples that do not count, such as bridged gaps.
+
+    Raises:
+        DrakeTeleopError: for arrays of another shape, or if fewer than 100 instants remain.
+    """
+    t = checked("t", t, np.size(t))
+    wrench = checked("wrench", wrench, len(t), 6)
+    gravity = checked("gravity_W", gravity_W, 3)
+    grid, poses = Grid.of(t, wrench), poses.continued()
+    base = _base_taper(grid, poses, lost)
+    if (base > 0.5).sum() < _FEWEST:
+        raise DrakeTeleopError(
+            "wrench and poses have too little in common",
+            remedy="record longer, without interruptions",
+        )
+    top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
+    splines, spectra, taper, rejected, note = _searched(grid, poses, base, gravity, delay, top)
+    zeta = splines.signals(grid.t + spectra.delay, gravity)
+    Z = spectra.moments()
+    Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
+    sizes, best = spectra.of.sizes, spectra.fit()
+
+    def fitted(start: State, free: NDArray[np.bool_]) -> RigidFit:
+        return fit_rigid(Z, Q, sizes, start, free, best.cost, gain=gain)
+
+    seen = read_off(best)
+    start = _start(p_SoPo_S, R_SP, seen)
+    fixed = np.ones(PARAMETERS, bool)
+    fixed[16] = delay is None
+    fixed[LEVER], fixed[TURN] = p_SoPo_S is None, R_SP is None
+    fit = fitted(start, fixed)
+    everything = np.ones(PARAMETERS, bool)
+    everything[16] = delay is None
+    free = fit if (fixed == everything).all() else fitted(_freed(fit, start, seen), everything)
+    return PoseEstimate(
+        fit=fit,
+        delay_s=spectra.delay + fit.state.tau,
+        delay_deviation=float(np.sqrt(fit.covariance[16, 16])),
+        frame=_frame(free, start),
+        free=free,
+        seen=seen,
+        spacing=splines.spacing,
+        splines=splines,
+        t=grid.t,
+        rejected=rejected,
+        note=note,
+    )
+
+
+def _searched(
+    grid: Grid, poses: Poses, base: Array, gravity: Array, delay: float | None, top: float
+) -> tuple[PoseSplines, Spectra, Array, NDArray[np.bool_], str]:
+    """Splines with the knots, and spectra with the delay and taper, that are used."""
+    part = _liveliest(grid)
+    some = replace(grid, t=grid.t[part], wrench=_rows(grid, part))
+    few = _within(poses, some)
+    taper = base[part] * end_taper(some.t, some.t[0], some.t[-1])
+    spacing, late = first_guess(few, some, taper, gravity, delay, top)
+    first = spectra_of(PoseSplines(few, spacing), some, taper, gravity, late, top)
+    clear = without(taper, disturbed(first, some, taper, spacing)[0], grid.dt)
+    spacing, late = best_spacing(few, some, clear, gravity, late, top, known=delay is not None)
+    splines = PoseSplines(poses, spacing)
+    spectra = spectra_of(splines, grid, base, gravity, late, top)
+    rejected, note = disturbed(spectra, grid, base, spacing)
+    taper = without(base, rejected, grid.dt)
+    spectra = spectra_of(splines, grid, taper, gravity, late, top)
+    return splines, spectra, taper, rejected, note
+
+
+def _rows(grid: Grid, part: slice) -> Array:
+    return grid.wrench[part.start * grid.stride : part.stop * grid.stride]
+
+
+def _within(poses: Poses, grid: Grid) -> Poses:
+    inside = (poses.t >= grid.t[0] - 2 * REACH) & (poses.t <= grid.t[-1] + 2 * REACH)
+    return Poses(poses.t[inside], poses.position[inside], poses.quaternion[inside])
+
+
+def _liveliest(grid: Grid) -> slice:
+    """The part of the record in which the wrench changes most."""
+    rows, length = len(grid.t), round(SEARCHED / grid.dt)
+    if rows <= length:
+        return slice(0, rows)
+    starts = range(0, rows - length, length // 2)
+    coarse = grid.wrench[:: grid.stride]
+    varied = [np.var(coarse[k : k + length], axis=0)[:3].sum() for k in starts]
+    first = starts[int(np.argmax(varied))]
+    return slice(first, first + length)
+
+
+def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None) -> Array:
+    """(M,) without the ends, gaps of the poses, and what the caller takes away."""
+    start, stop = max(grid.t[0], poses.t[0]), min(grid.t[-1], poses.t[-1])
+    if stop - start < 1.0:
+        return np.zeros(len(grid.t))
+    taper = end_taper(grid.t, start, stop)
+    bad = np.zeros(len(grid.t), bool)
+    if lost is not None:
+        rows = len(grid.t) * grid.stride
+        bad |= lost[:rows].reshape(-1, grid.stride).any(axis=1)
+    for k in np.flatnonzero(np.diff(poses.t) > _GAP):
+        bad |= (grid.t > poses.t[k] - _BESIDE) & (grid.t < poses.t[k + 1] + _BESIDE)
+    return without(taper, widened(bad, 1), grid.dt)
+
+
+def _start(p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: ReadOff) -> State:
+    R = np.eye(3) if R_SP is None else np.asarray(R_SP, float).T
+    if R_SP is None and seen.usable and not seen.mirrored:
+        R = seen.R_SP.T
+    p = np.zeros(3) if p_SoPo_S is None else np.asarray(p_SoPo_S, float)
+    return State(np.zeros(16), 0.0, -R @ p, R)
+
+
+def _freed(fit: RigidFit, start: State, seen: ReadOff) -> State:
+    """Where to start with the transform free: far from the described one, if the data say so."""
+    turned = seen.usable and not seen.mirrored and np.trace(seen.R_SP @ start.R) < 2.9
+    if not turned:
+        return fit.state
+    R = seen.R_SP.T
+    return State(np.zeros(16), fit.state.tau, R @ start.R.T @ start.r, R)
+
+
+def _frame(free: RigidFit, start: State) -> Frame:
+    R_SP, r = free.state.R.T, free.state.r
+    place = -R_SP @ r
+    covariance = free.covariance[17:, 17:]
+    # p = -R^T r, and R exp(rho x) instead of R makes it p - rho x p.
+    jacobian = np.hstack([-R_SP, cross_matrix(place)])
+    known = np.isfinite(np.diag(covariance))
+    finite = np.where(known[:, None] & known, covariance, 0.0)
+    deviations = np.sqrt(np.diag(jacobian @ finite @ jacobian.T))
+    if not known.all():
+        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _NOTHING
+        deviations = np.where(lost, np.inf, deviations)
+    moved = free.state.r - start.r
+    turned = Rotation.from_matrix(start.R.T @ free.state.R).as_rotvec()
+    change = np.concatenate([moved, turned])[known]
+    wald = float(change @ np.linalg.solve(covariance[np.ix_(known, known)], change))
+    along, about = _along(moved, covariance[:3, :3]), _along(turned, covariance[3:, 3:])
+    shift, angle = np.linalg.norm(moved), np.linalg.norm(turned)
+    limit, sure = np.radians([TURNED_DEG, TURN_KNOWN_DEG])
+    shifted = shift > max(SHIFT, _DEVIATIONS * along) and along < SHIFT_KNOWN
+    tilted = angle > max(limit, _DEVIATIONS * about) and about < sure
+    return Frame(
+        p_SoPo_S=place,
+        R_SP=R_SP,
+        position_deviations=deviations,
+        turn_deviations_deg=np.degrees(np.sqrt(np.diag(covariance)[3:])),
+        wald=wald,
+        shifted=bool(wald > _WALD and shifted),
+        turned=bool(wald > _WALD and tilted),
+    )
+
+
+def _along(x: Array, covariance: Array) -> float:
+    """Standard deviation of the length of x; inf if a part of it is unknown."""
+    if not np.isfinite(np.diag(covariance)).all():
+        return np.inf
+    direction = x / (np.linalg.norm(x) + 1e-300)
+    return float(np.sqrt(direction @ covariance @ direction))

@@ -1,0 +1,98 @@
+"""Stretches of a record in which something else than the load acts: contacts, knocks, saturation.
+
+The saturated model (`saturated`) is fitted sample by sample, below the frequencies at which the
+splines begin to miss the motion (a move that starts with a jerk is no knock), first with Huber's
+weights, then without what is more than 4.5 robust standard deviations away in some channel, until
+the same samples are left, as the robust method of `load.batch.methods` does with a load. It has no
+opinion on frames, units or axes: a wrong description is not taken for a contact. What is left out
+is widened to stretches, and the taper falls to zero beside them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.logs.pose_motion.saturated import ROUNDING, Spectra
+from drake_teleop.logs.pose_motion.spectra import Grid
+from drake_teleop.logs.read.alignment import widened
+
+NOTHING_REJECTED = (
+    "the residual is large where the load moves and small where it rests, so that disturbances"
+    " cannot be told from errors of the motion: no sample was rejected"
+)
+_HUBER, _REJECT, _FITS = 3.0, 4.5, 30
+_NORMAL_MAD = 1.4826
+_MOST_LOSS = 2.0
+_PASSED = 0.3
+_MARGIN = 0.1
+"""On either side of what is rejected, or the knots' distance [s]."""
+
+
+def disturbed(
+    spectra: Spectra, grid: Grid, taper: Array, spacing: float
+) -> tuple[NDArray[np.bool_], str]:
+    """(M,) where something else acts, and what a user has to know of it.
+
+    Nothing is rejected if that would double some standard deviation of the coefficients.
+
+    Args:
+        spectra: of the record with this taper, which knows nothing of disturbances.
+        grid, taper: as in `spectra_of`.
+        spacing: distance of the splines' knots [s].
+    """
+    # Half of the amplitude passes at this share of 1 / h; a Gauss curve does not ring.
+    gain = 0.5 ** ((spectra.of.frequency * spacing / _PASSED) ** 2)
+    x, y = (_in_time(s * gain[:, None], grid) for s in (spectra.signals, spectra.wrench))
+    inside = taper > 0.5
+    size = np.sqrt(np.mean(x**2, axis=0))
+    used = size > 1e-9 * size[0]
+    x = x[:, used] / size[used]
+    weights = inside.astype(float)
+    for _ in range(_FITS):
+        before = weights
+        distances = _distances(x, y, weights, inside)
+        weights = inside * np.minimum(1.0, _HUBER / np.maximum(distances, _HUBER))
+        if np.abs(weights - before).max() < 0.01:
+            break
+    rejected = np.zeros(len(x), bool)
+    for _ in range(_FITS):
+        last, rejected = rejected, _distances(x, y, weights, inside) > _REJECT
+        weights = (inside & ~rejected).astype(float)
+        if (rejected == last).all() or weights.sum() < 2 * x.shape[1]:
+            break
+    if not rejected.any():
+        return rejected, ""
+    rejected = widened(rejected, round(max(_MARGIN, spacing) / grid.dt))
+    if _loss(x, inside, inside & ~rejected) > _MOST_LOSS:
+        return np.zeros(len(x), bool), NOTHING_REJECTED
+    return rejected, ""
+
+
+def _in_time(spectrum: NDArray[np.complex128], grid: Grid) -> Array:
+    """(M, k) of spectra (K, k), what is above them left out."""
+    full = np.zeros((grid.length // 2 + 1, spectrum.shape[1]), np.complex128)
+    full[: len(spectrum)] = spectrum
+    return np.asarray(np.fft.irfft(full, grid.length, axis=0)[: len(grid.t)])
+
+
+def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) -> Array:
+    """(M,) largest residual of a sample's channels over the channel's robust deviation."""
+    weighted = x * weights[:, None]
+    C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
+    residual = np.abs(y - x @ C)
+    scale = _NORMAL_MAD * np.median(residual[inside], axis=0)
+    rms = np.sqrt(np.mean(y**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
+    return np.asarray((residual / np.maximum(scale, ROUNDING * rms + 1e-30)).max(axis=1))
+
+
+def _loss(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
+    """By how much the deviation of some coefficient grows."""
+    if kept.sum() < 2 * x.shape[1]:
+        return np.inf
+    every, some = (
+        np.diag(np.linalg.pinv(x[rows].T @ x[rows], rcond=1e-12, hermitian=True))
+        for rows in (inside, kept)
+    )
+    return float(np.sqrt(np.max(some / every)))

@@ -1,0 +1,339 @@
+"""A rigid load, the delay and the transform between the pose's frame and the sensor's, at once.
+
+The frame P of the poses and S of the sensor are fixed to each other. With R = R_PS, r = p_PoSo_P,
+and A r = alpha x r + omega x (omega x r), the sensor's motion is
+
+    s = R^T (a_P - g_P + A r),   alpha = R^T alpha_P,   omega omega^T = R^T (omega omega^T)_P R,
+
+so that z of `load.batch.moments` is linear in the signals of P, z = M(R, r) y, and moments of y are
+all that is needed: the residual of the wrench is e = L(theta) M(R, r) y. Unknown are theta =
+[offsets; phi] (16), the delay tau, r, and a small turn rho of R. Gauss-Newton with the columns
+
+    de/dtheta_j = -T_j M y,   de/dr_i = L dM/dr_i y,   de/drho_i = L dM/drho_i y,
+    de/dtau = L M dy/dt,
+
+on moments that are compensated for the noise Q of the poses (`noise`), which leaves the errors of
+the wrench alone: errors in variables, band by band. The weights are the inverse of
+
+    R_b = P_b + diag(residual's power - diag P_b, at least 10 % of it),   P_b = L M Q_b (L M)^T,
+
+renewed in every step. The power of a band is that of its numbers less the parameters that they pay
+for. Why r and R can be told: the torque at rest gives m c about So, the force in motion m (r + R c)
+about Po; and f = m R^T s shows R by gravity.
+
+The covariance counts what a stated error of the sensor's gains would do, and is enlarged by what no
+rigid load explains: twice the difference of the log likelihoods to the saturated model is a
+chi-square with as many degrees of freedom as that has more parameters, if the model holds. If it
+is far from it the higher bands, which rest on accelerations, must not decide: one weight for
+all bands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.load.batch.moments import coefficients
+from drake_teleop.logs.pose_motion.saturated import cost_of, least_power
+from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH
+from drake_teleop.logs.pose_motion.splines import SIGNALS
+from drake_teleop.logs.read.rotations import nearest_rotation, rotation_matrices
+from drake_teleop.vectors import cross_matrix
+
+PARAMETERS = 23
+"""[offsets; phi] (16), tau, r (3), rho (3)."""
+LOAD, DELAY, LEVER, TURN = slice(0, 16), slice(16, 17), slice(17, 20), slice(20, 23)
+ARM = 0.06
+"""Length that compares an error of a force's gain with one of a torque's [m]."""
+_STEPS, _CONVERGED = 40, 1e-4
+_RIGID = 4.0
+_LIMITS = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
+_LEAST_SHARE, _LEAST_LEFT = 0.1, 0.25
+_SMALL = 1e-4  # rad, of a numerical derivative
+_RANK = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What is estimated: theta (16), tau [s], r (3) [m], R_PS (3, 3)."""
+
+    theta: Array
+    tau: float
+    r: Array
+    R: Array
+
+
+@dataclass(frozen=True, eq=False)
+class RigidFit:
+    """A fit and how good it is.
+
+    Attributes:
+        state: the estimate; its tau is on top of the delay that the moments were made with.
+        covariance: (23, 23) of [theta, tau, r, rho], rho in the axes of S; inf on the diagonal, 0
+            beside it, of what is undetermined; 0 of what was not free.
+        misfit: twice the log likelihood ratio to the saturated model.
+        degrees: what it would be for a rigid load.
+        one_weight: whether all bands had the same.
+    """
+
+    state: State
+    covariance: Array
+    misfit: float
+    degrees: float
+    one_weight: bool = False
+
+    @property
+    def rigid(self) -> bool:
+        """Whether a rigid load explains the wrench: the misfit is below four times its degrees.
+
+        Of noise alone it would be below 1.8 times; splines that miss a lively motion give twice.
+        """
+        return self.misfit < _RIGID * self.degrees
+
+    @property
+    def inflation(self) -> float:
+        """By which deviations are larger than noise alone makes them."""
+        return float(np.sqrt(max(1.0, self.misfit / self.degrees)))
+
+
+def motion_map(R: Array, r: Array) -> Array:
+    """(19, 22) M with z = M [zeta; F], see the module docstring."""
+    M = np.zeros((19, SIGNALS + 6))
+    M[0, 0] = 1.0
+    M[1:7, SIGNALS:] = np.eye(6)
+    M[7:10, 1:4] = M[7:10, 4:7] = R.T
+    M[7:10, 7:10] = -R.T @ cross_matrix(r)
+    M[7:10, 10:16] = R.T @ _centripetal(r)
+    M[10:13, 7:10] = R.T
+    M[13:19, 10:16] = _turned_products(R)
+    return M
+
+
+def _centripetal(r: Array) -> Array:
+    """(3, 6) with omega x (omega x r) of the products of omega."""
+    x, y, z = r
+    return np.array(
+        [
+            [0.0, -x, -x, y, z, 0.0],
+            [-y, 0.0, -y, x, 0.0, z],
+            [-z, -z, 0.0, 0.0, x, y],
+        ]
+    )
+
+
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def _turned_products(R: Array) -> Array:
+    """(6, 6) products of R^T omega of those of omega."""
+    out = np.empty((6, 6))
+    for row, (i, j) in enumerate(_PAIRS):
+        for column, (k, m) in enumerate(_PAIRS):
+            out[row, column] = R[k, i] * R[m, j] + (k != m) * R[m, i] * R[k, j]
+    return out
+
+
+def fit_rigid(
+    Z: Array,
+    Q: Array,
+    sizes: Array,
+    start: State,
+    free: NDArray[np.bool_],
+    saturated_cost: float,
+    *,
+    gain: float = 0.0,
+) -> RigidFit:
+    """The fit, with one weight for all bands where no rigid load explains the wrench.
+
+    Args:
+        Z: (bands, 38, 38) `spectra.moments`.
+        Q: (bands, 38, 38) `noise.noise_moments`.
+        sizes: (bands,) of the bands.
+        start: where to start; its theta serves for the weights of the first step only.
+        free: (23,) which parameters are estimated.
+        saturated_cost: L of the saturated model on the same moments.
+        gain: standard deviation of each entry of the sensor's matrix of gains, of a torque's as at
+            `ARM`; 0 for an exact sensor.
+    """
+    record = _Record(Z, Q, sizes, free)
+    solution = _solve(record, start)
+    # The saturated model is not compensated: nor must be what is compared with it.
+    plain = _solve(replace(record, Q=np.zeros_like(Q)), solution.state).state
+    misfit = 2.0 * (cost_of(_plain_power(record, plain), sizes) - saturated_cost)
+    fit = RigidFit(solution.state, np.zeros((0, 0)), misfit, 6.0 * SIGNALS - float(free.sum()))
+    if not fit.rigid:
+        solution = _solve(record, solution.state, one_weight=True)
+        fit = replace(fit, state=solution.state, one_weight=True)
+    return replace(fit, covariance=_covariance(record, solution, fit.inflation, gain))
+
+
+@dataclass(frozen=True, eq=False)
+class _Record:
+    """Moments, those of the noise, sizes of the bands, and what is free; as in `fit_rigid`."""
+
+    Z: Array
+    Q: Array
+    sizes: Array
+    free: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """A state, and of the last step columns B (6, 23, 38), weights (bands, 6, 6), the inverse gram
+    (23, 23), the residual's covariance (bands, 6, 6) and (23,) what nothing determines."""
+
+    state: State
+    B: Array
+    W: Array
+    inverse: Array
+    R: Array
+    lost: NDArray[np.bool_]
+
+
+def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solution:
+    """Gauss-Newton."""
+    sizes, clean = record.sizes, record.Z - record.Q
+    shares = np.zeros((len(sizes), 6))
+    for _ in range(_STEPS):
+        R = _residual_covariances(record, state, shares)
+        W: Array = np.linalg.inv(R).astype(np.float64)
+        if one_weight:
+            W[:] = np.linalg.inv(np.einsum("b,bcd->cd", sizes / sizes.sum(), R))
+        B, Le = _columns(state)
+        gram, right = _normal(B, Le, clean, W)
+        inverse, lost = _inverse(gram, record.free)
+        step = inverse @ right
+        size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
+        step *= min(1.0, float(np.min(_LIMITS / np.maximum(np.abs(step), 1e-300))))
+        state = _moved(state, step)
+        shares = _shares(B, record.Z, W, inverse)
+        if np.max(np.abs(step) / size) < _CONVERGED:
+            break
+    R = _residual_covariances(record, state, shares)
+    return _Solution(state, B, W, inverse, R, lost)
+
+
+def _covariance(record: _Record, solution: _Solution, inflation: float, gain: float) -> Array:
+    """(23, 23) by the noise of wrench and poses, and by errors of gains if some are stated.
+
+    Where they are not, the misfit says how much larger the errors are than by noise.
+    """
+    B, W, inverse, lost = solution.B, solution.W, solution.inverse, solution.lost
+    middle = _normal(B, np.zeros((6, WIDTH)), record.Z, W @ solution.R @ W)[0]
+    covariance = 0.5 * inverse @ middle @ inverse
+    larger = covariance * inflation**2
+    if gain:
+        effects = gain * gain_effects(B, record.Z - record.Q, W, inverse)
+        covariance = covariance + effects @ effects.T
+        ratio = np.diag(larger) / np.maximum(np.diag(covariance), 1e-300)
+        scale = np.sqrt(np.maximum(1.0, ratio))
+        larger = covariance * np.outer(scale, scale)
+    larger[lost], larger[:, lost] = 0.0, 0.0
+    larger[lost, lost] = np.inf
+    return larger
+
+
+def _map(state: State) -> Array:
+    """(19, 38) with z = map y, the delay's first order in it."""
+    M = motion_map(state.R, state.r)
+    return np.hstack([M, state.tau * M[:, :SIGNALS]])
+
+
+def _residual_map(state: State) -> Array:
+    """(6, 19) L with e = L z."""
+    L = -np.einsum("cjk,j->ck", coefficients(), state.theta)
+    L[np.arange(6), np.arange(1, 7)] += 1.0
+    return L
+
+
+def _columns(state: State) -> tuple[Array, Array]:
+    """(6, 23, 38) B = -de/dx of the residual e, and (6, 38) of e itself, as functions of y."""
+    L, M = _residual_map(state), _map(state)
+    B = np.zeros((6, PARAMETERS, WIDTH))
+    B[:, LOAD] = coefficients() @ M
+    B[:, DELAY, RATES] = -(L @ M)[:, None, :SIGNALS]
+    for i, unit in enumerate(np.eye(3)):
+        lever = _map(replace(state, r=state.r + unit)) - M
+        ahead, behind = (
+            _map(replace(state, R=_turned(state.R, x * unit))) for x in (_SMALL, -_SMALL)
+        )
+        B[:, 17 + i] = -L @ lever
+        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * _SMALL)
+    return B, L @ M
+
+
+def _normal(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, Array]:
+    """Gram (23, 23) and right-hand side (23,) of a step."""
+    columns = B.reshape(-1, WIDTH)
+    BZ = (columns @ Z).reshape(len(Z), 6, PARAMETERS, WIDTH)
+    WB = np.einsum("bcd,bcjk->dbjk", W, BZ, optimize=True)
+    gram = np.einsum("dbjk,dik->ji", WB, B, optimize=True)
+    return 0.5 * (gram + gram.T), np.einsum("dbjk,dk->j", WB, Le, optimize=True)
+
+
+def _inverse(gram: Array, free: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+    """(23, 23) pseudo-inverse of what is free, and (23,) what nothing determines."""
+    diagonal = np.diag(gram)
+    used = free & (diagonal > 0.0)
+    scale = np.where(used, 1.0 / np.sqrt(np.where(used, diagonal, 1.0)), 0.0)
+    values, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
+    kept = values > _RANK * values[-1]
+    basis = scale[:, None] * vectors[:, kept]
+    null = np.sum(vectors[:, ~kept] ** 2, axis=1) > 1e-6
+    return (basis / values[kept]) @ basis.T, free & (~used | null)
+
+
+def _residual_powers(Z: Array, state: State) -> Array:
+    """(bands, 6, 6) of e, of the moments or of their noise."""
+    Le = _residual_map(state) @ _map(state)
+    return np.asarray(Le @ Z @ Le.T)
+
+
+def _plain_power(record: _Record, state: State) -> Array:
+    """(bands, 6) mean power of the residual."""
+    powers = np.diagonal(_residual_powers(record.Z, state), axis1=1, axis2=2)
+    return np.maximum(powers / record.sizes[:, None], least_power(record.Z, record.sizes))
+
+
+def _residual_covariances(record: _Record, state: State, shares: Array) -> Array:
+    """(bands, 6, 6) R_b of a number, less `shares` (bands, 6) of them that the fit took."""
+    sizes = record.sizes[:, None]
+    left = np.maximum(sizes - 0.5 * shares, _LEAST_LEFT * sizes)
+    power = _plain_power(record, state) * sizes / left
+    P = _residual_powers(record.Q, state) / sizes[:, :, None]
+    own = np.diagonal(P, axis1=1, axis2=2)
+    rest = np.maximum(power - own, _LEAST_SHARE * power)
+    return np.asarray(P + rest[:, :, None] * np.eye(6))
+
+
+def _shares(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
+    """(bands, 6) parameters that each channel of each band pays for."""
+    diagonal = np.diagonal(W, axis1=1, axis2=2)
+    half = np.einsum("cjk,ji->cik", B, inverse)
+    gram = np.einsum("cik,bkm,cim->bc", half, Z, B, optimize=True)
+    return np.asarray(np.clip(gram * diagonal, 0.0, None))
+
+
+def gain_effects(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
+    """(23, 36) what an error of 1 in each of the sensor's gains does, of a torque's as at `ARM`."""
+    BF = (B.reshape(-1, WIDTH) @ Z)[:, :, FORCES].reshape(len(Z), 6, PARAMETERS, 6)
+    right = np.einsum("bcd,bcjk->jdk", W, BF, optimize=True)  # of gain d, k
+    length = np.repeat([1.0, ARM], 3)
+    effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
+    return np.asarray(effect.reshape(PARAMETERS, 36))
+
+
+def _moved(state: State, step: Array) -> State:
+    return State(
+        state.theta + step[LOAD],
+        state.tau + float(step[16]),
+        state.r + step[LEVER],
+        nearest_rotation(_turned(state.R, step[TURN])),
+    )
+
+
+def _turned(R: Array, rho: Array) -> Array:
+    return np.asarray(R @ rotation_matrices(rho[None], "rotation_vector")[0])

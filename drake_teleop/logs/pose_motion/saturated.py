@@ -1,0 +1,229 @@
+"""The wrench as any linear function of the motion: what chooses knots and delay.
+
+The wrench of a rigid load is linear in the 16 signals of `splines`, whatever the frames, units and
+axes of wrench and pose are. So 6 x 16 free coefficients C, F = C zeta, have no hypotheses in them.
+Each channel is fitted with weights of 1 / (power of its residual) in every band, in turn with these
+powers. At the end
+
+    L = sum over channels and bands of n log(power)
+
+is minus the log likelihood but for a constant. The knots' distance h and the delay are where it is
+least. Residuals of the poses would not do: noise that is coloured follows the finest knots, and
+then the accelerations are noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.logs.pose_motion.spectra import (
+    FORCES,
+    Bands,
+    Complex,
+    Grid,
+    bands,
+    moments,
+    shifted,
+    signal_spectrum,
+    wrench_spectrum,
+)
+from drake_teleop.logs.pose_motion.splines import (
+    FEWEST_PER_KNOT,
+    SIGNALS,
+    Poses,
+    PoseSplines,
+)
+
+SPACINGS = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
+"""Distances of the knots that are tried [s]."""
+REACH = 0.1
+"""Delays are looked for so far on either side [s]."""
+ROUNDING = 1e-7
+"""Least noise of a channel, relative to the wrench."""
+_COARSE, _FINEST = 0.016, 1e-5
+_ITERATIONS = 4
+_SEARCH_RATE = 125.0
+_RANK = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Saturated:
+    """The fit of C.
+
+    Attributes:
+        coefficients: (6, 16) C; zero for signals that never change.
+        covariance: (6, 16, 16) of the rows of C.
+        power: (bands, 6) mean power of the residual, of a number of the spectrum.
+        cost: L.
+    """
+
+    coefficients: Array
+    covariance: Array
+    power: Array
+    cost: float
+
+
+def saturated(Z: Array, sizes: Array) -> Saturated:
+    """The fit to moments (bands, 38, 38) of bands of these sizes (bands,)."""
+    zz, zf = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES]
+    ff = np.diagonal(Z[:, FORCES, FORCES], axis1=1, axis2=2)
+    floor = least_power(Z, sizes)
+    scale = 1.0 / np.sqrt(np.diagonal(zz.sum(axis=0)) + 1e-300)
+    scale = np.where(np.diagonal(zz.sum(axis=0)) > 1e-18 * zz[:, 0, 0].sum(), scale, 0.0)
+    zz, zf = zz * np.outer(scale, scale), zf * scale[:, None]
+    power = np.maximum(ff / sizes[:, None], floor)
+    power[:] = power.mean(axis=0)
+    for _ in range(_ITERATIONS):
+        gram = np.einsum("bij,bc->cij", zz, 1.0 / power)
+        right = np.einsum("bic,bc->ci", zf, 1.0 / power)
+        values, vectors = np.linalg.eigh(gram)
+        good = values > _RANK * values[:, -1:]
+        inverse = (vectors * np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)[:, None]) @ (
+            vectors.transpose(0, 2, 1)
+        )
+        C = np.einsum("cij,cj->ci", inverse, right)
+        explained = 2.0 * np.einsum("ci,bic->bc", C, zf) - np.einsum("ci,bij,cj->bc", C, zz, C)
+        power = np.maximum((ff - explained) / sizes[:, None], floor)
+    return Saturated(
+        coefficients=C * scale,
+        covariance=0.5 * inverse * np.outer(scale, scale),
+        power=power,
+        cost=cost_of(power, sizes),
+    )
+
+
+def least_power(Z: Array, sizes: Array) -> Array:
+    """(6,) below which a residual's power is rounding, not noise."""
+    power = np.diagonal(Z[:, FORCES, FORCES].sum(axis=0)) / sizes.sum()
+    both = power.reshape(2, 3).sum(axis=1).repeat(3)
+    return np.maximum(ROUNDING**2 * both, 1e-60)
+
+
+def cost_of(power: Array, sizes: Array) -> float:
+    """L of mean powers (bands, 6)."""
+    return float(sizes @ np.log(power).sum(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Spectra:
+    """Spectra of a record with one taper, splines and delay.
+
+    Attributes:
+        of: the bands.
+        wrench: (K, 6).
+        signals: (K, 16), of P at t + `delay`.
+        delay: [s].
+    """
+
+    of: Bands
+    wrench: Complex
+    signals: Complex
+    delay: float
+
+    def at(self, delay: float) -> Spectra:
+        """The same with the signals moved to another delay, taper and all: for small moves."""
+        late = shifted(self.signals, self.of.frequency, delay - self.delay)
+        return Spectra(self.of, self.wrench, late, delay)
+
+    def moments(self) -> Array:
+        """(bands, 38, 38)"""
+        return moments(self.signals, self.wrench, self.of)
+
+    def fit(self) -> Saturated:
+        Z = moments(self.signals, self.wrench, self.of, rates=False)
+        return saturated(Z, self.of.sizes)
+
+
+def spectra_of(
+    splines: PoseSplines,
+    grid: Grid,
+    taper: Array,
+    gravity_W: Array,
+    delay: float,
+    top: float,
+) -> Spectra:
+    """Of the wrench and the motion `delay` [s] later, up to a frequency [Hz]."""
+    of = bands(grid, taper, top)
+    count = len(of.frequency)
+    zeta = splines.signals(grid.t + delay, gravity_W)
+    return Spectra(
+        of,
+        wrench_spectrum(grid, taper, count),
+        signal_spectrum(grid, taper, zeta, count),
+        delay,
+    )
+
+
+def best_delay(spectra: Spectra, reach: float = REACH) -> tuple[float, float]:
+    """The delay of the least L, within `reach` of the spectra's, and that L.
+
+    Make the spectra anew at the delay that was found, see `Spectra.at`.
+    """
+    step = min(_COARSE, reach / 2)
+    at = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1)
+    costs = np.array([spectra.at(x).fit().cost for x in at])
+    while step > _FINEST:
+        best = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
+        left, middle, right = costs[best - 1 : best + 2]
+        bend = left - 2.0 * middle + right
+        move = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
+        centre = float(at[best] + step * np.clip(move, -1.0, 1.0))
+        step /= 8.0
+        at = centre + step * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+        costs = np.array([spectra.at(x).fit().cost for x in at])
+    best = int(np.argmin(costs))
+    return float(at[best]), float(costs[best])
+
+
+def first_guess(
+    poses: Poses, grid: Grid, taper: Array, gravity_W: Array, delay: float | None, top: float
+) -> tuple[float, float]:
+    """Distance of the knots and delay, of a few distances and within `REACH`, of the least L.
+
+    A delay that is given stays. With knots too fine the motion is noise, and no delay shows.
+    """
+    few = _for_search(poses)
+    found = []
+    for h in _allowed(few)[::2]:
+        spectra = spectra_of(PoseSplines(few, h), grid, taper, gravity_W, delay or 0.0, top)
+        late, cost = best_delay(spectra) if delay is None else (delay, spectra.fit().cost)
+        found.append((cost, h, late))
+    return min(found)[1:]
+
+
+def best_spacing(
+    poses: Poses,
+    grid: Grid,
+    taper: Array,
+    gravity_W: Array,
+    delay: float,
+    top: float,
+    *,
+    known: bool = False,
+) -> tuple[float, float]:
+    """Distance of the knots [s] and delay [s] of the least L, from nearly the right delay.
+
+    Poses faster than 125 Hz are averaged for this. The delay, unless it is known, is found again
+    with the chosen knots.
+    """
+    few = _for_search(poses)
+
+    def spectra(h: float, late: float) -> Spectra:
+        return spectra_of(PoseSplines(few, h), grid, taper, gravity_W, late, top)
+
+    costs = {h: spectra(h, delay).fit().cost for h in _allowed(few)}
+    best = min(costs, key=lambda h: costs[h])
+    if not known:
+        delay, _ = best_delay(spectra(best, delay), _COARSE)
+    return best, delay
+
+
+def _for_search(poses: Poses) -> Poses:
+    return poses.averaged(max(1, int(poses.rate / _SEARCH_RATE + 1e-6)))
+
+
+def _allowed(poses: Poses) -> list[float]:
+    return [h for h in SPACINGS if h * poses.rate >= FEWEST_PER_KNOT] or [SPACINGS[0]]

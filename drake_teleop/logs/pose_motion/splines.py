@@ -1,0 +1,192 @@
+"""Motion from poses: splines of position and quaternion, and the signals that a wrench hangs on.
+
+Every column of position p and quaternion q is a least-squares spline of degree 5 with uniform
+knots. It takes uneven stamps as they are, and its fifth degree leaves accelerations smooth. With
+n = q . q, which noise and the fit keep from 1, and products of quaternions,
+
+    omega = 2 vec(q* qdot) / n,   alpha = 2 vec(q* qddot) / n - 2 omega (q . qdot) / n,
+
+in the axes of the posed frame P. Of white noise at frequency f the splines pass the share
+
+    g(f) = 1 / (1 + (f h / (1 - f h))^12)   below 1 / h
+
+of the power, h the distance of the knots: nearly all up to 0.3 / h, nearly nothing from 0.7 / h on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+from scipy.linalg import solveh_banded
+
+from drake_teleop.load.arrays import Array
+
+DEGREE = 5
+FEWEST_PER_KNOT = 2.0
+"""Poses between two knots, at least, on average."""
+SIGNALS = 16
+"""Columns of `PoseSplines.signals`."""
+# Frequencies times h between which the residual shows the noise: above what the splines pass.
+_NOISE_BAND = (0.7, 1.5)
+_CHUNK = 2**17
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses of a frame P in the world.
+
+    Attributes:
+        t: (K,) increasing stamps [s], uneven as they may be.
+        position: (K, 3) p_WoPo_W [m].
+        quaternion: (K, 4) [w, x, y, z] of R_WP, of unit length, either sign.
+    """
+
+    t: Array
+    position: Array
+    quaternion: Array
+
+    @property
+    def rate(self) -> float:
+        """Median rate [Hz]."""
+        return float(1.0 / np.median(np.diff(self.t)))
+
+    def continued(self) -> Poses:
+        """The same with the quaternions' signs such that none turns round."""
+        products = np.sum(self.quaternion[1:] * self.quaternion[:-1], axis=1)
+        sign = np.concatenate([[1.0], np.cumprod(np.where(products < 0.0, -1.0, 1.0))])
+        return Poses(self.t, self.position, self.quaternion * sign[:, None])
+
+    def averaged(self, count: int) -> Poses:
+        """Means of `count` poses, signs being continuous: as good for the search of the knots."""
+        rows = len(self.t) // count * count
+        t, p, q = (
+            x[:rows].reshape(-1, count, *x.shape[1:]).mean(axis=1)
+            for x in (self.t, self.position, self.quaternion)
+        )
+        return Poses(t, p, q / np.linalg.norm(q, axis=1, keepdims=True))
+
+
+class PoseSplines:
+    """Splines of poses.
+
+    Attributes:
+        poses: what they were fitted to, signs continuous.
+        spacing: h of the knots [s].
+        rate: of the poses [Hz].
+    """
+
+    def __init__(self, poses: Poses, spacing: float) -> None:
+        """Fits them; `poses` with continuous signs, see `Poses.continued`."""
+        self.poses, self.spacing, self.rate = poses, spacing, poses.rate
+        self._start = float(poses.t[0])
+        t = poses.t - self._start
+        parts = [slice(k, k + _CHUNK) for k in range(0, len(t), _CHUNK)]
+        values = (np.hstack([poses.position[part], poses.quaternion[part]]) for part in parts)
+        self._spline = _least_squares([t[part] for part in parts], values, _knots(t, spacing))
+        self._parts = parts
+
+    def signals(self, t: Array, gravity_W: Array) -> Array:
+        """(N, 16) signals of P at times t, in the axes of P; outside of the poses those of the end.
+
+        zeta = [1, a (3), -g (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]
+
+        with the acceleration a of Po [m/s^2], gravity g, the angular acceleration alpha and the
+        products of angular velocity. Whatever frame, units and axes the sensor has, the wrench of a
+        rigid load is linear in them.
+
+        Args:
+            t: (N,) [s].
+            gravity_W: (3,) in the world [m/s^2].
+        """
+        at = np.clip(t, self.poses.t[0], self.poses.t[-1]) - self._start
+        x = self._spline(at)
+        second = self._spline(at, 2)
+        q, qd, qdd = x[:, 3:], self._spline(at, 1)[:, 3:], second[:, 3:]
+        n = np.sum(q * q, axis=1, keepdims=True)
+        omega = 2.0 * _vector(q, qd) / n
+        alpha = 2.0 * _vector(q, qdd) / n - 2.0 * omega * np.sum(q * qd, axis=1, keepdims=True) / n
+        zeta = np.empty((len(t), SIGNALS))
+        zeta[:, 0] = 1.0
+        zeta[:, 1:4] = _in_P(q, n, second[:, :3])
+        zeta[:, 4:7] = _in_P(q, n, np.broadcast_to(-gravity_W, (len(t), 3)))
+        zeta[:, 7:10] = alpha
+        zeta[:, 10:13] = omega * omega
+        zeta[:, 13] = omega[:, 0] * omega[:, 1]
+        zeta[:, 14] = omega[:, 0] * omega[:, 2]
+        zeta[:, 15] = omega[:, 1] * omega[:, 2]
+        return zeta
+
+    def noise(self) -> tuple[float, float]:
+        """Standard deviations per axis of position [m] and turn [rad], as if they were white.
+
+        From what the splines leave just above the frequencies that they pass: coloured noise has
+        more there than at higher ones.
+        """
+        position, turn = np.empty((2, len(self.poses.t), 3))
+        for part in self._parts:
+            fitted = self._spline(self.poses.t[part] - self._start)
+            position[part] = self.poses.position[part] - fitted[:, :3]
+            turn[part] = 2.0 * _vector(fitted[:, 3:], self.poses.quaternion[part])
+        return self._level(position), self._level(turn)
+
+    def _level(self, residual: Array) -> float:
+        """Root of the mean power of (K, 3) residuals in the band that shows the noise."""
+        n = len(residual)
+        frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
+        low, high = (share / self.spacing for share in _NOISE_BAND)
+        inside = (frequency >= min(low, 0.35 * self.rate)) & (frequency <= high)
+        power = [np.abs(np.fft.rfft(x)[inside]) ** 2 for x in residual.T]
+        return float(np.sqrt(np.mean(power) / n))
+
+
+def passed(frequency: Array, spacing: float) -> Array:
+    """Share of white noise's power that splines pass (module docstring)."""
+    x = np.minimum(frequency * spacing, 0.999)
+    share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (DEGREE + 1)))
+    return np.where(frequency * spacing < 1.0, share, 0.0)
+
+
+def _knots(t: Array, spacing: float) -> Array:
+    """Uniform ones, without those that no sample stands before: over a gap goes one polynomial."""
+    inner = np.arange(t[0] + spacing, t[-1] - 0.5 * spacing, spacing)
+    before = np.searchsorted(t, inner)
+    first = np.unique(before, return_index=True)[1]
+    inner = inner[first[(before[first] > 0) & (before[first] < len(t))]]
+    ends = np.repeat(t[[0, -1]], DEGREE + 1)
+    return np.concatenate([ends[: DEGREE + 1], inner, ends[DEGREE + 1 :]])
+
+
+def _least_squares(times: list[Array], values: Iterable[Array], knots: Array) -> BSpline:
+    """The spline of these knots next to values (k, 7) at times (k,), part after part.
+
+    By the banded normal equations, as `scipy.interpolate.make_lsq_spline` did before it took QR,
+    which is five times slower; with two poses to a knot they lose no digit that a pose has.
+    """
+    size = len(knots) - DEGREE - 1
+    band, right = np.zeros((DEGREE + 1, size)), np.zeros((size, 7))
+    for t, x in zip(times, values, strict=True):
+        A = BSpline.design_matrix(t, knots, DEGREE)
+        gram = A.T @ A
+        for k in range(DEGREE + 1):
+            band[DEGREE - k, k:] += gram.diagonal(k)
+        right += A.T @ x
+    return BSpline(knots, solveh_banded(band, right), DEGREE)
+
+
+def _vector(q: Array, p: Array) -> Array:
+    """(N, 3) vector part of q* p."""
+    v, w = q[:, 1:], p[:, 1:]
+    out: Array = q[:, :1] * w - p[:, :1] * v - np.cross(v, w)
+    return out
+
+
+def _in_P(q: Array, n: Array, x: NDArray[np.float64]) -> Array:
+    """(N, 3) vectors in the axes of P, of such in the world."""
+    v = -q[:, 1:]
+    once = np.cross(v, x)
+    out: Array = x + 2.0 * (q[:, :1] * once + np.cross(v, once)) / n
+    return out

@@ -1,0 +1,392 @@
+"""Load, delay and frame from a wrench and noisy poses, against a motion in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from known_motion import GRAVITY_W as DOWN
+from known_motion import Motion, quaternions
+from known_motion import motion_at as fast_motion_at
+from scipy.signal import lfilter
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
+from drake_teleop.logs.pose_motion.noise import noise_moments
+from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
+from drake_teleop.logs.pose_motion.rigid import (
+    State,
+    _columns,
+    _moved,
+    _Record,
+    _solve,
+    gain_effects,
+    motion_map,
+)
+from drake_teleop.logs.pose_motion.saturated import best_delay, spectra_of
+from drake_teleop.logs.pose_motion.spectra import Grid, bands, end_taper, moments, signal_spectrum
+from drake_teleop.logs.pose_motion.spectra import without as taper_without
+from drake_teleop.logs.pose_motion.splines import Poses, PoseSplines
+from drake_teleop.logs.read.rotations import rotation_matrices
+
+PHI = phi_from_mass_com_inertia(
+    1.7,
+    [0.004, -0.010, 0.062],
+    [[0.0040, 0.0001, -0.0002], [0.0001, 0.0036, 0.0001], [-0.0002, 0.0001, 0.0018]],
+)
+OFFSETS = np.array([3.1, -1.4, 6.0, 0.13, -0.29, 0.06])
+TRUTH = np.concatenate([OFFSETS, PHI])
+GRAVITY_W = rotation_matrices(np.array([[0.4, -0.2, 0.0]]), "rotation_vector")[0] @ DOWN
+"""Tilted: turned about z and x only, gravity along z would never have an x in S."""
+SECONDS, LATE = 20.0, 0.013
+SHIFT = np.array([0.02, -0.035, 0.15])
+TURN = rotation_matrices(np.array([[0.3, -0.2, 0.6]]), "rotation_vector")[0]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Of a record: rates [Hz], noise of the poses [m, rad] and its colour, frame of the poses."""
+
+    wrench_rate: float = 200.0
+    rate: float = 125.0
+    place: float = 1e-4
+    turn: float = 2e-4
+    colour: float = 0.0
+    p_SoPo_S: tuple[float, ...] = (0.0, 0.0, 0.0)
+    turned: bool = False
+    gain: float = 0.0
+    seed: int = 0
+
+
+def motion_at(t: np.ndarray) -> Motion:
+    """The known motion at half its speed, in a world whose z is not up."""
+    fast = fast_motion_at(0.5 * t)
+    acceleration = 0.25 * (fast.specific_force + np.einsum("nji,j->ni", fast.R_WS, DOWN))
+    return Motion(
+        t,
+        fast.R_WS,
+        fast.p_WS,
+        acceleration - np.einsum("nji,j->ni", fast.R_WS, GRAVITY_W),
+        0.5 * fast.omega,
+        0.25 * fast.alpha,
+    )
+
+
+def record(kind: Kind) -> tuple[np.ndarray, np.ndarray, Poses]:
+    rng = np.random.default_rng(kind.seed)
+    t = np.arange(0.0, SECONDS, 1 / kind.wrench_rate)
+    at = motion_at(t)
+    wrench = non_contact_wrench(at.specific_force, at.omega, at.alpha, PHI)
+    wrench = wrench @ (np.eye(6) + kind.gain * rng.normal(size=(6, 6)) * _UNITS).T
+    wrench = wrench + OFFSETS + np.repeat([0.1, 0.004], 3) * rng.normal(size=wrench.shape)
+    # Stamps that jitter, and each pose really of its stamp but for the delay.
+    stamps = np.arange(0.0, SECONDS, 1 / kind.rate)
+    stamps += rng.uniform(-0.2, 0.2, len(stamps)) / kind.rate
+    posed = motion_at(stamps - LATE)
+    noise = rng.normal(size=(len(stamps), 6))
+    if kind.colour:
+        noise = np.sqrt(1 - kind.colour**2) * lfilter([1.0], [1.0, -kind.colour], noise, axis=0)
+    R = posed.R_WS @ (TURN if kind.turned else np.eye(3))
+    R = R @ rotation_matrices(kind.turn * noise[:, 3:], "rotation_vector")
+    place = posed.p_WS + posed.R_WS @ np.array(kind.p_SoPo_S) + kind.place * noise[:, :3]
+    return t, wrench, Poses(stamps, place, quaternions(R))
+
+
+_UNITS = np.outer(np.repeat([1.0, 0.06], 3), 1 / np.repeat([1.0, 0.06], 3))
+
+
+@cache
+def estimated(kind: Kind) -> PoseEstimate:
+    return estimate_from_poses(*record(kind), GRAVITY_W)
+
+
+def deviations(found: PoseEstimate) -> np.ndarray:
+    return (found.theta - TRUTH) / np.sqrt(np.diag(found.covariance))
+
+
+def test_signals_are_those_of_the_motion_on_stamps_that_jitter_and_over_a_gap():
+    t, _, poses = record(Kind(place=0.0, turn=0.0))
+    far = (poses.t < 9.0) | (poses.t > 9.6)
+    poses = Poses(poses.t[far], poses.position[far], poses.quaternion[far]).continued()
+    zeta = PoseSplines(poses, 0.05).signals(t + LATE, GRAVITY_W)
+    known = (t > 0.5) & (t < SECONDS - 0.5) & (np.abs(t - 9.3) > 1.2)
+    true = motion_at(t)
+    a = true.specific_force - zeta[:, 4:7]
+    w = true.omega
+    products = np.stack([w[:, i] * w[:, j] for i, j in ((0, 0), (1, 1), (2, 2))], 1)
+    mixed = np.stack([w[:, 0] * w[:, 1], w[:, 0] * w[:, 2], w[:, 1] * w[:, 2]], 1)
+    gravity = np.einsum("nji,j->ni", true.R_WS, -GRAVITY_W)
+    expected = np.hstack([np.ones((len(t), 1)), a, gravity, true.alpha, products, mixed])
+    error = np.abs(zeta - expected)[known]
+    assert error[:, 0].max() == 0.0
+    assert error[:, 4:7].max() < 2e-4
+    assert error[:, 1:4].max() < 0.01  # of 2 m/s^2
+    assert error[:, 7:10].max() < 0.05  # of 25 rad/s^2
+    assert error[:, 10:].max() < 1e-3
+
+
+def test_quaternions_need_not_stay_of_unit_length():
+    t, _, poses = record(Kind(place=0.0, turn=0.0))
+    poses = poses.continued()
+    longer = poses.quaternion * (1.0 + 0.1 * np.sin(3.0 * poses.t))[:, None]
+    inside = slice(100, -100)
+    signals, same = (
+        PoseSplines(x, 0.05).signals(t, GRAVITY_W)[inside]
+        for x in (poses, replace(poses, quaternion=longer))
+    )
+    np.testing.assert_allclose(same, signals, atol=0.01)  # of alpha, 25 rad/s^2
+
+
+def test_the_residual_of_the_splines_tells_the_noise():
+    poses = record(Kind(place=3e-4, turn=7e-4))[2].continued()
+    place, turn = PoseSplines(poses, 0.05).noise()
+    assert place == pytest.approx(3e-4, rel=0.08)
+    assert turn == pytest.approx(7e-4, rel=0.08)
+
+
+def test_noise_of_poses_adds_to_the_moments_what_is_said():
+    """Differences of signals with and without noise, 12 records."""
+    kind = Kind(place=0.0, turn=0.0)
+    t, wrench, clean = record(kind)
+    grid = Grid.of(t, wrench)
+    taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
+    of = bands(grid, taper, 8.0)
+    splines = PoseSplines(clean.continued(), 0.07)
+    zeta = splines.signals(grid.t, GRAVITY_W)
+    place, turn = 2e-4, 5e-4
+    Q = noise_moments(splines, grid, taper, zeta, of, (place, turn))
+    sums = np.zeros_like(Q)
+    none = np.zeros((len(of.frequency), 6))
+    for seed in range(12):
+        noise = np.random.default_rng(seed).normal(size=(len(clean.t), 6))
+        R = rotation_matrices(clean.quaternion, "quaternion_wxyz")
+        R = R @ rotation_matrices(turn * noise[:, 3:], "rotation_vector")
+        noisy = Poses(clean.t, clean.position + place * noise[:, :3], quaternions(R)).continued()
+        error = PoseSplines(noisy, 0.07).signals(grid.t, GRAVITY_W) - zeta
+        spectrum = signal_spectrum(grid, taper, error, len(of.frequency))
+        sums += moments(spectrum, none, of) / 12
+    # Below 2 Hz what is faster and turned into it by the motion is more than what is said.
+    well = of.sums(of.frequency) / of.sizes > 2.0
+    size = np.sqrt(np.einsum("bii,bjj->bij", Q, Q))
+    error = np.abs(sums - Q)[well] / np.where(size > 0.0, size, np.inf)[well]
+    assert error.max() < 0.45
+    both = sums[well], Q[well]
+    diagonal, expected = (np.diagonal(x, axis1=1, axis2=2).sum(axis=0) for x in both)
+    shown = expected > 0.0
+    np.testing.assert_allclose(diagonal[shown], expected[shown], rtol=0.15)
+
+
+finite = st.floats(-1.0, 1.0, allow_subnormal=False)
+vector = st.tuples(finite, finite, finite).map(np.array)
+
+
+@given(vector, vector, vector, vector, vector, vector)
+def test_the_map_is_that_of_rigid_bodies(rho, r, a, minus_g, alpha, w):
+    R = rotation_matrices(rho[None], "rotation_vector")[0]
+    zeta = np.concatenate(
+        [[1.0], a, minus_g, alpha, w * w, [w[0] * w[1], w[0] * w[2], w[1] * w[2]]]
+    )
+    F = np.arange(6.0)
+    z = motion_map(R, r) @ np.concatenate([zeta, F])
+    v = R.T @ w
+    s = R.T @ (a + minus_g + np.cross(alpha, r) + np.cross(w, np.cross(w, r)))
+    expected = [[1.0], F, s, R.T @ alpha, v * v, [v[0] * v[1], v[0] * v[2], v[1] * v[2]]]
+    np.testing.assert_allclose(z, np.concatenate(expected), atol=1e-12)
+
+
+@given(vector, vector, st.integers(0, 22))
+def test_columns_are_derivatives_of_the_residual(rho, r, k):
+    R = rotation_matrices(rho[None], "rotation_vector")[0]
+    state = State(TRUTH, 1e-3, r, R)
+    step = np.zeros(23)
+    step[k] = 1e-5
+    ahead, behind = (_columns(_moved(state, x))[1] for x in (step, -step))
+    derivative = (ahead - behind) / 2e-5
+    np.testing.assert_allclose(_columns(state)[0][:, k], -derivative, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        Kind(seed=1),
+        Kind(rate=60.0, seed=2),
+        Kind(rate=500.0, place=5e-5, turn=1e-4, colour=0.9, seed=3),
+    ],
+)
+def test_load_delay_and_frame_are_right_within_what_is_said(kind):
+    found = estimated(kind)
+    assert np.abs(deviations(found)).max() < 3.5
+    assert found.delay_s == pytest.approx(LATE, abs=5 * found.delay_deviation)
+    assert found.fit.rigid and found.rejected.mean() < 0.03 and found.note == ""
+    assert not found.frame.shifted and not found.frame.turned
+    assert found.frame.position_known.all() and found.frame.rotation_known.all()
+    assert np.abs(found.frame.p_SoPo_S / found.frame.position_deviations).max() < 4.0
+    assert np.sqrt(found.covariance[6, 6]) < 1e-3
+
+
+def test_a_pose_of_another_frame_is_named_and_its_transform_found():
+    kind = Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4)
+    found = estimated(kind)
+    frame = found.frame
+    assert frame.shifted and frame.turned
+    np.testing.assert_allclose(frame.p_SoPo_S, SHIFT, atol=5 * frame.position_deviations.max())
+    assert frame.position_deviations.max() < 5e-4
+    turn = np.degrees(np.arccos((np.trace(frame.R_SP.T @ TURN) - 1) / 2))
+    assert turn < 5 * frame.turn_deviations_deg.max() < 0.2
+    assert not found.fit.rigid and found.fit.inflation > 5.0
+
+
+def test_deviations_of_the_frame_are_those_of_what_was_estimated():
+    found = estimated(Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4))
+    place = np.empty((3, 6))
+    for k in range(6):
+        step = np.zeros(23)
+        step[17 + k] = 1e-6
+        states = [_moved(found.free.state, x) for x in (step, -step)]
+        ahead, behind = (-state.R.T @ state.r for state in states)
+        place[:, k] = (ahead - behind) / 2e-6
+    covariance = place @ found.free.covariance[17:, 17:] @ place.T
+    np.testing.assert_allclose(
+        found.frame.position_deviations, np.sqrt(np.diag(covariance)), rtol=1e-5
+    )
+
+
+def test_noise_in_the_signals_makes_no_load_lighter():
+    """Knots much too fine, so that accelerations are half noise."""
+    t, wrench, poses = record(Kind(place=6e-4, turn=6e-4, seed=11))
+    grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.035)
+    taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
+    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 12.0)
+    zeta = splines.signals(grid.t + LATE, GRAVITY_W)
+    Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
+    free, start = np.arange(23) < 17, State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
+    inertias = []
+    for noise in (Q, np.zeros_like(Q)):
+        record_ = _Record(spectra.moments(), noise, spectra.of.sizes, free)
+        inertias.append(_solve(record_, start).state.theta[[10, 13]] / PHI[[4, 7]] - 1.0)
+    compensated, plain = np.abs(inertias)
+    assert (compensated < 0.5 * plain).all()
+    assert (compensated < 0.02).all()
+
+
+def test_a_frame_that_is_declared_or_left_to_the_data_gives_the_load():
+    arrays = record(Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4))
+    declared = estimate_from_poses(*arrays, GRAVITY_W, p_SoPo_S=SHIFT, R_SP=TURN)
+    left = estimate_from_poses(*arrays, GRAVITY_W, p_SoPo_S=None, R_SP=None)
+    for found in (declared, left):
+        assert np.abs(deviations(found)).max() < 3.5
+        assert found.fit.rigid
+    assert not declared.frame.shifted and not declared.frame.turned
+    np.testing.assert_allclose(left.frame.p_SoPo_S, SHIFT, atol=1e-3)
+
+
+def test_a_contact_and_a_knock_are_left_out():
+    t, wrench, poses = record(Kind(seed=5))
+    touched = wrench.copy()
+    push = (t > 7.0) & (t < 9.5)
+    touched[push] += np.array([6.0, -3.0, 12.0, 0.2, 0.3, -0.1]) * np.sin(t[push, None]) ** 2
+    touched[(t > 15.0) & (t < 15.02)] += 40.0
+    found = estimate_from_poses(t, touched, poses, GRAVITY_W)
+    inside = (found.t > 7.1) & (found.t < 9.4)
+    assert found.rejected[inside].mean() > 0.8  # where the sine is zero nothing acts
+    assert found.rejected[(found.t > 15.0) & (found.t < 15.02)].all()
+    assert found.rejected.mean() < 0.2
+    assert np.abs(deviations(found)).max() < 3.5
+
+
+def test_coloured_noise_does_not_choose_the_finest_knots():
+    kind = Kind(place=3e-4, turn=6e-4, rate=250.0, colour=0.95, seed=6)
+    assert estimated(kind).spacing >= 0.05
+
+
+def seen_in(wrench_of_S: np.ndarray, poses: Poses, t: np.ndarray) -> ReadOff:
+    grid, splines = Grid.of(t, wrench_of_S), PoseSplines(poses.continued(), 0.1)
+    taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
+    return read_off(spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0).fit())
+
+
+def test_units_axes_and_sign_are_read_off():
+    t, wrench, poses = record(Kind(seed=7))
+    seen = seen_in(wrench, replace(poses, position=1000.0 * poses.position), t)
+    assert seen.kappa == pytest.approx(1e-3, abs=5 * seen.kappa_deviation)
+    assert seen.kappa_deviation < 2e-5
+    np.testing.assert_allclose(seen.masses, 1.7, atol=5 * seen.deviation)
+    seen = seen_in(wrench[:, [1, 0, 2, 4, 3, 5]], poses, t)
+    assert seen.usable and seen.mirrored and seen.oblique_deg < 0.5
+    np.testing.assert_array_equal(seen.permutation, [[0, 1, 0], [1, 0, 0], [0, 0, 1]])
+    assert seen.kappa == pytest.approx(1.0, abs=5 * seen.kappa_deviation)
+    np.testing.assert_array_equal(seen_in(-wrench, poses, t).permutation, -np.eye(3))
+
+
+def test_gravity_that_stays_in_a_plane_is_no_use_for_axes_but_for_the_unit():
+    """The known motion turns about z and x only, so that S has no gravity along x."""
+    t, _, poses = record(Kind(seed=7))
+    true = motion_at(t)
+    s = true.specific_force + np.einsum("nji,j->ni", true.R_WS, GRAVITY_W - DOWN)
+    noise = 0.01 * np.random.default_rng(7).normal(size=(len(t), 6))
+    grid = Grid.of(t, non_contact_wrench(s, true.omega, true.alpha, PHI) + noise)
+    splines, taper = PoseSplines(poses.continued(), 0.1), end_taper(t[::2], 0.3, SECONDS - 0.3)
+    seen = read_off(spectra_of(splines, grid, taper, DOWN, LATE, 20.0).fit())
+    assert not seen.usable
+    assert seen.kappa == pytest.approx(1.0, abs=0.02)
+
+
+def test_gains_that_are_wrong_are_a_misfit_and_those_stated_are_in_the_deviations():
+    found = estimate_from_poses(*record(Kind(gain=0.01, seed=8)), GRAVITY_W, gain=0.01)
+    assert not found.fit.rigid and found.fit.one_weight and found.fit.inflation > 3.0
+    assert np.abs(deviations(found)).max() < 4.0
+    assert np.sqrt(found.covariance[6, 6]) == pytest.approx(0.02, rel=0.5)
+
+
+def test_gains_enter_as_they_move_the_estimate():
+    """One gain that is wrong moves what is estimated by a column of what enters the covariance."""
+    t, wrench, poses = record(Kind(seed=9))
+    grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
+    taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
+    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
+    Z, sizes, free = spectra.moments(), spectra.of.sizes, np.ones(23, bool)
+    none, start = np.zeros_like(Z), State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
+    solution = _solve(_Record(Z, none, sizes, free), start)
+    effects = gain_effects(solution.B, Z, solution.W, solution.inverse).reshape(23, 6, 6)
+    size = np.sqrt(np.sum(effects**2, axis=(1, 2)))
+    for d, k in ((0, 2), (2, 2), (4, 0), (1, 5)):
+        A = np.eye(38)
+        A[16 + d, 16 + k] += 1e-3 * _UNITS[d, k]
+        other = _solve(_Record(A @ Z @ A.T, none, sizes, free), solution.state).state
+        moved = 1e3 * (other.theta - solution.state.theta)
+        np.testing.assert_allclose(moved / size[:16], effects[:16, d, k] / size[:16], atol=0.1)
+
+
+def test_a_delay_that_is_given_stays():
+    found = estimate_from_poses(*record(Kind(seed=1)), GRAVITY_W, delay=LATE)
+    assert found.delay_s == LATE
+    assert found.delay_deviation == 0.0
+
+
+def test_best_delay_is_found_from_afar():
+    t, wrench, poses = record(Kind(seed=10))
+    grid = Grid.of(t, wrench)
+    taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
+    spectra = spectra_of(PoseSplines(poses.continued(), 0.07), grid, taper, GRAVITY_W, -0.05, 20.0)
+    assert best_delay(spectra)[0] == pytest.approx(LATE, abs=2e-3)
+
+
+def test_a_taper_is_zero_where_lost_and_has_edges():
+    taper = end_taper(np.arange(1000) / 100, 0.0, 10.0)
+    lost = np.zeros(1000, bool)
+    lost[500] = True
+    cut = taper_without(taper, lost, 0.01)
+    assert cut[500] == 0.0 and cut[490] == pytest.approx(0.5, abs=0.01) and cut[475] == 1.0
+    assert taper[0] == 0.0 and taper[500] == 1.0
+
+
+def test_too_little_in_common_is_an_error():
+    t, wrench, poses = record(Kind(seed=1))
+    with pytest.raises(DrakeTeleopError, match="too little in common"):
+        estimate_from_poses(t + 100.0, wrench, poses, GRAVITY_W)
