@@ -126,7 +126,7 @@ class PassivityConfig(Methods, _Common):
 
     The servo is what the methods that act at the slave's motor port (`two_layer`, `pspm`, `ledger`)
     and `four_channel` believe of it: it pulls the slave with K (x_command - x) - D v. The mass is
-    what `ledger` believes.
+    what `two_layer` and `ledger` believe.
     """
 
 
