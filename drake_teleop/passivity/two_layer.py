@@ -14,9 +14,10 @@ walls cause, and |f| / m, which its motors cause: they pull hard at a command th
 What is sent leaves the tank *before* that is asked. So the tanks are never overdrawn, between hand
 and slave's *motors*, whatever the network does, as long as the hand and the walls accelerate no
 more than `acceleration`, and the servo's K, D and the slave's mass m (or more) are those that were
-told: by default those of the reference of one degree of freedom, a station's arm is stiffer and
-heavier (`drake_teleop.slave.servo`), and has to be told. Less is then never given out at the actual motion either: what the motors give and the wall
-does not get moves the slave, or rubs. A tank that was overdrawn all the same carries its debt.
+told: by default those of the reference of one degree of freedom; a station's arm is stiffer and
+heavier (`drake_teleop.slave.servo`), and has to be told. Less is then never given out at the actual
+motion either: what the motors give and the wall does not get moves the slave, or rubs. A tank that
+was overdrawn all the same carries its debt.
 
 A slave that is slower than a T might pay even for its brake: with an empty tank it would coast
 on for ever. So the slave keeps a reserve that is neither sent nor spent on the spring; only the
