@@ -62,7 +62,7 @@ class CutLoop:
         _find_crossings(
             opened.reshape(-1, n),
             closed.reshape(-1, n),
-            np.broadcast_to(level, shape).ravel(),
+            np.full(shape, level).ravel(),
             _ANGLES,
             found.reshape(3, -1, _MOST_CROSSINGS),
         )

@@ -62,13 +62,13 @@ def checked_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list
         raise DrakeTeleopError(
             f"the numbers of samples differ: {shapes}", remedy="give one row of each per sample"
         ) from error
-    rows = [
-        np.ascontiguousarray(np.broadcast_to(table, (*leading, table.shape[-1]))).reshape(
-            -1, table.shape[-1]
-        )
-        for table in tables.values()
-    ]
-    return leading, rows
+    return leading, [_rows(table, (*leading, table.shape[-1])) for table in tables.values()]
+
+
+def _rows(table: Array, shape: tuple[int, ...]) -> Array:
+    # What numpy broadcasts cannot be written to, another type, for which all is compiled again.
+    same = table if table.shape == shape else np.array(np.broadcast_to(table, shape))
+    return np.ascontiguousarray(same).reshape(-1, shape[-1])
 
 
 def number(name: str, value: Any) -> float:
