@@ -23,9 +23,11 @@ from drake_teleop.comparison.one_dof import (
     OneDofRun,
     run_one_dof,
 )
+from drake_teleop.passivity.energy import ledger, port_work
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.passivity.packet import difference_into
 from drake_teleop.passivity.tdpa import TdpaConfig
+from drake_teleop.passivity.wave import WaveConfig
 
 MEDIUM = dataclasses.replace(REFERENCE, hand_mass=0.25, hand_damping=8.0, hand_stiffness=250.0)
 
@@ -87,6 +89,29 @@ def test_tdpa_creates_nothing_at_the_command_and_at_most_a_motion_at_the_slave(
     moving = 0.5 * MEDIUM.force_scale * MEDIUM.slave_mass * TdpaConfig().speed[0] ** 2
     assert found.least(ACTUAL) > -moving
     assert found.least(COMMAND) > -1e-3  # the hand's pair is the held one here
+
+
+def test_a_wave_end_gives_out_only_what_it_was_given():
+    """Of what came at hand or command, and by the network, all is in store, sent on or lost.
+
+    A wave that is played without being paid for is missing here at once, and at the ports only if
+    somebody finds the motion that takes it.
+    """
+    rng, steps = np.random.default_rng(7), 3000
+    config = PassivityConfig(
+        method="wave", force_limit=3.0, torque_limit=0.05, retreat=[1e3, 1e3],
+        wave=WaveConfig(drift_rate=0.0),  # whose steps are a gift
+    )  # fmt: skip
+    master, f_e = poses(rng, steps), wrenches(rng, steps)
+    wrench, command, *_, memory = run(
+        "wave", config, master, poses(rng, steps), f_e, in_bursts(rng, steps)
+    )
+    at_hand = -port_work(wrench, master, "backward")[-1]
+    at_command = port_work(f_e, command[:, :7], "backward")[-1]
+    for put_in, end in zip((at_hand, at_command), map(ledger, memory), strict=True):
+        assert (end.received > 1e-3).all() and (end.stored >= 0.0).all()
+        kept = end.stored + end.sent + end.lost
+        np.testing.assert_allclose(put_in + end.received, kept, rtol=1e-9)
 
 
 def test_tdpa_repays_what_a_tap_has_cost():
