@@ -23,6 +23,7 @@ from drake_teleop.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.passivity.ledger import LedgerConfig
+from drake_teleop.passivity.ledger_slave import _ACCOUNT
 from drake_teleop.passivity.memory import LEDGER, LIMIT, LOST, RECEIVED, SENT
 from drake_teleop.passivity.methods import (
     METHODS,
@@ -150,6 +151,21 @@ def test_a_ledger_is_what_came_less_what_went_and_carries_its_debt():
             np.testing.assert_allclose(memory[LEDGER], books, atol=1e-12)
         least = min(least, ends[0][LEDGER].min(), ends[1][LEDGER].min())
     assert least < 0.0, "there should have been a debt"
+
+
+def test_motors_may_not_spend_what_the_slave_moves_with():
+    """A = L_s - m v^2 / 2 of each group, the mass taken for 5 % more than was told."""
+    p = parameters(PassivityConfig(method="ledger", slave_mass=[4.0, 0.02]))
+    start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    memory, zero = initial_memory("ledger", p, start), np.zeros(6)
+    twist = np.array([0.06, 0.08, 0.0, 0.0, 0.0, 0.5])
+    held = memory[LEDGER].copy()
+    slave_step(
+        METHODS.index("ledger"), np.zeros(PACKET_SIZE), False, start, twist, PERIOD * twist, zero,
+        PERIOD, p, memory, np.zeros(13), np.zeros(PACKET_SIZE),
+    )  # fmt: skip
+    moving = 1.05 * 0.5 * np.array([4.0 * 0.01, 0.02 * 0.25])
+    np.testing.assert_allclose(memory[_ACCOUNT], held - moving, rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [4, 38])
