@@ -17,8 +17,8 @@ from sockets import open_to_others
 # another worker has take longer than the work. numpy is not imported yet, so it will see this.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Cyclic garbage is looked for seldom: with Python's thresholds that took 11 % of the tests' time and
-# a quarter of that of their collection.
+# Cyclic garbage is looked for seldom: with Python's thresholds that took 11 % of the tests' time
+# and a quarter of that of their collection.
 gc.set_threshold(20_000, 20, 50)
 
 # Tests are never timed (the first call of a compiled function takes seconds) and the same on
