@@ -92,6 +92,9 @@ def MakeTeleopStation(
         ):
             if channel.HasInputPort(name):
                 wire(builder, source, name, channel, name)
+        # A slave of one's own may leave it out: then all of its wrench is a contact's.
+        if channel.HasInputPort("load_wrench_B") and slave.HasOutputPort("load_wrench_B"):
+            wire(builder, slave, "load_wrench_B", channel, "load_wrench_B")
     if master.HasInputPort("slave_state"):  # an operator with a task sees the tool
         wire(builder, slave, "slave_state", master, "slave_state")
     for name in ("clutch", "intended_pose", "intended_twist"):

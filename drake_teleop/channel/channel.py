@@ -1,8 +1,9 @@
-"""What lies between master and slave: a network, and a method that keeps the station passive.
+"""What lies between master and slave (long: a network, both ends of it, and their block).
 
-At every period both ends take one step of the method (`drake_teleop.passivity`), and what they send
-travels through one line of the network each (`drake_teleop.channel.network`). The block works in
-world axes and in the master's power units, see `drake_teleop.passivity.methods`.
+At every period both ends take one step of the method that keeps the station passive
+(`drake_teleop.passivity`), and what they send travels through one line of the network each
+(`drake_teleop.channel.network`). The block works in world axes and in the master's power units, see
+`drake_teleop.passivity.methods`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -28,9 +29,16 @@ from drake_teleop.fault import sound
 from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.passivity import methods
-from drake_teleop.passivity.memory import LIMIT, MEMORY, Slots
+from drake_teleop.passivity.memory import LIMIT, MEMORY, OF_LOAD, Slots
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
-from drake_teleop.passivity.packet import CONTACT, HEALTHY, PACKET_SIZE, difference_into, dot
+from drake_teleop.passivity.packet import (
+    CONTACT,
+    HEALTHY,
+    LOAD,
+    PACKET_SIZE,
+    difference_into,
+    dot,
+)
 from drake_teleop.passivity.safe_state import (
     MASTER_WATCH,
     SILENT,
@@ -125,6 +133,7 @@ _FELT, _TOLD = _places.vector(6), _places.number()
 # Steps that a packet is on its way at least. Forward: the slave sees the command a step later.
 # Backward: the master has taken its step when the slave takes its own.
 _LEAST_DELAY = 1
+_NO_LOAD = np.zeros(6)
 
 
 def initial_ends(
@@ -152,6 +161,7 @@ def channel_step(
     method,
     pose_command,
     wrench_B,
+    load_B,
     hand_B,
     slave_pose,
     saturated,
@@ -175,6 +185,7 @@ def channel_step(
         method: index in `METHODS`.
         pose_command: (7,) X_WS before the channel.
         wrench_B: (6,) F_E_B, what the hand should feel of the slave's wrench [N, N m].
+        load_B: (6,) its load's share of that: weight and inertia.
         hand_B: (6,) of the hand on the stylus, in B [N, N m].
         slave_pose: (7,) X_WS, actual.
         saturated: whether the wrench is not to be trusted: the last good one is kept.
@@ -201,7 +212,7 @@ def channel_step(
     work_M, work_S = ports[_WORK_M], ports[_WORK_S]
     dx, twist, hand, wrench = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
     limits, command, left = np.empty(2), np.empty(13), pose_received.copy()
-    received, packet = np.empty(PACKET_SIZE), np.empty(PACKET_SIZE)
+    received, packet = np.zeros(PACKET_SIZE), np.empty(PACKET_SIZE)
 
     # The master's end.
     good = _moved(pose_command, before_M, dx)
@@ -234,7 +245,8 @@ def channel_step(
         twist[i] = dx[i] / T
     for g in range(2):
         work_S[g] += dot(held_S, dx, g)
-    if not sound(wrench_B):
+    load = memory_S[OF_LOAD]
+    if not (sound(wrench_B) and sound(load_B)):
         good = False
         ends[_TRUSTED] = 0.0
     elif saturated:
@@ -245,6 +257,9 @@ def channel_step(
         share = T / max(STOP - ends[_TRUSTED], T)
         for i in range(6):
             held_S[i] = (1.0 - share) * held_S[i] + share * wrench[i]
+        _to_world(load_B, frame, wrench)
+        for i in range(6):
+            load[i] = (1.0 - share) * load[i] + share * wrench[i]
         ends[_TRUSTED] += T
     put(wrench, 0, held_S, 0, 6)
     _, fresh = network.receive(forward_parameters, forward, k + 1, received)
@@ -335,6 +350,7 @@ class TeleopChannel(LeafSystem):
         - pose_slave: (7,) X_WS, actual
         - saturated: (1,) 1 while the wrench is not to be trusted
         - contact: (1,) whether the slave's detector notices a contact; unconnected 0
+        - load_wrench_B: (6,) the load's share of wrench_B, for `ledger`; unconnected 0
         output_ports:
         - pose_received: (7,) X_WS that the slave shall follow
         - wrench_received: (6,) F_E_B that the hand shall feel [N, N m]
@@ -376,6 +392,7 @@ class TeleopChannel(LeafSystem):
         ]
         parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
         self._method = METHODS.index(passivity.method)
+        self._tells_apart = passivity.method == "ledger"
         self._constants = (
             *(
                 period,
@@ -391,8 +408,10 @@ class TeleopChannel(LeafSystem):
         self._slave = self.DeclareVectorInputPort("pose_slave", 7)
         self._saturated = self.DeclareVectorInputPort("saturated", 1)
         self._contact = self.DeclareVectorInputPort("contact", 1)
+        self._load = self.DeclareVectorInputPort("load_wrench_B", 6)
         ends = initial_ends(passivity.method, parameters, start)
-        state = [*(network.initial_state(p, np.zeros(PACKET_SIZE)) for p in lines), ends]
+        carried = np.zeros(PACKET_SIZE if self._tells_apart else LOAD.start)
+        state = [*(network.initial_state(p, carried) for p in lines), ends]
         state += [np.array(start), np.zeros(PORTS)]
         received = np.zeros(7)
         self._groups = [self.DeclareDiscreteState(part) for part in state]
@@ -417,10 +436,14 @@ class TeleopChannel(LeafSystem):
         *state, received = step.get_mutable_value()
         for part, group in zip(state, self._groups, strict=True):
             part[:] = context.get_discrete_state(group).value()
+        load = _NO_LOAD
+        if self._tells_apart and self._load.HasValue(context):  # to work it out takes time
+            load = self._load.Eval(context)
         channel_step(
             self._method,
             self._pose.Eval(context),
             self._wrench.Eval(context),
+            load,
             self._hand.Eval(context),
             self._slave.Eval(context),
             self._saturated.Eval(context)[0] > 0.5,

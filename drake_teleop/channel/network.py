@@ -39,7 +39,7 @@ from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fields import settings
 from drake_teleop.noise import random_bits
-from drake_teleop.passivity.packet import POSE, VELOCITY, WRENCH, arrived, moved_into
+from drake_teleop.passivity.packet import LOAD, POSE, VELOCITY, WRENCH, arrived, moved_into
 from drake_teleop.quantities import check_ranges, choice, plain, quantity
 from drake_teleop.vectors import put
 
@@ -274,7 +274,8 @@ def initial_state(p: NDArray[np.float64], neutral: NDArray[np.float64]) -> NDArr
 
     Args:
         p: the line's `parameters`.
-        neutral: (N,) what the receiver reads before the first packet arrives.
+        neutral: (N,) what the receiver reads before the first packet arrives. The line carries
+            so many numbers of a packet, the first ones.
     """
     slots = int(p[_SLOTS])
     header = [p[_BAD_SHARE], -1.0, -1.0, 0.0]
@@ -282,9 +283,16 @@ def initial_state(p: NDArray[np.float64], neutral: NDArray[np.float64]) -> NDArr
 
 
 @njit(cache=True)
+def _carried(p, state):
+    """How many numbers of a packet the line carries."""
+    slots = int(p[_SLOTS])
+    return (state.shape[0] - _FIRST_SLOT - slots) // (slots + 1)
+
+
+@njit(cache=True)
 def send(p, state, k, packet):
     """Sends the packet (N,) of step k. Steps count up from 0, none is left out."""
-    slots, size = int(p[_SLOTS]), packet.shape[0]
+    slots, size = int(p[_SLOTS]), _carried(p, state)
     state[_BAD], first, second = _fate(p, k, state[_BAD])
     for travel in (first, second):
         if travel >= 0:
@@ -308,7 +316,7 @@ def receive(p, state, k, packet):
     Returns:
         The step at which the newest packet was sent, -1 before there is one; whether it is new.
     """
-    slots, size = int(p[_SLOTS]), packet.shape[0]
+    slots, size = int(p[_SLOTS]), _carried(p, state)
     slot, last = _FIRST_SLOT + k % slots, _FIRST_SLOT + slots
     # What a slot still holds from a round ago is older, and changes nothing.
     state[_ARRIVED] = max(state[_ARRIVED], state[slot])
@@ -334,7 +342,7 @@ def _fill_silence(policy, silent, packet):
     velocity, pose = packet[VELOCITY], packet[POSE]
     if policy == _ZERO:
         velocity[:] = 0.0
-        packet[WRENCH] = 0.0
+        packet[WRENCH] = packet[LOAD] = 0.0
     elif policy == _EXTRAPOLATE and arrived(packet):
         moved_into(pose, velocity * min(silent, LONGEST_EXTRAPOLATION), pose)
         if silent > LONGEST_EXTRAPOLATION:

@@ -1,4 +1,4 @@
-"""One degree of freedom of the station, fast enough for thousands of runs: where each method ends.
+"""One degree of freedom of the station (long: its plant, task, figures): thousands of runs.
 
 Hand and device are one mass on the hand's spring and damper, the slave is a mass behind a position
 servo, the environment a stiff wall. Between them is the station's own channel,
@@ -364,7 +364,8 @@ def _simulate(
     frame = np.zeros(11)
     frame[0] = frame[4] = frame[8] = frame[9] = frame[10] = 1.0
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
-    wrench, hand, felt, ports = np.zeros(6), np.zeros(6), np.zeros(7), np.zeros(PORTS)
+    wrench, load, hand = np.zeros(6), np.zeros(6), np.zeros(6)
+    felt, ports = np.zeros(7), np.zeros(PORTS)
     rows, accounts = np.empty((course.shape[0], 13)), np.zeros(4)
     x = x_s = x_before = start[4]
     v = v_s = a_s = motor = 0.0
@@ -376,6 +377,7 @@ def _simulate(
         push = _push(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
         wall = -max(push, 0.0)
         wrench[0] = scale * (gamma * wall - sigma * tool_mass * a_s)
+        load[0] = -scale * sigma * tool_mass * a_s
         if noise > 0.0:
             wrench[0] += scale * noise * random_normal(np.uint64(seed), k)
         hand[0] = stiffness * (course[k, 0] - x) + damping * (course[k, 1] - v)
@@ -384,8 +386,8 @@ def _simulate(
         before, x_before = received[4], x
         # No literal False: for that the whole channel would be compiled once more.
         channel_step(
-            method, pose_m, wrench, hand, pose_s, np.bool_(False), 0.0, PERIOD, timeout, frame, p,
-            forward_line, backward_line, forward, backward, ends, received, ports, felt,
+            method, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD, timeout,
+            frame, p, forward_line, backward_line, forward, backward, ends, received, ports, felt,
         )  # fmt: skip
         command, accounts[COMMAND] = received[4], ports[6]
         put(rows[k], 0, (x, x_s, command, felt[0], wall, ports[0], ports[2]), 0, 7)

@@ -3,7 +3,8 @@
 They are those of one degree of freedom (`drake_teleop.comparison.one_dof`), in the same order, for
 translation and rotation apart; in the master's power units, positive inwards [J]. What comes out of
 a passive station never exceeds what its stores held at the start: the hand's account plus any one
-of the others never falls below -E_0 then. The command is no physical port.
+of the others never falls below -E_0 then. The command is no physical port. With sigma > 0 the hand
+feels the load too, which gives back what was put into it: energy that `MOTOR` and `ACTUAL` lack.
 
     HAND      -sum f_(k-1) . dx_k           the held wrench, at every period of the channel: exact
     COMMAND    sum w_k . dc_k               what the slave sends, along its command: as exact

@@ -69,8 +69,12 @@ packets were missing, or it has changed, the wrench goes over gradually. A wrenc
 another contact. In a station the mass is that of its arm at the
 start, see `slave.servo`. It is 54 kg in its heaviest direction and counts as 79 kg, since it may
 turn too: with R_s = 0.1 J it goes no faster than 0.2 m/s. A task at v needs R_s = k_f m v^2 / 2.
-w is the wrench that is sent. With sigma > 0 that is not the contact's alone, and what the account
-promises is E_act of this wrench: weight and inertia of the tool give back what was put into them.
+With sigma > 0 weight and inertia of the slave's load are felt as well, and are no contact: what is
+touched, its direction, stiffness and prediction are of the contact's wrench w alone. The load's is
+sent beside it, smoothed over a round trip, and added to u after M3. The ledgers take the work
+of both, so that E_act is that of contact and load, which gives back what was put into it. A hand
+that lowers the load is paid by L_m until the slave has done so too, and feels it fade when that is
+spent: after 11 mm, of 1.75 N and R_m = 20 mJ. M4 fades it where the hand goes down fast.
 The account is behind the safe state, on whose command the motors' clamp has the last word, and
 behind whatever else changes a command: it uses what the slave did. The packet's pose is z.
 """
@@ -125,6 +129,7 @@ from drake_teleop.passivity.memory import (
 from drake_teleop.passivity.packet import (
     ENERGY,
     GENTLE,
+    LOAD,
     POSE,
     SEQUENCE,
     VELOCITY,
@@ -242,6 +247,8 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     if arrived(received):
         difference_into(pose, received[POSE], ahead)
     _predict(received, dx, T, p, memory, ahead, wrench)
+    for i in range(6):
+        wrench[i] += received[LOAD][i]
     newest = received[SEQUENCE]
     if newest > memory[_NEWEST] + 1.0:
         memory[_MISSING] = 1.0

@@ -1,10 +1,10 @@
 """The slave's end of the method `ledger`, see `drake_teleop.passivity.ledger`.
 
-At each step, w the contact's wrench, x and v the slave's actual motion, m, K, D mass and servo as
-they are believed, all in the master's power units:
+At each step, w the contact's wrench, l what is felt of the load, x and v the slave's actual motion,
+m, K, D mass and servo as they are believed, all in the master's power units:
 
-S1. L_s += min(w_k . dx, w_(k-1) . dx) + what came; likewise Q, from zero at each contact's onset;
-    A = L_s - m v^2 / 2.
+S1. L_s += min((w + l)_k . dx, (w + l)_(k-1) . dx) + what came; likewise Q, from zero at each
+    contact's onset; A = L_s - m v^2 / 2.
 S2. To the master goes what is above the reserve R_s, if it is short; in contact and nearly at rest
     what is above 0.3 R_s, because pushing back takes energy then and moving does not.
 S3. The contact's direction n is the mean of w, as in M2; its stiffness k and damping b follow from
@@ -22,7 +22,7 @@ S5. Motors that push with the motion, f . v > 0, spend at most what A holds in 4
     wall what was paid since the onset, Q, and c F_u^2 / 2 k that nobody paid. With A at its end
     they brake. Standing still may always hold. It is done through the command, x + (f + D v) / K.
 S6. Sent: w, L_s, z and z' = the servo's model of the received pose, k_c = rho k / (1 + k / K) along
-    n, b, R.
+    n, b, R; and l, smoothed over R and the servo's lag: inertia that is felt late drives a hand.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ from drake_teleop.passivity.memory import (
     LEDGER,
     LOST,
     MASS,
+    OF_LOAD,
     RECEIVED,
     SENT,
     STEPS,
@@ -50,6 +51,7 @@ from drake_teleop.passivity.memory import (
 from drake_teleop.passivity.packet import (
     ENERGY,
     INTEGRAL,
+    LOAD,
     OTHER_ENERGY,
     POSE,
     VELOCITY,
@@ -124,6 +126,8 @@ _SMOOTHED, _ANCHOR, _FAST = (_places.number() for _ in range(3))
 _WAY, _BEHIND, _LEARNT, _SUMS = *(_places.number() for _ in range(3)), _places.vector(SUMS)
 # Time without packets and the longest such, the largest round trip, the period [s].
 _SILENT, _GAP, _ROUND_TRIP, _PERIOD = (_places.number() for _ in range(4))
+# The contact's wrench; the load's, smoothed.
+_CONTACT, _WEIGHT = _places.vector(6), _places.vector(6)
 
 
 @njit(cache=True)
@@ -194,10 +198,17 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     trip = max((memory[STEPS] - received[ECHO]) * T, 0.0) if heard else 0.0
     memory[_ROUND_TRIP] = max(memory[_ROUND_TRIP] * (1.0 - T / _FORGET), trip)
     smooth_velocity(twist, min(T / _FILTER, 1.0), memory)
-    touched = touches(wrench, p)
+    contact, load, weight = memory[_CONTACT], memory[OF_LOAD], memory[_WEIGHT]
+    for i in range(6):
+        contact[i] = wrench[i] - load[i]
+    touched = touches(contact, p)
+    late = memory[_ROUND_TRIP] + _lag(p)
+    share = min(T / late, 1.0) if memory[STEPS] > 0.0 else 1.0
+    for i in range(6):
+        weight[i] += share * (load[i] - weight[i])
     for g in range(2):
         _account_of_slave(g, received, heard, touched, twist, dx, wrench, T, p, memory)
-    _learn(touched, dx, wrench, T, p, memory)
+    _learn(touched, dx, contact, T, p, memory)
     put(memory, HELD.start, wrench, 0, 6)
     gap[:] = 0.0
     if heard:
@@ -210,7 +221,8 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     _clamp(now, pose, twist, p, memory)
     _model(received, heard, T, p, memory, gap)
     put(command, 0, memory, COMMAND.start, 13)
-    fill(memory[MODEL], memory[_MODEL_TWIST], wrench, packet)
+    fill(memory[MODEL], memory[_MODEL_TWIST], contact, packet)
+    put(packet, LOAD.start, weight, 0, 6)
     k, yields = memory[_STIFFNESS], 0.0
     for g in range(2):
         size = length(memory[NORMAL], g)
@@ -245,10 +257,15 @@ def _account_of_slave(g, received, heard, touched, twist, dx, wrench, T, p, memo
 
 
 @njit(cache=True)
+def _lag(p):
+    """How late the servo is [s]."""
+    return 2.0 * math.sqrt(p[MASS][0] / p[STIFFNESS][0])
+
+
+@njit(cache=True)
 def _shown_at_most(T, p, memory):
     """k_d, of S3."""
-    lag = 2.0 * math.sqrt(p[MASS][0] / p[STIFFNESS][0])  # of the servo
-    depth, first = _PRESS * (memory[_ROUND_TRIP] + lag), math.inf
+    depth, first = _PRESS * (memory[_ROUND_TRIP] + _lag(p)), math.inf
     for g in range(2):
         part = ARM[g] * length(memory[NORMAL], g) * depth
         first = min(first, 2.0 * p[HAND_RESERVE][g] / max(part * part, 1e-300))
@@ -361,7 +378,7 @@ def _clamp(command, pose, twist, p, memory):
 @njit(cache=True)
 def _hold_back(g, damping, twist, p, memory):
     """Shortens the motors' pull to what is paid for, or brakes; whether it did."""
-    pull, velocity, held = memory[_PULL], memory[VELOCITY_HERE], memory[HELD]
+    pull, velocity, held = memory[_PULL], memory[VELOCITY_HERE], memory[_CONTACT]
     size, speed, mass = length(pull, g), length(twist, g), HEAVY * p[MASS][g]
     still = length(velocity, g) < _STILL * ARM[g]
     margin, account, changed = MARGIN * p[RESERVE][g], memory[_ACCOUNT][g], False

@@ -6,7 +6,7 @@ method alone needs it names at the head of its file, with `own_memory` and `own_
 
 from __future__ import annotations
 
-MEMORY = 140  #: length of the memory of one end
+MEMORY = 160  #: length of the memory of one end
 PARAMETERS = 26  #: length of the parameters, packed by `methods.parameters`
 
 
@@ -48,9 +48,10 @@ RECEIVED = _memory.vector(2)  #: the other end's counter of energy, as accounted
 SENT = _memory.vector(2)  #: this end's counter of energy, as sent [J]
 LOST = _memory.vector(2)  #: energy that the method took out of the loop here [J]
 HELD = _memory.vector(6)  #: the wrench at this port since the last step
+OF_LOAD = _memory.vector(6)  #: of the slave's wrench now, what its load's weight and inertia are
 COMMAND = _memory.vector(13)  #: the slave's command since the last step, X_WS and its twist
 HAND_VELOCITY = _memory.vector(6)  #: at the master, filtered, see `retreat`
-PACKET = _memory.vector(32)  #: the last packet that was sent, see `packet`
+PACKET = _memory.vector(38)  #: the last packet that was sent, see `packet`
 _OWN = _memory.rest()
 _command = Slots(COMMAND.stop, COMMAND.start)
 COMMAND_POSE, COMMAND_TWIST = _command.vector(7), _command.rest()

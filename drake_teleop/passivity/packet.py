@@ -1,6 +1,6 @@
 """What a packet holds, and the small vector operations that the methods share.
 
-One layout serves every method and both directions: (32,) float64. Counters and integrals are
+One layout serves every method and both directions: (38,) float64. Counters and integrals are
 cumulative, so a receiver takes differences to the newest packet that it has, and lost, late or
 doubled packets do no harm.
 
@@ -16,7 +16,7 @@ from drake_teleop._compiled import njit
 from drake_teleop.passivity.memory import Slots
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, normalized
 
-PACKET_SIZE = 32
+PACKET_SIZE = 38
 _places = Slots(PACKET_SIZE)
 #: Number of the packet, counted by its sender.
 SEQUENCE = _places.number()
@@ -36,6 +36,9 @@ ENERGY = _places.vector(2)
 OTHER_ENERGY = _places.vector(2)
 #: 1 while the slave's detector says that something is touched.
 CONTACT = _places.number()
+#: What weight and inertia of the slave's load add to its wrench, likewise. The last, because only
+#: `ledger` tells the two apart, and other lines need not carry it.
+LOAD = _places.vector(6)
 
 #: What force and torque at the hand may change by without being felt as a blow [N/s, N m/s].
 GENTLE = (450.0, 4.5)

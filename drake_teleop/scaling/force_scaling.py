@@ -143,13 +143,17 @@ def _all_into(sample, estimate, gripper, change, time, elimination, believed, ou
 
 
 @njit(cache=True)
-def _felt_into(sample, estimate, gripper, change, time, arm, R_WB, believed, out):
-    """What the hand shall feel of F'; the orientation of S comes from the same sample."""
+def _felt_into(sample, estimate, gripper, change, time, arm, R_WB, believed, contact, out):
+    """What the hand shall feel of F'; the orientation of S comes from the same sample.
+
+    `contact` is 1, or 0 for what the load alone has in it.
+    """
     if fault_of(sample, estimate, time, believed) != _NONE:
         out[:] = np.nan
         return
     scales, scaled_S, R_WS, p_WS = np.empty(4), np.empty(6), np.empty((3, 3)), np.empty(3)
     scales_at(change, time, scales)
+    scales[2] *= contact
     _scaled_into(sample, estimate, gripper, scales, scaled_S)
     forward_kinematics(arm, sample[BEFORE_JOINTS:TIME], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
@@ -176,6 +180,7 @@ class ForceScaling(LeafSystem):
         - non_contact_wrench_S: Eq. (12)
         - wrench_B: F_E_B, what the hand shall feel: -force_scale F', in the master's base B; not a
           number while there is a fault
+        - load_wrench_B: what of that is weight and inertia of the load, zero for sigma = 0
 
     Args:
         config: the scales.
@@ -214,6 +219,7 @@ class ForceScaling(LeafSystem):
             ("contact_wrench_S", self._calc_contact),
             ("non_contact_wrench_S", self._calc_non_contact),
             ("wrench_B", self._calc_wrench_B),
+            ("load_wrench_B", self._calc_load_wrench_B),
         ):
             self.DeclareVectorOutputPort(name, 6, weak_callback(calc), inputs)
         self.DeclareVectorOutputPort("fault", 1, weak_callback(self._calc_fault), inputs)
@@ -274,8 +280,14 @@ class ForceScaling(LeafSystem):
         )
 
     def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
-        inputs = self._inputs(context)
-        _felt_into(*inputs, self._arm, self._R_WB, self._believed, output.get_mutable_value())
+        self._calc_felt(context, 1.0, output)
+
+    def _calc_load_wrench_B(self, context: Context, output: BasicVector) -> None:
+        self._calc_felt(context, 0.0, output)
+
+    def _calc_felt(self, context: Context, contact: float, output: BasicVector) -> None:
+        constants = self._arm, self._R_WB, self._believed, contact
+        _felt_into(*self._inputs(context), *constants, output.get_mutable_value())
 
     def _inputs(self, context: Context) -> tuple[Any, ...]:
         """The sample, the estimate, the gripper's part of it, and of the scales: change, time."""

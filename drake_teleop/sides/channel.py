@@ -35,6 +35,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m] (over a network)
         - pose_slave: (7,) X_WS of the slave, actual (over a network)
         - saturated: (1,) 1 while the wrench is not to be trusted (over a network)
+        - load_wrench_B: (6,) what of wrench_B is the load's weight and inertia; read by `ledger`,
+          may be left unconnected (over a network)
         output_ports:
         - pose_to_slave: (7,) X_WS that the slave shall follow
         - wrench_to_master: (6,) F_E_B that the hand shall feel [N, N m]
@@ -66,7 +68,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
             scenario.simulation.seed,
         ),
     )
-    for name in ("pose_command", "wrench_B", "hand_wrench_E", "pose_slave", "saturated"):
+    own = ("pose_command", "wrench_B", "hand_wrench_E", "pose_slave", "saturated", "load_wrench_B")
+    for name in own:
         builder.ExportInput(channel.GetInputPort(name), name)
     if scenario.contact_detection is not None:
         builder.ExportInput(channel.GetInputPort("contact"), "contact")

@@ -51,6 +51,7 @@ def MakeSlaveSide(
         output_ports:
         - wrench_B: (6,) F_E_B, what the hand should feel, in the master's base [N, N m]; not a
           number while there is a fault
+        - load_wrench_B: (6,) what of that is the load's weight and inertia
         - pose_slave: (7,) X_WS, actual, of the joint angles now (over a network)
         - saturated: (1,) 1 while the wrench is not to be trusted; a signal too
         - contact: (1,) 1 in contact; a signal too (with contact detection)
@@ -100,7 +101,7 @@ def MakeSlaveSide(
     estimate = body.load_estimator.GetOutputPort("load_estimate")
     builder.Connect(body.sample["sample"], force_scaling.GetInputPort("sample"))
     builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
-    export(builder, force_scaling, "wrench_B", "scaled_wrench_S", "fault")
+    export(builder, force_scaling, "wrench_B", "load_wrench_B", "scaled_wrench_S", "fault")
     if _is_known(scenario, load_estimate):
         export(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
 

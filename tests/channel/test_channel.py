@@ -8,11 +8,14 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
 from drake_teleop.channel import channel
-from drake_teleop.channel.channel import Channel, channel_step
+from drake_teleop.channel.channel import MEMORY_S, Channel, channel_step
 from drake_teleop.channel.network import PRESETS, NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.operator.operator import OperatorConfig, Sine
+from drake_teleop.passivity.memory import HELD, OF_LOAD
+from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.passivity.safe_state import RESUME, STOP
+from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.sides.channel import MakeChannel
 from drake_teleop.simulation import simulate
@@ -82,6 +85,25 @@ def test_the_ports_count_the_work_of_the_hand(load_estimate):
     counted = -(result["ports"][:, 0] - result["ports"][1, 0])
     np.testing.assert_allclose(counted[2:], work[:-1], atol=1e-12)
     assert np.abs(work).max() > 1e-4
+
+
+def test_what_the_load_has_in_the_wrench_is_told_as_the_wrench_is():
+    """In the same axes and units, with a base that is turned and unequal scales."""
+    scaling = KinematicScalingConfig(0.5, 0.2, alignment=[0.3, -0.4, 1.9])
+    scenario = moving(kinematic_scaling=scaling, passivity=PassivityConfig(method="ledger"))
+    side, wrench = MakeChannel(scenario), np.arange(1.0, 7.0)
+    assert side.HasInputPort("load_wrench_B")
+    block = side.GetSubsystemByName("channel")
+    context = block.CreateDefaultContext()
+    pose = np.array([1.0, 0.0, 0.0, 0.0, *scenario.slave.position])
+    inputs = {"pose_command": pose, "pose_slave": pose, "hand_wrench_E": np.zeros(6)}
+    inputs |= {"saturated": [0.0], "wrench_B": wrench, "load_wrench_B": 0.5 * wrench}
+    for name, value in inputs.items():
+        block.GetInputPort(name).FixValue(context, value)
+    ends = block.EvalUniquePeriodicDiscreteUpdate(context).value(2)
+    held = ends[MEMORY_S][HELD]
+    assert np.linalg.norm(held[:3]) == pytest.approx(np.linalg.norm(wrench[:3]) / 0.5)
+    np.testing.assert_allclose(ends[MEMORY_S][OF_LOAD], 0.5 * held, atol=1e-15)
 
 
 def test_directions_may_differ():

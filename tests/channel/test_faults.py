@@ -68,6 +68,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
         inputs = {
             "hand_pose": np.array([1.0, 0, 0, 0, x, 0, 0]),
             "slave_wrench": np.array([wall / 17.5, 0, 0, 0, 0, 0]),
+            "load_wrench": np.zeros(6),
             "hand_wrench": np.zeros(6),
             "slave_pose": slave.copy(),
         }

@@ -30,6 +30,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.passivity.packet import (
     ENERGY,
     INTEGRAL,
+    LOAD,
     PACKET_SIZE,
     POSE,
     SEQUENCE,
@@ -421,7 +422,7 @@ def test_silence(silence, silent):
     packet, received = lonely(silence, silent)
     expected = packet.copy()
     if silent and silence == "zero":
-        expected[VELOCITY] = expected[WRENCH] = 0.0
+        expected[VELOCITY] = expected[WRENCH] = expected[LOAD] = 0.0
     if silent and silence == "extrapolate":
         time = min(silent * PERIOD, LONGEST_EXTRAPOLATION)
         v, w = packet[VELOCITY][:3], packet[VELOCITY][3:]
@@ -431,8 +432,20 @@ def test_silence(silence, silent):
             expected[VELOCITY] = 0.0
     np.testing.assert_allclose(received, expected, rtol=0, atol=1e-14)
     # Whatever the policy, counters and integrals stand still: silence brings no energy.
-    for part in (INTEGRAL, slice(ENERGY.start, PACKET_SIZE)):
+    for part in (INTEGRAL, slice(ENERGY.start, LOAD.start)):
         np.testing.assert_array_equal(received[part], packet[part])
+
+
+def test_a_line_carries_as_many_numbers_as_its_receiver_reads_before_the_first():
+    p = parameters(NetworkConfig(), 0, FORWARD, PERIOD)
+    packets, received = random_packets(3), np.zeros(PACKET_SIZE)
+    state = initial_state(p, np.zeros(LOAD.start))
+    assert len(state) < len(initial_state(p, np.zeros(PACKET_SIZE)))
+    for k, packet in enumerate(packets):
+        send(p, state, k, packet)
+        receive(p, state, k, received)
+        np.testing.assert_array_equal(received[: LOAD.start], packet[: LOAD.start])
+        assert not received[LOAD].any()
 
 
 @pytest.mark.parametrize("silence", ["hold", "zero", "extrapolate"])

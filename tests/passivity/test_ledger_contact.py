@@ -17,7 +17,7 @@ from drake_teleop.passivity.ledger_slave import (
     along,
     find_direction,
 )
-from drake_teleop.passivity.memory import LEDGER, LIMIT
+from drake_teleop.passivity.memory import LEDGER, LIMIT, LOST, OF_LOAD, SENT
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -26,7 +26,7 @@ from drake_teleop.passivity.methods import (
     parameters,
     slave_step,
 )
-from drake_teleop.passivity.packet import GENTLE, PACKET_SIZE, POSE, SEQUENCE, WRENCH
+from drake_teleop.passivity.packet import GENTLE, LOAD, PACKET_SIZE, POSE, SEQUENCE, WRENCH
 
 T = 1e-3
 METHOD = METHODS.index("ledger")
@@ -147,3 +147,38 @@ def test_a_contact_is_the_same_whatever_the_scales_are_and_one_against_it_is_ano
         assert find_direction(turned, 0.01, 1e-3, p, memory) > 0.9 * size
         assert along(memory[NORMAL], wrench, p) < 0.0
     np.testing.assert_allclose(sizes, np.hypot(18.0, 7.0) / 17.5, rtol=1e-12)
+
+
+def test_the_loads_weight_is_no_contact_and_is_felt_beside_one():
+    """Lowered onto a wall of 200 N/m: the account is of all, touch and prediction are of the wall.
+
+    A load that shakes is felt smoothed, over a round trip and the servo's lag.
+    """
+    p, packet, command = parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
+    memory, received = initial_memory("ledger", p, START), np.zeros(PACKET_SIZE)
+    pose, received[POSE] = START.copy(), START
+    load = np.array([0.2, 0.0, -1.8, 0.0, 0.05, 0.0])
+    stored, depth = memory[LEDGER][0], 0.0
+    for k in range(1000):
+        dx = np.array([0.0, 0.0, -1e-5, 0.0, 0.0, 0.0])
+        pose[6] += dx[2]
+        contact = np.array([0.0, 0.0, max(depth := -pose[6] - 0.004, 0.0) * 200.0, 0.0, 0.0, 0.0])
+        memory[OF_LOAD] = load + 0.5 * np.sin(0.3 * k) * np.eye(6)[1]
+        wrench = contact + memory[OF_LOAD]
+        received[SEQUENCE] += 1.0
+        slave_step(METHOD, received, True, pose, dx / T, dx, wrench, T, p, memory, command, packet)
+        np.testing.assert_allclose(packet[WRENCH], contact, atol=1e-15)
+        np.testing.assert_allclose(packet[LOAD], load, atol=0.15)
+        assert k > 400 or not memory[TOUCHED], "nothing is touched yet"
+    np.testing.assert_allclose(memory[NORMAL], [0.0, 0.0, 1.0, 0.0, 0.0, 0.0], atol=1e-12)
+    stiffness = packet[CONTACT_STIFFNESS]
+    assert stiffness == pytest.approx(200.0, rel=0.05)
+    # The packets take what is passed on to the hand, which has nothing here.
+    books = memory[LEDGER][0] + memory[SENT][0] + memory[LOST][0] - stored
+    assert books == pytest.approx(1.8 * 0.01 - 0.5 * 200.0 * depth**2, rel=3e-3)
+    hand = Hand(packet[WRENCH], stiffness)
+    hand.packet[LOAD] = load
+    np.testing.assert_allclose(hand.rest(2500), load + packet[WRENCH], atol=1e-9)
+    for _ in range(50):
+        hand.step([0.0, 0.0, -2e-5, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(hand.rest(50)[:3] - load[:3], [0, 0, 1.2 + 0.2], atol=0.01)

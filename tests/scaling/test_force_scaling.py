@@ -37,7 +37,8 @@ def outputs(
     block.GetInputPort("load_estimate").FixValue(context, np.concatenate([offsets, arm.phi_load]))
     if scales is not None:
         block.SetScales(context, **scales, duration=0.0)
-    names = ("scaled_wrench_S", "contact_wrench_S", "non_contact_wrench_S", "wrench_B")
+    names = ("scaled_wrench_S", "contact_wrench_S", "non_contact_wrench_S")
+    names += ("wrench_B", "load_wrench_B")
     found = {name: block.GetOutputPort(name).Eval(context) for name in names}
     both = block.GetOutputPort("scaled_contact_and_fault").Eval(context)
     np.testing.assert_array_equal(both[:6], found["scaled_wrench_S"])
@@ -90,6 +91,18 @@ def test_what_the_hand_feels_is_the_scaled_reaction(arm):
     out = outputs(ForceScalingConfig(sigma=1.0), arm)
     force_S, force_B = out["scaled_wrench_S"][:3], out["wrench_B"][:3]
     assert np.linalg.norm(force_B) == pytest.approx(np.linalg.norm(force_S) / 17.5)
+
+
+def test_what_the_load_has_in_it_is_the_rest_of_the_contacts(arm):
+    contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
+    touched = outputs(ForceScalingConfig(sigma=0.0, gamma=3.0), arm, contact)
+    assert not touched["load_wrench_B"].any()
+    for sigma in (0.5, 2.0):
+        out = outputs(ForceScalingConfig(sigma=sigma, gamma=3.0), arm, contact)
+        rest = out["wrench_B"] - touched["wrench_B"]
+        np.testing.assert_allclose(out["load_wrench_B"], rest, atol=1e-12)
+        length = sigma * np.linalg.norm(out["non_contact_wrench_S"][:3]) / 17.5
+        assert np.linalg.norm(rest[:3]) == pytest.approx(length)
 
 
 @pytest.mark.parametrize(
