@@ -32,7 +32,7 @@ from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
-from drake_teleop.logs.pose_motion.splines import Poses
+from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.read.alignment import (
     angular_motion,
     low_passed,

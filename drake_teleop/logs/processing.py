@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import checked, number
+from drake_teleop.load.arrays import number
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, check_method, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta
@@ -25,9 +25,10 @@ from drake_teleop.logs.causal import CausalWrench, causal_wrenches
 from drake_teleop.logs.check.conventions import check_log, question_fit
 from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.contact import Detection, detect_contact, noise_floor, samples_of, shifted
+from drake_teleop.logs.posed_fit import fit_posed
 from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.delay import estimate_delay
+from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 
 _FEWEST_TO_TARE = 10
@@ -121,11 +122,13 @@ def identify_log(
 ) -> IdentifiedLog:
     """Identifies the load and the sensor's offsets from a log.
 
-    Wrench and motion pass the same zero-phase low-pass. Static poses are used as they are.
+    Where poses alone tell the motion it is of splines, and their noise is taken out, see
+    `drake_teleop.logs.pose_motion`. Otherwise wrench and motion pass the same zero-phase low-pass,
+    and the motion is taken as exact. Static poses are used as they are.
 
     Args:
         path: canonical table or log description.
-        method: one of `drake_teleop.load.batch.methods.METHODS`; the motion is taken as exact.
+        method: one of `drake_teleop.load.batch.methods.METHODS`.
         cutoff_hz: of the low-pass; None for none.
         delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
 
@@ -135,12 +138,16 @@ def identify_log(
     """
     check_method(method)
     log = read_log(path, bandwidth_hz=cutoff_hz)
-    delay_s, source = _delay(log, cutoff_hz, delay)
-    log = undelayed(log, delay_s)
-    log = low_passed(log, cutoff_hz).only(measured(log, cutoff_hz))
-    fit = identify_batch(
-        log.wrench, *log.motion, method=method, shared_noise=log.static, delay_s=delay_s
-    )
+    delay_s, source = delay_of(log, cutoff_hz, delay)
+    posed = fit_posed(log, method, cutoff_hz, delay_s, known=source != "estimated")
+    if posed is not None:
+        log, fit, delay_s = posed.log, posed.fit, posed.delay_s
+    else:
+        log = undelayed(log, delay_s)
+        log = low_passed(log, cutoff_hz).only(measured(log, cutoff_hz))
+        fit = identify_batch(
+            log.wrench, *log.motion, method=method, shared_noise=log.static, delay_s=delay_s
+        )
     result = fit.identification
     loads = () if log.static else tuple(segments(log.wrench, *log.motion, log.dt))
     notes = [*_load_notes(log, loads), *([fit.note] if fit.note else [])]
@@ -148,6 +155,8 @@ def identify_log(
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
     findings = question_fit(Path(path), log, result, predicted, known_delay)
+    if posed is not None and posed.finding is not None and not findings:
+        findings = (posed.finding,)
     if any(finding.name == "payload" for finding in findings):
         result = replace(
             result, identifiable=np.repeat([True, False], [6, 10]) & result.identifiable
@@ -279,7 +288,7 @@ def _eliminated(
         )
     phi, point_mass = usable_phi(identification)
     phi_object = phi - phi_gripper
-    delay_s, source = _delay(log, cutoff_hz, delay, phi)
+    delay_s, source = delay_of(log, cutoff_hz, delay, phi)
     if source == "undetermined":
         delay_s, source = identification.delay_s, "load"
     log = undelayed(log, delay_s)
@@ -392,21 +401,6 @@ def robust_offsets(residual: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
             break
         offsets = residual[agrees].mean(axis=0)
     return offsets, float(agrees.mean())
-
-
-def _delay(
-    log: Log, cutoff_hz: float | None, delay: str | float, phi: NDArray[np.float64] | None = None
-) -> tuple[float, str]:
-    if log.static:
-        return 0.0, "static"
-    if not isinstance(delay, str):
-        return float(checked("delay", number("delay", delay))), "given"
-    if delay != "auto":
-        raise DrakeTeleopError(
-            f"{delay!r} is neither seconds nor auto", where="delay", remedy="give a number or auto"
-        )
-    found = estimate_delay(log, cutoff_hz, phi)
-    return (0.0, "undetermined") if found is None else (found, "estimated")
 
 
 def _suspected(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,15 +10,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from known_motion import GRAVITY_W as DOWN
-from known_motion import Motion, quaternions
-from known_motion import motion_at as fast_motion_at
-from scipy.signal import lfilter
+from known_motion import quaternions
+from posed_record import (
+    GRAVITY_W,
+    LATE,
+    PHI,
+    SECONDS,
+    SHIFT,
+    TRUTH,
+    TURN,
+    UNITS,
+    Kind,
+    motion_at,
+    record,
+)
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
 from drake_teleop.logs.pose_motion.noise import noise_moments
+from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
 from drake_teleop.logs.pose_motion.rigid import (
     State,
@@ -26,79 +37,15 @@ from drake_teleop.logs.pose_motion.rigid import (
     _moved,
     _Record,
     _solve,
+    fit_rigid,
     gain_effects,
     motion_map,
 )
 from drake_teleop.logs.pose_motion.saturated import best_delay, spectra_of
 from drake_teleop.logs.pose_motion.spectra import Grid, bands, end_taper, moments, signal_spectrum
 from drake_teleop.logs.pose_motion.spectra import without as taper_without
-from drake_teleop.logs.pose_motion.splines import Poses, PoseSplines
+from drake_teleop.logs.pose_motion.splines import PoseSplines
 from drake_teleop.logs.read.rotations import rotation_matrices
-
-PHI = phi_from_mass_com_inertia(
-    1.7,
-    [0.004, -0.010, 0.062],
-    [[0.0040, 0.0001, -0.0002], [0.0001, 0.0036, 0.0001], [-0.0002, 0.0001, 0.0018]],
-)
-OFFSETS = np.array([3.1, -1.4, 6.0, 0.13, -0.29, 0.06])
-TRUTH = np.concatenate([OFFSETS, PHI])
-GRAVITY_W = rotation_matrices(np.array([[0.4, -0.2, 0.0]]), "rotation_vector")[0] @ DOWN
-"""Tilted: turned about z and x only, gravity along z would never have an x in S."""
-SECONDS, LATE = 20.0, 0.013
-SHIFT = np.array([0.02, -0.035, 0.15])
-TURN = rotation_matrices(np.array([[0.3, -0.2, 0.6]]), "rotation_vector")[0]
-
-
-@dataclass(frozen=True)
-class Kind:
-    """Of a record: rates [Hz], noise of the poses [m, rad] and its colour, frame of the poses."""
-
-    wrench_rate: float = 200.0
-    rate: float = 125.0
-    place: float = 1e-4
-    turn: float = 2e-4
-    colour: float = 0.0
-    p_SoPo_S: tuple[float, ...] = (0.0, 0.0, 0.0)
-    turned: bool = False
-    gain: float = 0.0
-    seed: int = 0
-
-
-def motion_at(t: np.ndarray) -> Motion:
-    """The known motion at half its speed, in a world whose z is not up."""
-    fast = fast_motion_at(0.5 * t)
-    acceleration = 0.25 * (fast.specific_force + np.einsum("nji,j->ni", fast.R_WS, DOWN))
-    return Motion(
-        t,
-        fast.R_WS,
-        fast.p_WS,
-        acceleration - np.einsum("nji,j->ni", fast.R_WS, GRAVITY_W),
-        0.5 * fast.omega,
-        0.25 * fast.alpha,
-    )
-
-
-def record(kind: Kind) -> tuple[np.ndarray, np.ndarray, Poses]:
-    rng = np.random.default_rng(kind.seed)
-    t = np.arange(0.0, SECONDS, 1 / kind.wrench_rate)
-    at = motion_at(t)
-    wrench = non_contact_wrench(at.specific_force, at.omega, at.alpha, PHI)
-    wrench = wrench @ (np.eye(6) + kind.gain * rng.normal(size=(6, 6)) * _UNITS).T
-    wrench = wrench + OFFSETS + np.repeat([0.1, 0.004], 3) * rng.normal(size=wrench.shape)
-    # Stamps that jitter, and each pose really of its stamp but for the delay.
-    stamps = np.arange(0.0, SECONDS, 1 / kind.rate)
-    stamps += rng.uniform(-0.2, 0.2, len(stamps)) / kind.rate
-    posed = motion_at(stamps - LATE)
-    noise = rng.normal(size=(len(stamps), 6))
-    if kind.colour:
-        noise = np.sqrt(1 - kind.colour**2) * lfilter([1.0], [1.0, -kind.colour], noise, axis=0)
-    R = posed.R_WS @ (TURN if kind.turned else np.eye(3))
-    R = R @ rotation_matrices(kind.turn * noise[:, 3:], "rotation_vector")
-    place = posed.p_WS + posed.R_WS @ np.array(kind.p_SoPo_S) + kind.place * noise[:, :3]
-    return t, wrench, Poses(stamps, place, quaternions(R))
-
-
-_UNITS = np.outer(np.repeat([1.0, 0.06], 3), 1 / np.repeat([1.0, 0.06], 3))
 
 
 @cache
@@ -268,7 +215,7 @@ def test_noise_in_the_signals_makes_no_load_lighter():
     free, start = np.arange(23) < 17, State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     inertias = []
     for noise in (Q, np.zeros_like(Q)):
-        record_ = _Record(spectra.moments(), noise, spectra.of.sizes, free)
+        record_ = _Record(spectra.moments(), noise, spectra.of.sizes, free, spectra.fit().power)
         inertias.append(_solve(record_, start).state.theta[[10, 13]] / PHI[[4, 7]] - 1.0)
     compensated, plain = np.abs(inertias)
     assert (compensated < 0.5 * plain).all()
@@ -298,6 +245,22 @@ def test_a_contact_and_a_knock_are_left_out():
     assert found.rejected[(found.t > 15.0) & (found.t < 15.02)].all()
     assert found.rejected.mean() < 0.2
     assert np.abs(deviations(found)).max() < 3.5
+
+
+def test_weights_of_a_poor_start_do_not_stay():
+    """With 1 mm and 1 mrad the upper bands are all noise: from zero they would keep all weight."""
+    t, wrench, poses = record(Kind(place=1e-3, turn=1e-3, seed=1))
+    grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
+    taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
+    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
+    zeta = splines.signals(grid.t + LATE, GRAVITY_W)
+    Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
+    start = State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
+    fit = fit_rigid(
+        spectra.moments(), Q, spectra.of.sizes, start, np.arange(23) < 17, spectra.fit()
+    )
+    assert not fit.one_weight
+    assert np.abs(fit.state.theta[6] - PHI[0]) < 4 * np.sqrt(fit.covariance[6, 6]) < 0.01
 
 
 def test_coloured_noise_does_not_choose_the_finest_knots():
@@ -352,13 +315,14 @@ def test_gains_enter_as_they_move_the_estimate():
     spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
     Z, sizes, free = spectra.moments(), spectra.of.sizes, np.ones(23, bool)
     none, start = np.zeros_like(Z), State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
-    solution = _solve(_Record(Z, none, sizes, free), start)
+    power = spectra.fit().power
+    solution = _solve(_Record(Z, none, sizes, free, power), start)
     effects = gain_effects(solution.B, Z, solution.W, solution.inverse).reshape(23, 6, 6)
     size = np.sqrt(np.sum(effects**2, axis=(1, 2)))
     for d, k in ((0, 2), (2, 2), (4, 0), (1, 5)):
         A = np.eye(38)
-        A[16 + d, 16 + k] += 1e-3 * _UNITS[d, k]
-        other = _solve(_Record(A @ Z @ A.T, none, sizes, free), solution.state).state
+        A[16 + d, 16 + k] += 1e-3 * UNITS[d, k]
+        other = _solve(_Record(A @ Z @ A.T, none, sizes, free, power), solution.state).state
         moved = 1e3 * (other.theta - solution.state.theta)
         np.testing.assert_allclose(moved / size[:16], effects[:16, d, k] / size[:16], atol=0.1)
 

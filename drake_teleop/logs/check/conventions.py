@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
+from drake_teleop.logs.check.against_frame import against_frame
 from drake_teleop.logs.check.against_load import against_load, payload_finding
 from drake_teleop.logs.check.against_pose import against_pose
 from drake_teleop.logs.check.edits import in_other_unit, unit_findings
@@ -27,7 +28,7 @@ from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 
-_NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
+NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ def check_conventions(
     if Path(source).suffix.lower() not in FORMATS:
         return found
     # A canonical table has no lines that could be changed.
-    findings = (replace(f, message=f"{f.message} ({_NO_YAML})") for f in found.findings)
+    findings = (replace(f, message=f"{f.message} ({NO_YAML})") for f in found.findings)
     return replace(found, findings=tuple(findings))
 
 
@@ -144,6 +145,8 @@ def _check(data: LogData, description: Description) -> Conventions:
         return Conventions(tuple(findings), fit, mounting, None)
     more, delay = against_load(description, data)
     findings = _one_clock(description, [*findings, *more], mounting, delay)
+    if all(finding.name == "lag" for finding in findings):
+        findings += against_frame(log, delay or 0.0)
     return Conventions(tuple(findings), fit, mounting, delay)
 
 

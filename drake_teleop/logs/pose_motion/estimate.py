@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array, checked
 from drake_teleop.logs.pose_motion.noise import noise_moments
+from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
 from drake_teleop.logs.pose_motion.rejection import disturbed
 from drake_teleop.logs.pose_motion.rigid import (
@@ -38,8 +39,7 @@ from drake_teleop.logs.pose_motion.saturated import (
     spectra_of,
 )
 from drake_teleop.logs.pose_motion.spectra import TOP, Grid, end_taper, without
-from drake_teleop.logs.pose_motion.splines import Poses, PoseSplines
-from drake_teleop.logs.read.alignment import widened
+from drake_teleop.logs.pose_motion.splines import PoseSplines
 from drake_teleop.vectors import cross_matrix
 
 SEARCHED = 120.0
@@ -140,6 +140,7 @@ def estimate_from_poses(
     p_SoPo_S: ArrayLike | None = (0.0, 0.0, 0.0),
     R_SP: ArrayLike | None = _UNTURNED,
     delay: float | None = None,
+    near: float = 0.0,
     gain: float = 0.0,
     lost: NDArray[np.bool_] | None = None,
 ) -> PoseEstimate:
@@ -152,7 +153,8 @@ def estimate_from_poses(
         gravity_W: (3,) in the world [m/s^2].
         p_SoPo_S: (3,) where Po is in S [m]; None: the data tell.
         R_SP: (3, 3) how P is turned; None: the data tell.
-        delay: of the poses behind the wrench, if known [s]; None: found within 0.1 s.
+        delay: of the poses behind the wrench, if known [s]; None: found.
+        near: a delay that is found is within 0.1 s of this one [s].
         gain: standard deviation of the sensor's gains, such as 0.01; it enters the covariance.
         lost: (N,) samples that do not count, such as bridged gaps.
 
@@ -170,14 +172,16 @@ def estimate_from_poses(
             remedy="record longer, without interruptions",
         )
     top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
-    splines, spectra, taper, rejected, note = _searched(grid, poses, base, gravity, delay, top)
+    splines, spectra, taper, rejected, note = _searched(
+        grid, poses, base, gravity, near if delay is None else delay, top, known=delay is not None
+    )
     zeta = splines.signals(grid.t + spectra.delay, gravity)
     Z = spectra.moments()
     Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
     sizes, best = spectra.of.sizes, spectra.fit()
 
     def fitted(start: State, free: NDArray[np.bool_]) -> RigidFit:
-        return fit_rigid(Z, Q, sizes, start, free, best.cost, gain=gain)
+        return fit_rigid(Z, Q, sizes, start, free, best, gain=gain)
 
     seen = read_off(best)
     start = _start(p_SoPo_S, R_SP, seen)
@@ -204,17 +208,24 @@ def estimate_from_poses(
 
 
 def _searched(
-    grid: Grid, poses: Poses, base: Array, gravity: Array, delay: float | None, top: float
+    grid: Grid,
+    poses: Poses,
+    base: Array,
+    gravity: Array,
+    delay: float,
+    top: float,
+    *,
+    known: bool,
 ) -> tuple[PoseSplines, Spectra, Array, NDArray[np.bool_], str]:
     """Splines with the knots, and spectra with the delay and taper, that are used."""
     part = _liveliest(grid)
     some = replace(grid, t=grid.t[part], wrench=_rows(grid, part))
     few = _within(poses, some)
     taper = base[part] * end_taper(some.t, some.t[0], some.t[-1])
-    spacing, late = first_guess(few, some, taper, gravity, delay, top)
+    spacing, late = first_guess(few, some, taper, gravity, delay, top, known=known)
     first = spectra_of(PoseSplines(few, spacing), some, taper, gravity, late, top)
     clear = without(taper, disturbed(first, some, taper, spacing)[0], grid.dt)
-    spacing, late = best_spacing(few, some, clear, gravity, late, top, known=delay is not None)
+    spacing, late = best_spacing(few, some, clear, gravity, late, top, known=known)
     splines = PoseSplines(poses, spacing)
     spectra = spectra_of(splines, grid, base, gravity, late, top)
     rejected, note = disturbed(spectra, grid, base, spacing)
@@ -256,7 +267,7 @@ def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None) -> Arr
         bad |= lost[:rows].reshape(-1, grid.stride).any(axis=1)
     for k in np.flatnonzero(np.diff(poses.t) > _GAP):
         bad |= (grid.t > poses.t[k] - _BESIDE) & (grid.t < poses.t[k + 1] + _BESIDE)
-    return without(taper, widened(bad, 1), grid.dt)
+    return without(taper, bad, grid.dt, grid.dt)
 
 
 def _start(p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: ReadOff) -> State:

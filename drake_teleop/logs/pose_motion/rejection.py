@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.load.arrays import Array
 from drake_teleop.logs.pose_motion.saturated import ROUNDING, Spectra
-from drake_teleop.logs.pose_motion.spectra import Grid
-from drake_teleop.logs.read.alignment import widened
+from drake_teleop.logs.pose_motion.spectra import Grid, distance
 
 NOTHING_REJECTED = (
     "the residual is large where the load moves and small where it rests, so that disturbances"
@@ -64,7 +63,7 @@ def disturbed(
             break
     if not rejected.any():
         return rejected, ""
-    rejected = widened(rejected, round(max(_MARGIN, spacing) / grid.dt))
+    rejected = distance(rejected) * grid.dt <= max(_MARGIN, spacing)
     if _loss(x, inside, inside & ~rejected) > _MOST_LOSS:
         return np.zeros(len(x), bool), NOTHING_REJECTED
     return rejected, ""

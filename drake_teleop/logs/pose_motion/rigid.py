@@ -34,13 +34,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.batch.moments import coefficients
-from drake_teleop.logs.pose_motion.saturated import cost_of, least_power
+from drake_teleop.logs.pose_motion.saturated import Saturated, cost_of, least_power
 from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH
 from drake_teleop.logs.pose_motion.splines import SIGNALS
-from drake_teleop.logs.read.rotations import nearest_rotation, rotation_matrices
 from drake_teleop.vectors import cross_matrix
 
 PARAMETERS = 23
@@ -49,7 +49,7 @@ LOAD, DELAY, LEVER, TURN = slice(0, 16), slice(16, 17), slice(17, 20), slice(20,
 ARM = 0.06
 """Length that compares an error of a force's gain with one of a torque's [m]."""
 _STEPS, _CONVERGED = 40, 1e-4
-_RIGID = 4.0
+_RIGID, _NOISE = 4.0, 1.5
 _LIMITS = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
 _LEAST_SHARE, _LEAST_LEFT = 0.1, 0.25
 _SMALL = 1e-4  # rad, of a numerical derivative
@@ -87,16 +87,16 @@ class RigidFit:
 
     @property
     def rigid(self) -> bool:
-        """Whether a rigid load explains the wrench: the misfit is below four times its degrees.
-
-        Of noise alone it would be below 1.8 times; splines that miss a lively motion give twice.
-        """
+        """Whether a rigid load explains the wrench: the misfit is below four times its degrees."""
         return self.misfit < _RIGID * self.degrees
 
     @property
     def inflation(self) -> float:
-        """By which deviations are larger than noise alone makes them."""
-        return float(np.sqrt(max(1.0, self.misfit / self.degrees)))
+        """By which deviations are larger than noise alone makes them.
+
+        Noise alone has a misfit of up to 1.5 times its degrees, because bands hold few numbers.
+        """
+        return float(np.sqrt(max(1.0, self.misfit / (_NOISE * self.degrees))))
 
 
 def motion_map(R: Array, r: Array) -> Array:
@@ -142,7 +142,7 @@ def fit_rigid(
     sizes: Array,
     start: State,
     free: NDArray[np.bool_],
-    saturated_cost: float,
+    saturated: Saturated,
     *,
     gain: float = 0.0,
 ) -> RigidFit:
@@ -152,17 +152,18 @@ def fit_rigid(
         Z: (bands, 38, 38) `spectra.moments`.
         Q: (bands, 38, 38) `noise.noise_moments`.
         sizes: (bands,) of the bands.
-        start: where to start; its theta serves for the weights of the first step only.
+        start: where to start.
         free: (23,) which parameters are estimated.
-        saturated_cost: L of the saturated model on the same moments.
+        saturated: of the same moments: its residual gives the weights of the first step. With those
+            of a poor start the bands that are all noise could decide, and keep their say.
         gain: standard deviation of each entry of the sensor's matrix of gains, of a torque's as at
             `ARM`; 0 for an exact sensor.
     """
-    record = _Record(Z, Q, sizes, free)
+    record = _Record(Z, Q, sizes, free, saturated.power)
     solution = _solve(record, start)
     # The saturated model is not compensated: nor must be what is compared with it.
     plain = _solve(replace(record, Q=np.zeros_like(Q)), solution.state).state
-    misfit = 2.0 * (cost_of(_plain_power(record, plain), sizes) - saturated_cost)
+    misfit = 2.0 * (cost_of(_plain_power(record, plain), sizes) - saturated.cost)
     fit = RigidFit(solution.state, np.zeros((0, 0)), misfit, 6.0 * SIGNALS - float(free.sum()))
     if not fit.rigid:
         solution = _solve(record, solution.state, one_weight=True)
@@ -172,12 +173,14 @@ def fit_rigid(
 
 @dataclass(frozen=True, eq=False)
 class _Record:
-    """Moments, those of the noise, sizes of the bands, and what is free; as in `fit_rigid`."""
+    """Moments, those of the noise, sizes of the bands, and what is free, as in `fit_rigid`; and
+    (bands, 6) powers of the residual to begin with."""
 
     Z: Array
     Q: Array
     sizes: Array
     free: NDArray[np.bool_]
+    power: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,9 +199,8 @@ class _Solution:
 def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solution:
     """Gauss-Newton."""
     sizes, clean = record.sizes, record.Z - record.Q
-    shares = np.zeros((len(sizes), 6))
+    R = _residual_covariances(record, state, record.power)
     for _ in range(_STEPS):
-        R = _residual_covariances(record, state, shares)
         W: Array = np.linalg.inv(R).astype(np.float64)
         if one_weight:
             W[:] = np.linalg.inv(np.einsum("b,bcd->cd", sizes / sizes.sum(), R))
@@ -209,10 +211,10 @@ def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solut
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
         step *= min(1.0, float(np.min(_LIMITS / np.maximum(np.abs(step), 1e-300))))
         state = _moved(state, step)
-        shares = _shares(B, record.Z, W, inverse)
+        power = _power(record, state, _shares(B, record.Z, W, inverse))
+        R = _residual_covariances(record, state, power)
         if np.max(np.abs(step) / size) < _CONVERGED:
             break
-    R = _residual_covariances(record, state, shares)
     return _Solution(state, B, W, inverse, R, lost)
 
 
@@ -298,12 +300,16 @@ def _plain_power(record: _Record, state: State) -> Array:
     return np.maximum(powers / record.sizes[:, None], least_power(record.Z, record.sizes))
 
 
-def _residual_covariances(record: _Record, state: State, shares: Array) -> Array:
-    """(bands, 6, 6) R_b of a number, less `shares` (bands, 6) of them that the fit took."""
+def _power(record: _Record, state: State, shares: Array) -> Array:
+    """(bands, 6) mean power of the residual's noise: `shares` of its numbers the fit took."""
     sizes = record.sizes[:, None]
     left = np.maximum(sizes - 0.5 * shares, _LEAST_LEFT * sizes)
-    power = _plain_power(record, state) * sizes / left
-    P = _residual_powers(record.Q, state) / sizes[:, :, None]
+    return np.asarray(_plain_power(record, state) * sizes / left)
+
+
+def _residual_covariances(record: _Record, state: State, power: Array) -> Array:
+    """(bands, 6, 6) R_b of a number, with the residual's power (bands, 6)."""
+    P = _residual_powers(record.Q, state) / record.sizes[:, None, None]
     own = np.diagonal(P, axis1=1, axis2=2)
     rest = np.maximum(power - own, _LEAST_SHARE * power)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
@@ -331,9 +337,9 @@ def _moved(state: State, step: Array) -> State:
         state.theta + step[LOAD],
         state.tau + float(step[16]),
         state.r + step[LEVER],
-        nearest_rotation(_turned(state.R, step[TURN])),
+        Rotation.from_matrix(_turned(state.R, step[TURN])).as_matrix(),
     )
 
 
 def _turned(R: Array, rho: Array) -> Array:
-    return np.asarray(R @ rotation_matrices(rho[None], "rotation_vector")[0])
+    return np.asarray(R @ Rotation.from_rotvec(rho).as_matrix())

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_teleop.load.arrays import Array
+from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (
     FORCES,
     Bands,
@@ -33,7 +34,6 @@ from drake_teleop.logs.pose_motion.spectra import (
 from drake_teleop.logs.pose_motion.splines import (
     FEWEST_PER_KNOT,
     SIGNALS,
-    Poses,
     PoseSplines,
 )
 
@@ -179,17 +179,24 @@ def best_delay(spectra: Spectra, reach: float = REACH) -> tuple[float, float]:
 
 
 def first_guess(
-    poses: Poses, grid: Grid, taper: Array, gravity_W: Array, delay: float | None, top: float
+    poses: Poses,
+    grid: Grid,
+    taper: Array,
+    gravity_W: Array,
+    delay: float,
+    top: float,
+    *,
+    known: bool = False,
 ) -> tuple[float, float]:
     """Distance of the knots and delay, of a few distances and within `REACH`, of the least L.
 
-    A delay that is given stays. With knots too fine the motion is noise, and no delay shows.
+    A delay that is known stays. With knots too fine the motion is noise, and no delay shows.
     """
     few = _for_search(poses)
     found = []
     for h in _allowed(few)[::2]:
-        spectra = spectra_of(PoseSplines(few, h), grid, taper, gravity_W, delay or 0.0, top)
-        late, cost = best_delay(spectra) if delay is None else (delay, spectra.fit().cost)
+        spectra = spectra_of(PoseSplines(few, h), grid, taper, gravity_W, delay, top)
+        late, cost = (delay, spectra.fit().cost) if known else best_delay(spectra)
         found.append((cost, h, late))
     return min(found)[1:]
 

@@ -130,16 +130,18 @@ def end_taper(t: Array, start: float, stop: float) -> Array:
     return 0.5 - 0.5 * np.cos(np.pi * x)
 
 
-def without(taper: Array, lost: NDArray[np.bool_], dt: float) -> Array:
-    """The taper, 0 where `lost` (M,) and with cosine edges beside it."""
-    if not lost.any():
-        return taper
-    at = np.arange(len(lost))
-    before = np.maximum.accumulate(np.where(lost, at, -len(lost)))
-    after = np.minimum.accumulate(np.where(lost, at, 2 * len(lost))[::-1])[::-1]
-    distance = np.minimum(at - before, after - at) * dt
-    edge: Array = 0.5 - 0.5 * np.cos(np.pi * np.clip(distance / EDGE, 0.0, 1.0))
-    return taper * edge
+def without(taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0) -> Array:
+    """The taper, 0 where `lost` (M,) and within `margin` [s] of it, with cosine edges beside."""
+    edge = np.clip((distance(lost) * dt - margin) / EDGE, 0.0, 1.0)
+    return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
+
+
+def distance(flags: NDArray[np.bool_]) -> Array:
+    """(M,) how many instants away the nearest flag of (M,) is; inf without any."""
+    at = np.arange(len(flags), dtype=float)
+    before = np.maximum.accumulate(np.where(flags, at, -np.inf))
+    after = np.minimum.accumulate(np.where(flags, at, np.inf)[::-1])[::-1]
+    return np.minimum(at - before, after - at)
 
 
 def wrench_spectrum(grid: Grid, taper: Array, count: int) -> Complex:

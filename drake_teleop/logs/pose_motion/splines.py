@@ -16,7 +16,6 @@ of the power, h the distance of the knots: nearly all up to 0.3 / h, nearly noth
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
 from drake_teleop.load.arrays import Array
+from drake_teleop.logs.pose_motion.poses import Poses
 
 DEGREE = 5
 FEWEST_PER_KNOT = 2.0
@@ -33,41 +33,6 @@ SIGNALS = 16
 # Frequencies times h between which the residual shows the noise: above what the splines pass.
 _NOISE_BAND = (0.7, 1.5)
 _CHUNK = 2**17
-
-
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """Poses of a frame P in the world.
-
-    Attributes:
-        t: (K,) increasing stamps [s], uneven as they may be.
-        position: (K, 3) p_WoPo_W [m].
-        quaternion: (K, 4) [w, x, y, z] of R_WP, of unit length, either sign.
-    """
-
-    t: Array
-    position: Array
-    quaternion: Array
-
-    @property
-    def rate(self) -> float:
-        """Median rate [Hz]."""
-        return float(1.0 / np.median(np.diff(self.t)))
-
-    def continued(self) -> Poses:
-        """The same with the quaternions' signs such that none turns round."""
-        products = np.sum(self.quaternion[1:] * self.quaternion[:-1], axis=1)
-        sign = np.concatenate([[1.0], np.cumprod(np.where(products < 0.0, -1.0, 1.0))])
-        return Poses(self.t, self.position, self.quaternion * sign[:, None])
-
-    def averaged(self, count: int) -> Poses:
-        """Means of `count` poses, signs being continuous: as good for the search of the knots."""
-        rows = len(self.t) // count * count
-        t, p, q = (
-            x[:rows].reshape(-1, count, *x.shape[1:]).mean(axis=1)
-            for x in (self.t, self.position, self.quaternion)
-        )
-        return Poses(t, p, q / np.linalg.norm(q, axis=1, keepdims=True))
 
 
 class PoseSplines:
@@ -102,23 +67,30 @@ class PoseSplines:
             t: (N,) [s].
             gravity_W: (3,) in the world [m/s^2].
         """
+        a, minus_g, omega, alpha = self._motion(t, gravity_W)
+        zeta = np.empty((len(t), SIGNALS))
+        zeta[:, 0] = 1.0
+        zeta[:, 1:4], zeta[:, 4:7], zeta[:, 7:10] = a, minus_g, alpha
+        zeta[:, 10:13] = omega * omega
+        for column, (i, j) in enumerate(((0, 1), (0, 2), (1, 2)), start=13):
+            zeta[:, column] = omega[:, i] * omega[:, j]
+        return zeta
+
+    def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array]:
+        """(N, 3) specific force of Po, angular velocity and acceleration of P, in its axes."""
+        a, minus_g, omega, alpha = self._motion(t, gravity_W)
+        return a + minus_g, omega, alpha
+
+    def _motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
+        """(N, 3) a, -g, omega and alpha."""
         at = np.clip(t, self.poses.t[0], self.poses.t[-1]) - self._start
-        x = self._spline(at)
-        second = self._spline(at, 2)
-        q, qd, qdd = x[:, 3:], self._spline(at, 1)[:, 3:], second[:, 3:]
+        x, first, second = (self._spline(at, order) for order in range(3))
+        q, qd, qdd = x[:, 3:], first[:, 3:], second[:, 3:]
         n = np.sum(q * q, axis=1, keepdims=True)
         omega = 2.0 * _vector(q, qd) / n
         alpha = 2.0 * _vector(q, qdd) / n - 2.0 * omega * np.sum(q * qd, axis=1, keepdims=True) / n
-        zeta = np.empty((len(t), SIGNALS))
-        zeta[:, 0] = 1.0
-        zeta[:, 1:4] = _in_P(q, n, second[:, :3])
-        zeta[:, 4:7] = _in_P(q, n, np.broadcast_to(-gravity_W, (len(t), 3)))
-        zeta[:, 7:10] = alpha
-        zeta[:, 10:13] = omega * omega
-        zeta[:, 13] = omega[:, 0] * omega[:, 1]
-        zeta[:, 14] = omega[:, 0] * omega[:, 2]
-        zeta[:, 15] = omega[:, 1] * omega[:, 2]
-        return zeta
+        down = np.broadcast_to(-gravity_W, (len(t), 3))
+        return _in_P(q, n, second[:, :3]), _in_P(q, n, down), omega, alpha
 
     def noise(self) -> tuple[float, float]:
         """Standard deviations per axis of position [m] and turn [rad], as if they were white.

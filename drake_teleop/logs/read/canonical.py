@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.read.clocks import SLOWEST
 from drake_teleop.logs.read.description import (
     Acceleration,
@@ -68,6 +69,7 @@ class Log:
             if there are no gaps.
         notes: what the reader had to assume, in words.
         source: the file, for messages.
+        posed: the poses themselves, on the clock of `t`, where they alone tell the motion.
 
     Raises:
         DrakeTeleopError: if the arrays do not fit each other, hold NaN or infinity, or `t` does not
@@ -84,6 +86,7 @@ class Log:
     bridged: NDArray[np.bool_] | None = None
     notes: tuple[str, ...] = ()
     source: str = "log"
+    posed: Posed | None = None
 
     def __post_init__(self) -> None:
         n = len(self.t)
@@ -121,6 +124,14 @@ class Log:
         """Time between samples [s]; where samples in gaps were taken out, between the others."""
         steps = np.diff(self.t)
         return float(steps[steps < 1.5 * np.median(steps)].mean())
+
+    def earlier(self, start: float) -> Log:
+        """The same with the times since `start` [s]."""
+        posed = self.posed
+        if posed is not None:
+            poses = replace(posed.poses, t=posed.poses.t - start)
+            posed = replace(posed, poses=poses)
+        return replace(self, t=self.t - start, posed=posed)
 
     def only(self, rows: slice | NDArray[np.bool_]) -> Log:
         """These samples of the log.

@@ -8,6 +8,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import checked, number
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.alignment import low_passed, measured, resample, widened
@@ -55,6 +57,30 @@ def estimate_delay(
     if best in (0, len(shifts) - 1) or costs.max() - costs[best] < 0.1 + 50 / independent:
         return None
     return _refined(cost, float(shifts[best]), step)
+
+
+def delay_of(
+    log: Log, cutoff_hz: float | None, delay: str | float, phi: NDArray[np.float64] | None = None
+) -> tuple[float, str]:
+    """The delay to take out of the motion, and where it is from, as the summary has it.
+
+    Args:
+        log, cutoff_hz, phi: as of `estimate_delay`.
+        delay: seconds, or "auto" to estimate it.
+
+    Raises:
+        DrakeTeleopError: for another text, or no number.
+    """
+    if log.static:
+        return 0.0, "static"
+    if not isinstance(delay, str):
+        return float(checked("delay", number("delay", delay))), "given"
+    if delay != "auto":
+        raise DrakeTeleopError(
+            f"{delay!r} is neither seconds nor auto", where="delay", remedy="give a number or auto"
+        )
+    found = estimate_delay(log, cutoff_hz, phi)
+    return (0.0, "undetermined") if found is None else (found, "estimated")
 
 
 def _known(log: Log, cutoff: float, reach: float) -> NDArray[np.bool_]:

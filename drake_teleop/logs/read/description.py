@@ -16,28 +16,35 @@ import types
 import typing
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
     BaseModel,
-    BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
-    WithJsonSchema,
     field_validator,
     model_validator,
 )
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
+from drake_teleop.logs.pose_motion.poses import Posed, Poses
+from drake_teleop.logs.read.description_fields import (
+    Column,
+    Frame,
+    Gravity,
+    ImuFrame,
+    Number,
+    Place,
+    Turn,
+    Vector,
+)
 from drake_teleop.texts import read_yaml
 
 STANDARD_GRAVITY = 9.80665
 _LARGEST_GRAVITY = 100.0
-ROTATION_TOLERANCE = 0.01
 
 UNITS = {
     "s": 1.0,
@@ -60,54 +67,6 @@ UNITS = {
     "mm": 1e-3,
 }
 """SI value of each unit; "g" is the magnitude of the description's gravity."""
-
-
-def _frame(value: Any) -> Any:
-    if value in ("sensor", "base"):
-        return value
-    try:
-        matrix = np.asarray(value)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape != (3, 3) or matrix.dtype.kind not in "fi":
-        raise ValueError("must be sensor, base, or a 3x3 rotation matrix from the stream to S")
-    if not (np.abs(matrix) < 2.0).all() or rotation_error(matrix) > ROTATION_TOLERANCE:
-        raise ValueError("is not a rotation: rows must be orthonormal with determinant +1")
-    return tuple(map(tuple, nearest_rotation(matrix).tolist()))
-
-
-def _imu_frame(value: Any) -> Any:
-    return value if value == "auto" else _frame(value)
-
-
-def _place(value: Any) -> Any:
-    if isinstance(value, str) and value != "auto":
-        raise ValueError("must be three numbers [m], or auto")
-    return value
-
-
-def _gravity(value: Any) -> Any:
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        value = [0.0, 0.0, -float(value)]
-    return value
-
-
-Column = str | int
-
-
-Number = Annotated[float, Field(strict=True)]  # neither true nor "1"
-Vector = Annotated[tuple[Number, Number, Number], Field(strict=False)]
-Rotation = tuple[Vector, Vector, Vector]
-_GRAVITY_SCHEMA = {
-    "anyOf": [
-        {"type": "number"},
-        {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
-    ],
-    "description": "magnitude, or the vector in the world, m/s^2",
-}
-Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_frame)]
-ImuFrame = Annotated[Literal["sensor", "base", "auto"] | Rotation, BeforeValidator(_imu_frame)]
-Place = Annotated[Vector | Literal["auto"], BeforeValidator(_place)]
 
 
 class _Strict(BaseModel):
@@ -249,6 +208,13 @@ class Wrench(_Recorded):
     torque: Torque
     sign: Literal[1, -1] = 1
     frame: Frame = "sensor"
+    gain_std: Number = Field(
+        default=0.0,
+        ge=0,
+        le=0.2,
+        description="standard deviation of the sensor's gains, 0.01 for 1 %, as its maker or a"
+        " calibration says",
+    )
 
 
 class Imu(_Recorded):
@@ -286,12 +252,40 @@ class Pose(_Recorded):
     orientation: Orientation
     position: Position | None = None
     frame: Frame = "sensor"
+    position_in_sensor: Place = Field(
+        default=(0.0, 0.0, 0.0),
+        description="p_SoPo_S of the posed frame's origin, m; auto: it is found",
+    )
+    rotation_in_sensor: Turn = Field(
+        default=None,
+        description="R_SP, from the posed frame to S, as frame has it; auto: it is found",
+    )
 
     @model_validator(mode="after")
     def _not_base(self) -> Pose:
         if self.frame == "base":
             raise ValueError("frame must be sensor, or the rotation from the posed frame to S")
+        if self.frame != "sensor" and self.rotation_in_sensor is not None:
+            raise ValueError("frame and rotation_in_sensor are the same: give one of them")
+        shifted = self.position_in_sensor == "auto" or any(self.position_in_sensor)
+        if self.position is None and (shifted or self.rotation_in_sensor == "auto"):
+            raise ValueError(
+                "position_in_sensor and auto need positions: give pose.position, or leave them out"
+            )
         return self
+
+    @property
+    def automatic(self) -> bool:
+        """Whether the data shall tell where the posed frame is."""
+        return self.position_in_sensor == "auto" or self.rotation_in_sensor == "auto"
+
+    @property
+    def R_SP(self) -> NDArray[np.float64] | None:
+        """(3, 3) from the posed frame to S, where it is given; None for the axes of S."""
+        for rotation in (self.rotation_in_sensor, self.frame):
+            if isinstance(rotation, tuple):
+                return np.array(rotation)
+        return None
 
 
 class Static(_Stream):
@@ -317,7 +311,7 @@ class Static(_Stream):
 class Description(_Strict):
     """A whole log: a wrench stream with imu, pose, or both; or static poses."""
 
-    gravity: Annotated[Vector, BeforeValidator(_gravity), WithJsonSchema(_GRAVITY_SCHEMA)] = (
+    gravity: Gravity = (
         0.0,
         0.0,
         -STANDARD_GRAVITY,
@@ -349,12 +343,21 @@ class Description(_Strict):
             raise ValueError("nothing gives the specific force: add imu.specific_force or pose")
         if self.pose is None and self.imu is not None and self.imu.frame == "auto":
             raise ValueError("imu.frame: auto compares the IMU with a pose: add pose")
+        if self.pose is not None and self.pose.automatic and self.wrench.frame == "base":
+            raise ValueError("pose: auto needs a wrench in the axes of the sensor, not in base")
         return self
 
     @property
     def gravity_W(self) -> NDArray[np.float64]:
         """(3,) gravity in W [m/s^2]."""
         return np.array(self.gravity)
+
+    def posed(self, poses: Poses) -> Posed:
+        """Poses of S with what else is described of them."""
+        assert self.wrench is not None and self.pose is not None
+        place, turn = self.pose.position_in_sensor, self.pose.R_SP
+        turn = np.eye(3) if turn is None else turn
+        return Posed(poses, self.gravity_W, self.wrench.gain_std, np.array(place), turn)
 
     def scale(self, unit: str) -> float:
         """SI value of a unit; "g" is the magnitude of this description's gravity."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError, expect
 from drake_teleop.load.arrays import number
+from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW,
     angular_motion,
@@ -21,11 +22,11 @@ from drake_teleop.logs.read.alignment import (
     uniform_times,
 )
 from drake_teleop.logs.read.auto_mounting import describe_mounting
+from drake_teleop.logs.read.auto_pose import describe_pose_frame
 from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, gaps, read_clock
 from drake_teleop.logs.read.description import (
-    ROTATION_TOLERANCE,
     Description,
     Imu,
     Orientation,
@@ -34,13 +35,15 @@ from drake_teleop.logs.read.description import (
     Wrench,
     load_description,
 )
+from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
 from drake_teleop.logs.read.rotations import (
     WIDTHS,
     nearest_rotation,
+    quaternions,
     rotation_error,
     rotation_matrices,
 )
-from drake_teleop.logs.read.streams import LARGEST, Stream, in_S, on_clock, turned_wrench
+from drake_teleop.logs.read.streams import LARGEST, Stream, at_S, in_S, on_clock, turned_wrench
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 
 MINIMUM_SAMPLES = 16
@@ -130,8 +133,10 @@ class _Reader:
                 self._notes.append("each row is taken for a pose at rest")
             return self._static(self._description.static)
         assert self._description.wrench is not None
+        if self._description.pose is not None and self._description.pose.automatic:
+            self._find(describe_pose_frame)
         if self._description.imu is not None and self._description.imu.automatic:
-            self._find_mounting()
+            self._find(describe_mounting)
         wrench_t, wrench = self._wrench(self._description.wrench)
         pose = imu = None
         if self._description.pose is not None:
@@ -141,14 +146,16 @@ class _Reader:
         streams = [stream for stream in (imu, pose) if stream is not None]
         t = self._common_time(wrench_t, streams)
         log = self._assembled(t, resample(t, wrench_t, wrench), imu, pose)
-        return log if keep_origin else replace(log, t=log.t - wrench_t[0])
+        if pose is not None and pose.raw is not None and imu is None:
+            log = replace(log, posed=self._description.posed(pose.raw))
+        return log if keep_origin else log.earlier(float(wrench_t[0]))
 
-    def _find_mounting(self) -> None:
+    def _find(self, describe: Callable[..., tuple[Description, tuple[str, ...]]]) -> None:
         """Puts what the data say in the place of `auto`."""
         for name in ("wrench", "imu", "pose"):
             if (stream := getattr(self._description, name)) is not None:
                 self._table(stream)
-        self._description, notes = describe_mounting(
+        self._description, notes = describe(
             self._description,
             self._source,
             lambda description: _Reader(description, self._source, 30.0, self._tables).log(),
@@ -192,15 +199,18 @@ class _Reader:
         clock = self._clock("pose", stream, table)
         raw_t = clock.t
         raw_R = self._rotations("pose", stream.orientation, table, clock.total)[clock.rows]
-        if isinstance(stream.frame, tuple):
-            raw_R = raw_R @ np.array(stream.frame).T
+        if stream.R_SP is not None:
+            raw_R = raw_R @ stream.R_SP.T
         t = uniform_times(raw_t)
         dt = spacing(t)
         R_WS = nearest_rotation(resample(t, raw_t, raw_R))
-        acceleration = np.zeros(3)
+        acceleration, raw = np.zeros(3), None
         if stream.position is not None:
             position = self._vectors("pose", "position", stream.position, table, clock.total)
-            position = resample(t, raw_t, position[clock.rows])
+            # From the posed origin to that of S.
+            position = position[clock.rows] - raw_R @ np.array(stream.position_in_sensor)
+            raw = Poses(raw_t, position, quaternions(raw_R))
+            position = resample(t, raw_t, position)
             acceleration = smooth_derivatives(position, dt, self._bandwidth_hz)[2]
         return Stream(
             "pose",
@@ -208,6 +218,7 @@ class _Reader:
             in_S(R_WS, acceleration - self._description.gravity_W),
             *angular_motion(R_WS, dt, self._bandwidth_hz),
             R_WS,
+            raw,
         )
 
     def _imu(self, stream: Imu, pose: Stream | None) -> Stream:
@@ -230,25 +241,8 @@ class _Reader:
             alpha = smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
-            s = self._at_S(s, np.array(stream.position), t, omega, alpha, pose)
+            s = at_S(s, np.array(stream.position), t, omega, alpha, pose)
         return Stream("imu", t, s, omega, alpha)
-
-    def _at_S(
-        self,
-        s: NDArray[np.float64],
-        p_SoIo_S: NDArray[np.float64],
-        t: NDArray[np.float64],
-        omega: NDArray[np.float64] | None,
-        alpha: NDArray[np.float64] | None,
-        pose: Stream | None,
-    ) -> NDArray[np.float64]:
-        """Specific force of So from the one measured at Io, a point of the same rigid body."""
-        if omega is None or alpha is None:
-            assert pose is not None and pose.angular_velocity is not None
-            assert pose.angular_acceleration is not None
-            omega = resample(t, pose.t, pose.angular_velocity)
-            alpha = resample(t, pose.t, pose.angular_acceleration)
-        return s - np.cross(alpha, p_SoIo_S) - np.cross(omega, np.cross(omega, p_SoIo_S))
 
     def _to_S(
         self,

@@ -40,6 +40,13 @@ def nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
     return R
 
 
+def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 4) [w, x, y, z] of rotations (N, 3, 3), of either sign."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]])
+
+
 def _from_quaternions(q: NDArray[np.float64]) -> NDArray[np.float64]:
     w, x, y, z = q.T
     return np.stack(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.read.alignment import low_pass, resample, spacing
 
 LARGEST = {
@@ -23,7 +24,10 @@ LARGEST = {
 
 @dataclass(frozen=True)
 class Stream:
-    """Signals on one clock. Arrays (N, ...) or None; `t` is [s] on the common clock."""
+    """Signals on one clock. Arrays (N, ...) or None; `t` is [s] on the common clock.
+
+    `raw` are the poses of S as they were recorded.
+    """
 
     name: str
     t: NDArray[np.float64]
@@ -31,6 +35,7 @@ class Stream:
     angular_velocity: NDArray[np.float64] | None = None
     angular_acceleration: NDArray[np.float64] | None = None
     R_WS: NDArray[np.float64] | None = None
+    raw: Poses | None = None
 
     @property
     def dt(self) -> float:
@@ -55,3 +60,20 @@ def turned_wrench(R_SW: NDArray[np.float64], wrench_W: NDArray[np.float64]) -> N
     """(N, 6) wrenches in S, of such in W."""
     both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
     return both.reshape(-1, 6)
+
+
+def at_S(
+    s: NDArray[np.float64],
+    p_SoIo_S: NDArray[np.float64],
+    t: NDArray[np.float64],
+    omega: NDArray[np.float64] | None,
+    alpha: NDArray[np.float64] | None,
+    pose: Stream | None,
+) -> NDArray[np.float64]:
+    """Specific force of So from the one measured at Io, a point of the same rigid body."""
+    if omega is None or alpha is None:
+        assert pose is not None and pose.angular_velocity is not None
+        assert pose.angular_acceleration is not None
+        omega = resample(t, pose.t, pose.angular_velocity)
+        alpha = resample(t, pose.t, pose.angular_acceleration)
+    return s - np.cross(alpha, p_SoIo_S) - np.cross(omega, np.cross(omega, p_SoIo_S))

@@ -1,0 +1,93 @@
+"""Whether the poses are of the sensor's frame, from the wrench."""
+
+from __future__ import annotations
+
+from itertools import permutations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.pose_motion.poses import Posed
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.description import UNITS
+
+if TYPE_CHECKING:
+    from drake_teleop.logs.pose_motion.estimate import PoseEstimate
+
+SHORTEST = 4.0
+"""Records below have too few frequencies to tell [s]."""
+_NAMES = ("N m", "N mm", "lbf in")
+# A unit of the positions that is wrong, and centres of mass that no load has [m].
+_UNIT, _NEAREST, _FARTHEST = 0.1, 2e-4, 1.5
+_TORQUE_UNITS = tuple(UNITS[unit] / UNITS[other] for unit, other in permutations(_NAMES, 2))
+_SAME = 0.03
+
+
+def usable(log: Log) -> bool:
+    """Whether poses alone tell the motion of a log, for long enough."""
+    return log.posed is not None and not log.static and float(log.t[-1] - log.t[0]) >= SHORTEST
+
+
+def against_frame(log: Log, delay: float) -> list[Finding]:
+    """That the poses are of another frame than S, if so.
+
+    Args:
+        log: the whole log, in which nothing else is wrong.
+        delay: of the motion behind the wrench, nearly [s].
+    """
+    from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
+
+    if log.posed is None or not usable(log):
+        return []
+    posed = log.posed
+    found = estimate_from_poses(
+        log.t, log.wrench, posed.poses, posed.gravity_W, near=delay, lost=log.bridged
+    )
+    finding = frame_finding(found, posed)
+    return [] if finding is None else [finding]
+
+
+def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:
+    """The shift and the turn, and the lines that say so; None without either.
+
+    Nothing where something else is wrong with the description: a unit of the positions, axes that
+    are mirrored, or a unit of the torque, which puts the centre of mass anywhere.
+
+    Args:
+        found: of the poses as they were described.
+        posed: how that was.
+    """
+    frame, seen, phi = found.frame, found.seen, found.free.state.theta[6:]
+    if not (frame.shifted or frame.turned) or phi[0] <= 0.0:
+        return None
+    unit = abs(seen.kappa - 1.0) > max(_UNIT, 5.0 * seen.kappa_deviation)
+    if unit or (seen.usable and seen.mirrored) or _torque_unit(phi[1:4] / phi[0], frame.p_SoPo_S):
+        return None
+    place = frame.p_SoPo_S + frame.R_SP @ posed.p_SoPo_S
+    said, lines = [], []
+    if frame.shifted:
+        shift = ", ".join(f"{1e3 * x:.1f}" for x in frame.p_SoPo_S)
+        sure = 1e3 * float(frame.position_deviations.max())
+        said.append(f"its origin is [{shift}] mm from that of S in the axes of S (+- {sure:.2g})")
+        lines.append(f"pose.position_in_sensor: {_written(place)}")
+    if frame.turned:
+        angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(frame.R_SP) - 1.0), -1.0, 1.0)))
+        sure = float(frame.turn_deviations_deg.max())
+        said.append(f"its axes are turned by {angle:.1f} deg (+- {sure:.2g})")
+        lines.append(f"pose.rotation_in_sensor: {_written(frame.R_SP @ posed.R_SP)}")
+    return Finding(
+        "pose frame", f"the pose is not that of S: {', and '.join(said)}; set {' and '.join(lines)}"
+    )
+
+
+def _torque_unit(com: np.ndarray, shift: np.ndarray) -> bool:
+    """Whether a wrong unit of the torque explains the shift: com is the torque's, with it."""
+    size = float(np.linalg.norm(com))
+    off = [np.linalg.norm(com - unit * (com - shift)) for unit in _TORQUE_UNITS]
+    return not _NEAREST < size < _FARTHEST or bool(min(off) < _SAME * size)
+
+
+def _written(x: np.ndarray) -> list:
+    """To four digits, without -0.0."""
+    return list((np.round(x, 4) + 0.0).tolist())

@@ -1,0 +1,138 @@
+"""The load of a log whose motion is known by poses alone: `pose_motion` for `identify_log`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.load.batch.consistent import consistent_least_squares
+from drake_teleop.load.batch.methods import METHODS, BatchResult
+from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.normal_equations import NormalEquations
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.check.against_frame import frame_finding, usable
+from drake_teleop.logs.check.conventions import NO_YAML
+from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
+from drake_teleop.logs.read.alignment import low_passed, measured, undelayed
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.tables import FORMATS
+
+ROBUST = ("robust", "consistent")
+"""Methods that take this way; the others have the motion differentiated and believe it."""
+_LEAST = 1e-9
+
+
+@dataclass(frozen=True)
+class PosedFit:
+    """What `fit_posed` found.
+
+    Attributes:
+        log: the samples that were used, with the motion of the splines, low-passed.
+        fit: the load.
+        delay_s: that was taken out [s].
+        finding: that the poses are of another frame, or None.
+    """
+
+    log: Log
+    fit: BatchResult
+    delay_s: float
+    finding: Finding | None
+
+
+def fit_posed(
+    log: Log, method: str, cutoff_hz: float | None, delay: float, *, known: bool
+) -> PosedFit | None:
+    """The load from wrench and poses; None where the method or the log is not of that kind.
+
+    Args:
+        log: as it was read.
+        method: one of `METHODS`.
+        cutoff_hz: of the low-pass on what is shown, and on the residual that is stated.
+        delay: of the motion behind the wrench [s], or nearly.
+        known: whether it is to be taken as it is.
+    """
+    if log.posed is None or method not in ROBUST or not usable(log):
+        return None
+    found = estimate_from_poses(
+        log.t,
+        log.wrench,
+        log.posed.poses,
+        log.posed.gravity_W,
+        delay=delay if known else None,
+        near=delay,
+        gain=log.posed.gain_std,
+        lost=log.bridged,
+    )
+    moved = _moved(log, found)
+    shown = low_passed(moved, cutoff_hz)
+    margin = 2.0 * found.spacing
+    inside = (moved.t >= moved.t[0] + margin) & (moved.t <= moved.t[-1] - margin)
+    shown = shown.only(measured(moved, cutoff_hz) & inside)
+    at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
+    fit = _fit(shown, found, found.rejected[at], method)
+    finding = frame_finding(found, log.posed)
+    if finding is not None:  # then nothing of the load is what it seems
+        flags = fit.identification.identifiable & np.repeat([True, False], [6, 10])
+        fit = replace(fit, note="", identification=replace(fit.identification, identifiable=flags))
+        if Path(log.source).suffix.lower() in FORMATS:
+            finding = replace(finding, message=f"{finding.message} ({NO_YAML})")
+    return PosedFit(shown, fit, found.delay_s, finding)
+
+
+def _moved(log: Log, found: PoseEstimate) -> Log:
+    """The log with the motion of the splines, moved forward by the delay."""
+    assert log.posed is not None
+    moved = undelayed(log, found.delay_s)
+    s, omega, alpha = found.splines.motion(moved.t + found.delay_s, log.posed.gravity_W)
+    return replace(moved, specific_force=s, angular_velocity=omega, angular_acceleration=alpha)
+
+
+def _fit(log: Log, found: PoseEstimate, rejected: NDArray[np.bool_], method: str) -> BatchResult:
+    """As of `identify_batch`, with the estimate and covariance of the spectra."""
+    kept = ~rejected
+    theta = _consistent(found) if method == "consistent" else found.theta
+    residual = log.wrench - theta[:6] - non_contact_wrench(*log.motion, theta[6:])
+    noise = np.sqrt(np.mean(residual[kept] ** 2, axis=0))
+    size = np.sqrt(np.mean(log.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
+    equations = NormalEquations(np.maximum(noise, _LEAST * size + 1e-30))
+    equations.add(*(table[kept] for table in (log.wrench, *log.motion)))
+    plain = equations.solve(found.delay_s)
+    covariance = found.covariance.copy()
+    unknown = np.isinf(np.diag(plain.covariance)) | np.isinf(np.diag(covariance))
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = np.inf
+    load: Identification = replace(
+        plain,
+        phi=theta[6:],
+        offsets=theta[:6],
+        covariance=covariance,
+        identifiable=worth_stating(np.sqrt(np.diag(covariance)), theta[6:]),
+        residual_rms=noise,
+        method=METHODS[method].name,
+    )
+    return BatchResult(load, noise, rejected, _note(found), equations)
+
+
+def _consistent(found: PoseEstimate) -> NDArray[np.float64]:
+    """(16,) the nearest load that a body can have; one of negative mass stays as it is."""
+    theta, covariance = found.theta, found.covariance
+    if theta[6] < 0.0 or np.isinf(np.diag(covariance)).any():
+        return theta
+    scale = 1.0 / np.sqrt(np.diag(covariance))
+    gram = np.linalg.pinv(covariance * np.outer(scale, scale), hermitian=True)
+    gram = gram * np.outer(scale, scale)
+    return consistent_least_squares(gram, gram @ theta, theta)
+
+
+def _note(found: PoseEstimate) -> str:
+    if found.fit.rigid:
+        return found.note
+    text = (
+        "the wrench is not that of a rigid load alone: gains, bending, or a frame that is not S;"
+        f" deviations are {found.fit.inflation:.2g} times as large as by noise"
+    )
+    return f"{found.note}; {text}" if found.note else text

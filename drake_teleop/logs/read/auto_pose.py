@@ -1,0 +1,84 @@
+"""What `pose.position_in_sensor: auto` and `pose.rotation_in_sensor: auto` stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.delay import estimate_delay
+from drake_teleop.logs.read.description import Description
+
+
+def describe_pose_frame(
+    description: Description, source: str, read: Callable[[Description], Log]
+) -> tuple[Description, tuple[str, ...]]:
+    """The description with what the wrench says of the frame of the poses.
+
+    The load is fitted together with the transform between pose and sensor, see
+    `drake_teleop.logs.pose_motion`; an IMU is not asked.
+
+    Args:
+        description: with a pose that has `auto`.
+        source: its file, for messages.
+        read: reads a log as it is described.
+
+    Returns:
+        the description, and notes that say what was found and how to write it down.
+
+    Raises:
+        DrakeTeleopError: if the data do not determine it.
+    """
+    from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
+
+    pose = description.pose
+    assert pose is not None
+    plain = {"position_in_sensor": (0.0, 0.0, 0.0), "rotation_in_sensor": None, "frame": "sensor"}
+    alone = {"imu": None, "pose": pose.model_copy(update=plain)}
+    log = read(description.model_copy(update=alone))
+    assert log.posed is not None
+    found = estimate_from_poses(
+        log.t,
+        log.wrench,
+        log.posed.poses,
+        log.posed.gravity_W,
+        p_SoPo_S=None,
+        R_SP=None,
+        near=estimate_delay(log, None) or 0.0,
+        lost=log.bridged,
+    )
+    frame = found.frame
+    changes: dict[str, Any] = {}
+    notes: list[str] = []
+    if pose.position_in_sensor == "auto":
+        _known(frame.position_known, f"{source}:pose.position_in_sensor", "the pose's origin along")
+        changes["position_in_sensor"] = tuple(frame.p_SoPo_S.tolist())
+        sure = 1e3 * float(frame.position_deviations.max())
+        notes.append(_note("position_in_sensor", frame.p_SoPo_S, f"{sure:.2g} mm"))
+    if pose.rotation_in_sensor == "auto":
+        _known(frame.rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about")
+        changes["rotation_in_sensor"] = tuple(map(tuple, frame.R_SP.tolist()))
+        sure = float(frame.turn_deviations_deg.max())
+        notes.append(_note("rotation_in_sensor", frame.R_SP, f"{sure:.2g} deg"))
+    return description.model_copy(update={"pose": pose.model_copy(update=changes)}), tuple(notes)
+
+
+def _known(known: Any, where: str, what: str) -> None:
+    if not known.all():
+        axes = ", ".join(a for a, sure in zip("xyz", known, strict=True) if not sure)
+        raise DrakeTeleopError(
+            f"the data do not determine {what} {axes}",
+            where=where,
+            remedy="turn the sensor faster, about more axes, touching nothing; or give it",
+        )
+
+
+def _note(name: str, value: Any, sure: str) -> str:
+    written = (np.round(value, 4) + 0.0).tolist()
+    return (
+        f"pose.{name} found, standard deviation {sure}; write it into the description as"
+        f" pose.{name}: {written}"
+    )

@@ -1,0 +1,69 @@
+"""Kinds of fields of a log description: numbers, vectors, frames and places."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field, WithJsonSchema
+
+from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
+
+ROTATION_TOLERANCE = 0.01
+"""Entries of R^T R may be off those of the identity by this."""
+
+
+def _frame(value: Any) -> Any:
+    if value in ("sensor", "base"):
+        return value
+    try:
+        matrix = np.asarray(value)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (3, 3) or matrix.dtype.kind not in "fi":
+        raise ValueError("must be sensor, base, or a 3x3 rotation matrix from the stream to S")
+    if not (np.abs(matrix) < 2.0).all() or rotation_error(matrix) > ROTATION_TOLERANCE:
+        raise ValueError("is not a rotation: rows must be orthonormal with determinant +1")
+    return tuple(map(tuple, nearest_rotation(matrix).tolist()))
+
+
+def _imu_frame(value: Any) -> Any:
+    return value if value == "auto" else _frame(value)
+
+
+def _turn(value: Any) -> Any:
+    if value in ("sensor", "base"):
+        raise ValueError("must be a 3x3 rotation matrix from the posed frame to S, or auto")
+    return value if value is None else _imu_frame(value)
+
+
+def _place(value: Any) -> Any:
+    if isinstance(value, str) and value != "auto":
+        raise ValueError("must be three numbers [m], or auto")
+    return value
+
+
+def _gravity(value: Any) -> Any:
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        value = [0.0, 0.0, -float(value)]
+    return value
+
+
+Column = str | int
+
+
+Number = Annotated[float, Field(strict=True)]  # neither true nor "1"
+Vector = Annotated[tuple[Number, Number, Number], Field(strict=False)]
+Rotation = tuple[Vector, Vector, Vector]
+_GRAVITY_SCHEMA = {
+    "anyOf": [
+        {"type": "number"},
+        {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
+    ],
+    "description": "magnitude, or the vector in the world, m/s^2",
+}
+Gravity = Annotated[Vector, BeforeValidator(_gravity), WithJsonSchema(_GRAVITY_SCHEMA)]
+Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_frame)]
+ImuFrame = Annotated[Literal["sensor", "base", "auto"] | Rotation, BeforeValidator(_imu_frame)]
+Turn = Annotated[Literal["auto"] | Rotation | None, BeforeValidator(_turn)]
+Place = Annotated[Vector | Literal["auto"], BeforeValidator(_place)]

@@ -1,0 +1,168 @@
+"""Logs whose motion is known by noisy poses, of S or of another frame, from file to load."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+from posed_record import GRAVITY_W, LATE, PHI, SHIFT, TURN, Kind, record
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.check.against_frame import frame_finding
+from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
+from drake_teleop.logs.pose_motion.poses import Posed
+from drake_teleop.logs.processing import IdentifiedLog, identify_log
+from drake_teleop.logs.read.description import load_description
+from drake_teleop.logs.read.reading import read_log
+
+WRENCH, POSE = ("fx", "fy", "fz", "tx", "ty", "tz"), ("qw", "qx", "qy", "qz", "x", "y", "z")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Two records of 10 s: of S, and of a frame that is shifted and turned."""
+    folder = tmp_path_factory.mktemp("posed")
+    for name, kind in (
+        ("own", Kind(seed=1)),
+        ("tcp", Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=2)),
+    ):
+        t, wrench, poses = record(kind)
+        for file, times, names, values in (
+            ("wrench", t, WRENCH, wrench),
+            ("pose", poses.t, POSE, np.hstack([poses.quaternion, poses.position])),
+        ):
+            times, values = times[times < 10.0], values[times < 10.0]
+            columns = {"t": times + 50.0} | dict(zip(names, values.T, strict=True))
+            pl.DataFrame(columns).write_csv(folder / f"{name}_{file}.csv")
+    return folder
+
+
+def described(folder: Path, name: str, wrench: Any = None, **pose: Any) -> Path:
+    time = {"column": "t"}
+    path = folder / f"{name}.yaml"
+    document = {
+        "gravity": GRAVITY_W.tolist(),
+        "wrench": {
+            "file": f"{name}_wrench.csv",
+            "time": time,
+            "force": {"columns": list(WRENCH[:3])},
+            "torque": {"columns": list(WRENCH[3:])},
+            **(wrench or {}),
+        },
+        "pose": {
+            "file": f"{name}_pose.csv",
+            "time": time,
+            "orientation": {"columns": list(POSE[:4]), "form": "quaternion_wxyz"},
+            "position": {"columns": list(POSE[4:])},
+            **pose,
+        },
+    }
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+def deviations(found: IdentifiedLog) -> np.ndarray:
+    load = found.identification
+    return (load.phi - PHI) / load.standard_deviations[6:]
+
+
+def test_identify_takes_the_noise_of_poses_into_account(folder):
+    found = identify_log(described(folder, "own"))
+    load = found.identification
+    assert np.abs(deviations(found)).max() < 3.5
+    assert load.identifiable.all() and not found.findings
+    assert load.delay_s == pytest.approx(LATE, abs=1e-3)
+    assert load.standard_deviations[6] < 1e-3
+    residual = found.log.wrench - found.predicted
+    np.testing.assert_allclose(residual[~found.rejected].std(axis=0), load.residual_rms, rtol=0.1)
+    assert load.residual_rms[:3].max() < 0.1  # of 0.1 N before the low-pass
+
+
+def test_gains_that_are_stated_widen_the_deviations(folder):
+    path = described(folder, "own", wrench={"gain_std": 0.01})
+    load = identify_log(path).identification
+    assert 0.005 * load.mass < load.standard_deviations[6] < 0.03 * load.mass
+
+
+def test_a_pose_of_another_frame_is_named_with_the_lines_that_mend_it(folder):
+    path = described(folder, "tcp")
+    found = identify_log(path)
+    (finding,) = found.findings
+    assert finding.name == "pose frame"
+    assert not found.identification.identifiable[6:].any()
+    place, turn = (
+        json.loads(finding.message.split(f"pose.{name}: ")[1].split(" and ")[0])
+        for name in ("position_in_sensor", "rotation_in_sensor")
+    )
+    np.testing.assert_allclose(place, SHIFT, atol=1e-3)
+    np.testing.assert_allclose(turn, TURN, atol=2e-3)
+    mended = described(folder, "tcp", position_in_sensor=place, rotation_in_sensor=turn)
+    found = identify_log(mended)
+    assert not found.findings and found.identification.identifiable.all()
+    assert np.abs(deviations(found)).max() < 4.0
+
+
+def test_what_is_named_counts_from_what_was_described(folder, tmp_path):
+    """Half of the shift and the whole turn are described: the line has the whole shift."""
+    path = described(folder, "tcp", position_in_sensor=(0.5 * SHIFT).tolist(), frame=TURN.tolist())
+    (finding,) = identify_log(path).findings
+    assert "rotation_in_sensor" not in finding.message
+    summary = inspect_command(path, tmp_path, quiet=True)
+    assert finding.message.split("set ")[1] in summary["findings"][-1]["message"]
+    place = json.loads(finding.message.split("position_in_sensor: ")[1])
+    np.testing.assert_allclose(place, SHIFT, atol=1e-3)
+
+
+def test_auto_finds_the_frame_and_says_so(folder):
+    path = described(folder, "tcp", position_in_sensor="auto", rotation_in_sensor="auto")
+    log = read_log(path)
+    assert log.posed is not None
+    np.testing.assert_allclose(log.posed.p_SoPo_S, SHIFT, atol=1e-3)
+    np.testing.assert_allclose(log.posed.R_SP, TURN, atol=1e-3)
+    assert [note.split(" found")[0] for note in log.notes] == [
+        "pose.position_in_sensor",
+        "pose.rotation_in_sensor",
+    ]
+
+
+def test_auto_that_the_data_do_not_tell_is_an_error(folder, tmp_path):
+    t, wrench, poses = record(Kind(seed=3))
+    rest = np.hstack([np.repeat(poses.quaternion[:1], len(poses.t), 0), 0.0 * poses.position])
+    still = pl.DataFrame({"t": poses.t} | dict(zip(POSE, rest.T, strict=True)))
+    noise = np.random.default_rng(0).normal(size=wrench.shape) + wrench[:1]
+    moved = pl.DataFrame({"t": t} | dict(zip(WRENCH, noise.T, strict=True)))
+    still.write_csv(tmp_path / "rest_pose.csv")
+    moved.write_csv(tmp_path / "rest_wrench.csv")
+    with pytest.raises(DrakeTeleopError, match="do not determine the pose's origin along x, y, z"):
+        read_log(described(tmp_path, "rest", position_in_sensor="auto"))
+
+
+@pytest.mark.parametrize(
+    ("pose", "wrench", "message"),
+    [
+        ({"frame": TURN.tolist(), "rotation_in_sensor": TURN.tolist()}, {}, "give one of them"),
+        ({"position": None, "position_in_sensor": "auto"}, {}, "need positions"),
+        ({"rotation_in_sensor": "auto"}, {"frame": "base"}, "axes of the sensor, not in base"),
+        ({"rotation_in_sensor": "base"}, {}, "must be a 3x3 rotation matrix"),
+        ({}, {"gain_std": -0.1}, "greater than or equal to 0"),
+    ],
+)
+def test_descriptions_that_contradict_themselves_are_refused(folder, pose, wrench, message):
+    with pytest.raises(DrakeTeleopError, match=message):
+        load_description(described(folder, "own", wrench, **pose))
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e-3, 8.8507])
+def test_a_wrong_unit_of_the_torque_is_no_shift(unit):
+    """The motion shows r + R c and the torque says c: a lever along c explains a wrong unit too."""
+    t, wrench, poses = record(Kind(seed=4))
+    wrench = wrench * np.repeat([1.0, unit], 3)
+    posed = Posed(poses, GRAVITY_W)
+    found = estimate_from_poses(t, wrench, poses, GRAVITY_W)
+    assert frame_finding(found, posed) is None
