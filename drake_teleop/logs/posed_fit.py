@@ -19,11 +19,13 @@ from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
 from drake_teleop.logs.read.alignment import low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.tables import FORMATS
 
 ROBUST = ("robust", "consistent")
 """Methods that take this way; the others have the motion differentiated and believe it."""
 _LEAST = 1e-9
+_DELAY_KNOWN = 0.005  # s, standard deviation
 
 
 @dataclass(frozen=True)
@@ -34,17 +36,19 @@ class PosedFit:
         log: the samples that were used, with the motion of the splines, low-passed.
         fit: the load.
         delay_s: that was taken out [s].
+        source: "given", "estimated", or "undetermined" (0 was taken).
         finding: that the poses are of another frame, or None.
     """
 
     log: Log
     fit: BatchResult
     delay_s: float
+    source: str
     finding: Finding | None
 
 
 def fit_posed(
-    log: Log, method: str, cutoff_hz: float | None, delay: float, *, known: bool
+    log: Log, method: str, cutoff_hz: float | None, delay: str | float
 ) -> PosedFit | None:
     """The load from wrench and poses; None where the method or the log is not of that kind.
 
@@ -52,21 +56,14 @@ def fit_posed(
         log: as it was read.
         method: one of `METHODS`.
         cutoff_hz: of the low-pass on what is shown, and on the residual that is stated.
-        delay: of the motion behind the wrench [s], or nearly.
-        known: whether it is to be taken as it is.
+        delay: of the motion behind the wrench [s], or "auto".
     """
     if log.posed is None or method not in ROBUST or not usable(log):
         return None
-    found = estimate_from_poses(
-        log.t,
-        log.wrench,
-        log.posed.poses,
-        log.posed.gravity_W,
-        delay=delay if known else None,
-        near=delay,
-        gain=log.posed.gain_std,
-        lost=log.bridged,
-    )
+    known, source = (None, "estimated") if delay == "auto" else delay_of(log, None, delay)
+    found = _estimate(log, known)
+    if known is None and not found.delay_deviation < _DELAY_KNOWN:
+        found, source = _estimate(log, 0.0), "undetermined"
     moved = _moved(log, found)
     shown = low_passed(moved, cutoff_hz)
     margin = 2.0 * found.spacing
@@ -80,7 +77,20 @@ def fit_posed(
         fit = replace(fit, note="", identification=replace(fit.identification, identifiable=flags))
         if Path(log.source).suffix.lower() in FORMATS:
             finding = replace(finding, message=f"{finding.message} ({NO_YAML})")
-    return PosedFit(shown, fit, found.delay_s, finding)
+    return PosedFit(shown, fit, found.delay_s, source, finding)
+
+
+def _estimate(log: Log, delay: float | None) -> PoseEstimate:
+    assert log.posed is not None
+    return estimate_from_poses(
+        log.t,
+        log.wrench,
+        log.posed.poses,
+        log.posed.gravity_W,
+        delay=delay,
+        gain=log.posed.gain_std,
+        lost=log.bridged,
+    )
 
 
 def _moved(log: Log, found: PoseEstimate) -> Log:

@@ -138,11 +138,11 @@ def identify_log(
     """
     check_method(method)
     log = read_log(path, bandwidth_hz=cutoff_hz)
-    delay_s, source = delay_of(log, cutoff_hz, delay)
-    posed = fit_posed(log, method, cutoff_hz, delay_s, known=source != "estimated")
+    posed = fit_posed(log, method, cutoff_hz, delay)
     if posed is not None:
-        log, fit, delay_s = posed.log, posed.fit, posed.delay_s
+        log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.source
     else:
+        delay_s, source = delay_of(log, cutoff_hz, delay)
         log = undelayed(log, delay_s)
         log = low_passed(log, cutoff_hz).only(measured(log, cutoff_hz))
         fit = identify_batch(

@@ -338,7 +338,7 @@ def test_best_delay_is_found_from_afar():
     grid = Grid.of(t, wrench)
     taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
     spectra = spectra_of(PoseSplines(poses.continued(), 0.07), grid, taper, GRAVITY_W, -0.05, 20.0)
-    assert best_delay(spectra)[0] == pytest.approx(LATE, abs=2e-3)
+    assert best_delay(spectra, 0.1)[0] == pytest.approx(LATE, abs=2e-3)
 
 
 def test_a_taper_is_zero_where_lost_and_has_edges():

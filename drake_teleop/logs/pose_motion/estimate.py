@@ -154,7 +154,7 @@ def estimate_from_poses(
         p_SoPo_S: (3,) where Po is in S [m]; None: the data tell.
         R_SP: (3, 3) how P is turned; None: the data tell.
         delay: of the poses behind the wrench, if known [s]; None: found.
-        near: a delay that is found is within 0.1 s of this one [s].
+        near: a delay that is found is within 0.25 s of this one, and a tenth of the record [s].
         gain: standard deviation of the sensor's gains, such as 0.01; it enters the covariance.
         lost: (N,) samples that do not count, such as bridged gaps.
 
@@ -165,15 +165,15 @@ def estimate_from_poses(
     wrench = checked("wrench", wrench, len(t), 6)
     gravity = checked("gravity_W", gravity_W, 3)
     grid, poses = Grid.of(t, wrench), poses.continued()
-    base = _base_taper(grid, poses, lost)
-    if (base > 0.5).sum() < _FEWEST:
+    guess = near if delay is None else delay
+    if (_base_taper(grid, poses, lost, guess) > 0.5).sum() < _FEWEST:
         raise DrakeTeleopError(
             "wrench and poses have too little in common",
             remedy="record longer, without interruptions",
         )
     top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
     splines, spectra, taper, rejected, note = _searched(
-        grid, poses, base, gravity, near if delay is None else delay, top, known=delay is not None
+        grid, poses, lost, gravity, guess, top, known=delay is not None
     )
     zeta = splines.signals(grid.t + spectra.delay, gravity)
     Z = spectra.moments()
@@ -210,7 +210,7 @@ def estimate_from_poses(
 def _searched(
     grid: Grid,
     poses: Poses,
-    base: Array,
+    lost: NDArray[np.bool_] | None,
     gravity: Array,
     delay: float,
     top: float,
@@ -221,12 +221,12 @@ def _searched(
     part = _liveliest(grid)
     some = replace(grid, t=grid.t[part], wrench=_rows(grid, part))
     few = _within(poses, some)
-    taper = base[part] * end_taper(some.t, some.t[0], some.t[-1])
+    taper = _base_taper(grid, poses, lost, delay)[part] * end_taper(some.t, some.t[0], some.t[-1])
     spacing, late = first_guess(few, some, taper, gravity, delay, top, known=known)
     first = spectra_of(PoseSplines(few, spacing), some, taper, gravity, late, top)
     clear = without(taper, disturbed(first, some, taper, spacing)[0], grid.dt)
     spacing, late = best_spacing(few, some, clear, gravity, late, top, known=known)
-    splines = PoseSplines(poses, spacing)
+    splines, base = PoseSplines(poses, spacing), _base_taper(grid, poses, lost, late)
     spectra = spectra_of(splines, grid, base, gravity, late, top)
     rejected, note = disturbed(spectra, grid, base, spacing)
     taper = without(base, rejected, grid.dt)
@@ -255,9 +255,10 @@ def _liveliest(grid: Grid) -> slice:
     return slice(first, first + length)
 
 
-def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None) -> Array:
+def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None, delay: float) -> Array:
     """(M,) without the ends, gaps of the poses, and what the caller takes away."""
-    start, stop = max(grid.t[0], poses.t[0]), min(grid.t[-1], poses.t[-1])
+    stamps = poses.t - delay
+    start, stop = max(grid.t[0], stamps[0]), min(grid.t[-1], stamps[-1])
     if stop - start < 1.0:
         return np.zeros(len(grid.t))
     taper = end_taper(grid.t, start, stop)
@@ -265,8 +266,8 @@ def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None) -> Arr
     if lost is not None:
         rows = len(grid.t) * grid.stride
         bad |= lost[:rows].reshape(-1, grid.stride).any(axis=1)
-    for k in np.flatnonzero(np.diff(poses.t) > _GAP):
-        bad |= (grid.t > poses.t[k] - _BESIDE) & (grid.t < poses.t[k + 1] + _BESIDE)
+    for k in np.flatnonzero(np.diff(stamps) > _GAP):
+        bad |= (grid.t > stamps[k] - _BESIDE) & (grid.t < stamps[k + 1] + _BESIDE)
     return without(taper, bad, grid.dt, grid.dt)
 
 

@@ -39,8 +39,8 @@ from drake_teleop.logs.pose_motion.splines import (
 
 SPACINGS = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
 """Distances of the knots that are tried [s]."""
-REACH = 0.1
-"""Delays are looked for so far on either side [s]."""
+REACH = 0.25
+"""Delays are looked for so far on either side, or a tenth of the record [s]."""
 ROUNDING = 1e-7
 """Least noise of a channel, relative to the wrench."""
 _COARSE, _FINEST = 0.016, 1e-5
@@ -157,7 +157,7 @@ def spectra_of(
     )
 
 
-def best_delay(spectra: Spectra, reach: float = REACH) -> tuple[float, float]:
+def best_delay(spectra: Spectra, reach: float) -> tuple[float, float]:
     """The delay of the least L, within `reach` of the spectra's, and that L.
 
     Make the spectra anew at the delay that was found, see `Spectra.at`.
@@ -192,11 +192,11 @@ def first_guess(
 
     A delay that is known stays. With knots too fine the motion is noise, and no delay shows.
     """
-    few = _for_search(poses)
-    found = []
+    few, found = _for_search(poses), []
+    reach = min(REACH, 0.1 * float(grid.t[-1] - grid.t[0]))
     for h in _allowed(few)[::2]:
         spectra = spectra_of(PoseSplines(few, h), grid, taper, gravity_W, delay, top)
-        late, cost = (delay, spectra.fit().cost) if known else best_delay(spectra)
+        late, cost = (delay, spectra.fit().cost) if known else best_delay(spectra, reach)
         found.append((cost, h, late))
     return min(found)[1:]
 

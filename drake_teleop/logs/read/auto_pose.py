@@ -9,7 +9,6 @@ import numpy as np
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.description import Description
 
 
@@ -47,7 +46,6 @@ def describe_pose_frame(
         log.posed.gravity_W,
         p_SoPo_S=None,
         R_SP=None,
-        near=estimate_delay(log, None) or 0.0,
         lost=log.bridged,
     )
     frame = found.frame
