@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.wrench_alone import mirrored_finding, other_units
 from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import UNITS
+from drake_teleop.logs.read.description import UNITS, Wrench
 
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
+    from drake_teleop.logs.pose_motion.read_off import ReadOff
 
 SHORTEST = 4.0
 """Records below have too few frequencies to tell [s]."""
@@ -22,6 +24,7 @@ _NAMES = ("N m", "N mm", "lbf in")
 _UNIT, _NEAREST, _FARTHEST = 0.1, 2e-4, 1.5
 _TORQUE_UNITS = tuple(UNITS[unit] / UNITS[other] for unit, other in permutations(_NAMES, 2))
 _SAME = 0.03
+_OBLIQUE = 10.0
 
 
 def usable(log: Log) -> bool:
@@ -29,10 +32,11 @@ def usable(log: Log) -> bool:
     return log.posed is not None and not log.static and float(log.t[-1] - log.t[0]) >= SHORTEST
 
 
-def against_frame(log: Log, delay: float) -> list[Finding]:
-    """That the poses are of another frame than S, if so.
+def against_frame(wrench: Wrench, log: Log, delay: float) -> list[Finding]:
+    """That the wrench has mirrored axes or other units, or the poses are of another frame than S.
 
     Args:
+        wrench: as described.
         log: the whole log, in which nothing else is wrong.
         delay: of the motion behind the wrench, nearly [s].
     """
@@ -44,8 +48,26 @@ def against_frame(log: Log, delay: float) -> list[Finding]:
     found = estimate_from_poses(
         log.t, log.wrench, posed.poses, posed.gravity_W, near=delay, lost=log.bridged
     )
-    finding = frame_finding(found, posed)
+    finding = _of_wrench(wrench, found.seen) or frame_finding(found, posed)
     return [] if finding is None else [finding]
+
+
+def _of_wrench(wrench: Wrench, seen: ReadOff) -> Finding | None:
+    """What the saturated model says of the wrench; a shift along the centre of mass says the same
+    as a wrong unit, and is the less likely of the two."""
+    if not seen.usable or abs(seen.kappa - 1.0) > _UNIT:
+        return None
+    if seen.mirrored:
+        sign = float(np.trace(seen.R_SP)) < -2.5
+        return (
+            None
+            if sign or seen.oblique_deg > _OBLIQUE
+            else mirrored_finding(wrench, seen.permutation)
+        )
+    mass = float(seen.masses.mean())
+    both = seen.turning_force, seen.gravity_torque
+    found = other_units(wrench, mass, both, seen.moment_deviations)
+    return None if found is None else found[0]
 
 
 def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:

@@ -19,11 +19,18 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.against_frame import against_frame
 from drake_teleop.logs.check.against_load import against_load, payload_finding
 from drake_teleop.logs.check.against_pose import against_pose
+from drake_teleop.logs.check.against_position import position_finding
+from drake_teleop.logs.check.channels import channel_findings
 from drake_teleop.logs.check.edits import in_other_unit, unit_findings
 from drake_teleop.logs.check.finding import CLOCK, Finding
+from drake_teleop.logs.check.imu_alone import against_itself
 from drake_teleop.logs.check.load_fit import EXPLAINED, LoadFit, load_fit, unexplained_share
 from drake_teleop.logs.check.log_data import LogData
+from drake_teleop.logs.check.over_time import drift_finding
+from drake_teleop.logs.check.wrench_alone import wrench_findings
+from drake_teleop.logs.read.alignment import undelayed
 from drake_teleop.logs.read.canonical import Log, describe_canonical
+from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
@@ -133,21 +140,38 @@ def check_conventions(
 
 def _check(data: LogData, description: Description) -> Conventions:
     log = data.read(description)
+    dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
+    if dead:  # What that does to motion and load would be taken for something else.
+        return Conventions((*dead, *broken), load_fit(data.thin(description)), None, None)
     findings = list(unit_findings(description, log))
-    if findings:
-        description = in_other_unit(description)
+    description = in_other_unit(description, log)
+    more, description = against_itself(description, data.thin(description))
+    findings += more
     mounting = None
     if description.imu and description.pose:
         more, mounting, description = against_pose(description, data)
         findings += more
     fit = load_fit(data.thin(description))
-    if mounting is not None and mounting.mirrored:
+    if broken or (mounting is not None and mounting.mirrored):
+        return Conventions((*broken, *findings), fit, mounting, None)
+    if not findings:
+        more, description = drift_finding(description, data)
+        findings += more
+        lag = 0.0 if mounting is None else mounting.lag_s
+        findings += position_finding(description, data, lag)
+    more, description = wrench_findings(description, _aligned(data.thin(description)))
+    findings += more
+    if any(finding.name in ("swapped axes", "mounting") for finding in more):
         return Conventions(tuple(findings), fit, mounting, None)
     more, delay = against_load(description, data)
     findings = _one_clock(description, [*findings, *more], mounting, delay)
-    if all(finding.name == "lag" for finding in findings):
-        findings += against_frame(log, delay or 0.0)
+    if description.wrench is not None and all(finding.name == "lag" for finding in findings):
+        findings += against_frame(description.wrench, log, delay or 0.0)
     return Conventions(tuple(findings), fit, mounting, delay)
+
+
+def _aligned(log: Log) -> Log:
+    return log if log.static else undelayed(log, estimate_delay(log, 30.0) or 0.0)
 
 
 def _one_clock(

@@ -27,29 +27,40 @@ def _gravity_field(description: Description) -> str | None:
 def unit_findings(description: Description, log: Log) -> Iterator[Finding]:
     """That an accelerometer, or gravity at rest, is not in the unit that is given, if so."""
     field = _gravity_field(description)
-    if field is None:
+    unit = None if field is None else _right_unit(description, log, field)
+    if field is None or unit is None:
         return
-    ratio = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
-    ratio /= float(np.linalg.norm(description.gravity))
-    unit = _field(description, field).unit
-    # 9.81 apart; a median that far from gravity is no motion.
-    if (unit == "m/s^2" and 0.07 < ratio < 0.15) or (unit == "g" and 7 < ratio < 14):
-        yield Finding(
-            "units",
-            f"the accelerometer reads {ratio:.3g} times gravity: it is not in {unit};"
-            f" set {field}.unit: {_other_unit(unit)}",
-        )
+    ratio = _over_gravity(description, log)
+    yield Finding(
+        "units",
+        f"the accelerometer reads {ratio:.3g} times gravity: it is not in"
+        f" {_field(description, field).unit}; set {field}.unit: {unit}",
+    )
 
 
-def _other_unit(unit: str) -> str:
-    return "g" if unit == "m/s^2" else "m/s^2"
-
-
-def in_other_unit(description: Description) -> Description:
+def in_other_unit(description: Description, log: Log) -> Description:
     """The description with that unit exchanged."""
     field = _gravity_field(description)
-    assert field is not None
-    return edit_field(description, f"{field}.unit", _other_unit(_field(description, field).unit))
+    unit = None if field is None else _right_unit(description, log, field)
+    return description if unit is None else edit_field(description, f"{field}.unit", unit)
+
+
+def _over_gravity(description: Description, log: Log) -> float:
+    median = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
+    return median / float(np.linalg.norm(description.gravity))
+
+
+def _right_unit(description: Description, log: Log, field: str) -> str | None:
+    """The unit in which the median is gravity, if it is not the one that is given.
+
+    Units are 9.81 or more apart; a median that far from gravity is no motion.
+    """
+    given = _field(description, field).unit
+    number = _over_gravity(description, log) / description.scale(given)
+    for unit in ("m/s^2", "g", "mm/s^2"):
+        if unit != given and 0.7 < number * description.scale(unit) < 1.43:
+            return unit
+    return None
 
 
 def _field(description: Description, path: str) -> Any:

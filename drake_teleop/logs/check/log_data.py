@@ -21,11 +21,11 @@ _STAMPS = "time stamps of a stream without"
 
 
 class LogData:
-    """The tables of a log, as they are and thinned."""
+    """The tables of a log, as they are, by their `source`, and thinned."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
         self._source = source
-        self._tables = tables
+        self.tables = tables
         self._thinned: dict[Path, Table] = {}
         steps: dict[Path, list[int]] = {}
         for stream in _streams(description):
@@ -41,7 +41,7 @@ class LogData:
 
     def read(self, description: Description) -> Log:
         """The whole log."""
-        return read_description(description, self._source, tables=self._tables)
+        return read_description(description, self._source, tables=self.tables)
 
     def thin(self, description: Description) -> Log:
         """The log with as many samples as a comparison needs."""
@@ -59,7 +59,7 @@ class LogData:
         """When the stream's first row was taken, on the common clock [s]."""
         if stream.time.column is None:
             return float(stream.time.offset)
-        t = self._tables[stream.source].single(stream.time.column, "time")
+        t = self.tables[stream.source].single(stream.time.column, "time")
         return float(t[0]) * description.scale(stream.time.unit) + stream.time.offset
 
     def _stride(self, description: Description, stream: Any) -> int:
@@ -70,17 +70,17 @@ class LogData:
         if time.rate is not None:
             rate = time.rate
         else:
-            t = self._tables[stream.source].single(str(time.column), "time")
+            t = self.tables[stream.source].single(str(time.column), "time")
             if len(t) < 2:  # read_log says what is wrong
                 return 1
             rate = 1 / max(1e-12, float(np.median(np.diff(t))) * description.scale(time.unit))
         # So that enough are left of a short record.
-        most = min(rate / _RATE, self._tables[stream.source].rows / MINIMUM_SAMPLES)
+        most = min(rate / _RATE, self.tables[stream.source].rows / MINIMUM_SAMPLES)
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
     def _thin(self, stream: Any, thin: Table, k: int) -> None:
         """Means over k rows; of an orientation, which has no mean, the row in the middle."""
-        table = self._tables[stream.source]
+        table = self.tables[stream.source]
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):

@@ -33,7 +33,10 @@ class ReadOff:
         masses: (3,) its singular values [kg].
         permutation: (3, 3) its nearest matrix of one 1 or -1 in each row and column.
         oblique_deg: the angle between `R_SP` and `permutation` [deg].
-        gravity_torque: (3, 3) torque over minus gravity [kg m].
+        gravity_torque: (3, 3) torque over minus gravity [kg m], [h]x R_SP with h = m c.
+        turning_force: (3, 3) force over minus angular acceleration, the same if the origin of P is
+            that of S, and the units are right.
+        moment_deviations: of the lengths of the last and the one before; inf if not determined.
     """
 
     kappa: float
@@ -45,6 +48,8 @@ class ReadOff:
     permutation: Array
     oblique_deg: float
     gravity_torque: Array
+    turning_force: Array
+    moment_deviations: tuple[float, float]
 
     @property
     def usable(self) -> bool:
@@ -64,7 +69,7 @@ def read_off(fit: Saturated) -> ReadOff:
     shown = bool((variances[:3, 4:7] > 0.0).all())
     U, masses, Vt = np.linalg.svd(M_g)
     R_SP = U @ Vt
-    permutation = _nearest_permutation(R_SP)
+    permutation = nearest_permutation(R_SP)
     cosine = 0.5 * (float(np.trace(permutation.T @ R_SP)) - 1.0)
     return ReadOff(
         kappa=kappa,
@@ -76,7 +81,13 @@ def read_off(fit: Saturated) -> ReadOff:
         permutation=permutation,
         oblique_deg=float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
         gravity_torque=C[3:, 4:7],
+        turning_force=-C[:3, 7:10],
+        moment_deviations=(_length(variances[:3, 7:10]), _length(variances[3:, 4:7])),
     )
+
+
+def _length(variances: Array) -> float:
+    return float(np.sqrt(variances.sum())) if (variances > 0.0).all() else np.inf
 
 
 def _ratio(a: Array, g: Array, variances_a: Array, variances_g: Array) -> tuple[float, float]:
@@ -96,7 +107,7 @@ def _ratio(a: Array, g: Array, variances_a: Array, variances_g: Array) -> tuple[
     return kappa, information**-0.5
 
 
-def _nearest_permutation(R: Array) -> Array:
+def nearest_permutation(R: Array) -> Array:
     """Of the 48 matrices with one 1 or -1 in each row and column, that with the largest trace."""
     from scipy.optimize import linear_sum_assignment
 

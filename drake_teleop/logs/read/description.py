@@ -65,6 +65,7 @@ UNITS = {
     "deg/s^2": np.pi / 180,
     "m": 1.0,
     "mm": 1e-3,
+    "mm/s^2": 1e-3,
 }
 """SI value of each unit; "g" is the magnitude of the description's gravity."""
 
@@ -116,7 +117,7 @@ class Torque(_Strict):
 
 class Acceleration(_Strict):
     columns: tuple[Column, ...]
-    unit: Literal["m/s^2", "g"] = "m/s^2"
+    unit: Literal["m/s^2", "g", "mm/s^2"] = "m/s^2"
     bias: Vector = (0.0, 0.0, 0.0)
 
 

@@ -1,0 +1,75 @@
+"""The accelerometer against the pose's positions, which nothing else uses beside an IMU."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.fitting import fit_with_offset
+from drake_teleop.logs.check.log_data import LogData
+from drake_teleop.logs.read.alignment import low_pass, resample
+from drake_teleop.logs.read.description import Description
+from drake_teleop.vectors import cross_matrix
+
+_CUTOFF = 3.0
+_SHIFT, _KNOWN, _SURE = 0.02, 0.01, 5.0
+_UNITS = {"mm": 1e3, "m": 1e-3}
+_NEAR, _SAME = (0.7, 1.43), 0.15
+
+
+def position_finding(description: Description, data: LogData, lag: float) -> list[Finding]:
+    """That the positions are in another unit, or of a point that is not S.
+
+    In S, a_P = k (a_S + alpha x r + omega x (omega x r)) with the unit k and the point r.
+
+    Args:
+        description: of the log, in which nothing else is wrong with the IMU.
+        data: of the log.
+        lag: of the IMU behind the pose [s].
+    """
+    imu, pose = description.imu, description.pose
+    if imu is None or pose is None or imu.specific_force is None or pose.position is None:
+        return []
+    if imu.automatic or pose.automatic:
+        return []
+    sensed = data.thin(description)
+    posed = data.thin(description.model_copy(update={"imu": None}))
+    if sensed.gravity is None or posed.gravity is None:
+        return []
+    # Each log begins with the wrench, so that the times are the same clock's.
+    t = sensed.t[(sensed.t + lag <= sensed.t[-1]) & (sensed.t + lag >= sensed.t[0])]
+    t = t[(t >= posed.t[0]) & (t <= posed.t[-1])]
+    g = resample(t, posed.t, posed.gravity)
+    by_pose = resample(t, posed.t, posed.specific_force) + g
+    s, omega, alpha = (resample(t + lag, sensed.t, x) for x in sensed.motion)
+    turning = np.stack([cross_matrix(w) @ cross_matrix(w) for w in omega])
+    turning += np.stack([cross_matrix(x) for x in alpha])
+    columns = np.concatenate([(s + g)[:, :, None], turning], axis=2)
+    columns, by_pose = (low_pass(x, sensed.dt, _CUTOFF) for x in (columns, by_pose))
+    inner = slice(len(t) // 50, len(t) - len(t) // 50)
+    fit = fit_with_offset(columns[inner], by_pose[inner], 2.0 * _CUTOFF * float(t[-1] - t[0]))
+    if fit is None or abs(fit.x[0]) < _SURE * fit.deviations[0]:
+        return []
+    k = float(fit.x[0])
+    for unit, ratio in _UNITS.items():
+        if unit != pose.position.unit and _NEAR[0] < k / ratio < _NEAR[1]:
+            return [
+                Finding(
+                    "units",
+                    f"the acceleration by the position is {k:.3g} times that of the accelerometer:"
+                    f" it is not in {pose.position.unit}; set pose.position.unit: {unit}",
+                )
+            ]
+    shift, sure = fit.x[1:] / k, float(np.linalg.norm(fit.deviations[1:]))
+    size = float(np.linalg.norm(shift))
+    if abs(k - 1.0) > _SAME or sure > _KNOWN or size < max(_SHIFT, _SURE * sure):
+        return []
+    place = np.round(shift + np.array(pose.position_in_sensor), 4) + 0.0
+    return [
+        Finding(
+            "pose frame",
+            f"the pose's origin is {1e3 * size:.0f} mm (+- {1e3 * sure:.2g}) from the"
+            f" accelerometer; if that is where the description says, set pose.position_in_sensor:"
+            f" {place.tolist()}, else imu.position: {(0.0 - place).tolist()}",
+        )
+    ]

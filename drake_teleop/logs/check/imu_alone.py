@@ -1,0 +1,187 @@
+"""The IMU against itself: its three quantities are bound to each other, whatever the load is.
+
+- The angular acceleration is the derivative of the angular velocity.
+- A specific force that gravity dominates turns as the gyroscope says: ds/dt = s x omega + (jerk).
+- Turned back by the gyroscope for a few seconds, it is in the mean minus gravity: what is
+  accelerated is braked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.logs.check.edits import edit_field
+from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.read.alignment import low_pass, smooth_derivatives
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.description import Description, Imu
+from drake_teleop.logs.read.rotations import rotation_matrices
+from drake_teleop.vectors import cross_matrix
+
+Array = NDArray[np.float64]
+DEGREES = (40.0, 80.0)
+"""Ratios of two speeds that only degrees explain: 180 / pi, but for noise and gains."""
+OFF = 0.02
+"""Gravity is questioned from 2 % on; one sensor in its first calibration is within 1 %."""
+_SURE = 5.0
+_ALIKE = 0.8
+_BAND_HZ = (5.0, 1.5)
+_HALF, _LEFT = 0.5, 0.4
+_WINDOW, _MOST = (2.0, 6.0), 60
+
+
+def against_itself(description: Description, log: Log) -> tuple[list[Finding], Description]:
+    """Findings about an IMU, and the description without what they name, as far as it can say so.
+
+    Args:
+        description: of the log.
+        log: about 100 Hz of it.
+    """
+    imu = description.imu
+    if imu is None or imu.angular_velocity is None or log.static or imu.automatic:
+        return [], description
+    unit = _angle_unit(imu, log)
+    if unit is not None:
+        return [unit[0]], edit_field(description, *unit[1:])
+    if imu.specific_force is None or imu.frame == "base":
+        return [], description
+    axes = _gyro_axes(imu, log)
+    if axes is not None:
+        finding, columns = axes
+        if columns is not None:
+            description = edit_field(description, "imu.angular_velocity.columns", columns)
+        return [finding], description
+    scale = _gravity(imu, log, float(np.linalg.norm(description.gravity)))
+    return ([] if scale is None else [scale]), description
+
+
+def _angle_unit(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
+    """Degrees where radians are declared, or the other way round: finding, field and unit."""
+    assert imu.angular_velocity is not None
+    if imu.angular_acceleration is None:
+        return None
+    rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
+    said, seen = (low_pass(x, log.dt, _BAND_HZ[0]) for x in (log.angular_acceleration, rate))
+    sizes = float(np.linalg.norm(said)), float(np.linalg.norm(seen))
+    if min(sizes) == 0.0 or float(np.sum(said * seen)) < _ALIKE * sizes[0] * sizes[1]:
+        return None
+    ratio = sizes[0] / sizes[1]
+    field, now = "angular_acceleration", imu.angular_acceleration.unit
+    if DEGREES[0] < ratio < DEGREES[1] and now == "rad/s^2":
+        unit = "deg/s^2"
+    elif DEGREES[0] < 1.0 / ratio < DEGREES[1] and now == "deg/s^2":
+        unit = "rad/s^2"
+    elif DEGREES[0] < 1.0 / ratio < DEGREES[1] and imu.angular_velocity.unit == "rad/s":
+        field, unit = "angular_velocity", "deg/s"
+    else:
+        return None
+    finding = Finding(
+        "degrees",
+        f"the angular acceleration is {ratio:.3g} times the derivative of the angular velocity;"
+        f" set imu.{field}.unit: {unit}",
+    )
+    return finding, f"imu.{field}.unit", unit
+
+
+def _gyro_axes(imu: Imu, log: Log) -> tuple[Finding, tuple | None] | None:
+    """Whether the gyroscope's axes are others than the accelerometer's, and its columns in order.
+
+    Of the 48 ways to name and sign three axes another has to leave less than `_LEFT` of what turns
+    the specific force, and less than half of what is left as described. The factor between both
+    is free, since the jerk of a motion on a circle has the shape of what the turning does.
+    """
+    assert imu.angular_velocity is not None
+    s, omega = (
+        low_pass(x, log.dt, _BAND_HZ[1]) for x in (log.specific_force, log.angular_velocity)
+    )
+    change = np.gradient(s, log.dt, axis=0)
+    inner = slice(len(s) // 50, len(s) - len(s) // 50)
+    turning = np.stack([cross_matrix(x) for x in s[inner]])
+    columns = np.einsum("nij,nk->nijk", turning, omega[inner]).reshape(-1, 9)
+    target = change[inner].reshape(-1)
+    gram, right, total = columns.T @ columns, columns.T @ target, float(target @ target) + 1e-300
+
+    def left(P: Array) -> float:
+        along = float(right @ P.ravel())
+        return 1.0 - max(along, 0.0) ** 2 / (float(P.ravel() @ gram @ P.ravel()) * total + 1e-300)
+
+    given = left(np.eye(3))
+    best, P = min(((left(P), P) for P in _signed_permutations()), key=lambda entry: entry[0])
+    if best > _LEFT or best > _HALF * given:
+        return None
+    order = np.abs(P).argmax(axis=1)
+    text = "the axes of the gyroscope are not those of the accelerometer"
+    names = imu.angular_velocity.columns
+    if (P < 0).any() or len(names) != 3 or imu.frame != "sensor":
+        rows = ", ".join(f"{'-' if P[i, k] < 0 else ''}{'xyz'[k]}" for i, k in enumerate(order))
+        return Finding(
+            "swapped axes",
+            f"{text}: its x, y, z should be its {rows}; correct imu.angular_velocity.columns, in"
+            " the file where a sign is wrong",
+        ), None
+    ordered = tuple(names[k] for k in order)
+    return Finding(
+        "swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}"
+    ), ordered
+
+
+def _signed_permutations() -> list[Array]:
+    return [
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+
+
+@dataclass(frozen=True)
+class MeanGravity:
+    """Length of the mean specific force over gravity, and its standard deviation."""
+
+    ratio: float
+    deviation: float
+
+
+def mean_gravity(log: Log, gravity: float) -> MeanGravity | None:
+    """From windows, weighed by a Hann window, turned back by the gyroscope; None if too short."""
+    length = float(np.clip((log.t[-1] - log.t[0]) / 8.0, *_WINDOW))
+    rows = round(length / log.dt)
+    count = len(log) // rows
+    if count < 6:
+        return None
+    starts = np.linspace(0, len(log) - rows, min(count, _MOST)).astype(int)
+    take = starts[:, None] + np.arange(rows)
+    omega, s = log.angular_velocity[take], log.specific_force[take]
+    steps = rotation_matrices((omega * log.dt).reshape(-1, 3), "rotation_vector")
+    steps = steps.reshape(len(starts), rows, 3, 3)
+    R, sums = np.broadcast_to(np.eye(3), (len(starts), 3, 3)), np.zeros((len(starts), 3))
+    weight = np.hanning(rows + 2)[1:-1]
+    for k in range(rows):
+        sums = sums + weight[k] * np.einsum("nij,nj->ni", R, s[:, k])
+        R = R @ steps[:, k]
+    ratios = np.linalg.norm(sums, axis=1) / (weight.sum() * gravity)
+    return MeanGravity(float(np.mean(ratios)), float(np.std(ratios, ddof=1) / np.sqrt(len(ratios))))
+
+
+def _gravity(imu: Imu, log: Log, gravity: float) -> Finding | None:
+    """That the accelerometer reads another gravity than is described, in a unit that is right."""
+    found = mean_gravity(log, gravity)
+    if found is None or not 0.7 < found.ratio < 1.4:
+        return None
+    off = found.ratio - 1.0
+    if abs(off) < OFF + 3.0 * found.deviation or abs(off) < _SURE * found.deviation:
+        return None
+    assert imu.specific_force is not None
+    seen = found.ratio * gravity
+    remedy = f"divide the columns of imu.specific_force by {found.ratio:.4f}, or calibrate them"
+    if imu.specific_force.unit != "g" and abs(seen / 9.80665 - 1.0) < 0.01:
+        remedy = f"set gravity: {seen:.4g}"
+    return Finding(
+        "gravity",
+        f"the accelerometer reads {seen:.4g} m/s^2 of gravity in the mean,"
+        f" {100 * abs(off):.2g} % {'more' if off > 0 else 'less'} than the description says:"
+        f" the mass would be wrong by as much; {remedy}",
+    )

@@ -1,0 +1,183 @@
+"""The wrench against the motion, without one load for both force and torque.
+
+- Force is linear in the specific force, whatever the frames and axes are: f = m Q s + what angular
+  motion adds. Q = 1 if wrench and motion are in the same axes; det Q = -1 if axes are mirrored.
+- m c follows from the force alone, of angular motion, and from the torque alone, of the specific
+  force. Their ratio is the ratio of the units of torque and force.
+
+No load fit shows either for sure: a wrong unit of the torque leaves hardly anything unexplained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.load.regressor import regressor
+from drake_teleop.logs.check.edits import edit_field
+from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.fitting import fit_with_offset
+from drake_teleop.logs.pose_motion.read_off import nearest_permutation
+from drake_teleop.logs.read.alignment import low_passed, measured
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.description import UNITS, Description, Wrench
+
+Array = NDArray[np.float64]
+_CUTOFF = 3.0
+_MOST = 3000
+_KNOWN, _SURE = 0.05, 5.0
+_OBLIQUE, _SPREAD = 5.0, 0.2
+_MATCH, _FARTHEST, _NEAREST = 0.1, 1.5, 2e-4
+
+
+def wrench_findings(description: Description, log: Log) -> tuple[list[Finding], Description]:
+    """A unit or axes of the wrench that are wrong, and the description without that.
+
+    Args:
+        description: of the log, in which the motion is right.
+        log: about 100 Hz of it, the delay taken out.
+    """
+    wrench = description.wrench
+    if wrench is None or wrench.frame == "base" or log.static:
+        return [], description
+    smooth = low_passed(log, _CUTOFF).only(measured(log, _CUTOFF))
+    smooth = smooth.only(slice(None, None, max(1, len(smooth) // _MOST)))
+    independent = 2.0 * _CUTOFF * float(log.t[-1] - log.t[0])
+    axes = _axes(description, wrench, smooth, independent)
+    if axes is not None:
+        return [axes], description
+    found = _unit(wrench, smooth, independent)
+    return ([], description) if found is None else ([found[0]], found[1](description))
+
+
+def _axes(description: Description, wrench: Wrench, log: Log, independent: float) -> Finding | None:
+    s, omega, alpha = log.motion
+    squares = np.stack([omega[:, i] * omega[:, k] for i in range(3) for k in range(i, 3)], axis=1)
+    columns = np.hstack([s, alpha, squares])
+    fits = [fit_with_offset(columns[:, None], f[:, None], independent) for f in log.wrench[:, :3].T]
+    if any(fit is None for fit in fits):
+        return None
+    M = np.stack([fit.x[:3] for fit in fits if fit])
+    deviation = max(float(fit.deviations[:3].max()) for fit in fits if fit)
+    U, masses, Vt = np.linalg.svd(M)
+    mass = float(masses.mean())
+    if deviation > _KNOWN * mass or masses[0] - masses[2] > _SPREAD * mass:
+        return None
+    Q = U @ Vt
+    near = nearest_permutation(Q)
+    oblique, angle = _angle(near.T @ Q), _angle(Q)
+    if np.linalg.det(Q) < 0.0:
+        mirrored = oblique < 2 * _OBLIQUE and _angle(-Q) > 45.0 and (near < 0.0).any()
+        return mirrored_finding(wrench, near) if mirrored else None
+    sure = np.degrees(_SURE * deviation / mass)
+    if angle < max(_OBLIQUE, sure) or (description.imu is None and description.pose is not None):
+        return None  # The frame of poses alone is `against_frame`'s.
+    right_angled = oblique < _OBLIQUE
+    old = np.array(wrench.frame) if isinstance(wrench.frame, tuple) else np.eye(3)
+    frame = np.round((near if right_angled else Q).T @ old, 4) + 0.0
+    return Finding(
+        "swapped axes" if right_angled else "mounting",
+        f"the axes of the wrench are turned by {angle:.1f} deg (+- {sure / _SURE:.2g}) against"
+        f" those of the motion; set wrench.frame: {frame.tolist()}",
+    )
+
+
+def _angle(R: Array) -> float:
+    return float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(R) - 1.0), -1.0, 1.0))))
+
+
+def mirrored_finding(wrench: Wrench, near: Array) -> Finding:
+    """Of axes that a signed permutation mirrors: the lines if only one sign is wrong."""
+    order, signs = np.abs(near).argmax(axis=1), near.sum(axis=1)
+    text = "the axes of the wrench are those of the motion mirrored"
+    columns = wrench.force.columns, wrench.torque.columns
+    if (order == np.arange(3)).all() and all(len(x) == 3 for x in columns):
+        named = [str(x[i]) for x in columns for i in np.flatnonzero(signs < 0.0)]
+        return Finding(
+            "swapped axes",
+            f"{text}: column {' and column '.join(map(repr, named))} have the wrong sign; change it"
+            " in the file, or where it is written",
+        )
+    rows = ", ".join(f"{'-' if signs[i] < 0 else ''}{'xyz'[k]}" for i, k in enumerate(order))
+    return Finding(
+        "swapped axes",
+        f"{text}: its x, y, z are {rows} of S; put wrench.force.columns and wrench.torque.columns"
+        " into this order, and the signs right in the file",
+    )
+
+
+def _unit(
+    wrench: Wrench, log: Log, independent: float
+) -> tuple[Finding, Callable[[Description], Description]] | None:
+    """Units of force and torque that are wrong, and the edit."""
+    V = regressor(*log.motion)
+    force = fit_with_offset(V[:, :3, :4], log.wrench[:, :3], independent)
+    torque = fit_with_offset(V[:, 3:, 1:], log.wrench[:, 3:], independent)
+    if torque is None:
+        torque = fit_with_offset(V[:, 3:, 1:4], log.wrench[:, 3:], independent)
+    if force is None or torque is None or force.x[0] <= _SURE * force.deviations[0]:
+        return None
+    found = other_units(
+        wrench,
+        force.x[0],
+        (force.x[1:4], torque.x[:3]),
+        (_norm(force.deviations[1:4]), _norm(torque.deviations[:3])),
+    )
+    if found is None:
+        return None
+    finding, units = found
+
+    def edited(description: Description) -> Description:
+        for name, unit in units.items():
+            description = edit_field(description, f"wrench.{name}.unit", unit)
+        return description
+
+    return finding, edited
+
+
+def _norm(x: Array) -> float:
+    return float(np.linalg.norm(x))
+
+
+def other_units(
+    wrench: Wrench, mass: float, moments: tuple[Array, Array], deviations: tuple[float, float]
+) -> tuple[Finding, dict[str, str]] | None:
+    """The units of force and torque that make one centre of mass of two, if others do.
+
+    Args:
+        wrench: as described.
+        mass: by the force, in the unit that was described [kg].
+        moments: m c by the force, and by the torque, of any shape but the same [kg m].
+        deviations: standard deviations of their lengths.
+
+    Returns:
+        the finding, and the unit of each field to change.
+    """
+    by_force, by_torque = moments
+    size = _norm(by_torque)
+    if size < _SURE * deviations[1]:
+        return None
+    now = {"force": wrench.force.unit, "torque": wrench.torque.unit}
+    found = []
+    for pair in product(("N", "lbf"), ("N m", "N mm", "lbf in")):
+        right = dict(zip(now, pair, strict=True))
+        seen = {name: UNITS[now[name]] / UNITS[right[name]] for name in now}
+        ratio = seen["torque"] / seen["force"]
+        com = size / seen["torque"] / (mass / seen["force"])
+        known = ratio * deviations[0] < _KNOWN * size and _NEAREST < com < _FARTHEST
+        off = _norm(by_torque - ratio * by_force) / size
+        if right != now and known and off < _MATCH:
+            found.append((off, ratio, {k: unit for k, unit in right.items() if unit != now[k]}))
+    if not found:
+        return None
+    _, ratio, units = min(found, key=lambda entry: entry[0])
+    lines = " and ".join(f"wrench.{name}.unit: {unit}" for name, unit in units.items())
+    finding = Finding(
+        "units",
+        f"the centre of mass is {ratio:.4g} times as far away by the torque as by the force: they"
+        f" are not in {now['torque']} and {now['force']}; set {lines}",
+    )
+    return finding, units

@@ -1,0 +1,145 @@
+"""Mistakes that leave the fit of a load good are named, with the line that mends them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+from posed_record import GRAVITY_W, OFFSETS, PHI, motion_at
+
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.check.conventions import check_log
+from drake_teleop.logs.read.rotations import quaternions
+
+Columns = dict[str, np.ndarray]
+IMU, POSE, BOTH = ("imu",), ("pose",), ("imu", "pose")
+FIELDS = {
+    "wrench": ("force", "torque"),
+    "imu": ("specific_force", "angular_velocity", "angular_acceleration"),
+    "pose": ("orientation", "position"),
+}
+
+
+@pytest.fixture(scope="module")
+def good() -> Columns:
+    """24 s at 100 Hz, with noise."""
+    rng = np.random.default_rng(3)
+    t = np.arange(0.0, 24.0, 0.01)
+    at = motion_at(t)
+    wrench = non_contact_wrench(at.specific_force, at.omega, at.alpha, PHI) + OFFSETS
+    wrench += np.repeat([0.1, 0.004], 3) * rng.normal(size=wrench.shape)
+    return {
+        "t": t,
+        "force": wrench[:, :3],
+        "torque": wrench[:, 3:],
+        "specific_force": at.specific_force + 0.03 * rng.normal(size=(len(t), 3)),
+        "angular_velocity": at.omega + 2e-3 * rng.normal(size=(len(t), 3)),
+        "angular_acceleration": at.alpha + 0.1 * rng.normal(size=(len(t), 3)),
+        "orientation": quaternions(at.R_WS),
+        "position": at.p_WS + 2e-5 * rng.normal(size=(len(t), 3)),
+        "R": at.R_WS,
+    }
+
+
+def said(folder: Path, columns: Columns, motion: tuple[str, ...], **top: Any) -> list[str]:
+    """Names and messages of the findings but for lags; `top` are fields of the description."""
+    document: dict[str, Any] = {"gravity": GRAVITY_W.tolist()}
+    for stream in ("wrench", *motion):
+        table = {"t": columns.get(f"{stream}_t", columns["t"])}
+        document[stream] = {"file": f"{stream}.parquet", "time": {"column": "t"}}
+        for name in FIELDS[stream]:
+            names = [f"{name}_{i}" for i in range(columns[name].shape[1])]
+            table |= dict(zip(names, columns[name].T, strict=True))
+            document[stream][name] = {"columns": names} | top.get(name, {})
+        pl.DataFrame(table).write_parquet(folder / f"{stream}.parquet")
+    if "pose" in motion:
+        document["pose"]["orientation"]["form"] = "quaternion_wxyz"
+    (folder / "log.yaml").write_text(yaml.safe_dump(document))
+    found = check_log(folder / "log.yaml").findings
+    return [f"{f.name}: {f.message}" for f in found if f.name != "lag"]
+
+
+@pytest.mark.parametrize("motion", [IMU, POSE, BOTH])
+def test_nothing_is_said_of_a_good_log(
+    good: Columns, tmp_path: Path, motion: tuple[str, ...]
+) -> None:
+    assert said(tmp_path, good, motion) == []
+
+
+def _times(name: str, factor: float) -> Callable[[Columns], None]:
+    return lambda c: c.update({name: factor * c[name]})
+
+
+def _wrench_in(R: Any) -> Callable[[Columns], None]:
+    return lambda c: c.update({k: c[k] @ np.array(R).T for k in ("force", "torque")})
+
+
+def _gyro_axes(c: Columns) -> None:
+    for name in ("angular_velocity", "angular_acceleration"):
+        c[name] = c[name][:, [1, 0, 2]]
+
+
+def _tcp(c: Columns) -> None:
+    c["position"] = c["position"] + c["R"] @ [0.02, 0.0, 0.15]
+
+
+def _dead(name: str) -> Callable[[Columns], None]:
+    def plant(c: Columns) -> None:
+        c[name] = c[name].copy()
+        c[name][:, 1] = 0.5
+
+    return plant
+
+
+def _copied(c: Columns) -> None:
+    c["force"] = c["force"][:, [0, 0, 2]]
+
+
+TURNED = [[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]
+MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]] = [
+    ("N mm", _times("torque", 1e3), IMU, "units", "wrench.torque.unit: N mm"),
+    ("lbf in", _times("torque", 8.851), POSE, "units", "wrench.torque.unit: lbf in"),
+    ("lbf", _times("force", 1 / 4.448), IMU, "units", "wrench.force.unit: lbf"),
+    ("mirrored", _wrench_in(np.diag([1, -1, 1])), IMU, "swapped axes", "'force_1'"),
+    ("mirrored pose", _wrench_in(np.diag([1, -1, 1])), POSE, "swapped axes", "'torque_1'"),
+    ("turned", _wrench_in(TURNED), IMU, "mounting", "wrench.frame: [[0.8"),
+    ("alpha", _times("angular_acceleration", 57.3), IMU, "degrees", "acceleration.unit: deg/s^2"),
+    ("gyro", _times("angular_velocity", 57.3), IMU, "degrees", "velocity.unit: deg/s"),
+    ("axes", _gyro_axes, IMU, "swapped axes", "['angular_velocity_1', 'angular_velocity_0', 'ang"),
+    ("mm/s^2", _times("specific_force", 1e3), IMU, "units", "specific_force.unit: mm/s^2"),
+    ("gravity", _times("specific_force", 1.05), IMU, "gravity", "by 1.05"),
+    ("mm", _times("position", 1e3), BOTH, "units", "pose.position.unit: mm"),
+    ("TCP", _tcp, BOTH, "pose frame", "pose.position_in_sensor: [0.0"),
+    ("clock", lambda c: c.update(pose_t=1.01 * c["t"]), POSE, "clock", "pose.time.scale: 0.990"),
+    ("dead", _dead("torque"), IMU, "dead channel", "'torque_1'"),
+    ("dead gyro", _dead("angular_velocity"), IMU, "dead channel", "'angular_velocity_1'"),
+    ("copied", _copied, IMU, "repeated channel", "'force_0' and 'force_1'"),
+]
+
+
+@pytest.mark.parametrize(
+    ("plant", "motion", "name", "line"), [m[1:] for m in MISTAKES], ids=[m[0] for m in MISTAKES]
+)
+def test_a_mistake_is_named(
+    good: Columns,
+    tmp_path: Path,
+    plant: Callable[[Columns], None],
+    motion: tuple[str, ...],
+    name: str,
+    line: str,
+) -> None:
+    columns = dict(good)
+    plant(columns)
+    found = said(tmp_path, columns, motion)
+    assert any(text.startswith(f"{name}: ") and line in text for text in found), found
+
+
+def test_a_column_that_is_named_twice_is_named(good: Columns, tmp_path: Path) -> None:
+    names = {"columns": ["torque_0", "torque_0", "torque_2"]}
+    found = said(tmp_path, good, IMU, torque=names)
+    assert [text for text in found if "names 'torque_0' twice" in text] == found[:1]
