@@ -14,6 +14,7 @@ from posed_record import GRAVITY_W, OFFSETS, PHI, motion_at
 
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.check.conventions import check_log
+from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.rotations import quaternions
 
 Columns = dict[str, np.ndarray]
@@ -137,6 +138,12 @@ def test_a_mistake_is_named(
     plant(columns)
     found = said(tmp_path, columns, motion)
     assert any(text.startswith(f"{name}: ") and line in text for text in found), found
+
+
+def test_identify_names_what_a_good_fit_hides(good: Columns, tmp_path: Path) -> None:
+    said(tmp_path, good | {"specific_force": 1.05 * good["specific_force"]}, IMU)
+    (found,) = identify_log(tmp_path / "log.yaml").findings
+    assert found.name == "gravity"
 
 
 def test_a_column_that_is_named_twice_is_named(good: Columns, tmp_path: Path) -> None:

@@ -182,6 +182,7 @@ def _gravity(imu: Imu, log: Log, gravity: float) -> Finding | None:
     return Finding(
         "gravity",
         f"the accelerometer reads {seen:.4g} m/s^2 of gravity in the mean,"
-        f" {100 * abs(off):.2g} % {'more' if off > 0 else 'less'} than the description says:"
+        f" {100 * abs(off):.2g} % (+- {100 * found.deviation:.1g})"
+        f" {'more' if off > 0 else 'less'} than the description says:"
         f" the mass would be wrong by as much; {remedy}",
     )
