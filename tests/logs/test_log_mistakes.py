@@ -11,10 +11,12 @@ import polars as pl
 import pytest
 import yaml
 from posed_record import GRAVITY_W, OFFSETS, PHI, motion_at
+from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.check.conventions import check_log
 from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.read.canonical import SPECIFIC_FORCE, WRENCH
 from drake_teleop.logs.read.rotations import quaternions
 
 Columns = dict[str, np.ndarray]
@@ -85,6 +87,10 @@ def _gyro_axes(c: Columns) -> None:
         c[name] = c[name][:, [1, 0, 2]]
 
 
+def _alpha_axes(c: Columns) -> None:
+    c["angular_acceleration"] = c["angular_acceleration"][:, [1, 0, 2]] * [1, 1, -1]
+
+
 def _tcp(c: Columns) -> None:
     c["position"] = c["position"] + c["R"] @ [0.02, 0.0, 0.15]
 
@@ -105,6 +111,7 @@ TURNED = [[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]
 MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]] = [
     ("N mm", _times("torque", 1e3), IMU, "units", "wrench.torque.unit: N mm"),
     ("lbf in", _times("torque", 8.851), POSE, "units", "wrench.torque.unit: lbf in"),
+    ("alpha", _alpha_axes, IMU, "swapped axes", "the gyroscope's y, x, -z"),
     ("lbf", _times("force", 1 / 4.448), IMU, "units", "wrench.force.unit: lbf"),
     ("mirrored", _wrench_in(np.diag([1, -1, 1])), IMU, "swapped axes", "'force_1'"),
     ("mirrored pose", _wrench_in(np.diag([1, -1, 1])), POSE, "swapped axes", "'torque_1'"),
@@ -150,3 +157,19 @@ def test_a_column_that_is_named_twice_is_named(good: Columns, tmp_path: Path) ->
     names = {"columns": ["torque_0", "torque_0", "torque_2"]}
     found = said(tmp_path, good, IMU, torque=names)
     assert [text for text in found if "names 'torque_0' twice" in text] == found[:1]
+
+
+@pytest.mark.parametrize(
+    ("turn", "rows", "says"), [(0.2, 12, "too alike"), (2.0, 12, None), (2.0, 5, "5 poses")]
+)
+def test_poses_at_rest_are_enough_and_different(
+    tmp_path: Path, turn: float, rows: int, says: str | None
+) -> None:
+    rng = np.random.default_rng(1)
+    R = Rotation.from_rotvec(turn * rng.normal(size=(rows, 3))).as_matrix()
+    s, rest = -GRAVITY_W @ R, np.zeros((rows, 3))
+    wrench = non_contact_wrench(s, rest, rest, PHI) + 0.01 * rng.normal(size=(rows, 6))
+    table = dict(zip((*WRENCH, *SPECIFIC_FORCE), np.hstack([wrench, s]).T, strict=True))
+    pl.DataFrame(table).write_csv(tmp_path / "rest.csv")
+    found = check_log(tmp_path / "rest.csv").findings
+    assert [says is not None and says in f.message for f in found] == ([True] if says else [])

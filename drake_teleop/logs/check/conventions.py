@@ -27,6 +27,7 @@ from drake_teleop.logs.check.imu_alone import against_itself
 from drake_teleop.logs.check.load_fit import EXPLAINED, LoadFit, load_fit, unexplained_share
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.check.over_time import drift_finding
+from drake_teleop.logs.check.rest_poses import rest_finding
 from drake_teleop.logs.check.wrench_alone import wrench_findings
 from drake_teleop.logs.read.alignment import undelayed
 from drake_teleop.logs.read.canonical import Log, describe_canonical
@@ -180,6 +181,9 @@ def _check(data: LogData, description: Description) -> Conventions:
     findings = _one_clock(description, [*findings, *more], mounting, delay)
     if description.wrench is not None and all(finding.name == "lag" for finding in findings):
         findings += against_frame(description.wrench, log, delay or 0.0)
+    rest = rest_finding(log)
+    if rest is not None:
+        findings.append(rest)
     return Conventions(tuple(findings), fit, mounting, delay)
 
 

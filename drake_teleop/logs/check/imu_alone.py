@@ -55,6 +55,9 @@ def against_itself(description: Description, log: Log) -> tuple[list[Finding], D
         if columns is not None:
             description = edit_field(description, "imu.angular_velocity.columns", columns)
         return [finding], description
+    alpha = _alpha_axes(imu, log)
+    if alpha is not None:
+        return [alpha], description
     scale = _gravity(imu, log, float(np.linalg.norm(description.gravity)))
     return ([] if scale is None else [scale]), description
 
@@ -127,6 +130,26 @@ def _gyro_axes(imu: Imu, log: Log) -> tuple[Finding, tuple | None] | None:
     return Finding(
         "swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}"
     ), ordered
+
+
+def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
+    """Whether the angular acceleration is in other axes than the gyroscope, which are right."""
+    if imu.angular_acceleration is None:
+        return None
+    rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
+    said, seen = (low_pass(x, log.dt, _BAND_HZ[0]) for x in (log.angular_acceleration, rate))
+    size = float(np.linalg.norm(said) * np.linalg.norm(seen)) + 1e-300
+    alike = said.T @ seen / size
+    best = max(_signed_permutations(), key=lambda P: float(np.sum(alike * P)))
+    if np.sum(alike * best) < _ALIKE or np.trace(alike) > _HALF * np.sum(alike * best):
+        return None
+    axes = ["xyz"[k] if row[k] > 0 else f"-{'xyz'[k]}" for row in best for k in np.flatnonzero(row)]
+    return Finding(
+        "swapped axes",
+        "the axes of the angular acceleration are not those of the gyroscope: its x, y, z are"
+        f" the gyroscope's {', '.join(axes)}; correct imu.angular_acceleration.columns, or take it"
+        " out",
+    )
 
 
 def _signed_permutations() -> list[Array]:
