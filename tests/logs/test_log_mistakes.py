@@ -30,9 +30,13 @@ FIELDS = {
 
 @pytest.fixture(scope="module")
 def good() -> Columns:
-    """24 s at 100 Hz, with noise."""
+    return record(12.0)
+
+
+def record(seconds: float) -> Columns:
+    """100 Hz, with noise."""
     rng = np.random.default_rng(3)
-    t = np.arange(0.0, 24.0, 0.01)
+    t = np.arange(0.0, seconds, 0.01)
     at = motion_at(t)
     wrench = non_contact_wrench(at.specific_force, at.omega, at.alpha, PHI) + OFFSETS
     wrench += np.repeat([0.1, 0.004], 3) * rng.normal(size=wrench.shape)
@@ -120,7 +124,6 @@ MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]]
     ("gyro", _times("angular_velocity", 57.3), IMU, "degrees", "velocity.unit: deg/s"),
     ("axes", _gyro_axes, IMU, "swapped axes", "['angular_velocity_1', 'angular_velocity_0', 'ang"),
     ("mm/s^2", _times("specific_force", 1e3), IMU, "units", "specific_force.unit: mm/s^2"),
-    ("gravity", _times("specific_force", 1.05), IMU, "gravity", "by 1.05"),
     ("mm", _times("position", 1e3), BOTH, "units", "pose.position.unit: mm"),
     ("TCP", _tcp, BOTH, "pose frame", "pose.position_in_sensor: [0.0"),
     ("clock", lambda c: c.update(pose_t=1.01 * c["t"]), POSE, "clock", "pose.time.scale: 0.990"),
@@ -147,8 +150,11 @@ def test_a_mistake_is_named(
     assert any(text.startswith(f"{name}: ") and line in text for text in found), found
 
 
-def test_identify_names_what_a_good_fit_hides(good: Columns, tmp_path: Path) -> None:
-    said(tmp_path, good | {"specific_force": 1.05 * good["specific_force"]}, IMU)
+def test_identify_names_what_a_good_fit_hides(tmp_path: Path) -> None:
+    columns = record(24.0)  # the mean of an acceleration is small only then
+    columns["specific_force"] = 1.05 * columns["specific_force"]
+    (text,) = said(tmp_path, columns, IMU)
+    assert text.startswith("gravity: ") and "by 1.05" in text
     (found,) = identify_log(tmp_path / "log.yaml").findings
     assert found.name == "gravity"
 
