@@ -91,6 +91,10 @@ assert 0 < points["front"].sum() < 4
 }
 
 
+#: What goes before a notebook: as in conftest.py, garbage is looked for seldom.
+SELDOM = "import gc; gc.set_threshold(20_000, 20, 50)"
+
+
 def test_every_notebook_is_checked():
     assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == CHECKS.keys()
 
@@ -102,6 +106,7 @@ def test_it_runs_and_shows_what_it_promises(name):
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
     for cell in notebook.cells:
         cell.source = cell.source.replace("repeats: 2", "repeats: 1")
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(SELDOM))
     notebook.cells.append(nbformat.v4.new_code_cell(CHECKS[name]))
     client = NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(NOTEBOOKS)}})
     client.execute()
