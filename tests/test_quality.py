@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,13 +17,19 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-#: mypy as it is, but for its search for garbage, a quarter of its time, which it turns on itself.
+#: mypy as it is, but for its search for garbage, a quarter of its time, which it turns on itself,
+#: and for the cache that it would write.
 MYPY = "import gc; gc.disable(); gc.enable = gc.disable; from mypy.main import main; main()"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "check", [["-m", "ruff", "check"], ["-m", "ruff", "format", "--check"], ["-c", MYPY]]
+    "check",
+    [
+        ["-m", "ruff", "check"],
+        ["-m", "ruff", "format", "--check"],
+        ["-c", MYPY, "--cache-dir", os.devnull],
+    ],
 )
 def test_linters_find_nothing(check):
     answer = subprocess.run(
