@@ -261,7 +261,10 @@ def _at_rest(table: Table, s: bool, omega: bool, q: bool) -> bool:
             return False
     if "t" not in table.columns:
         return True
-    steps = np.diff(table.single("t", where))
+    t = table.single("t", where)
+    if not np.isfinite(t).all():
+        return False  # the reader names the row
+    steps = np.diff(t)
     if not len(steps) or not np.median(steps) > 1 / SLOWEST:
         return False
     if q:
