@@ -27,6 +27,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.film import Arrow, Film, Reading, Show, frame_times, plain_room
+from drake_teleop.master.data_sheets import PHANTOM
 from drake_teleop.master.phantom import serial_joint_angles
 from drake_teleop.pages.style import BLUE, VERMILION, contact_spans
 from drake_teleop.resources import models_dir
@@ -211,7 +212,10 @@ class ReplayScene:
         if scenario.environment is not None:
             touched = AddEnvironment(self.plant, scenario.environment)
             self._sheet = None if scenario.environment.moving_part is None else touched
-        self._master = _add_master(self.plant) if "master_state" in recorded else None
+        self._is_phantom = scenario.master.model == PHANTOM
+        self._master = None
+        if "master_state" in recorded:
+            self._master = _add_master(self.plant, scenario)
         finalize(self.plant)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
         self._diagram: Diagram = builder.Build()
@@ -236,7 +240,9 @@ class ReplayScene:
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, :6])
         if self._master is not None:
-            master = serial_joint_angles(signals["master_state"][sample, :6])
+            master = signals["master_state"][sample, :6]
+            if self._is_phantom:
+                master = serial_joint_angles(master)
             plant.SetPositions(context, self._master, master)
         if self._sheet is not None:
             plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
@@ -270,8 +276,9 @@ class ReplayScene:
         return places
 
 
-def _add_master(plant: MultibodyPlant) -> ModelInstanceIndex:
-    (master,) = Parser(plant, "master").AddModels(str(models_dir() / "phantom.sdf"))
+def _add_master(plant: MultibodyPlant, scenario: Scenario) -> ModelInstanceIndex:
+    name = "phantom" if scenario.master.model == PHANTOM else "grip"
+    (master,) = Parser(plant, "master").AddModels(str(models_dir() / f"{name}.sdf"))
     base = plant.GetFrameByName("base", master)
     plant.WeldFrames(plant.world_frame(), base, RigidTransform(_P_WB))
     return master

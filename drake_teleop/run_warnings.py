@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from drake_teleop.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.fault import MEANINGS, Fault
 from drake_teleop.load.sample import LOST
-from drake_teleop.master.phantom import FORCE_LIMIT, WRIST_TORQUE_LIMIT, jacobian_into
+from drake_teleop.master.dynamics import HapticDevice
 from drake_teleop.pages.style import contact_spans
 from drake_teleop.passivity.ledger import fastest
 from drake_teleop.result import SimulationResult
@@ -196,10 +196,13 @@ def _limits(
         for joint in np.flatnonzero(clipped.any(axis=0)):
             yield f"joint {joint + 1} is at its largest {what}", spans_of(t, clipped[:, joint])
     if "force_to_master" in result:
-        shown = result["force_to_master"]
-        full = np.linalg.norm(shown[:, :3], axis=1) >= _AT_LIMIT * FORCE_LIMIT
-        full |= _full_torque(shown[:, 3:], result["master_state"])
+        shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
+        full = np.linalg.norm(shown[:, :3], axis=1) >= _AT_LIMIT * device.peak_force
+        if device.peak_torque.all():
+            full |= _full_torque(shown[:, 3:], result["master_state"], device)
         yield "the device displays the most that it can", spans_of(t, full, LASTING)
+        ended = device.at_an_end(result["master_state"][:, :6])
+        yield "the device is at the end of its workspace", spans_of(t, ended)
     if scenario.sheet_spring is not None and "sheet_state" in result:
         bent = scenario.sheet_spring.largest_small_deflection
         yield (
@@ -335,13 +338,13 @@ def _joint_error(result: SimulationResult) -> Array:
     return command - result["slave_state"][:, : command.shape[1]]
 
 
-def _full_torque(torque: Array, master_state: Array) -> Flags:
+def _full_torque(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
     """(N,) whether a wrist motor of the device gives its largest torque."""
-    full, J = np.zeros(len(torque), dtype=bool), np.empty((6, 6))
+    full, peak = np.zeros(len(torque), dtype=bool), _AT_LIMIT * device.peak_torque
     # A motor's torque is the component about its axis: no larger than the torque.
-    for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= _AT_LIMIT * WRIST_TORQUE_LIMIT.min()):
-        jacobian_into.py_func(master_state[k, :6], J)  # seldom: not worth compiling
-        full[k] = (np.abs(torque[k] @ J[3:, 3:]) >= _AT_LIMIT * WRIST_TORQUE_LIMIT).any()
+    for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= peak.min()):
+        turned = np.abs(torque[k] @ device.jacobian(master_state[k, :6])[3:, 3:])
+        full[k] = (turned >= peak).any()
     return full
 
 

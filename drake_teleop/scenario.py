@@ -22,7 +22,7 @@ from drake_teleop.errors import DrakeTeleopError, expect, meant
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.fields import settings
-from drake_teleop.master.device import JointFriction
+from drake_teleop.master.data_sheets import Master, figures_of
 from drake_teleop.operator.operator import OperatorConfig
 from drake_teleop.operator.task import check_task
 from drake_teleop.passivity.methods import PassivityConfig
@@ -92,17 +92,6 @@ class Simulation:
 
 @settings
 @dataclass
-class Master:
-    """Where the device starts, and its friction."""
-
-    position: list[float] = quantity(
-        [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
-    )
-    friction: JointFriction = field(default_factory=JointFriction)
-
-
-@settings
-@dataclass
 class Slave:
     """Where the tool starts: S points down at this position; and what it holds."""
 
@@ -162,6 +151,7 @@ class Scenario:
         check_ranges(self, where)
         self.force_scaling.scales(f"{where}:force_scaling")
         self.load_estimator.check(f"{where}:load_estimator")
+        self.master.check(f"{where}:master")
         self.wrist_sensor.check(f"{where}:wrist_sensor", self.rates.sensor_hz)
         if len(self._environments) > 1:
             raise DrakeTeleopError(
@@ -229,7 +219,10 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
         DrakeTeleopError: naming the field of what is wrong.
     """
     check_structure(Scenario, data, where)
-    defaults = Scenario(wrist_sensor=preset_of(data.get("wrist_sensor")))
+    defaults = Scenario(
+        wrist_sensor=preset_of(data.get("wrist_sensor")),
+        master=Master(figures=figures_of(data.get("master"))),
+    )
     scenario = yaml_load_typed(schema=Scenario, data=yaml_dump(data), defaults=defaults)
     scenario.check(where)
     return scenario

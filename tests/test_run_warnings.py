@@ -77,6 +77,7 @@ PLANTED = [
     ("joint_torque", (4, 1e4 * during(2.5, 2.6)), "joint 5 is at its largest torque"),
     ("joint_command", (0, 0.2 * during(2.0, 2.1)), "joint 1 is at its largest speed"),
     ("force_to_master", (2, FORCE_LIMIT * during(1, 2)), "most that it can from 1.000"),
+    ("master_state", (1, 2.1 * during(1, 2)), "at the end of its workspace from 1.000 to 2.000 s"),
     ("ports", (4, 0.15 * during(1, 2)), "master's end is in its safe state, as nothing comes from"
      " the slave, from 1.000 to 2.000 s"),
     ("ports", (5, np.where(during(1, 2), np.inf, 0)), "slave's end is in its safe state"),

@@ -20,7 +20,7 @@ from drake_teleop.load.compensation import scaled_wrench
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.master import phantom
-from drake_teleop.master.device import JointFriction
+from drake_teleop.master.data_sheets import JointFriction
 from drake_teleop.operator.operator import OperatorConfig, Sine
 from drake_teleop.operator.task import Touch
 from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace

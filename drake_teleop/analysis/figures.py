@@ -229,8 +229,8 @@ def measured_figures(
 
     The device's Coulomb friction is left out here too: what it does depends on the amplitude.
     """
-    coulomb = dataclasses.replace(scenario.master.friction, coulomb=[0.0] * 6)
-    smooth = replace(scenario.without_environment(), master__friction=coulomb)
+    frictionless = scenario.master.without_coulomb_friction()
+    smooth = replace(scenario.without_environment(), master=frictionless)
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     if scenario.wrist_sensor.ideal:
         estimate[:6] = 0.0

@@ -43,7 +43,6 @@ from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.point_contact import FRICTION
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import checked
-from drake_teleop.master import phantom
 from drake_teleop.master.force_display import initial_display
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
@@ -408,6 +407,8 @@ class _Period:
             for g in self._groups
             for k in range(len(g.steps))
         )
+        hand = smooth.operator.hand
+        self._device = smooth.master.device(hand.mass, hand.inertia)
         self._start_B = np.array([1.0, 0.0, 0.0, 0.0, *smooth.master.position])
         self._pose = self._eval("kinematic_scaling", "pose_command")
         self._hand, self._wrench = np.zeros(6), np.zeros(6)
@@ -515,9 +516,14 @@ class _Period:
         start = self._pose
         pose_B = self._start_B.copy()
         pose_B[4:] += displacement
-        q = phantom.inverse_kinematics(pose_B)
+        q = self._device.inverse_kinematics(pose_B)
         context = self._context("master_device")
-        rest = (np.append(q, np.zeros(6)), pose_B, np.zeros(6), initial_display(q))
+        rest = (
+            np.append(q, np.zeros(6)),
+            pose_B,
+            np.zeros(6),
+            initial_display(q, self._device.numbers),
+        )
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
         target = self._eval("kinematic_scaling", "pose_command")
@@ -613,7 +619,7 @@ def _smooth(scenario: Scenario) -> Scenario:
         channel=Channel(),
         passivity=PassivityConfig(),
         wrist_sensor=without(scenario.wrist_sensor, *parts),
-        master__friction=dataclasses.replace(scenario.master.friction, coulomb=[0.0] * 6),
+        master=scenario.master.without_coulomb_friction(),
         load_estimator__enabled=False,
     )
 

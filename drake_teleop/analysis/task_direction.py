@@ -21,7 +21,6 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.analysis.one_axis import OneAxis
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import checked
-from drake_teleop.master import phantom
 from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.slave.arm import ArmModel, forward_kinematics, inverse_dynamics, jacobian
 from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
@@ -147,11 +146,12 @@ def _device(scenario: Scenario, moved_B: Array, n: Array) -> tuple[float, float]
     hand = scenario.operator.hand
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     start[4:] += moved_B
-    q = phantom.inverse_kinematics(start)
-    J, M = phantom.jacobian(q), phantom.mass_matrix(q, hand.mass, hand.inertia)
+    device = scenario.master.device(hand.mass, hand.inertia)
+    q = device.inverse_kinematics(start)
+    J, M = device.jacobian(q), device.mass_matrix(q)
     rate = np.linalg.solve(M, J.T @ n)  # of the joints, for a unit push
     mobility = n @ J @ rate
-    damping = rate @ (np.array(scenario.master.friction.viscous) * rate) / mobility**2
+    damping = rate @ device.damping_matrix(q) @ rate / mobility**2
     return float(1 / mobility - hand.mass), float(damping)
 
 

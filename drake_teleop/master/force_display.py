@@ -11,12 +11,8 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_teleop._compiled import njit
 from drake_teleop.fault import Fault, sound
 from drake_teleop.lifetime import ONE_DICT, weak_callback
-from drake_teleop.master.phantom import (
-    FORCE_LIMIT,
-    WRIST_TORQUE_LIMIT,
-    gravity_torque_into,
-    jacobian_into,
-)
+from drake_teleop.master.dynamics import HapticDevice, gravity_torque_into, jacobian_into
+from drake_teleop.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.passivity.memory import Slots
 from drake_teleop.passivity.packet import limit
 from drake_teleop.passivity.safe_state import (
@@ -36,22 +32,31 @@ _ANGLES, _LAST_ANGLES, _LAST = _places.vector(6), _places.vector(6), _places.vec
 _FAULT, _CHANGED, _SOUND = _places.number(), _places.number(), _places.number()
 _WATCH = _places.vector(MASTER_WATCH)
 _SHOWN = slice(_LAST.start, _FAULT + 1)
-# Of force and torque; from the limits on the device's own hold, motor by motor.
-_FULL = np.array([FORCE_LIMIT, WRIST_TORQUE_LIMIT.max()])
 _NONE, _WRENCH, _HAND, _RESUMING = map(int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING))
 
 
-def initial_display(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What the display is told before the first period, at the device's angles q (6,) [rad]."""
+@njit(cache=True)
+def _full(numbers):
+    """(2,) of force and torque; from the limits on the device's own hold, motor by motor."""
+    return np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
+
+
+def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What the display is told before the first period.
+
+    Args:
+        q: (6,) the device's joints.
+        numbers: (NUMBERS,) of the device.
+    """
     display = np.zeros(_WATCH.stop)
     display[_ANGLES] = display[_LAST_ANGLES] = q
-    display[_WATCH] = initial_master_watch(_FULL)
+    display[_WATCH] = initial_master_watch(_full(numbers))
     return display
 
 
 @njit(cache=True)
-def limit_wrench_into(wrench, J, displayed):
-    """Writes what the device can display of `wrench` (6,) [f; tau] at E, in B.
+def limit_wrench_into(wrench, numbers, J, displayed):
+    """Writes what the device of these numbers can display of `wrench` (6,) [f; tau] at E, in B.
 
     The force is shortened to the peak force and the torque until no wrist motor is beyond its
     peak torque; both keep their directions. A wrench that is not finite gives zero.
@@ -62,34 +67,35 @@ def limit_wrench_into(wrench, J, displayed):
             return
     # hypot does not overflow, however large the command.
     force = math.hypot(math.hypot(wrench[0], wrench[1]), wrench[2])
-    scale = 1.0 if force <= FORCE_LIMIT else FORCE_LIMIT / force
+    scale = 1.0 if force <= numbers[PEAK_FORCE] else numbers[PEAK_FORCE] / force
     for k in range(3):
         displayed[k] = scale * wrench[k]
-    scale = 1.0
+    scale, peak = 1.0, numbers[PEAK_TORQUE]
     for i in range(3):
         motor = abs(J[3, 3 + i] * wrench[3] + J[4, 3 + i] * wrench[4] + J[5, 3 + i] * wrench[5])
-        if motor * scale > WRIST_TORQUE_LIMIT[i]:
-            scale = WRIST_TORQUE_LIMIT[i] / motor
+        if motor * scale > peak[i]:
+            scale = peak[i] / motor
     for k in range(3, 6):
         displayed[k] = scale * wrench[k]
 
 
 @njit(cache=True)
-def motor_torque_into(displayed, q, J, torque):
+def motor_torque_into(displayed, q, numbers, J, torque):
     """Writes J_M^T F + gravity compensation (6,) for a wrench F `displayed` (6,), J (6, 6) of q."""
-    gravity_torque_into(q, torque)
+    gravity_torque_into(q, numbers, torque)
     for i in range(6):
         for k in range(6):
             torque[i] += J[k, i] * displayed[k]
 
 
 @njit(cache=True)
-def display_into(wrench, device, period, J, drive):
+def display_into(wrench, device, numbers, period, J, drive):
     """One period of the display; see `ForceDisplay` for its safe state.
 
     Args:
         wrench: (6,) F_E_B that the hand shall feel.
         device: (27,) of `MasterDevice`.
+        numbers: (NUMBERS,) of the device.
         period: [s].
         J: (6, 6) scratch.
         drive: (27,) written, for `MasterDevice`; in it what is displayed, and a `Fault`.
@@ -103,31 +109,31 @@ def display_into(wrench, device, period, J, drive):
     if not sound(wrench):
         fault = _WRENCH
     displayed, drive[_FAULT] = drive[_LAST], fault
-    jacobian_into(q, J)
-    limit_wrench_into(wrench, J, displayed)
+    jacobian_into(q, numbers, J)
+    limit_wrench_into(wrench, numbers, J, displayed)
     if fault != _NONE or device[_CHANGED] != 0.0:
-        _change(device, period, drive)
-    motor_torque_into(displayed, q, J, drive[:6])
+        _change(device, numbers, period, drive)
+    motor_torque_into(displayed, q, numbers, J, drive[:6])
 
 
 @njit(cache=True)
-def _change(device, period, drive):
+def _change(device, numbers, period, drive):
     """Of a fault, and after one: fades what was displayed, and goes over to what is wanted.
 
     Arguments as of `display_into`; `drive` has what is wanted and the fault, and is changed.
     """
-    displayed, last, limits = drive[_LAST], device[_LAST], np.empty(2)
+    displayed, last, limits, full = drive[_LAST], device[_LAST], np.empty(2), _full(numbers)
     fault = drive[_FAULT] != _NONE
     drive[_SOUND] = 0.0 if fault else device[_SOUND] + period
     # All of the way within STOP, so that it does not turn at once either.
     share = 0.0 if fault else period / max(STOP + period - drive[_SOUND], period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
-    master_limits_into(not fault, fault, period, 0.0, _FULL, last, drive[_WATCH], limits)
+    master_limits_into(not fault, fault, period, 0.0, full, last, drive[_WATCH], limits)
     drive[_CHANGED] = 0.0
     for g in range(2):
         limit(displayed, g, limits[g])
-        if limits[g] < _FULL[g]:
+        if limits[g] < full[g]:
             drive[_CHANGED] = 1.0
     if not fault:
         drive[_FAULT] = _RESUMING
@@ -156,13 +162,15 @@ class ForceDisplay(LeafSystem):
 
     Args:
         period: of the device [s].
+        device: what displays it.
     """
 
     __slots__ = ONE_DICT
 
-    def __init__(self, period: float = 5e-4) -> None:
+    def __init__(self, period: float, device: HapticDevice) -> None:
         super().__init__()
         self._period = period
+        self._numbers = device.numbers
         self._jacobian = np.zeros((6, 6))
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._device = self.DeclareVectorInputPort("for_display", _WATCH.stop)
@@ -182,6 +190,7 @@ class ForceDisplay(LeafSystem):
         display_into(
             self._command.Eval(context),
             self._device.Eval(context),
+            self._numbers,
             self._period,
             self._jacobian,
             output.get_mutable_value(),

@@ -30,8 +30,9 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.master.numbers import COULOMB, HAND_INERTIA, HAND_MASS, VISCOUS
 from drake_teleop.quaternions import multiply
-from drake_teleop.vectors import cross, dot, plus, put, solve, times
+from drake_teleop.vectors import cross, dot, plus, solve, times
 
 GRAVITY = 9.81  # m/s^2, along -z_B
 
@@ -231,51 +232,28 @@ def _add_friction_and_stops(q, v, coulomb, viscous, torque):
 
 
 @njit(cache=True)
-def acceleration_into(q, v, hand_wrench, motor_torque, parameters, work, vdot):
+def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
     """Forward dynamics of device and hand; writes the joint accelerations (6,) into `vdot`.
 
     Args:
         q, v: joint angles and rates (6,).
         hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
         motor_torque: (6,) at the joints.
-        parameters: (14,) [hand mass, hand inertia, coulomb (6), viscous (6)].
+        device: (NUMBERS,) of the device, see `numbers`.
         work: (2, 6, 6) scratch.
         vdot: (6,) written.
     """
     J, M = work[0], work[1]
     jacobian_into(q, J)
-    mass_matrix_into(q, J, parameters[0], parameters[1], M)
+    mass_matrix_into(q, J, device[HAND_MASS], device[HAND_INERTIA], M)
     gravity_torque_into(q, vdot)
     for i in range(6):
         vdot[i] = motor_torque[i] - vdot[i]
         for k in range(6):
             vdot[i] += J[k, i] * hand_wrench[k]
-    _subtract_coriolis(q, v, J, parameters[0], parameters[1], vdot)
-    _add_friction_and_stops(q, v, parameters[2:8], parameters[8:14], vdot)
+    _subtract_coriolis(q, v, J, device[HAND_MASS], device[HAND_INERTIA], vdot)
+    _add_friction_and_stops(q, v, device[COULOMB], device[VISCOUS], vdot)
     solve(M, vdot, 6)
-
-
-@njit(cache=True)
-def step(state, hand_wrench, motor_torque, parameters, period, work, stages):
-    """One classical Runge-Kutta step of `state` (12,) [q; v] in place, inputs held.
-
-    Error per step O(period^5). `work` (2, 6, 6) and `stages` (3, 12) are scratch.
-    """
-    stage, slope, total = stages[0], stages[1], stages[2]
-    put(stage, 0, state, 0, 12)
-    total[:] = 0.0
-    for i in range(4):
-        put(slope, 0, stage, 6, 6)
-        acceleration_into(
-            stage[:6], stage[6:], hand_wrench, motor_torque, parameters, work, slope[6:]
-        )
-        weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
-        ahead = 1.0 if i == 2 else 0.5
-        for k in range(12):
-            total[k] += weight * slope[k]
-            stage[k] = state[k] + ahead * period * slope[k]
-    for k in range(12):
-        state[k] += period * total[k]
 
 
 @njit(cache=True)
@@ -298,16 +276,6 @@ def pose_into(q, pose):
     pose[4] = math.cos(q[0]) * reach
     pose[5] = math.sin(q[0]) * reach
     pose[6] = L1 * math.sin(q[1]) - L2 * math.cos(q[2])
-
-
-@njit(cache=True)
-def twist_into(q, v, J, twist):
-    """Writes [v; omega] of E in B (6,) = J v; `J` (6, 6) is scratch."""
-    jacobian_into(q, J)
-    for i in range(6):
-        twist[i] = 0.0
-        for k in range(6):
-            twist[i] += J[i, k] * v[k]
 
 
 def closed_form_mass_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -395,6 +363,13 @@ def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
     return serial
+
+
+def at_an_end(q: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) whether an end stop, of a joint or of the five-bar, holds at q (N, 6)."""
+    folded = q[:, 1] - q[:, 2]
+    beyond = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=1)
+    return beyond | (folded < FIVE_BAR_RANGE[0]) | (folded > FIVE_BAR_RANGE[1])
 
 
 def check_limits(q: NDArray[np.float64]) -> None:

@@ -59,7 +59,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            told_of_the_arm(scenario),
+            _told_of_the_device(scenario, told_of_the_arm(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
             scenario.force_scaling.force_scale,
@@ -83,6 +83,19 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         wrench_to_master="wrench_received",
     )
     return builder.Build()
+
+
+def _told_of_the_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
+    """A method's limits at the hand are no larger than what the device displays.
+
+    Otherwise an account would hold a wrench that the hand does not feel.
+    """
+    device = scenario.master.device(0.0, 0.0)
+    return dataclasses.replace(
+        passivity,
+        force_limit=min(passivity.force_limit, device.peak_force),
+        torque_limit=min(passivity.torque_limit, float(device.peak_torque.min())),
+    )
 
 
 def told_of_the_arm(scenario: Scenario) -> PassivityConfig:

@@ -10,10 +10,11 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master import device, phantom
+from drake_teleop.master import device, dynamics, phantom
+from drake_teleop.master.data_sheets import JointFriction, Master
 from drake_teleop.master.force_display import initial_display
 
-NO_FRICTION = device.JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
+NO_FRICTION = JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
 
 
 def random_postures(count: int, seed: int = 0) -> np.ndarray:
@@ -26,7 +27,7 @@ def random_postures(count: int, seed: int = 0) -> np.ndarray:
 
 
 def parameters(hand_mass=0.0, hand_inertia=0.0, friction=NO_FRICTION) -> np.ndarray:
-    return np.array([hand_mass, hand_inertia, *friction.coulomb, *friction.viscous])
+    return Master(friction=friction).device(hand_mass, hand_inertia).numbers
 
 
 def acceleration(q, v, wrench, torque, parameters) -> np.ndarray:
@@ -44,7 +45,7 @@ def energy(state, hand_mass=0.0, hand_inertia=0.0) -> float:
 def advance(state, wrench, torque, parameters, period, steps) -> np.ndarray:
     state, work, stages = state.copy(), np.empty((2, 6, 6)), np.empty((3, 12))
     for _ in range(steps):
-        phantom.step(state, wrench, torque, parameters, period, work, stages)
+        dynamics.step(state, wrench, torque, parameters, period, work, stages)
     return state
 
 
@@ -233,7 +234,7 @@ def test_energy_is_conserved_in_free_motion_to_fourth_order():
 
 
 def test_friction_only_takes_energy_away():
-    friction = parameters(friction=device.JointFriction())
+    friction = parameters(friction=JointFriction())
     torque = np.zeros(6)
     state = free_state()
     for _ in range(200):
@@ -279,7 +280,7 @@ def test_a_joint_stops_at_its_limit(joint, side):
     if joint in (1, 2):
         q[3 - joint] = limit - side * 0.1  # the other link follows inside the five-bar's range
     push = side * np.array([2.0, 2.0, 2.0, 0.05, 0.05, 0.05]) * np.eye(6)[joint]
-    friction = parameters(friction=device.JointFriction())
+    friction = parameters(friction=JointFriction())
     state, farthest = np.concatenate([q, np.zeros(6)]), 0.0
     for _ in range(2000):
         torque = push + phantom.gravity_torque(state[:6])
@@ -310,7 +311,7 @@ def test_an_end_stop_pushes_back_and_never_pulls(joint, side):
 
 
 def test_the_five_bar_stops_at_its_limits():
-    friction = parameters(friction=device.JointFriction())
+    friction = parameters(friction=JointFriction())
     for side, limit in ((1, np.radians(65)), (-1, np.radians(-55))):
         state = np.zeros(12)
         for _ in range(3000):
@@ -323,9 +324,7 @@ def test_the_five_bar_stops_at_its_limits():
 
 def simulate(q_initial, duration, motor_torque):
     builder = DiagramBuilder()
-    master = builder.AddSystem(
-        device.MasterDevice(5e-4, hand_mass=0.1, hand_inertia=1e-4, q_initial=q_initial)
-    )
+    master = builder.AddSystem(device.MasterDevice(5e-4, Master().device(0.1, 1e-4), q_initial))
     for port in ("hand_wrench_E", "drive"):
         builder.ExportInput(master.GetInputPort(port), port)
     for port in ("state", "pose_master", "twist_master"):
@@ -334,7 +333,7 @@ def simulate(q_initial, duration, motor_torque):
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
     diagram.GetInputPort("hand_wrench_E").FixValue(context, np.zeros(6))
-    drive = np.append(motor_torque, initial_display(q_initial)[6:])
+    drive = np.append(motor_torque, initial_display(q_initial, parameters())[6:])
     diagram.GetInputPort("drive").FixValue(context, drive)
     simulator.AdvanceTo(duration)
     return {
@@ -360,11 +359,9 @@ def test_ports_agree_with_the_state():
 
 def test_a_slow_period_or_a_start_beyond_a_limit_is_refused():
     with pytest.raises(DrakeTeleopError, match=r"master\.period"):
-        device.MasterDevice(2e-3, hand_mass=0.1, hand_inertia=1e-4)
+        device.MasterDevice(2e-3, Master().device(0.1, 1e-4), phantom.HOME)
     with pytest.raises(DrakeTeleopError, match="joint 1"):
-        device.MasterDevice(
-            5e-4, hand_mass=0.1, hand_inertia=1e-4, q_initial=np.array([2.0, 0, 0, 0, 0, 0])
-        )
+        device.MasterDevice(5e-4, Master().device(0.1, 1e-4), np.array([2.0, 0, 0, 0, 0, 0]))
 
 
 @pytest.mark.parametrize(("name", "slope"), [("viscous", 1.0), ("coulomb", 0.01)])
@@ -372,8 +369,9 @@ def test_friction_that_the_step_cannot_follow_is_refused(name, slope):
     """The wrist's last joint turns 1.5e-4 kg m^2, of which a step of 0.5 ms follows 0.6 N m s."""
 
     def made(last):
-        friction = device.JointFriction(**{name: [*[0.0] * 5, slope * last]})
-        device.MasterDevice(5e-4, hand_mass=0.1, hand_inertia=1e-4, friction=friction)
+        friction = JointFriction(**{name: [*[0.0] * 5, slope * last]})
+        model = Master(friction=friction).device(0.1, 1e-4)
+        device.MasterDevice(5e-4, model, phantom.HOME)
 
     made(0.5)
     with pytest.raises(DrakeTeleopError, match=r"master\.friction"):

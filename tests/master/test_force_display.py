@@ -7,9 +7,12 @@ import pytest
 
 from drake_teleop.fault import Fault
 from drake_teleop.master import phantom
+from drake_teleop.master.data_sheets import Master
 from drake_teleop.master.force_display import ForceDisplay, display_into, initial_display
 from drake_teleop.passivity.safe_state import RESUME, STOP
 
+DEVICE = Master().device(0.1, 1e-4)
+PERIOD = 5e-4
 POSTURES = [
     np.zeros(6),
     np.array([0.4, 0.3, 0.5, -0.6, 0.7, 0.8]),
@@ -19,10 +22,11 @@ POSTURES = [
 
 def display(wrench, q) -> tuple[np.ndarray, np.ndarray]:
     """The block's outputs (motor torque, displayed wrench)."""
-    block = ForceDisplay()
+    block = ForceDisplay(PERIOD, DEVICE)
     context = block.CreateDefaultContext()
     block.GetInputPort("wrench_command").FixValue(context, np.asarray(wrench, dtype=float))
-    block.GetInputPort("for_display").FixValue(context, initial_display(np.array(q, dtype=float)))
+    start = initial_display(np.array(q, dtype=float), DEVICE.numbers)
+    block.GetInputPort("for_display").FixValue(context, start)
     return (
         block.GetOutputPort("drive").Eval(context)[:6].copy(),
         block.GetOutputPort("force_to_master").Eval(context).copy(),
@@ -96,17 +100,16 @@ def test_a_huge_command_is_limited_too_and_one_that_is_no_wrench_is_none():
     np.testing.assert_array_equal(display([1e9, 0, 0, 0, 0, 0], phantom.HOME)[1], 0)
 
 
-PERIOD = 5e-4
 WRENCH = np.array([3.0, -2.0, 5.0, 0.05, -0.02, 0.03])
 
 
 def displayed_over(commands, angles) -> tuple[np.ndarray, np.ndarray]:
     """(N, 7) displayed wrench and fault, (N, 6) torque, one period after the other."""
-    device, J, drive = initial_display(POSTURES[1]), np.empty((6, 6)), np.empty(27)
+    device, J, drive = initial_display(POSTURES[1], DEVICE.numbers), np.empty((6, 6)), np.empty(27)
     shown, torque = np.empty((len(commands), 7)), np.empty((len(commands), 6))
     for k, (command, q) in enumerate(zip(commands, angles, strict=True)):
         device[:6] = q
-        display_into(command, device, PERIOD, J, drive)
+        display_into(command, device, DEVICE.numbers, PERIOD, J, drive)
         torque[k], shown[k] = drive[:6], drive[12:19]
         device[6:] = drive[6:]
     return shown, torque

@@ -15,6 +15,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.master import device, phantom
+from drake_teleop.master.data_sheets import JointFriction, Master
 from drake_teleop.master.force_display import ForceDisplay
 from drake_teleop.operator.operator import (
     GRIPS,
@@ -151,17 +152,14 @@ def test_hand_is_not_stronger_than_a_hand():
 def test_hand_gives_way_to_the_displayed_force(grip):
     """The two-port at rest: the hand pushes back with the displayed force, at F / K."""
     period, force = 5e-4, np.array([0.4, 0.3, -1.0])
-    viscous = device.JointFriction(coulomb=[0.0] * 6, viscous=[5e-4] * 3 + [5e-5] * 3)
+    viscous = JointFriction(coulomb=[0.0] * 6, viscous=[5e-4] * 3 + [5e-5] * 3)
     config = OperatorConfig(grip=grip)
     hand = config.hand
+    model = Master(friction=viscous).device(hand.mass, hand.inertia)
     builder = DiagramBuilder()
     operator = builder.AddSystem(Operator(config, START))
-    master = builder.AddSystem(
-        device.MasterDevice(
-            period, hand_mass=hand.mass, hand_inertia=hand.inertia, friction=viscous
-        )
-    )
-    display = builder.AddSystem(ForceDisplay())
+    master = builder.AddSystem(device.MasterDevice(period, model, phantom.HOME))
+    display = builder.AddSystem(ForceDisplay(period, model))
     for source, sink, port in (
         (master, operator, "pose_master"),
         (master, operator, "twist_master"),

@@ -10,7 +10,7 @@ from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import true_load
-from drake_teleop.master.device import JointFriction
+from drake_teleop.master.data_sheets import JointFriction
 from drake_teleop.noise import random_normal
 from drake_teleop.operator import decision
 from drake_teleop.operator.decision import DONE, OVER, PHASE, SEEKING, STOPPING

@@ -1,0 +1,164 @@
+"""A haptic device by its data sheet."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RotationMatrix
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.master import dynamics
+from drake_teleop.master.data_sheets import FIGURES, JointFriction, Master
+from drake_teleop.master.device import MasterDevice
+from drake_teleop.master.force_display import display_into, initial_display
+from drake_teleop.scenario import LoadScenario, ScenarioFromData, replace
+from drake_teleop.simulation import simulate
+from drake_teleop.station import MakeTeleopStation
+
+HAND = (0.2, 3e-4)
+PERIOD = 5e-4
+Q = np.array([0.25, 0.02, 0.05, 0.5, -0.7, 0.9])
+V = np.array([0.3, -0.2, 0.1, 2.0, -1.0, 3.0])
+
+
+def device(model="omega_6", **figures) -> dynamics.HapticDevice:
+    return Master(model=model, figures=dataclasses.replace(FIGURES[model], **figures)).device(*HAND)
+
+
+def smooth(model="omega_6", **figures) -> dynamics.HapticDevice:
+    none = {"friction": 0.0, "friction_torque": 0.0, "damping": 0.0, "turning_damping": 0.0}
+    return device(model, **none | figures)
+
+
+def advance(device, state, wrench, motor, steps, period=PERIOD) -> np.ndarray:
+    state, work, stages = state.copy(), np.empty((2, 6, 6)), np.empty((3, 12))
+    for _ in range(steps):
+        dynamics.step(state, wrench, motor, device.numbers, period, work, stages)
+    return state
+
+
+def rotation(pose) -> np.ndarray:
+    return RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))).matrix()
+
+
+def test_the_jacobian_is_the_derivative_of_the_pose():
+    omega, step = device(), 1e-6
+    R = rotation(omega.forward_kinematics(Q))
+    for k, column in enumerate(omega.jacobian(Q).T):
+        ahead = omega.forward_kinematics(Q + step * np.eye(6)[k])
+        behind = omega.forward_kinematics(Q - step * np.eye(6)[k])
+        spin = (rotation(ahead) - rotation(behind)) @ R.T / (2 * step)
+        numeric = [*(ahead[4:] - behind[4:]) / (2 * step), spin[2, 1], spin[0, 2], spin[1, 0]]
+        np.testing.assert_allclose(column, numeric, atol=1e-9)
+    np.testing.assert_allclose(omega.inverse_kinematics(omega.forward_kinematics(Q)), Q, atol=1e-12)
+
+
+def test_free_it_keeps_its_velocity_and_its_angular_velocity():
+    """A body whose inertia is the same about every axis, whatever the angles do."""
+    omega = smooth()
+    start = np.concatenate([Q, 0.1 * V])
+    after = advance(omega, start, np.zeros(6), np.zeros(6), 200)
+    twist = omega.jacobian(Q) @ start[6:]
+    np.testing.assert_allclose(omega.jacobian(after[:6]) @ after[6:], twist, rtol=1e-9)
+    np.testing.assert_allclose(after[:3] - Q[:3], 0.1 * twist[:3], rtol=1e-9)
+
+
+def test_hand_and_motors_accelerate_the_mass_on_the_data_sheet():
+    """F = m a and tau = I alpha at E in B, by the hand and by J^T F of the motors alike."""
+    omega = smooth(apparent_mass=0.3, inertia=2e-4)
+    wrench = np.array([0.3, -0.2, 0.1, 1e-3, -2e-3, 3e-3])
+    start = np.concatenate([Q, np.zeros(6)])
+    expected = np.concatenate([wrench[:3] / 0.5, wrench[3:] / 5e-4]) * PERIOD
+    of_motors = omega.jacobian(Q).T @ wrench
+    for by in ((wrench, np.zeros(6)), (np.zeros(6), of_motors)):
+        after = advance(omega, start, *by, 1)
+        np.testing.assert_allclose(omega.jacobian(Q) @ after[6:], expected, rtol=1e-5)
+    M = omega.jacobian(Q).T @ np.diag(np.repeat([0.5, 5e-4], 3)) @ omega.jacobian(Q)
+    np.testing.assert_allclose(omega.mass_matrix(Q), M, atol=1e-15)
+
+
+def test_friction_is_against_the_motion_and_the_same_in_every_direction():
+    omega = device(friction=0.3, damping=2.0, friction_torque=1e-3, turning_damping=1e-4)
+    rate = np.linalg.solve(omega.jacobian(Q), V)  # twist V
+    after = advance(omega, np.concatenate([Q, rate]), np.zeros(6), np.zeros(6), 1, period=1e-5)
+    change = (omega.jacobian(after[:6]) @ after[6:] - V) / 1e-5
+    speed, turning = np.linalg.norm(V[:3]), np.linalg.norm(V[3:])
+    mass, inertia = 0.3 + HAND[0], 1e-4 + HAND[1]
+    np.testing.assert_allclose(change[:3], -(0.3 / speed + 2.0) * V[:3] / mass, rtol=1e-3)
+    drag = 1e-3 / turning + 1e-4
+    np.testing.assert_allclose(change[3:], -drag * V[3:] / inertia, rtol=1e-3)
+    slope = omega.damping_matrix(Q)
+    np.testing.assert_allclose(rate @ slope @ rate, 2.0 * speed**2 + 1e-4 * turning**2, rtol=1e-12)
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_it_ends_where_the_workspace_ends(axis):
+    touch = device("geomagic_touch")
+    figures, side = FIGURES["geomagic_touch"], (-1.0) ** axis
+    end = np.append(0.5 * np.array(figures.size), figures.turn)[axis]
+    centre = np.append(figures.centre, np.zeros(3))
+    push = side * np.array([2.0, 2.0, 2.0, 0.05, 0.05, 0.05]) * np.eye(6)[axis]
+    start = np.concatenate([centre, np.zeros(6)])
+    after = advance(touch, start, np.zeros(6), push, 3000)
+    assert 0.0 < side * (after[axis] - centre[axis]) - end < 0.02
+    assert np.abs(after[6:]).max() < 0.05
+    back = after.copy()
+    back[6 + axis] = -side * 10.0  # out of the stop: it does not hold back
+    slower = advance(touch, back, np.zeros(6), np.zeros(6), 1, period=1e-6)
+    assert side * (slower[6 + axis] - back[6 + axis]) > 0.0 or axis > 2
+    with pytest.raises(DrakeTeleopError, match=r"workspace is 0\.235 to 0\.305"):
+        MasterDevice(PERIOD, touch, centre + 1.01 * side * end * np.eye(6)[axis])
+
+
+def test_what_is_not_actuated_displays_nothing():
+    for model, force, torque in (("geomagic_touch", 3.3, 0.0), ("virtuose_6d", 35.0, 3.1)):
+        numbers, q = device(model).numbers, np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0])
+        start, drive = initial_display(q, numbers), np.empty(27)
+        display_into(np.full(6, 100.0), start, numbers, PERIOD, np.empty((6, 6)), drive)
+        assert np.linalg.norm(drive[12:15]) == pytest.approx(force, rel=1e-12)
+        np.testing.assert_allclose(drive[15:18], torque, rtol=1e-12)
+        np.testing.assert_allclose(drive[:6], drive[12:18], atol=1e-12)  # no weight to hold
+
+
+def test_a_file_names_the_device_and_changes_what_it_likes():
+    scenario = ScenarioFromData(
+        {"master": {"model": "omega_3", "figures": {"friction": 0.1}}}, "mine.yaml"
+    )
+    expected = dataclasses.replace(FIGURES["omega_3"], friction=0.1)
+    assert scenario.master.figures == expected
+    named = ScenarioFromData({"master": {"model": "falcon"}}, "mine.yaml")
+    np.testing.assert_array_equal(
+        named.master.device(*HAND).numbers, Master(model="falcon").device(*HAND).numbers
+    )
+    for block, where in (
+        ({"figures": {"friction": 0.1}}, "figures"),
+        ({"model": "falcon", "friction": {"coulomb": [0.1] * 6}}, "friction"),
+        ({"model": "custom", "figures": {"turn": [0.1, 1.55, 0.1]}}, "figures.turn"),
+        ({"model": "omega_5"}, "model"),
+        ({"model": "omega_6", "figures": {"apparent_mass": 0.0}}, "figures.apparent_mass"),
+    ):
+        with pytest.raises(DrakeTeleopError, match=rf"mine\.yaml:master\.{where}"):
+            ScenarioFromData({"master": block}, "mine.yaml")
+    with pytest.raises(DrakeTeleopError, match=r"master\.figures.*friction stops the device"):
+        MasterDevice(PERIOD, device(friction=50.0), np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0]))
+    assert JointFriction() == Master().friction
+
+
+@pytest.mark.parametrize("model", ["geomagic_touch", "omega_6"])
+def test_a_station_feels_what_its_device_can_display(model):
+    """The paper's contact with another device: the wall is touched, the force is within limits."""
+    paper = LoadScenario("contact_transition")
+    scenario = replace(
+        paper, master=Master(model=model), simulation__duration=0.6, force_scaling__sigma=1.0
+    )
+    result = simulate(MakeTeleopStation(scenario), scenario.simulation, progress=False)
+    force = np.linalg.norm(result["force_to_master"][:, :3], axis=1)
+    peak = FIGURES[model].peak_force
+    assert np.isfinite(result["pose_master"]).all()
+    assert force.max() <= peak * (1 + 1e-12)
+    np.testing.assert_array_equal(result["force_to_master"][:, 3:], 0.0)
+    moved = result["pose_master"][:, 4:] - result["pose_master"][0, 4:]
+    assert np.abs(moved).max() > 0.01
