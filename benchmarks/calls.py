@@ -30,9 +30,9 @@ from drake_teleop.load.contact.memory import SIZE
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.contact.statistics import detection_update
 from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.sensor.presets import PRESETS
 from drake_teleop.sensor.sensor_chain import (
     NOISE_SIZE,
-    PRESETS,
     WristSensorConfig,
     read_into,
     sensor_chain,

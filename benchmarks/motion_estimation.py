@@ -34,9 +34,9 @@ from drake_teleop.sensor.motion_estimation import (
     motion_estimator,
     path_delays,
 )
+from drake_teleop.sensor.presets import PRESETS
 from drake_teleop.sensor.sensor_chain import (
     NOISE_SIZE,
-    PRESETS,
     WristSensorConfig,
     read_into,
     sensor_chain,

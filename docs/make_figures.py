@@ -37,7 +37,8 @@ from drake_teleop.pages.style import (
     shade_contact,
 )
 from drake_teleop.reproduction.reproduce import reproduce_command
-from drake_teleop.sensor.sensor_chain import PRESETS, without
+from drake_teleop.sensor.presets import PRESETS
+from drake_teleop.sensor.sensor_chain import without
 from drake_teleop.sensor.sensor_noise import (
     allan_deviation,
     predicted_allan_deviation,

@@ -38,7 +38,8 @@ from drake_teleop.resources import scenarios_dir
 from drake_teleop.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
-from drake_teleop.sensor.sensor_chain import WristSensorConfig, preset_of
+from drake_teleop.sensor.presets import preset_of
+from drake_teleop.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.slave.joint_control import JointControlConfig
 from drake_teleop.slave.payload import Payload
 from drake_teleop.texts import read_yaml

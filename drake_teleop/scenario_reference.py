@@ -16,7 +16,8 @@ import yaml
 
 from drake_teleop.fields import FieldInfo, fields_of
 from drake_teleop.scenario import Scenario
-from drake_teleop.sensor.sensor_chain import WristSensorConfig, preset_of
+from drake_teleop.sensor.presets import preset_of
+from drake_teleop.sensor.sensor_chain import WristSensorConfig
 
 _COLUMN = 34  # at which the comments of a block begin, if its values leave them that place
 

@@ -15,7 +15,7 @@ from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.result import SimulationResult
 from drake_teleop.run_warnings import behind, hunts, run_warnings, spans_of, turns
 from drake_teleop.scenario import Scenario, Simulation, replace
-from drake_teleop.sensor.sensor_chain import PRESETS
+from drake_teleop.sensor.presets import PRESETS
 from drake_teleop.signals import SIGNALS
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation

@@ -19,7 +19,7 @@ from drake_teleop.operator.task import Press
 from drake_teleop.resources import scenarios_dir
 from drake_teleop.scenario import LoadScenario, Scenario, ScenarioFromData, ScenarioNames
 from drake_teleop.scenario_reference import commented, json_schema, reference
-from drake_teleop.sensor.sensor_chain import PRESETS
+from drake_teleop.sensor.presets import PRESETS
 
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -18,15 +18,14 @@ rate, the signal processor filters what comes out, noise and quantisation steps 
 electronics that make the noise (`before_noise`).
 
 Each part is a group of fields of `WristSensorConfig` that is off when it is zero; `without` turns
-parts off by name. Calibration errors are off in every preset: what a maker's calibration sheet
-leaves is far below the bound of 1 % that is stated for such sensors, an error that is constant can
-be calibrated away, and a study of errors wants to see this one on its own.
+parts off by name. Calibration errors are off in the presets of sensors: what a maker's calibration
+sheet leaves is far below the bound of 1 % that is stated for such sensors, an error that is
+constant can be calibrated away, and a study of errors wants to see this one on its own.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import copy
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -47,7 +46,11 @@ _CHANNELS = 12
 #: Standard normal numbers for NOISE_BLOCK samples: 12 for each, then 12 for the random walks.
 NOISE_SIZE = _CHANNELS * (NOISE_BLOCK + 1)
 
-_PRESET_NAMES = ("ideal", "jr3_85m35a3", "ati_gamma_imu")
+#: Of what is in `drake_teleop.sensor.presets`.
+PRESET_NAMES = (
+    *("ideal", "jr3_85m35a3", "ati_gamma_imu", "ati_mini45", "bota_sensone", "bota_rokubi"),
+    *("robotiq_ft300", "onrobot_hex_e", "ur5e_built_in", "franka_estimated"),
+)
 _LOW_PASS = ("none", "before_noise", "after_converter")
 _SECTIONS = 2  # second-order sections of the fourth-order low-pass
 _ROTATION_ERROR = 1e-6
@@ -67,7 +70,7 @@ class WristSensorConfig:
         init=False,
         compare=False,
         metadata={
-            "choices": ("custom", *_PRESET_NAMES),
+            "choices": ("custom", *PRESET_NAMES),
             "doc": "in a file: whose figures the fields have that the file leaves out; custom: the "
             'defaults. In Python: `dataclasses.replace(PRESETS["ati_gamma_imu"], force_noise=0.1)`',
         },
@@ -240,52 +243,6 @@ class WristSensorConfig:
             )
 
 
-PRESETS: dict[str, WristSensorConfig] = {
-    "ideal": WristSensorConfig(ideal=True),
-    "jr3_85m35a3": WristSensorConfig(),
-    "ati_gamma_imu": WristSensorConfig(
-        p_SoAo_S=[0.0, 0.0, 0.05],
-        R_SA=[0.0, -1.0, 0.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0],
-        low_pass="before_noise",
-        bandwidth_hz=300.0,
-        force_noise=0.018,
-        torque_noise=9e-4,
-        acceleration_noise=0.053,
-        angular_acceleration_noise=0.3,
-        angular_acceleration_walk=0.0,
-        offset=[9.08, -1.02, 9.98, 0.433, -0.692, -0.157],
-        acceleration_offset=[-0.036, 0.086, 0.757, 0.0, 0.0, 0.0],
-        resolution=3.05e-5,
-        force_range=[130.0, 130.0, 400.0],
-        torque_range=[10.0, 10.0, 10.0],
-        acceleration_range=78.5,
-        angular_acceleration_range=500.0,
-        acceleration_latency=6e-3,
-    ),
-}
-"""Sensors by name.
-
-jr3_85m35a3: JR3 85M35A3-I40-D 200N12, the paper's. Ranges of force and torque: its name and data
-sheet. S lies on the flange, and the acceleration part in the middle of the housing, 35 mm high.
-Noise, quantum, ranges of acceleration: estimates. Filter: one of those that can be selected. Drift:
-0.5 N in 10 min, between the records of the ATI. Walks of force and torque: the Allan deviation at 1
-to 2.5 s of a force sensor on a UR5 at rest (kkufieta/ur5_modeling_force_estimate, No10); of the
-specific force: 0.2 mg at 30 s, what MEMS accelerometers have; of the angular acceleration: in the
-ratio of the noises, as it is made of accelerometers a few centimetres apart. No latency: force and
-acceleration go through the same converter, filter and line.
-
-ati_gamma_imu: ATI Gamma with NetBox and MPU6886 IMU on an end effector, as recorded by A. Skrede
-(doi 10.5281/zenodo.11075229). The white noise is what the record at rest has from one sample to the
-next (Allan deviation at one sample, 698 Hz and 254 Hz; the standard deviation would count the arm's
-vibration): force 0.018, 0.019, 0.018 N, torque 0.0012, 0.0010, 0.0003 N m, specific force 0.061,
-0.060, 0.031 m/s^2, here their root mean squares. The spectrum of tz is white up to 349 Hz, so the
-low-pass, 300 Hz for the mechanics (an estimate), stands before the noise. Offsets, axes of the IMU
-and its lag of 6 ms: fits to the same records. Quantum and range of the IMU: steps of 2.44e-4 g in
-its record, 16 bits of +-8 g. Ranges of the Gamma: SI-130-10, an estimate, as are the place of the
-IMU and its angular acceleration: differences of a gyroscope's samples, without a walk. The record
-at rest lasts 1 s: the other walks and the drift are those of the other preset.
-"""
-
 #: The parts by name, and the fields that turn each of them off.
 PARTS: dict[str, dict[str, Any]] = {
     "calibration": {
@@ -328,15 +285,6 @@ def without(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
     """
     changes = {name: value for part in parts for name, value in PARTS[part].items()}
     return dataclasses.replace(config, **copy.deepcopy(changes))
-
-
-def preset_of(block: Mapping[str, Any] | None) -> WristSensorConfig:
-    """The defaults for a scenario's block `wrist_sensor`: those of the preset that it names.
-
-    A name that is not known is left to the check of the loaded block.
-    """
-    name = (block or {}).get("preset")
-    return copy.deepcopy(PRESETS.get(str(name), WristSensorConfig()))
 
 
 def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:

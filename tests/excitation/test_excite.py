@@ -35,10 +35,10 @@ from drake_teleop.sensor.motion_estimation import (
     estimate_into,
     motion_estimator,
 )
+from drake_teleop.sensor.presets import PRESETS
 from drake_teleop.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
-    PRESETS,
     WristSensorConfig,
     read_into,
     sensor_chain,

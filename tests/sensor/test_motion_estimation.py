@@ -27,10 +27,10 @@ from drake_teleop.sensor.motion_estimation import (
     path_delays,
     steady_state,
 )
+from drake_teleop.sensor.presets import PRESETS
 from drake_teleop.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
-    PRESETS,
     WristSensorConfig,
     butterworth_sections,
     read_into,
