@@ -28,7 +28,7 @@ def _with_imu(
         force_noise, torque_noise: white, 1 sigma of a sample [N, N m].
         **others: what else is not as `WristSensorConfig` has it.
     """
-    figures = {
+    figures: dict[str, Any] = {
         "p_SoAo_S": [0.0, 0.0, 0.05],
         "low_pass": "before_noise",
         "bandwidth_hz": 300.0,
