@@ -21,7 +21,7 @@ from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.master import phantom
 from drake_teleop.master.data_sheets import JointFriction
-from drake_teleop.operator.operator import OperatorConfig, Sine
+from drake_teleop.operator.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.operator.task import Touch
 from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.signals import SIGNALS
@@ -122,11 +122,18 @@ def test_samples_between_the_steps_are_those_of_short_steps(name, most):
     scenario = replace(
         LoadScenario(name),
         wrist_sensor__ideal=True,
-        simulation__duration=0.28,  # the contact ends at 0.275 s
+        simulation__settle=0.0,
+        simulation__duration=0.3,
+        operator__intent=[  # down into the leaf, where there is one, and up again
+            MinimumJerk(t_start=0.01, duration=0.14, translation=[0.004, 0.003, -0.058]),
+            MinimumJerk(t_start=0.19, duration=0.14, translation=[0.0, 0.0, 0.058]),
+        ],
         force_scaling__sigma=1.0,  # the hand feels the tool: no load need be known
     )
     tight = replace(scenario, simulation__accuracy=1e-9, simulation__max_step=4e-5)
     result, reference = (simulate(MakeTeleopStation(s), s.simulation) for s in (scenario, tight))
+    if name == "contact_transition":
+        assert reference["sheet_state"][:, 0].min() < -1e-3
     off = np.abs(result["measured_wrench_S"] - reference["measured_wrench_S"])[:, :3].max()
     # The log shows the sample 125 us before its instant, inside a step.
     assert off < most

@@ -9,6 +9,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.environment.sheet_spring import AddSheetSpring, SheetSpring
+from drake_teleop.operator.operator import MinimumJerk
 from drake_teleop.scenario import LoadScenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
@@ -46,6 +47,13 @@ def test_it_rings_at_the_frequency_of_its_stiffness_and_mass_and_decays():
     assert plant.GetPositions(context)[0] == pytest.approx(expected, rel=1e-4)
 
 
+# Down into the leaf by 2 mm, at once, and up again.
+STRIKE = [
+    MinimumJerk(t_start=0.01, duration=0.14, translation=[0.004, 0.003, -0.058]),
+    MinimumJerk(t_start=0.19, duration=0.14, translation=[0.0, 0.0, 0.058]),
+]
+
+
 @pytest.mark.slow
 def test_a_contact_at_the_scenarios_step_agrees_with_a_tight_run():
     """RK2 at the sensor's 125 us against error-controlled RK3 at half of that, which is as good as
@@ -54,7 +62,9 @@ def test_a_contact_at_the_scenarios_step_agrees_with_a_tight_run():
     scenario = replace(
         LoadScenario("contact_transition"),
         wrist_sensor__ideal=True,
+        simulation__settle=0.0,
         simulation__duration=0.3,
+        operator__intent=STRIKE,
         rates__log_hz=8000.0,
         force_scaling__sigma=1.0,  # the hand feels the tool: no load need be known
     )

@@ -28,7 +28,7 @@ def bench() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def least(bench: ModuleType) -> dict[str, dict[str, float]]:
-    return bench.study(networks=24, seconds=4.0, processes=1)
+    return bench.study(networks=14, seconds=4.0, processes=1)
 
 
 @pytest.mark.slow
