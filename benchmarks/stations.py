@@ -1,0 +1,136 @@
+"""Does every station keep the promises of the paper's: each device, free and before a wall?
+
+For each cell: the ideal sensor's force against the plant's reaction port; the mass that `identify`
+finds, and what elimination leaves of the peak inertial force; what the hand feels of the device and
+of sigma times the load, against (device + sigma k m_t), from forces and accelerations at 1.3 Hz;
+CPU time over the bare plant.
+
+    python benchmarks/stations.py [--devices NAME,NAME] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+from station import against_the_port, fastest
+
+from drake_teleop.identification import slave_arm
+from drake_teleop.master.data_sheets import FIGURES, PHANTOM, Master
+from drake_teleop.operator.operator import Sine
+from drake_teleop.reproduction.speed import MakeBarePlant, MakeMovingStation
+from drake_teleop.run import run_scenario, summarise
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+
+_SIGMA, _PUSHED = 0.5, 1.3  # Hz
+_REACH = 0.1  # m, how far the scenarios' intents lead from their start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--devices", default=",".join((PHANTOM, *FIGURES)))
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    arguments = parser.parse_args()
+    rows = []
+    columns = "port N", "mass %", "left %", "felt %", "cost"
+    print(f"{'device':20s} {'surroundings':12s}", *(f"{name:>10s}" for name in columns))
+    for device in arguments.devices.split(","):
+        for surroundings, scenario in _scenarios(device).items():
+            row = figures(scenario, free=surroundings == "free motion")
+            rows.append({"device": device, "surroundings": surroundings} | row)
+            shown = (f"{value:10.3g}" if value is not None else 10 * " " for value in row.values())
+            print(f"{device:20s} {surroundings:12s}", *shown, flush=True)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+def _scenarios(device: str) -> dict[str, Scenario]:
+    """The tool moves as in the paper; a small device less, by a larger kinematic scale."""
+    scenarios = {}
+    for what, name in (("free motion", "free_motion_force"), ("wall", "contact_transition")):
+        scenario, share = LoadScenario(name), 1.0
+        if device != PHANTOM:
+            share = min(1.0, 0.5 * min(FIGURES[device].size) / _REACH)
+        intent = [
+            dataclasses.replace(move, translation=[share * x for x in move.translation])
+            for move in scenario.operator.intent
+        ]
+        scenarios[what] = replace(
+            scenario,
+            master=Master(model=device),
+            operator__intent=intent,
+            kinematic_scaling__translation_scale=1 / share,
+        )
+    return scenarios
+
+
+def figures(scenario: Scenario, free: bool) -> dict[str, float | None]:
+    """The row of one station; `felt` in free motion only."""
+    summary = summarise(run_scenario(scenario, progress=False))
+    inertial = summary["peak_measured_force_N"]
+    left = summary["residual_force_max_N"] if free else None
+    makes = {
+        "whole": partial(MakeMovingStation, scenario),
+        "bare": partial(MakeBarePlant, scenario),
+    }
+    seconds = fastest(makes, scenario.simulation.duration)
+    return {
+        "port_N": against_the_port(scenario),
+        "mass_error_percent": summary["mass_error_percent"],
+        "left_percent": None if left is None else 100 * left / inertial,
+        "felt_error_percent": _felt_error(scenario) if free else None,
+        "cost_over_bare": seconds["whole"] / seconds["bare"],
+    }
+
+
+def _felt_error(scenario: Scenario) -> float:
+    """The larger error [%] of what the hand feels along z: of the device, and of sigma m_t k_f.
+
+    Of force and acceleration at one frequency; the load's share by how far the slave follows.
+    """
+    found = {sigma: _pushed(scenario, sigma) for sigma in (0.0, _SIGMA)}
+    device = scenario.master.device(*_hand(scenario))
+    q = device.inverse_kinematics(np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position]))
+    J = device.jacobian(q)
+    alone = np.linalg.inv(J @ np.linalg.solve(device.mass_matrix(q), J.T))[2, 2]
+    load = _SIGMA * slave_arm(scenario).phi_load[0] * scenario.force_scaling.force_scale
+    (felt_0, _), (felt, follows) = found[0.0], found[_SIGMA]
+    errors = felt_0.real / alone - 1, ((felt - felt_0) / follows).real / load - 1
+    return 100 * float(np.abs(errors).max())
+
+
+def _hand(scenario: Scenario) -> tuple[float, float]:
+    return scenario.operator.hand.mass, scenario.operator.hand.inertia
+
+
+def _pushed(scenario: Scenario, sigma: float) -> tuple[complex, complex]:
+    """Hand's force over acceleration [kg], and the slave's acceleration over the master's."""
+    changed = replace(
+        scenario,
+        force_scaling__sigma=sigma,
+        operator__intent=[
+            Sine(duration=10.0, ramp=0.5, frequency=_PUSHED, translation=[0.0, 0.0, 0.02])
+        ],
+        master=scenario.master.without_coulomb_friction(),
+        simulation__settle=1.5,
+        simulation__duration=2 / _PUSHED,
+    )
+    result = run_scenario(changed, progress=False).result
+    turning = np.exp(-2j * np.pi * _PUSHED * result.t[:-1])
+    force, velocity, slave = (
+        2 * np.mean(result[name][:-1, 2] * turning)
+        for name in ("hand_wrench_E", "twist_master", "specific_force_S")
+    )
+    acceleration = 2j * np.pi * _PUSHED * velocity
+    return force / acceleration, -slave / acceleration
+
+
+if __name__ == "__main__":
+    main()
