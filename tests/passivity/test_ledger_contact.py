@@ -98,6 +98,19 @@ def test_friction_is_of_the_hands_own_motion_and_at_rest_what_is_measured():
     np.testing.assert_allclose(hand.rest(400), np.zeros(6), atol=1e-9)
 
 
+def test_a_hand_that_lets_go_gets_no_more_than_what_its_ledger_keeps():
+    """R_m + 0.7 R_s in contact, and what its drag has cost, though the wall follows with 3 N."""
+    hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
+    hand.rest(1000)
+    got = 0.0
+    for _ in range(1500):
+        held, way = hand.felt[2], 6e-5
+        hand.packet[POSE][6] += way
+        hand.step([0.0, 0.0, way, 0.0, 0.0, 0.0])
+        got += held * way
+    assert 0.08 < got <= 0.02 + 0.7 * 0.1
+
+
 def test_after_missing_packets_the_wrench_goes_over_gradually():
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0)
     hand.rest(100)

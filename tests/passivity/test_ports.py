@@ -11,7 +11,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_methods import line, poses, run, wrenches
+from test_methods import START, line, poses, run, wrenches
 
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.comparison.one_dof import (
@@ -25,7 +25,7 @@ from drake_teleop.comparison.one_dof import (
 )
 from drake_teleop.passivity.energy import ledger, port_work
 from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.passivity.packet import difference_into
+from drake_teleop.passivity.packet import ENERGY, difference_into
 from drake_teleop.passivity.tdpa import TdpaConfig
 from drake_teleop.passivity.wave import WaveConfig
 
@@ -124,6 +124,27 @@ def test_tdpa_repays_what_a_tap_has_cost():
     )  # fmt: skip
     assert found.wall.min() < -10.0, "the wall should have been touched"
     assert found.least(ACTUAL) > -0.06
+
+
+@pytest.mark.parametrize("method", ["tdpa", "charged_tdpa"])
+def test_a_debt_at_the_actual_motion_is_repaid_before_anything_is_sent(method):
+    """The slave goes 30 mm into a wall that pushes with 2 N, and is pushed 60 mm out again.
+
+    The hand has paid little: in a whole run the energy of `charged_tdpa`'s drag hides a debt that
+    was forgotten.
+    """
+    steps = 900
+    master, slave = np.tile(START, (2, steps, 1))
+    slave[:, 6] += 1e-4 * (np.abs(np.arange(steps) - 300) - 300)
+    master[300:, 6] += 0.1  # out, so that command and slave do the same work
+    wrench = np.tile([0.0, 0.0, 2.0, 0.0, 0.0, 0.0], (steps, 1))
+    to_the_slave_alone = np.stack([np.arange(steps) - 1, np.full(steps, -1)])
+    _, _, packets, dx, _ = run(
+        method, PassivityConfig(method=method), master, slave, wrench, to_the_slave_alone
+    )
+    put_in, (paid, sent) = np.cumsum(2.0 * dx[1, :, 2]), packets[:, :, ENERGY][..., 0]
+    assert put_in.min() == pytest.approx(-0.06) and put_in[-1] > 0.059 > 4.0 * paid[-1]
+    np.testing.assert_allclose(sent[1:], np.maximum(put_in[1:] + paid[:-1], 0.0), atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [1, 3])
