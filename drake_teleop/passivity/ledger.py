@@ -39,7 +39,7 @@ At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
 
 M1. L_m -= f_(k-1) . dx; below zero it is a debt, never written off. While something is touched,
     what the hand pays is sent instead: the slave presses with it. L_m += what came.
-M2. What is touched pushes along one unit wrench n, the mean of w over two round trips and 0.8 s
+M2. What is touched pushes along one unit wrench n, the mean of w over two round trips and 3 s
     at least: force and torque together, so that a point that is touched far from So is one spring
     and not two. With w_n = w . n and x_n = n . x, where a torque counts as a force at 0.1 m,
 
@@ -54,13 +54,17 @@ M2. What is touched pushes along one unit wrench n, the mean of w over two round
         h' = -k_h v_m + (w - w_n n - h) / tau,    |h| <= h_m u_n / w_n,
 
     at rest what is measured too; k_h = 2.5 kN/m, h_m is the largest |w - w_n n| of about a second,
-    tau ten round trips, but 0.6 s at least.
+    tau thirty round trips, but 0.6 s at least. Both means are so slow because what they pass on of
+    the slave's friction, a round trip late, moves the hand, and that turns the friction round: with
+    0.8 s and ten round trips the tip stuck and slipped on for good over 100 ms.
 M3. The wall is remembered, so that fast taps are felt: while nothing else is heard,
     u_n = -k_c (x_m - x_w)_n. It is dropped when the slave was so deep in it that it should
     have met 1 N, 1 to 3 mm, and met nothing: a hard wall that has gone stops the hand before 3 mm.
 M4. A hand that moves fast along u, as one that has let go, is pushed less: module `retreat`,
     after M6. The next step counts what was held.
-M5. u may spend a share of L_m; what was shortened comes back in 20 ms.
+M5. u may spend a share of L_m; what was shortened comes back in 20 ms. With L_m at its end there is
+    a force only at steps in which the hand is seen to move against it, likewise for M6: a reversal
+    is seen late, by a step of the encoder at least, and nothing could pay for it.
 M6. Drag on the hand until both reserves are full, and on one that was pushed, while it is fast.
 M7. What L_m has beyond its reserve R_m (in contact R_m + 0.7 R_s) is sent.
 
@@ -151,7 +155,7 @@ _STIFFEST, _SOFTEST = 2500.0, 50.0  # N/m that are predicted with at most; that 
 _LEAD = 2.0  # steps, by which the hand is led: half a step in theory, but velocity is filtered
 _ONSET = 0.3  # s, in which o fades
 _FORGET = 1.0  # s, of the largest friction
-_PATIENCE = 10.0  # round trips, in which friction at the hand goes over to what is measured
+_PATIENCE = 30.0  # round trips, in which friction at the hand goes over to what is measured
 _PREDICTED = 3.0  # N, beyond twice the wrench: more is no prediction
 _REMEMBERED = 10.0  # N, the most that a remembered wall pushes with
 _SAME = 5e-3  # m, between touches of one wall
@@ -382,7 +386,23 @@ def _afford(g, dx, T, p, memory, wrench):
     if share * cost > most:
         share = most / cost
     memory[_WITHHELD][g] = 1.0 - share
+    if not cost > 0.0:
+        share *= _earning(g, dx, T, p, memory)
     scale(wrench, g, share)
+
+
+@njit(cache=True)
+def _earning(g, dx, T, p, memory):
+    """What an empty ledger leaves of a force that the hand pays for, 0 to 1.
+
+    The filter is late for a reversal, by a step of the encoder at least. Nothing is earned yet that
+    this could cost, so there is a force only where the hand is seen to move.
+    """
+    if memory[LEDGER][g] >= MARGIN * p[RESERVE][g]:
+        return 1.0
+    velocity = memory[VELOCITY_HERE]
+    along, speed = dot(velocity, dx, g), length(velocity, g)
+    return min(max(along, 0.0) / max(along, T * speed * speed, 1e-300), 1.0)
 
 
 @njit(cache=True)
@@ -395,10 +415,7 @@ def _drag(g, received, dx, T, p, memory, wrench):
         drag = p[DRAG][g]
     if memory[_GIVEN][g] > 0.0 and speed > _BRAKED * ARM[g]:
         drag = max(drag, _BRAKE * LEVER[g])
-    if memory[LEDGER][g] < MARGIN * p[RESERVE][g]:
-        # Nothing is earned yet that a reversal, which the filter is late for, could cost.
-        along = dot(velocity, dx, g)
-        drag *= min(max(along, 0.0) / max(along, T * speed * speed, 1e-300), 1.0)
+    drag *= _earning(g, dx, T, p, memory)
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= drag * velocity[i] / max(speed, _FADING * ARM[g])
 

@@ -13,8 +13,8 @@ S3. The contact's direction n is the mean of w, as in M2; its stiffness k and da
     round trip R: a hand goes v_p R deep before it feels anything, and R_m has to push it back. A
     hand that stays feels at once how deep it goes, and in contact its end has 4.5 R_m (S2): c goes
     from 1 to 10 in about a second, for k_d up to 1200 N/m; but not over a network that falls
-    silent. At a contact's onset k is that of the last one, so that a bounce does not stiffen the
-    wall. Beyond the wall x_w the target is x_w + rho (x_received - x_w), along n. rho is left alone
+    silent for half a round trip, or 60 ms (20 ms at least). At a contact's onset k is that of the
+    last one, so that a bounce does not stiffen the wall. Beyond the wall x_w the target is x_w + rho (x_received - x_w), along n. rho is left alone
     while it would change by less than a tenth: it moves the slave, and friction makes a new k of
     that.
 S4. The command follows the target with bounded acceleration, and m v^2 / 2 <= L_s.
@@ -87,13 +87,14 @@ _LEARN, _KNOWN = 1e-3, 1e-2  # m, way that a stiffness is the mean of at least, 
 _SLOW = 0.15  # m/s; an impact's wrench says less of the stiffness
 _SMOOTH = 0.02  # s, of the wall's place and of rho
 _SURE = 0.1  # of rho, by which it is not changed: it moves the slave, which changes k
-_DIRECTION = 0.8  # s, of the contact's direction at least: friction comes and goes
+_DIRECTION = 3.0  # s, of the contact's direction at least: a tip that sticks and slips turns it
 _SETTLED, _TIMES = 0.5, 10.0  # s and c, of a hand that stays
 _STIFFEST = 1200.0  # N/m, of its k_d
 _FOLLOW = 0.01  # s, of the command's generator
 _FASTER = 30.0  # m/s^2, its acceleration
 _STOPPING = 0.7  # of the speed from which that acceleration stops in time
 _NEWS = 0.02  # s without a packet, after which the hand's velocity is not fed forward any more
+_SHORT, _LONGER = 0.5, 0.06  # of the round trip; s: a silence that is little to what is late
 _HORIZON = 4e-3  # s, in which the motors may spend what there is
 _UNPAID = 5.0  # N, what the slave may press a wall with though nobody has paid
 _STILL = 2e-3  # m/s, at rest: standing costs nothing
@@ -269,7 +270,8 @@ def _shown_at_most(T, p, memory):
     for g in range(2):
         part = ARM[g] * length(memory[NORMAL], g) * depth
         first = min(first, 2.0 * p[HAND_RESERVE][g] / max(part * part, 1e-300))
-    if memory[TOUCHED] == 0.0 or memory[_GAP] >= _NEWS:
+    quiet = min(max(_NEWS, _SHORT * memory[_ROUND_TRIP]), _LONGER)
+    if memory[TOUCHED] == 0.0 or memory[_GAP] >= quiet:
         memory[_STAYED] = 0.0
     else:
         memory[_STAYED] += T / _SETTLED * (_TIMES - 1.0 - memory[_STAYED])

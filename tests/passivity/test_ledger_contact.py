@@ -98,6 +98,20 @@ def test_friction_is_of_the_hands_own_motion_and_at_rest_what_is_measured():
     np.testing.assert_allclose(hand.rest(400), np.zeros(6), atol=1e-9)
 
 
+def test_a_tip_that_sticks_and_slips_does_not_drive_the_hand():
+    """Three times a second to and fro on what is touched, as before a stiff leaf over `internet`.
+
+    What is felt of that comes a round trip late, and would keep it going.
+    """
+    hand, felt = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0), []
+    hand.rest(1000)
+    for k in range(1400):
+        hand.packet[WRENCH][1] = rubs = np.clip(np.sin(2 * np.pi * k / 350), -0.6, 0.6)
+        hand.packet[WRENCH][3] = -0.2 * rubs
+        felt.append(hand.step())
+    assert (np.ptp(felt[700:], axis=0)[1:4] < [0.1, 0.07, 0.02]).all()
+
+
 def test_a_hand_that_lets_go_gets_no_more_than_what_its_ledger_keeps():
     """R_m + 0.7 R_s in contact, and what its drag has cost, though the wall follows with 3 N."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
@@ -109,6 +123,18 @@ def test_a_hand_that_lets_go_gets_no_more_than_what_its_ledger_keeps():
         hand.step([0.0, 0.0, way, 0.0, 0.0, 0.0])
         got += held * way
     assert 0.08 < got <= 0.02 + 0.7 * 0.1
+
+
+def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder():
+    """A hand that goes to and fro by one step pays for the way in only if it feels a force then."""
+    hand, got, step = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0), 0.0, 3e-5
+    hand.memory[LEDGER] = 0.0
+    for k in range(600):
+        way = step * ((k % 20 == 10) - float(k % 20 == 0))
+        got += hand.felt[2] * way
+        hand.step([0.0, 0.0, way, 0.0, 0.0, 0.0])
+        assert hand.memory[LEDGER][0] == pytest.approx(-got)
+    assert got <= 0.0
 
 
 def test_after_missing_packets_the_wrench_goes_over_gradually():
