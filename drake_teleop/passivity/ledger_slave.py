@@ -14,9 +14,9 @@ S3. The contact's direction n is the mean of w, as in M2; its stiffness k and da
     hand that stays feels at once how deep it goes, and in contact its end has 4.5 R_m (S2): c goes
     from 1 to 10 in about a second, for k_d up to 1200 N/m; but not over a network that falls
     silent for half a round trip, or 60 ms (20 ms at least). At a contact's onset k is that of the
-    last one, so that a bounce does not stiffen the wall. Beyond the wall x_w the target is x_w + rho (x_received - x_w), along n. rho is left alone
-    while it would change by less than a tenth: it moves the slave, and friction makes a new k of
-    that.
+    last one, so that a bounce does not stiffen the wall. Beyond the wall x_w the target is
+    x_w + rho (x_received - x_w), along n. rho is left alone while it would change by less than a
+    tenth: it moves the slave, and friction makes a new k of that.
 S4. The command follows the target with bounded acceleration, and m v^2 / 2 <= L_s.
 S5. Motors that push with the motion, f . v > 0, spend at most what A holds in 4 ms; pressing on the
     wall what was paid since the onset, Q, and c F_u^2 / 2 k that nobody paid. With A at its end

@@ -232,6 +232,18 @@ def test_a_hard_wall_is_hard_to_a_hand_that_stays(grip):
     assert found.felt_force > 0.95 * 0.02 * hard * grip[2] / (hard + grip[2])
 
 
+def test_a_short_silence_does_not_let_a_hand_that_stays_sink():
+    """48 ms without a packet, at a round trip of 100 ms: the slave used to give way by 2.6 mm."""
+    network = NetworkConfig(delay=0.05, loss=0.01, burst=0.02)
+    run = run_one_dof(
+        model(FIRM, 15e3), CHARGED_BEFORE, network, seed=4, timeout=PATIENT,
+        intent=charging(times(9.0), 3.2, 0.02),
+    )  # fmt: skip
+    rest = run.t > 6.5
+    assert 0.045 < run.silent[rest].max() < 0.05
+    assert np.ptp(run.slave[rest]) < 2e-5 and np.ptp(run.felt[rest]) < 0.01
+
+
 def test_a_change_of_grip_leaves_no_motion_behind():
     t = times(9.0)
     for before, after in ((FIRM, LIGHT), (LIGHT, FIRM)):
