@@ -17,7 +17,7 @@ from drake_teleop.logs.check.against_frame import frame_finding, usable
 from drake_teleop.logs.check.conventions import NO_YAML
 from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
-from drake_teleop.logs.read.alignment import low_passed, measured, undelayed
+from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed, widened
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.tables import FORMATS
@@ -25,6 +25,9 @@ from drake_teleop.logs.read.tables import FORMATS
 ROBUST = ("robust", "consistent")
 """Methods that take this way; the others have the motion differentiated and believe it."""
 _LEAST = 1e-9
+# Samples that a log keeps, at least, and their rate over the cut-off of the low-pass.
+_SHOWN, _RATE_OF_CUTOFF = 400_000, 0.25
+_CHUNK, _BESIDE = 2**14, 2**8  # of those, at a time, and beside them to smooth with
 _DELAY_KNOWN = 0.005  # s, standard deviation
 
 
@@ -64,7 +67,7 @@ def fit_posed(
     found = _estimate(log, known)
     if known is None and not found.delay_deviation < _DELAY_KNOWN:
         found, source = _estimate(log, 0.0), "undetermined"
-    moved = _moved(log, found)
+    moved = _moved(_fewer(log, cutoff_hz), found)
     shown = low_passed(moved, cutoff_hz)
     margin = 2.0 * found.spacing
     inside = (moved.t >= moved.t[0] + margin) & (moved.t <= moved.t[-1] - margin)
@@ -72,9 +75,13 @@ def fit_posed(
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _fit(shown, found, found.rejected[at], method)
     finding = frame_finding(found, log.posed)
-    if finding is not None:  # then nothing of the load is what it seems
+    # Gains that are wrong are no rigid load's; those that are stated are in the deviations.
+    doubtful = not found.fit.rigid and log.posed.gain_std == 0.0
+    if finding is not None or doubtful:  # then nothing of the load is what it seems
         flags = fit.identification.identifiable & np.repeat([True, False], [6, 10])
-        fit = replace(fit, note="", identification=replace(fit.identification, identifiable=flags))
+        fit = replace(fit, identification=replace(fit.identification, identifiable=flags))
+    if finding is not None:
+        fit = replace(fit, note="")
         if Path(log.source).suffix.lower() in FORMATS:
             finding = replace(finding, message=f"{finding.message} ({NO_YAML})")
     return PosedFit(shown, fit, found.delay_s, source, finding)
@@ -93,8 +100,25 @@ def _estimate(log: Log, delay: float | None) -> PoseEstimate:
     )
 
 
+def _fewer(log: Log, cutoff_hz: float | None) -> Log:
+    """A very long log at a lower rate: enough for residuals, pictures and changes of the load."""
+    stride = len(log) // _SHOWN
+    if cutoff_hz is not None:
+        stride = min(stride, int(_RATE_OF_CUTOFF / (cutoff_hz * log.dt)))
+    if stride < 2:
+        return log
+    few = log.only(slice(None, None, stride))
+    wrench = np.empty((len(few), 6))
+    for start in range(0, len(few), _CHUNK):  # the whole would take as much memory again
+        before, stop = max(0, start - _BESIDE), start + _CHUNK + _BESIDE
+        smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
+        wrench[start : start + _CHUNK] = smooth[::stride][start - before :][:_CHUNK]
+    bridged = None if log.bridged is None else widened(log.bridged, stride)[::stride]
+    return replace(few, wrench=wrench, bridged=bridged)
+
+
 def _moved(log: Log, found: PoseEstimate) -> Log:
-    """The log with the motion of the splines, moved forward by the delay."""
+    """The log with the motion of the splines, moved forward by the delay [s]."""
     assert log.posed is not None
     moved = undelayed(log, found.delay_s)
     s, omega, alpha = found.splines.motion(moved.t + found.delay_s, log.posed.gravity_W)
@@ -142,7 +166,7 @@ def _note(found: PoseEstimate) -> str:
     if found.fit.rigid:
         return found.note
     text = (
-        "the wrench is not that of a rigid load alone: gains, bending, or a frame that is not S;"
-        f" deviations are {found.fit.inflation:.2g} times as large as by noise"
+        "the wrench is not that of a rigid load alone: gains (state wrench.gain_std), bending, or a"
+        f" frame that is not S; deviations are {found.fit.inflation:.2g} times as large as by noise"
     )
     return f"{found.note}; {text}" if found.note else text

@@ -25,7 +25,7 @@ from drake_teleop.logs.causal import CausalWrench, causal_wrenches
 from drake_teleop.logs.check.conventions import check_log, question_fit
 from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.contact import Detection, detect_contact, noise_floor, samples_of, shifted
-from drake_teleop.logs.posed_fit import fit_posed
+from drake_teleop.logs.posed_fit import ROBUST, fit_posed
 from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import delay_of
@@ -137,8 +137,10 @@ def identify_log(
             worthless, see `drake_teleop.logs.check.conventions.question_fit`.
     """
     check_method(method)
-    log = read_log(path, bandwidth_hz=cutoff_hz)
+    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in ROBUST)
     posed = fit_posed(log, method, cutoff_hz, delay)
+    if posed is None and log.posed is not None:  # too short for splines
+        log = read_log(path, bandwidth_hz=cutoff_hz)
     if posed is not None:
         log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.source
     else:

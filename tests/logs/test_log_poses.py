@@ -26,11 +26,12 @@ WRENCH, POSE = ("fx", "fy", "fz", "tx", "ty", "tz"), ("qw", "qx", "qy", "qz", "x
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Two records of 10 s: of S, and of a frame that is shifted and turned."""
+    """Records of 10 s: of S, of a frame that is shifted and turned, with gains that are wrong."""
     folder = tmp_path_factory.mktemp("posed")
     for name, kind in (
         ("own", Kind(seed=1)),
         ("tcp", Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=2)),
+        ("gains", Kind(gain=0.01, seed=8)),
     ):
         t, wrench, poses = record(kind)
         for file, times, names, values in (
@@ -88,6 +89,14 @@ def test_gains_that_are_stated_widen_the_deviations(folder):
     path = described(folder, "own", wrench={"gain_std": 0.01})
     load = identify_log(path).identification
     assert 0.005 * load.mass < load.standard_deviations[6] < 0.03 * load.mass
+
+
+def test_what_no_rigid_load_explains_identifies_none_unless_it_is_stated(folder):
+    found = identify_log(described(folder, "gains"))
+    assert not found.identification.identifiable[6:].any()
+    assert any("state wrench.gain_std" in note for note in found.log.notes)
+    stated = identify_log(described(folder, "gains", wrench={"gain_std": 0.01}))
+    assert stated.identification.identifiable[6:10].all()
 
 
 def test_a_pose_of_another_frame_is_named_with_the_lines_that_mend_it(folder):

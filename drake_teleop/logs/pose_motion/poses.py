@@ -30,7 +30,9 @@ class Poses:
 
     def continued(self) -> Poses:
         """The same with the quaternions' signs such that none turns round."""
-        products = np.sum(self.quaternion[1:] * self.quaternion[:-1], axis=1)
+        products = np.einsum("ki,ki->k", self.quaternion[1:], self.quaternion[:-1])
+        if (products >= 0.0).all():
+            return self
         sign = np.concatenate([[1.0], np.cumprod(np.where(products < 0.0, -1.0, 1.0))])
         return Poses(self.t, self.position, self.quaternion * sign[:, None])
 

@@ -83,6 +83,13 @@ class PoseSplines:
 
     def _motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
         """(N, 3) a, -g, omega and alpha."""
+        out = np.empty((4, len(t), 3))
+        for start in range(0, len(t), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            out[:, part] = self._motion_at(t[part], gravity_W)
+        return out[0], out[1], out[2], out[3]
+
+    def _motion_at(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
         at = np.clip(t, self.poses.t[0], self.poses.t[-1]) - self._start
         x, first, second = (self._spline(at, order) for order in range(3))
         q, qd, qdd = x[:, 3:], first[:, 3:], second[:, 3:]
@@ -98,21 +105,23 @@ class PoseSplines:
         From what the splines leave just above the frequencies that they pass: coloured noise has
         more there than at higher ones.
         """
-        position, turn = np.empty((2, len(self.poses.t), 3))
+        sums, count = np.zeros(2), 0
         for part in self._parts:
             fitted = self._spline(self.poses.t[part] - self._start)
-            position[part] = self.poses.position[part] - fitted[:, :3]
-            turn[part] = 2.0 * _vector(fitted[:, 3:], self.poses.quaternion[part])
-        return self._level(position), self._level(turn)
+            position = self.poses.position[part] - fitted[:, :3]
+            turn = 2.0 * _vector(fitted[:, 3:], self.poses.quaternion[part])
+            powers = self._powers(position), self._powers(turn)
+            sums, count = sums + np.sum(powers, axis=(1, 2)), count + np.size(powers[0])
+        place_std, turn_std = np.sqrt(sums / count)
+        return float(place_std), float(turn_std)
 
-    def _level(self, residual: Array) -> float:
-        """Root of the mean power of (K, 3) residuals in the band that shows the noise."""
+    def _powers(self, residual: Array) -> Array:
+        """(3, m) powers of (K, 3) residuals at the frequencies that show the noise."""
         n = len(residual)
         frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
         low, high = (share / self.spacing for share in _NOISE_BAND)
         inside = (frequency >= min(low, 0.35 * self.rate)) & (frequency <= high)
-        power = [np.abs(np.fft.rfft(x)[inside]) ** 2 for x in residual.T]
-        return float(np.sqrt(np.mean(power) / n))
+        return np.array([np.abs(np.fft.rfft(x)[inside]) ** 2 / n for x in residual.T])
 
 
 def passed(frequency: Array, spacing: float) -> Array:

@@ -13,6 +13,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log
 
 _FEWEST = 8
+_CHUNK = 2**18
 _SMOOTHER_SAMPLES = 9
 _SMOOTHER_DEGREE = 5
 SMOOTHER_WINDOW = 1.8
@@ -43,6 +44,16 @@ def resample(
     """Linear interpolation of (N, ...) signals at the times `t` to `t_new`; ends are held."""
     if np.array_equal(t_new, t):
         return x
+    out = np.empty((len(t_new), *x.shape[1:]))
+    for start in range(0, len(t_new), _CHUNK):  # so that temporaries stay small
+        part = slice(start, start + _CHUNK)
+        out[part] = _interpolated(t_new[part], t, x)
+    return out
+
+
+def _interpolated(
+    t_new: NDArray[np.float64], t: NDArray[np.float64], x: NDArray[np.float64]
+) -> NDArray[np.float64]:
     # One search serves all columns; np.interp would search, and copy, for each.
     after = np.clip(np.searchsorted(t, t_new, side="right"), 1, len(t) - 1)
     share = np.clip((t_new - t[after - 1]) / (t[after] - t[after - 1]), 0.0, 1.0)

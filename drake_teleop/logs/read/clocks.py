@@ -50,6 +50,10 @@ class Clock:
     total: int
     notes: tuple[str, ...] = ()
 
+    def taken(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, ...) those rows of (total, ...)."""
+        return x if len(self.rows) == self.total else x[self.rows]
+
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
     """The times of a stream's rows, see the top of this module.

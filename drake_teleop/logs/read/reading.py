@@ -1,4 +1,4 @@
-"""From a file to a `Log`: canonical tables and log descriptions go the same way."""
+"""From a file to a `Log`: canonical tables and descriptions alike (long: stream by stream)."""
 
 from __future__ import annotations
 
@@ -49,9 +49,12 @@ from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 MINIMUM_SAMPLES = 16
 MINIMUM_POSES = 3
 _LEAST_HZ = 1e-3
+_CHUNK = 2**16
 
 
-def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
+def read_log(
+    path: str | Path, *, bandwidth_hz: float | None = 30.0, differentiate: bool = True
+) -> Log:
     """Reads a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
 
     Streams are brought to the wrench's clock and its median rate by linear interpolation, over the
@@ -66,6 +69,8 @@ def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
     Args:
         path: the file.
         bandwidth_hz: of the smoother that differentiates; see `smooth_derivatives`.
+        differentiate: whether poses are differentiated that alone tell the motion; if not, the
+            motion is zero, and `Log.posed` is there for those who have a better way.
 
     Raises:
         DrakeTeleopError: naming file and field and what to do, if the log cannot be used.
@@ -77,11 +82,13 @@ def read_log(path: str | Path, *, bandwidth_hz: float | None = 30.0) -> Log:
         )
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):
-        return _Reader(load_description(path), str(path), bandwidth_hz).log()
+        reader = _Reader(load_description(path), str(path), bandwidth_hz)
+        return reader.log(differentiate=differentiate)
     if path.suffix.lower() in FORMATS:
         table = read_table(path)
         description = describe_canonical(path, table)
-        return _Reader(description, str(path), bandwidth_hz, {path: table}).log(keep_origin=True)
+        reader = _Reader(description, str(path), bandwidth_hz, {path: table})
+        return reader.log(keep_origin=True, differentiate=differentiate)
     if is_bag(path):
         raise topic_missing(path)
     raise DrakeTeleopError(
@@ -127,20 +134,20 @@ class _Reader:
         self._gaps: list[NDArray[np.float64]] = []
         self._tables = dict(tables or {})
 
-    def log(self, *, keep_origin: bool = False) -> Log:
+    def log(self, *, keep_origin: bool = False, differentiate: bool = True) -> Log:
         if self._description.static is not None:
             if keep_origin:
                 self._notes.append("each row is taken for a pose at rest")
             return self._static(self._description.static)
         assert self._description.wrench is not None
         if self._description.pose is not None and self._description.pose.automatic:
-            self._find(describe_pose_frame)
+            self._find(describe_pose_frame, differentiate=False)
         if self._description.imu is not None and self._description.imu.automatic:
             self._find(describe_mounting)
         wrench_t, wrench = self._wrench(self._description.wrench)
         pose = imu = None
         if self._description.pose is not None:
-            pose = self._pose(self._description.pose)
+            pose = self._pose(self._description.pose, differentiate=differentiate)
         if self._description.imu is not None:
             imu = self._imu(self._description.imu, pose)
         streams = [stream for stream in (imu, pose) if stream is not None]
@@ -150,7 +157,12 @@ class _Reader:
             log = replace(log, posed=self._description.posed(pose.raw))
         return log if keep_origin else log.earlier(float(wrench_t[0]))
 
-    def _find(self, describe: Callable[..., tuple[Description, tuple[str, ...]]]) -> None:
+    def _find(
+        self,
+        describe: Callable[..., tuple[Description, tuple[str, ...]]],
+        *,
+        differentiate: bool = True,
+    ) -> None:
         """Puts what the data say in the place of `auto`."""
         for name in ("wrench", "imu", "pose"):
             if (stream := getattr(self._description, name)) is not None:
@@ -158,7 +170,9 @@ class _Reader:
         self._description, notes = describe(
             self._description,
             self._source,
-            lambda description: _Reader(description, self._source, 30.0, self._tables).log(),
+            lambda description: _Reader(description, self._source, 30.0, self._tables).log(
+                differentiate=differentiate
+            ),
         )
         self._notes += notes
 
@@ -170,7 +184,7 @@ class _Reader:
     def _wrench(self, stream: Wrench) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         table = self._table(stream)
         clock = self._clock("wrench", stream, table)
-        return clock.t, self._forces("wrench", stream, table, clock.total)[clock.rows]
+        return clock.t, clock.taken(self._forces("wrench", stream, table, clock.total))
 
     def _forces(
         self, name: str, stream: Wrench | Static, table: Table, rows: int
@@ -189,28 +203,32 @@ class _Reader:
     ) -> NDArray[np.float64]:
         """(rows, 3) of a stream's field in SI, in the axes of the file, of a size that can be."""
         where = f"{self._source}:{name}.{field}.columns"
-        values = table.numbers(quantity.columns, 3, where, rows) - getattr(quantity, "bias", 0.0)
-        values = values * (sign * self._description.scale(quantity.unit))
+        values = table.numbers(quantity.columns, 3, where, rows)
+        values -= getattr(quantity, "bias", 0.0)
+        values *= sign * self._description.scale(quantity.unit)
         table.check_size(values, *LARGEST[field], where)
         return values
 
-    def _pose(self, stream: Pose) -> Stream:
+    def _pose(self, stream: Pose, *, differentiate: bool) -> Stream:
+        """The motion by differentiation, unless it is not wanted and the poses are enough.
+
+        Of an hour at 1 kHz the poses fit into memory, their rotations and derivatives do not.
+        """
         table = self._table(stream)
         clock = self._clock("pose", stream, table)
-        raw_t = clock.t
-        raw_R = self._rotations("pose", stream.orientation, table, clock.total)[clock.rows]
-        if stream.R_SP is not None:
-            raw_R = raw_R @ stream.R_SP.T
-        t = uniform_times(raw_t)
+        t, raw = uniform_times(clock.t), None
+        quaternion, position = self._poses_of_S(stream, table, clock)
+        if position is not None:
+            raw = Poses(clock.t, position, quaternion).continued()
+            wrench, imu = self._description.wrench, self._description.imu
+            if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
+                return Stream("pose", t, raw=raw)
         dt = spacing(t)
-        R_WS = nearest_rotation(resample(t, raw_t, raw_R))
-        acceleration, raw = np.zeros(3), None
-        if stream.position is not None:
-            position = self._vectors("pose", "position", stream.position, table, clock.total)
-            # From the posed origin to that of S.
-            position = position[clock.rows] - raw_R @ np.array(stream.position_in_sensor)
-            raw = Poses(raw_t, position, quaternions(raw_R))
-            position = resample(t, raw_t, position)
+        raw_R = rotation_matrices(quaternion, "quaternion_wxyz")
+        R_WS = nearest_rotation(resample(t, clock.t, raw_R))
+        acceleration = np.zeros(3)
+        if position is not None:
+            position = resample(t, clock.t, position)
             acceleration = smooth_derivatives(position, dt, self._bandwidth_hz)[2]
         return Stream(
             "pose",
@@ -220,6 +238,26 @@ class _Reader:
             R_WS,
             raw,
         )
+
+    def _poses_of_S(
+        self, stream: Pose, table: Table, clock: Clock
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """(N, 4) quaternions [w, x, y, z] of R_WS, and (N, 3) p_WoSo_W if there are positions."""
+        position = None
+        if stream.position is not None:
+            position = self._vectors("pose", "position", stream.position, table, clock.total)
+            position = clock.taken(position)
+        columns = self._orientation("pose", stream.orientation, table, clock.total)
+        quaternion = np.empty((len(clock.rows), 4))
+        for start in range(0, len(quaternion), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            R_WS = self._rotations("pose", stream.orientation, table, columns, clock.rows[part])
+            if stream.R_SP is not None:
+                R_WS = R_WS @ stream.R_SP.T
+            quaternion[part] = quaternions(R_WS)
+            if position is not None:  # from the posed origin to that of S
+                position[part] -= R_WS @ np.array(stream.position_in_sensor)
+        return quaternion, position
 
     def _imu(self, stream: Imu, pose: Stream | None) -> Stream:
         table = self._table(stream)
@@ -233,7 +271,7 @@ class _Reader:
             if quantity is None:
                 return None
             values = self._vectors("imu", field, quantity, table, clock.total, sign)
-            return self._to_S("imu", stream.frame, resample(t, raw_t, values[clock.rows]), t, pose)
+            return self._to_S("imu", stream.frame, resample(t, raw_t, clock.taken(values)), t, pose)
 
         s = vectors("specific_force", stream.sign)
         omega, alpha = vectors("angular_velocity"), vectors("angular_acceleration")
@@ -275,7 +313,9 @@ class _Reader:
             gravity = -s
         else:
             assert stream.orientation is not None
-            R_WS = self._rotations("static", stream.orientation, table, table.rows)
+            columns = self._orientation("static", stream.orientation, table, table.rows)
+            every = np.arange(table.rows)
+            R_WS = self._rotations("static", stream.orientation, table, columns, every)
             R_SW = np.swapaxes(R_WS, 1, 2)
             gravity = R_SW @ self._description.gravity_W
         if stream.frame == "base":
@@ -332,21 +372,32 @@ class _Reader:
             self._gaps.append(holes + np.array([-seen, seen]))
         return clock
 
-    def _rotations(
+    def _orientation(
         self, name: str, orientation: Orientation, table: Table, rows: int
     ) -> NDArray[np.float64]:
-        where = f"{self._source}:{name}.orientation"
-        width = WIDTHS[orientation.form]
-        columns = table.numbers(orientation.columns, width, f"{where}.columns", rows)
+        """(rows, k) the columns, a rotation vector in radians."""
+        where = f"{self._source}:{name}.orientation.columns"
+        columns = table.numbers(orientation.columns, WIDTHS[orientation.form], where, rows)
         if orientation.form == "rotation_vector":
-            columns = columns * self._description.scale(orientation.unit)
-        R = rotation_matrices(columns, orientation.form)
+            columns *= self._description.scale(orientation.unit)
+        return columns
+
+    def _rotations(
+        self,
+        name: str,
+        orientation: Orientation,
+        table: Table,
+        columns: NDArray[np.float64],
+        rows: NDArray[np.intp],
+    ) -> NDArray[np.float64]:
+        """(len(rows), 3, 3) rotations of some rows of `_orientation`."""
+        R = rotation_matrices(columns[rows], orientation.form)
         errors = rotation_error(R)
         worst = int(np.argmax(errors))
         if errors[worst] > ROTATION_TOLERANCE:
             raise DrakeTeleopError(
-                f"row {worst + table.first_row} of {table.path.name} is not a rotation",
-                where=where,
+                f"row {rows[worst] + table.first_row} of {table.path.name} is not a rotation",
+                where=f"{self._source}:{name}.orientation",
                 remedy=f"check the columns and their order; form is {orientation.form}",
             )
         return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
@@ -392,7 +443,7 @@ class _Reader:
                 values = None if stream is None else getattr(stream, field)
                 if stream is not None and values is not None:
                     return on_clock(t, stream, values)
-            raise AssertionError(field)
+            return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
         gravity = None
         if pose is not None and pose.R_WS is not None:

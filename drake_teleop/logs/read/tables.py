@@ -9,10 +9,11 @@ import difflib
 import math
 import os
 import zipfile
-from collections.abc import Callable, Sequence
+from collections import UserDict
+from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 FORMATS = (".csv", ".parquet", ".npz")
 LARGEST = 1e25
 """Numbers beyond are none that were measured, in whatever unit: nanoseconds since 1970 are 2e18."""
+_LARGE = 2**24
+"""Numbers in a table that are more than is kept in memory, where the file's format allows it."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Table:
     """
 
     path: Path
-    columns: dict[str, NDArray]
+    columns: MutableMapping[str, NDArray]
     first_row: int = 1
     absent: tuple[str, ...] = ()
 
@@ -231,19 +234,37 @@ def read_table(path: Path, *, header: bool = True) -> Table:
 def _read_frame(path: Path, header: bool) -> Table:
     import polars as pl
 
-    is_csv = path.suffix.lower() == ".csv"
-    if is_csv:
-        frame = pl.read_csv(path, has_header=header, infer_schema_length=None)
-        names = [name if header else str(i) for i, name in enumerate(frame.columns)]
-        found = [_frame_column(series) for series in frame.get_columns()]
-    else:
-        # One column at a time: the whole table would be in memory twice.
+    if path.suffix.lower() == ".parquet":
         names = list(pl.read_parquet_schema(path))
-        found = [_frame_column(pl.read_parquet(path, columns=[n]).to_series()) for n in names]
-    columns = {name.strip(): column for name, column in zip(names, found, strict=True)}
-    if len(columns) < len(names):
+        lazy = _ParquetColumns(path, dict(zip(_stripped(names), names, strict=True)))
+        small = len(names) * pl.scan_parquet(path).select(pl.len()).collect().item() <= _LARGE
+        return Table(path, dict(lazy) if small else lazy)
+    frame = pl.read_csv(path, has_header=header, infer_schema_length=None)
+    names = [name if header else str(i) for i, name in enumerate(frame.columns)]
+    found = [_frame_column(series) for series in frame.get_columns()]
+    columns = dict(zip(_stripped(names), found, strict=True))
+    return Table(path, columns, first_row=2 if header else 1)
+
+
+def _stripped(names: list[str]) -> list[str]:
+    stripped = [name.strip() for name in names]
+    if len(set(stripped)) < len(names):
         raise ValueError("two of its columns have names that differ in spaces alone")
-    return Table(path, columns, first_row=2 if is_csv and header else 1)
+    return stripped
+
+
+class _ParquetColumns(UserDict[str, Any]):
+    """The columns of a file, each read when it is asked for: all of an hour's fill the memory."""
+
+    def __init__(self, path: Path, names: dict[str, str]) -> None:
+        super().__init__(names)
+        self._path = path
+
+    def __getitem__(self, key: str) -> NDArray:
+        import polars as pl
+
+        name = self.data[key]
+        return _frame_column(pl.read_parquet(self._path, columns=[name]).to_series())
 
 
 def _frame_column(series: pl.Series) -> NDArray:
