@@ -7,8 +7,8 @@ and IMU, or all three. A mistake is planted into the numbers or into the descrip
 False alarms are findings, but for "lag", of good logs: as above, with gains that are wrong by 1 %,
 slow, hardly tilted, and real ones.
 
-    python benchmarks/planted_mistakes.py [--runs 1] [--only KIND ...] [--streams pose imu both]
-        [--no-good] [--data FOLDER] [--json FILE]
+    python benchmarks/planted_mistakes.py [--runs 1] [--seed 0] [--only KIND ...] [--no-good]
+        [--streams pose imu both] [--data FOLDER] [--json FILE]
 
 FOLDER has the records ntnu_fts_imu_contact.
 """
@@ -322,26 +322,25 @@ def is_named(mistake: Mistake, found: list[tuple[str, str]]) -> bool:
     )
 
 
-def of_kind(kind: str, streams: str, motion: str, runs: int, folder: Path) -> dict[str, Any]:
+def of_kind(kind: str, streams: str, motion: str, seeds: range, folder: Path) -> dict[str, Any]:
     """How often a mistake is named."""
     named, said = 0, []
-    for seed in range(runs):
+    for seed in seeds:
         record = make(motion, seed)
         KINDS[kind].plant(record)
         found = asked(written(record, folder, STREAMS[streams]))
         named += is_named(KINDS[kind], found)
         said.append(found)
-    return {"named": named, "of": runs, "said": said}
+    return {"named": named, "of": len(seeds), "said": said}
 
 
-def alarms(kind: str, streams: str, motion: str, runs: int, folder: Path) -> dict[str, Any]:
+def alarms(kind: str, streams: str, motion: str, seeds: range, folder: Path) -> dict[str, Any]:
     """How many of the good logs are called bad."""
     said = [
-        asked(written(make(motion, seed, **GOOD[kind]), folder, STREAMS[streams]))
-        for seed in range(runs)
+        asked(written(make(motion, seed, **GOOD[kind]), folder, STREAMS[streams])) for seed in seeds
     ]
     said = [[entry for entry in found if entry[0] != "lag"] for found in said]
-    return {"alarms": sum(map(bool, said)), "of": runs, "said": said}
+    return {"alarms": sum(map(bool, said)), "of": len(seeds), "said": said}
 
 
 def real(data: Path, folder: Path) -> dict[str, Any]:
@@ -378,6 +377,7 @@ def real(data: Path, folder: Path) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=0, help="the first one of the runs")
     parser.add_argument("--only", nargs="*", default=[], help="kinds whose name has one of these")
     parser.add_argument("--streams", nargs="*", default=list(STREAMS))
     parser.add_argument("--motions", default="FP")
@@ -388,6 +388,7 @@ def main() -> None:
     arguments = parser.parse_args()
     cases = [] if arguments.no_bad else [(k, of_kind, KINDS[k].streams) for k in KINDS]
     cases += [] if arguments.no_good else [(k, alarms, ALL) for k in GOOD]
+    seeds = range(arguments.seed, arguments.seed + arguments.runs)
     report: dict[str, Any] = {}
     start = time.process_time()
     with tempfile.TemporaryDirectory() as name:
@@ -400,7 +401,7 @@ def main() -> None:
                     if streams not in possible or streams not in arguments.streams:
                         line += f"{'':12s}"
                         continue
-                    got = count(kind, streams, motion, arguments.runs, Path(name))
+                    got = count(kind, streams, motion, seeds, Path(name))
                     report.setdefault(kind, {})[f"{motion} {streams}"] = got
                     share = f"{got.get('named', got.get('alarms'))}/{got['of']}"
                     line += f"{motion} {streams} {share}".ljust(12)

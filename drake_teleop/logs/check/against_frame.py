@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drake_teleop.logs.check.against_position import position_unit
 from drake_teleop.logs.check.finding import Finding
-from drake_teleop.logs.check.wrench_alone import mirrored_finding, other_units
+from drake_teleop.logs.check.wrench_alone import TORQUES, mirrored_finding, other_units
 from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import UNITS, Wrench
+from drake_teleop.logs.read.description import UNITS, Pose, Wrench
 
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -19,10 +20,9 @@ if TYPE_CHECKING:
 
 SHORTEST = 4.0
 """Records below have too few frequencies to tell [s]."""
-_NAMES = ("N m", "N mm", "lbf in")
 # A unit of the positions that is wrong, and centres of mass that no load has [m].
 _UNIT, _NEAREST, _FARTHEST = 0.1, 2e-4, 1.5
-_TORQUE_UNITS = tuple(UNITS[unit] / UNITS[other] for unit, other in permutations(_NAMES, 2))
+_TORQUE_UNITS = tuple(UNITS[unit] / UNITS[other] for unit, other in permutations(TORQUES, 2))
 _SAME = 0.03
 _OBLIQUE = 10.0
 
@@ -32,11 +32,12 @@ def usable(log: Log) -> bool:
     return log.posed is not None and not log.static and float(log.t[-1] - log.t[0]) >= SHORTEST
 
 
-def against_frame(wrench: Wrench, log: Log, delay: float) -> list[Finding]:
+def against_frame(wrench: Wrench, pose: Pose, log: Log, delay: float) -> list[Finding]:
     """That the wrench has mirrored axes or other units, or the poses are of another frame than S.
 
     Args:
         wrench: as described.
+        pose: likewise.
         log: the whole log, in which nothing else is wrong.
         delay: of the motion behind the wrench, nearly [s].
     """
@@ -48,8 +49,16 @@ def against_frame(wrench: Wrench, log: Log, delay: float) -> list[Finding]:
     found = estimate_from_poses(
         log.t, log.wrench, posed.poses, posed.gravity_W, near=delay, lost=log.bridged
     )
-    finding = _of_wrench(wrench, found.seen) or frame_finding(found, posed)
+    seen = found.seen
+    finding = _of_position(pose, seen) or _of_wrench(wrench, seen) or frame_finding(found, posed)
     return [] if finding is None else [finding]
+
+
+def _of_position(pose: Pose, seen: ReadOff) -> Finding | None:
+    """That the positions are in another unit; noise in them makes `kappa` less than 1 as well."""
+    if pose.position is None or not seen.usable or seen.mirrored:
+        return None
+    return position_unit(pose.position.unit, seen.kappa, seen.kappa_deviation)
 
 
 def _of_wrench(wrench: Wrench, seen: ReadOff) -> Finding | None:

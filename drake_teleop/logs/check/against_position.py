@@ -13,8 +13,9 @@ from drake_teleop.vectors import cross_matrix
 
 _CUTOFF = 3.0
 _SHIFT, _KNOWN, _SURE = 0.02, 0.01, 5.0
-_UNITS = {"mm": 1e3, "m": 1e-3}
+_UNITS = {"mm": 1e-3, "m": 1e3}
 _NEAR, _SAME = (0.7, 1.43), 0.15
+_FAR = 50.0
 
 
 def position_finding(description: Description, data: LogData, lag: float) -> list[Finding]:
@@ -51,15 +52,9 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
     if fit is None or abs(fit.x[0]) < _SURE * fit.deviations[0]:
         return []
     k = float(fit.x[0])
-    for unit, ratio in _UNITS.items():
-        if unit != pose.position.unit and _NEAR[0] < k / ratio < _NEAR[1]:
-            return [
-                Finding(
-                    "units",
-                    f"the acceleration by the position is {k:.3g} times that of the accelerometer:"
-                    f" it is not in {pose.position.unit}; set pose.position.unit: {unit}",
-                )
-            ]
+    unit = position_unit(pose.position.unit, 1.0 / k, float(fit.deviations[0]) / k**2)
+    if unit is not None:
+        return [unit]
     shift, sure = fit.x[1:] / k, float(np.linalg.norm(fit.deviations[1:]))
     size = float(np.linalg.norm(shift))
     if abs(k - 1.0) > _SAME or sure > _KNOWN or size < max(_SHIFT, _SURE * sure):
@@ -73,3 +68,26 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
             f" {place.tolist()}, else imu.position: {(0.0 - place).tolist()}",
         )
     ]
+
+
+def position_unit(now: str, kappa: float, deviation: float) -> Finding | None:
+    """That the positions are in another unit, if so.
+
+    Args:
+        now: the unit that is described.
+        kappa: what accelerates by another instrument, over the same by the positions.
+        deviation: its standard deviation.
+    """
+    if not abs(kappa) > _SURE * deviation:
+        return None
+    text = f"the acceleration by the position is {1.0 / kappa:.3g} times what is felt: it is not in"
+    for unit, ratio in _UNITS.items():
+        if unit != now and _NEAR[0] < kappa / ratio < _NEAR[1]:
+            return Finding("units", f"{text} {now}; set pose.position.unit: {unit}")
+    if 1.0 / _FAR < abs(kappa) < _FAR:  # Noise, or something else that is wrong.
+        return None
+    return Finding(
+        "units",
+        f"{text} {' or '.join(_UNITS)}, the units that a description knows; convert the columns of"
+        " pose.position",
+    )

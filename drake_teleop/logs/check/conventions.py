@@ -29,7 +29,6 @@ from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.check.over_time import drift_finding
 from drake_teleop.logs.check.rest_poses import rest_finding
 from drake_teleop.logs.check.wrench_alone import wrench_findings
-from drake_teleop.logs.read.alignment import undelayed
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.description import Description, load_description
@@ -173,22 +172,21 @@ def _check(data: LogData, description: Description) -> Conventions:
         findings += more
         lag = 0.0 if mounting is None else mounting.lag_s
         findings += position_finding(description, data, lag)
-    more, description = wrench_findings(description, _aligned(data.thin(description)))
+    thin = data.thin(description)
+    delay = None if thin.static else estimate_delay(thin, 30.0)
+    more, description = wrench_findings(description, thin, (0.0, delay or 0.0))
     findings += more
     if any(finding.name in ("swapped axes", "mounting") for finding in more):
         return Conventions(tuple(findings), fit, mounting, None)
     more, delay = against_load(description, data)
     findings = _one_clock(description, [*findings, *more], mounting, delay)
-    if description.wrench is not None and all(finding.name == "lag" for finding in findings):
-        findings += against_frame(description.wrench, log, delay or 0.0)
+    wrench, pose = description.wrench, description.pose
+    if wrench and pose and all(finding.name == "lag" for finding in findings):
+        findings += against_frame(wrench, pose, log, delay or 0.0)
     rest = rest_finding(log)
     if rest is not None:
         findings.append(rest)
     return Conventions(tuple(findings), fit, mounting, delay)
-
-
-def _aligned(log: Log) -> Log:
-    return log if log.static else undelayed(log, estimate_delay(log, 30.0) or 0.0)
 
 
 def _one_clock(

@@ -1,9 +1,8 @@
 """The IMU against itself: its three quantities are bound to each other, whatever the load is.
 
 - The angular acceleration is the derivative of the angular velocity.
-- A specific force that gravity dominates turns as the gyroscope says: ds/dt = s x omega + (jerk).
-- Turned back by the gyroscope for a few seconds, it is in the mean minus gravity: what is
-  accelerated is braked.
+- Turned back by the gyroscope for a few seconds, the specific force is in the mean minus gravity:
+  what is accelerated is braked.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from drake_teleop.logs.read.alignment import low_pass, smooth_derivatives
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description, Imu
 from drake_teleop.logs.read.rotations import rotation_matrices
-from drake_teleop.vectors import cross_matrix
 
 Array = NDArray[np.float64]
 DEGREES = (40.0, 80.0)
@@ -29,9 +27,10 @@ OFF = 0.02
 """Gravity is questioned from 2 % on; one sensor in its first calibration is within 1 %."""
 _SURE = 5.0
 _ALIKE = 0.8
-_BAND_HZ = (5.0, 1.5)
-_HALF, _LEFT = 0.5, 0.4
-_WINDOW, _MOST = (2.0, 6.0), 60
+_BAND_HZ = 5.0
+_HALF = 0.5
+_WINDOW, _FEWEST, _MOST = (2.0, 8.0), 6, 60
+_TURNING_HZ, _STRAY, _CLEARLY = 25.0, 0.05, 3.0
 
 
 def against_itself(description: Description, log: Log) -> tuple[list[Finding], Description]:
@@ -49,7 +48,8 @@ def against_itself(description: Description, log: Log) -> tuple[list[Finding], D
         return [unit[0]], edit_field(description, *unit[1:])
     if imu.specific_force is None or imu.frame == "base":
         return [], description
-    axes = _gyro_axes(imu, log)
+    gravity = float(np.linalg.norm(description.gravity))
+    axes = _gyro_axes(imu, log, gravity)
     if axes is not None:
         finding, columns = axes
         if columns is not None:
@@ -58,7 +58,7 @@ def against_itself(description: Description, log: Log) -> tuple[list[Finding], D
     alpha = _alpha_axes(imu, log)
     if alpha is not None:
         return [alpha], description
-    scale = _gravity(imu, log, float(np.linalg.norm(description.gravity)))
+    scale = _gravity(imu, log, gravity)
     return ([] if scale is None else [scale]), description
 
 
@@ -68,7 +68,7 @@ def _angle_unit(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
     if imu.angular_acceleration is None:
         return None
     rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
-    said, seen = (low_pass(x, log.dt, _BAND_HZ[0]) for x in (log.angular_acceleration, rate))
+    said, seen = (low_pass(x, log.dt, _BAND_HZ) for x in (log.angular_acceleration, rate))
     sizes = float(np.linalg.norm(said)), float(np.linalg.norm(seen))
     if min(sizes) == 0.0 or float(np.sum(said * seen)) < _ALIKE * sizes[0] * sizes[1]:
         return None
@@ -90,31 +90,22 @@ def _angle_unit(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
     return finding, f"imu.{field}.unit", unit
 
 
-def _gyro_axes(imu: Imu, log: Log) -> tuple[Finding, tuple | None] | None:
+def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
     """Whether the gyroscope's axes are others than the accelerometer's, and its columns in order.
 
-    Of the 48 ways to name and sign three axes another has to leave less than `_LEFT` of what turns
-    the specific force, and less than half of what is left as described. The factor between both
-    is free, since the jerk of a motion on a circle has the shape of what the turning does.
+    Of the 48 ways to name and sign three axes another has to bring the mean specific force of
+    windows `_CLEARLY` times as near to gravity, and to that of the next window, as the one that is
+    described does.
     """
     assert imu.angular_velocity is not None
-    s, omega = (
-        low_pass(x, log.dt, _BAND_HZ[1]) for x in (log.specific_force, log.angular_velocity)
+    few = log.only(slice(None, None, max(1, round(1.0 / (_TURNING_HZ * log.dt)))))
+    given = _astray(few, np.eye(3), gravity)
+    if not given > _STRAY:
+        return None
+    best, P = min(
+        ((_astray(few, P, gravity), P) for P in _signed_permutations()), key=lambda entry: entry[0]
     )
-    change = np.gradient(s, log.dt, axis=0)
-    inner = slice(len(s) // 50, len(s) - len(s) // 50)
-    turning = np.stack([cross_matrix(x) for x in s[inner]])
-    columns = np.einsum("nij,nk->nijk", turning, omega[inner]).reshape(-1, 9)
-    target = change[inner].reshape(-1)
-    gram, right, total = columns.T @ columns, columns.T @ target, float(target @ target) + 1e-300
-
-    def left(P: Array) -> float:
-        along = float(right @ P.ravel())
-        return 1.0 - max(along, 0.0) ** 2 / (float(P.ravel() @ gram @ P.ravel()) * total + 1e-300)
-
-    given = left(np.eye(3))
-    best, P = min(((left(P), P) for P in _signed_permutations()), key=lambda entry: entry[0])
-    if best > _LEFT or best > _HALF * given:
+    if _CLEARLY * best > given:
         return None
     order = np.abs(P).argmax(axis=1)
     text = "the axes of the gyroscope are not those of the accelerometer"
@@ -137,7 +128,7 @@ def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
     if imu.angular_acceleration is None:
         return None
     rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
-    said, seen = (low_pass(x, log.dt, _BAND_HZ[0]) for x in (log.angular_acceleration, rate))
+    said, seen = (low_pass(x, log.dt, _BAND_HZ) for x in (log.angular_acceleration, rate))
     size = float(np.linalg.norm(said) * np.linalg.norm(seen)) + 1e-300
     alike = said.T @ seen / size
     best = max(_signed_permutations(), key=lambda P: float(np.sum(alike * P)))
@@ -169,24 +160,49 @@ class MeanGravity:
 
 
 def mean_gravity(log: Log, gravity: float) -> MeanGravity | None:
-    """From windows, weighed by a Hann window, turned back by the gyroscope; None if too short."""
-    length = float(np.clip((log.t[-1] - log.t[0]) / 8.0, *_WINDOW))
-    rows = round(length / log.dt)
-    count = len(log) // rows
-    if count < 6:
+    """From the mean of each window; None if the record is too short."""
+    forces = _mean_forces(log, np.eye(3))[0]
+    if len(forces) < _FEWEST:
         return None
-    starts = np.linspace(0, len(log) - rows, min(count, _MOST)).astype(int)
-    take = starts[:, None] + np.arange(rows)
-    omega, s = log.angular_velocity[take], log.specific_force[take]
-    steps = rotation_matrices((omega * log.dt).reshape(-1, 3), "rotation_vector")
-    steps = steps.reshape(len(starts), rows, 3, 3)
-    R, sums = np.broadcast_to(np.eye(3), (len(starts), 3, 3)), np.zeros((len(starts), 3))
-    weight = np.hanning(rows + 2)[1:-1]
-    for k in range(rows):
-        sums = sums + weight[k] * np.einsum("nij,nj->ni", R, s[:, k])
-        R = R @ steps[:, k]
-    ratios = np.linalg.norm(sums, axis=1) / (weight.sum() * gravity)
+    ratios = np.linalg.norm(forces, axis=1) / gravity
     return MeanGravity(float(np.mean(ratios)), float(np.std(ratios, ddof=1) / np.sqrt(len(ratios))))
+
+
+def _mean_forces(log: Log, P: Array) -> Array:
+    """Mean specific force of windows, (2, n, 3) [m/s^2]: of each, and of it half its length later.
+
+    Both are turned back to the window's start by the gyroscope, and weighed by a Hann window, so
+    that a motion that stays in place counts for little. n is 0 if the record is too short.
+
+    Args:
+        log: of even steps.
+        P: (3, 3) the right angular velocity over that of the log.
+    """
+    length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW))
+    half = max(1, int(0.5 * length / log.dt))
+    count = max(0, len(log) // half - 2)
+    starts = np.linspace(0, len(log) - 3 * half, min(count, _MOST)).astype(int)
+    take = starts[:, None] + np.arange(3 * half)
+    omega, s = log.angular_velocity[take] @ P.T, log.specific_force[take]
+    steps = rotation_matrices((omega * log.dt).reshape(-1, 3), "rotation_vector")
+    steps = steps.reshape(*omega.shape, 3)
+    weight = np.zeros((2, 3 * half))
+    weight[0, : 2 * half] = weight[1, half:] = np.hanning(2 * half + 2)[1:-1]
+    weight /= weight[0].sum()
+    R, means = np.broadcast_to(np.eye(3), (len(starts), 3, 3)), np.zeros((2, len(starts), 3))
+    for k in range(3 * half):
+        means += weight[:, k, None, None] * np.einsum("nij,nj->ni", R, s[:, k])
+        R = R @ steps[:, k]
+    return means
+
+
+def _astray(log: Log, P: Array, gravity: float) -> float:
+    """How far the means are from gravity, and from each other [rms, of gravity]; nan without."""
+    means = _mean_forces(log, P) / gravity
+    if means.shape[1] == 0:
+        return np.nan
+    off = np.linalg.norm(means, axis=2) - 1.0
+    return float(np.sqrt(np.mean(off**2) + np.mean(np.sum((means[1] - means[0]) ** 2, axis=1))))
 
 
 def _gravity(imu: Imu, log: Log, gravity: float) -> Finding | None:

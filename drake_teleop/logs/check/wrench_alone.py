@@ -10,7 +10,7 @@ No load fit shows either for sure: a wrong unit of the torque leaves hardly anyt
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import product
 
 import numpy as np
@@ -21,7 +21,7 @@ from drake_teleop.logs.check.edits import edit_field
 from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.check.fitting import fit_with_offset
 from drake_teleop.logs.pose_motion.read_off import nearest_permutation
-from drake_teleop.logs.read.alignment import low_passed, measured
+from drake_teleop.logs.read.alignment import low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import UNITS, Description, Wrench
 
@@ -31,37 +31,56 @@ _MOST = 3000
 _KNOWN, _SURE = 0.05, 5.0
 _OBLIQUE, _SPREAD = 5.0, 0.2
 _MATCH, _FARTHEST, _NEAREST = 0.1, 1.5, 2e-4
+_FAR, _PARALLEL = 20.0, 0.98
+FORCES, TORQUES = ("N", "lbf"), ("N m", "N mm", "lbf in")
 
 
-def wrench_findings(description: Description, log: Log) -> tuple[list[Finding], Description]:
+def wrench_findings(
+    description: Description, log: Log, delays: tuple[float, ...] = (0.0,)
+) -> tuple[list[Finding], Description]:
     """A unit or axes of the wrench that are wrong, and the description without that.
 
     Args:
         description: of the log, in which the motion is right.
-        log: about 100 Hz of it, the delay taken out.
+        log: about 100 Hz of it.
+        delays: of which one is that of the motion behind the wrench, nearly [s]; what fits a load
+            best is none where axes are mirrored and no load fits.
     """
     wrench = description.wrench
     if wrench is None or wrench.frame == "base" or log.static:
         return [], description
-    smooth = low_passed(log, _CUTOFF).only(measured(log, _CUTOFF))
-    smooth = smooth.only(slice(None, None, max(1, len(smooth) // _MOST)))
     independent = 2.0 * _CUTOFF * float(log.t[-1] - log.t[0])
-    axes = _axes(description, wrench, smooth, independent)
+    logs = [_smooth(undelayed(log, delay)) for delay in sorted({*delays})]
+    fits = [_force_by_motion(log, independent) for log in logs]
+    fit, smooth = min(zip(fits, logs, strict=True), key=lambda entry: entry[0][1])
+    axes = _axes(description, wrench, *fit)
     if axes is not None:
         return [axes], description
     found = _unit(wrench, smooth, independent)
     return ([], description) if found is None else ([found[0]], found[1](description))
 
 
-def _axes(description: Description, wrench: Wrench, log: Log, independent: float) -> Finding | None:
+def _smooth(log: Log) -> Log:
+    smooth = low_passed(log, _CUTOFF).only(measured(log, _CUTOFF))
+    return smooth.only(slice(None, None, max(1, len(smooth) // _MOST)))
+
+
+def _force_by_motion(log: Log, independent: float) -> tuple[Array, float]:
+    """Force over specific force (3, 3) whatever the axes are, and its deviation [kg]; inf if none
+    is determined."""
     s, omega, alpha = log.motion
     squares = np.stack([omega[:, i] * omega[:, k] for i in range(3) for k in range(i, 3)], axis=1)
     columns = np.hstack([s, alpha, squares])
     fits = [fit_with_offset(columns[:, None], f[:, None], independent) for f in log.wrench[:, :3].T]
-    if any(fit is None for fit in fits):
-        return None
-    M = np.stack([fit.x[:3] for fit in fits if fit])
-    deviation = max(float(fit.deviations[:3].max()) for fit in fits if fit)
+    known = [fit for fit in fits if fit is not None]
+    if len(known) < 3:
+        return np.eye(3), np.inf
+    deviation = max(float(fit.deviations[:3].max()) for fit in known)
+    return np.stack([fit.x[:3] for fit in known]), deviation
+
+
+def _axes(description: Description, wrench: Wrench, M: Array, deviation: float) -> Finding | None:
+    """From the force over the specific force, and its deviation."""
     U, masses, Vt = np.linalg.svd(M)
     mass = float(masses.mean())
     if deviation > _KNOWN * mass or masses[0] - masses[2] > _SPREAD * mass:
@@ -154,7 +173,7 @@ def other_units(
         deviations: standard deviations of their lengths.
 
     Returns:
-        the finding, and the unit of each field to change.
+        the finding, and the unit of each field to change; none if it is of no unit that is known.
     """
     by_force, by_torque = moments
     size = _norm(by_torque)
@@ -162,7 +181,7 @@ def other_units(
         return None
     now = {"force": wrench.force.unit, "torque": wrench.torque.unit}
     found = []
-    for pair in product(("N", "lbf"), ("N m", "N mm", "lbf in")):
+    for pair in product(FORCES, TORQUES):
         right = dict(zip(now, pair, strict=True))
         seen = {name: UNITS[now[name]] / UNITS[right[name]] for name in now}
         ratio = seen["torque"] / seen["force"]
@@ -172,7 +191,8 @@ def other_units(
         if right != now and known and off < _MATCH:
             found.append((off, ratio, {k: unit for k, unit in right.items() if unit != now[k]}))
     if not found:
-        return None
+        unknown = _unknown_unit(now, both=(by_force, by_torque), deviation=deviations[0])
+        return None if unknown is None else (unknown, {})
     _, ratio, units = min(found, key=lambda entry: entry[0])
     lines = " and ".join(f"wrench.{name}.unit: {unit}" for name, unit in units.items())
     finding = Finding(
@@ -181,3 +201,26 @@ def other_units(
         f" are not in {now['torque']} and {now['force']}; set {lines}",
     )
     return finding, units
+
+
+def _unknown_unit(
+    now: Mapping[str, str], both: tuple[Array, Array], deviation: float
+) -> Finding | None:
+    """Of a centre of mass in one direction, but `_FAR` times as far by the one as by the other.
+
+    A shorter way may be where the poses are of another place.
+    """
+    by_force, by_torque = both
+    size, torque = _norm(by_force), _norm(by_torque)
+    if deviation > _KNOWN * size or float(np.sum(by_force * by_torque)) < _PARALLEL * size * torque:
+        return None
+    if 1.0 / _FAR < torque / size < _FAR:
+        return None
+    return Finding(
+        "units",
+        f"the centre of mass is {torque / size:.4g} times as far away by the torque as by the"
+        f" force: they are not in {now['torque']} and {now['force']}, nor in"
+        f" {' or '.join(u for u in TORQUES if u != now['torque'])}; write the columns of"
+        " wrench.force and wrench.torque in units that a description knows:"
+        f" {', '.join((*FORCES, *TORQUES))}",
+    )
