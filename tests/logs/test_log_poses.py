@@ -99,6 +99,7 @@ def test_what_no_rigid_load_explains_identifies_none_unless_it_is_stated(folder)
     assert stated.identification.identifiable[6:10].all()
 
 
+@pytest.mark.slow
 def test_a_pose_of_another_frame_is_named_with_the_lines_that_mend_it(folder):
     path = described(folder, "tcp")
     found = identify_log(path)
@@ -117,6 +118,7 @@ def test_a_pose_of_another_frame_is_named_with_the_lines_that_mend_it(folder):
     assert np.abs(deviations(found)).max() < 4.0
 
 
+@pytest.mark.slow
 def test_what_is_named_counts_from_what_was_described(folder, tmp_path):
     """Half of the shift and the whole turn are described: the line has the whole shift."""
     path = described(folder, "tcp", position_in_sensor=(0.5 * SHIFT).tolist(), frame=TURN.tolist())
