@@ -93,6 +93,19 @@ def test_a_command_that_is_not_finite_displays_nothing(bad, index):
     np.testing.assert_allclose(torque, phantom.gravity_torque(POSTURES[1]), atol=1e-15)
 
 
+def test_the_fault_has_a_port_of_its_own_and_stands_beside_what_is_displayed():
+    block = ForceDisplay(PERIOD, DEVICE)
+    context = block.CreateDefaultContext()
+    start = initial_display(POSTURES[1], DEVICE.numbers)
+    block.GetInputPort("for_display").FixValue(context, start)
+    for wrench, fault in ((np.ones(6), Fault.NONE), (np.full(6, np.nan), Fault.WRENCH)):
+        block.GetInputPort("wrench_command").FixValue(context, wrench)
+        assert block.GetOutputPort("fault_at_hand").Eval(context) == [fault]
+        both = block.GetOutputPort("displayed_and_fault").Eval(context)
+        force = block.GetOutputPort("force_to_master").Eval(context)
+        np.testing.assert_array_equal(both, [*force, fault])
+
+
 def test_a_huge_command_is_limited_too_and_one_that_is_no_wrench_is_none():
     _, displayed = display([1e6, 1e6, 0, 0, 0, 1e6], phantom.HOME)
     assert np.linalg.norm(displayed[:3]) == pytest.approx(37.5)

@@ -113,6 +113,20 @@ def test_it_ends_where_the_workspace_ends(axis):
         MasterDevice(PERIOD, touch, centre + 1.01 * side * end * np.eye(6)[axis])
 
 
+def test_the_end_of_the_workspace_is_said_and_no_start_beyond_it():
+    fixed, omega = device("omega_3"), device("omega_6")
+    inside = np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0])
+    turned, aside = inside + 2.9 * np.eye(6)[5], inside + 0.06 * np.eye(6)[1]
+    # An axis that does not turn is at its end all the time, which is nothing to say.
+    wobbling = inside + 1e-3 * np.eye(6)[5]
+    for model, ends in ((fixed, [False, False, True]), (omega, [False, False, True])):
+        np.testing.assert_array_equal(model.at_an_end(np.array([inside, wobbling, aside])), ends)
+    np.testing.assert_array_equal(omega.at_an_end(np.array([turned])), [True])
+    for pose in (aside, turned):
+        with pytest.raises(DrakeTeleopError, match="the device's workspace is"):
+            omega.inverse_kinematics(omega.forward_kinematics(pose))
+
+
 def test_what_is_not_actuated_displays_nothing():
     for model, force, torque in (("geomagic_touch", 3.3, 0.0), ("virtuose_6d", 35.0, 3.1)):
         numbers, q = device(model).numbers, np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0])

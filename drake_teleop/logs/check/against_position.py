@@ -49,7 +49,7 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
     columns, by_pose = (low_pass(x, sensed.dt, _CUTOFF) for x in (columns, by_pose))
     inner = slice(len(t) // 50, len(t) - len(t) // 50)
     fit = fit_with_offset(columns[inner], by_pose[inner], 2.0 * _CUTOFF * float(t[-1] - t[0]))
-    if fit is None or abs(fit.x[0]) < _SURE * fit.deviations[0]:
+    if fit is None or abs(fit.x[0]) <= _SURE * fit.deviations[0]:
         return []
     k = float(fit.x[0])
     unit = position_unit(pose.position.unit, 1.0 / k, float(fit.deviations[0]) / k**2)
