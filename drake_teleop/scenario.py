@@ -40,6 +40,7 @@ from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.sensor.presets import preset_of
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
+from drake_teleop.slave.ik_methods import METHODS
 from drake_teleop.slave.joint_control import JointControlConfig
 from drake_teleop.slave.payload import Payload
 from drake_teleop.texts import read_yaml
@@ -98,6 +99,9 @@ class Slave:
 
     position: list[float] = quantity([0.55, 0.0, 0.45], "m", -1.5, 1.5, "p_WS at the start")
     payload: Payload = field(default_factory=Payload)
+    inverse_kinematics: str = choice(
+        "closed_form", tuple(METHODS), "how a pose becomes joint angles; numeric keeps their speeds"
+    )
 
 
 @settings

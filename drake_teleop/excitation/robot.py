@@ -29,7 +29,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.slave.arm import ArmModel
+from drake_teleop.slave.arm import SLIDES, ArmModel
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.payload import AddPayload
 from drake_teleop.slave.plant import AddEnvironment, ParseSlave, finalize, home_position
@@ -161,7 +161,15 @@ def RobotFromModel(
 
     assumptions = ["a table at z = 0"]
     with drakes_errors_said(path):
-        load = _arm_of(parse).phi_load
+        arm = _arm_of(parse)
+    sliding = np.flatnonzero(arm.table[:, SLIDES])
+    if sliding.size:
+        raise DrakeTeleopError(
+            f"{arm.joint_names[sliding[0]]} slides, and only turning joints can be excited",
+            where=str(path),
+            remedy="fix that joint in the model where the arm shall stand",
+        )
+    load = arm.phi_load
     if payload is None and load[0] > 0:
         reserve = (_LOAD_FACTOR - 1) * load
     else:

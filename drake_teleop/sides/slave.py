@@ -21,7 +21,7 @@ from drake_teleop.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.sensor.wrist_sensor import AddWristSensor
 from drake_teleop.sides.ports import export
 from drake_teleop.slave.forward_kinematics import ForwardKinematics
-from drake_teleop.slave.inverse_kinematics import InverseKinematics
+from drake_teleop.slave.ik_methods import METHODS
 from drake_teleop.slave.joint_control import JointControl
 from drake_teleop.slave.joint_trajectory import JointTrajectory
 from drake_teleop.slave.monitor import SlaveMonitor
@@ -77,7 +77,11 @@ def MakeSlaveSide(
     body = _add_body(builder, scenario, load_estimate, load_covariance)
     arm = body.slave.arm
 
-    ik = builder.AddNamedSystem("inverse_kinematics", InverseKinematics(arm.lower, arm.upper))
+    start = body.slave.plant.GetDefaultPositions(body.slave.instance)
+    make_ik = METHODS[scenario.slave.inverse_kinematics]
+    ik = builder.AddNamedSystem(
+        "inverse_kinematics", make_ik(arm, start, 1 / scenario.rates.joint_control_hz)
+    )
     builder.Connect(body.sample["joint_position"], ik.GetInputPort("joint_position"))
     builder.Connect(
         ik.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")

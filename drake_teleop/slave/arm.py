@@ -1,4 +1,4 @@
-"""Kinematics and inverse dynamics of any serial arm of revolute joints, compiled.
+"""Kinematics and dynamics of any serial arm of revolute and prismatic joints, compiled.
 
 `ArmModel` is the arm as one table of numbers (`arm_from_plant` reads it out of a plant); the
 kernels below run on that table. They repeat what the plant can do because an 8 kHz sample has
@@ -35,7 +35,7 @@ from drake_teleop.vectors import (
 Array = NDArray[np.float64]
 
 # Columns of ArmModel.table.
-ROTATION, TRANSLATION, PHI, ROTOR, DAMPING, WIDTH = 0, 9, 12, 22, 23, 25
+ROTATION, TRANSLATION, PHI, ROTOR, DAMPING, SLIDES, WIDTH = 0, 9, 12, 22, 23, 25, 26
 # In the last row, which has no joint, gravity stands from here on.
 GRAVITY = 22
 
@@ -45,20 +45,21 @@ MOTION_SIZE = 21
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """A serial chain of n revolute joints from the world to the sensor frame S, as plain arrays.
+    """A serial chain of n joints from the world to the sensor frame S, as plain arrays.
 
-    Link frame L_j turns with joint j about its z axis and coincides with the joint's frame J_j at
-    q_j = 0; L_0 is the world. Everything welded to a link belongs to the link; everything outboard
-    of the body that carries S is the load.
+    Link frame L_j turns with joint j about its z axis, or slides along it, and coincides with the
+    joint's frame J_j at q_j = 0; L_0 is the world. Everything welded to a link belongs to the link;
+    everything outboard of the body that carries S is the load. Where a joint slides, read m for
+    rad, N for N m and kg for kg m^2.
 
     Attributes:
         joint_names: names of the joints, from the base outwards.
-        table: (n+1, 25), what the kernels read. Row j, of joint j (row n: of S, fixed to L_n):
+        table: (n+1, 26), what the kernels read. Row j, of joint j (row n: of S, fixed to L_n):
             columns 0-8 rotation from the joint's frame to the previous link's (by rows), 9-11 its
             origin in the previous link's frame [m], 12-21 phi of the link about the origin of L_j
             in L_j (row n: of the load, in S), ordered [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz],
-            22 reflected rotor inertia [kg m^2], 23 damping [N m s/rad]; in row n columns 22-24 are
-            gravity in the world [m/s^2].
+            22 reflected rotor inertia [kg m^2], 23 damping [N m s/rad], 25 is 1 where the joint
+            slides; in row n columns 22-24 are gravity in the world [m/s^2].
         lower: (n,) joint limits [rad].
         upper: (n,) joint limits [rad].
         velocity_limit: (n,) [rad/s], inf where the model gives none.
@@ -104,7 +105,11 @@ class ArmModel:
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
     """Moves the pose in x from the previous link to this one; returns p_PL_W."""
     joint = table[row]
-    p_PL_W = apply(nine(x, 12), three(joint, TRANSLATION))
+    p_PL_P = three(joint, TRANSLATION)
+    if joint[SLIDES] != 0.0:
+        p_PL_P = plus(p_PL_P, times(q, (joint[2], joint[5], joint[8])))
+        q = 0.0
+    p_PL_W = apply(nine(x, 12), p_PL_P)
     add_into(x, 9, p_PL_W)
     c = np.cos(q)
     s = np.sin(q)
@@ -121,8 +126,11 @@ def _advance(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) 
     r = _advance_pose(table, row, q, x)
     omega, alpha, z = three(x, 3), three(x, 6), (x[14], x[17], x[20])
     add_into(x, 0, plus_cross(cross(alpha, r), omega, cross(omega, r)))
-    add_into(x, 3, times(qd, z))
-    add_into(x, 6, plus(times(qdd, z), times(qd, cross(omega, z))))
+    if table[row, SLIDES] != 0.0:
+        add_into(x, 0, plus(times(qdd, z), times(2.0 * qd, cross(omega, z))))
+    else:
+        add_into(x, 3, times(qd, z))
+        add_into(x, 6, plus(times(qdd, z), times(qd, cross(omega, z))))
 
 
 def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
@@ -183,8 +191,14 @@ def jacobian(table: Array, q: Array, J_out: Array) -> None:
         q: (n,) joint positions [rad].
         J_out: (6, n) filled; rows 0-2 velocity of the origin of S, rows 3-5 angular velocity, in W.
     """
+    jacobian_and_pose(table, q, J_out, np.empty(21))
+
+
+@njit(cache=True)
+def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
+    """`jacobian`, and the pose of S in x (21,): ``x[9:12]`` p_WS [m], ``x[12:21]`` R_WS by rows."""
     n = table.shape[0] - 1
-    x = np.zeros(21)
+    x[:] = 0.0
     x[12] = x[16] = x[20] = 1.0
     for row in range(n):
         _advance_pose(table, row, q[row], x)
@@ -195,8 +209,12 @@ def jacobian(table: Array, q: Array, J_out: Array) -> None:
     p_WS = three(x, 9)
     for row in range(n):
         column = J_out[:, row]
-        lever = minus(p_WS, column)
-        column[0], column[1], column[2] = cross(three(column, 3), lever)
+        axis = three(column, 3)
+        if table[row, SLIDES] != 0.0:
+            column[0], column[1], column[2] = axis
+            column[3] = column[4] = column[5] = 0.0
+        else:
+            column[0], column[1], column[2] = cross(axis, minus(p_WS, column))
 
 
 @njit(cache=True)
@@ -265,7 +283,7 @@ def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
 
 
 @njit(cache=True)
-def _to_the_joints(link: Array, tau: Array) -> None:
+def _to_the_joints(table: Array, link: Array, tau: Array) -> None:
     """Torques (n,) of the joints for the links' wrenches, see `_link_wrench`; sums them inboard."""
     n = tau.shape[0]
     for row in range(n, 0, -1):
@@ -273,9 +291,12 @@ def _to_the_joints(link: Array, tau: Array) -> None:
             link[row - 1, k] += link[row, k]
     for row in range(n):
         x = link[row]
-        # About the joint's own origin.
-        moment = plus_cross(three(x, 9), times(-1.0, three(x, 3)), three(x, 6))
-        tau[row] = dot(three(x, 0), moment)
+        if table[row, SLIDES] != 0.0:
+            tau[row] = dot(three(x, 0), three(x, 6))
+        else:
+            # About the joint's own origin.
+            moment = plus_cross(three(x, 9), times(-1.0, three(x, 3)), three(x, 6))
+            tau[row] = dot(three(x, 0), moment)
 
 
 @njit(cache=True)
@@ -303,7 +324,7 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
         else:
             _advance(table, row, 0.0, 0.0, 0.0, x)
         _link_wrench(table, row, x, link)
-    _to_the_joints(link, tau_out)
+    _to_the_joints(table, link, tau_out)
     for row in range(n):
         tau_out[row] += table[row, ROTOR] * vdot[row] + table[row, DAMPING] * v[row]
 
@@ -333,28 +354,36 @@ def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None
 def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
     """M (n, n) from the joints' axes in `link` and the links' inertias; sums them inboard.
 
-    Composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 6.2).
+    Composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 6.2). What
+    is in `link` of wrenches is lost.
     """
     n = M.shape[0]
+    for row in range(n):
+        # Of a unit of the joint's speed: velocity at Wo and angular velocity.
+        x = link[row]
+        x[9], x[10], x[11] = three(x, 0)
+        x[6], x[7], x[8] = cross(three(x, 3), three(x, 9))
+        if table[row, SLIDES] != 0.0:
+            x[6], x[7], x[8] = three(x, 9)
+            x[9] = x[10] = x[11] = 0.0
     for row in range(n - 1, -1, -1):
         for k in range(10):
             inertia[row, k] += inertia[row + 1, k]
         c = inertia[row]
-        z, h = three(link[row], 0), three(c, 1)
-        v = cross(three(link[row], 3), z)
+        h = three(c, 1)
+        v, w = three(link[row], 6), three(link[row], 9)
         # Momentum about Wo of all that is outboard, for a unit of this joint's speed.
-        linear = plus_cross(times(c[0], v), z, h)
-        angular = plus_cross(apply(symmetric(c, 4), z), h, v)
-        # Only the lower half is needed; the axis of joint i moves along z_i through p_i.
+        linear = plus_cross(times(c[0], v), w, h)
+        angular = plus_cross(apply(symmetric(c, 4), w), h, v)
+        # Only the lower half is needed.
         for i in range(row + 1):
-            z = three(link[i], 0)
-            v = cross(three(link[i], 3), z)
-            M[row, i] = dot(z, angular) + v[0] * linear[0] + v[1] * linear[1] + v[2] * linear[2]
+            v, w = three(link[i], 6), three(link[i], 9)
+            M[row, i] = dot(w, angular) + v[0] * linear[0] + v[1] * linear[1] + v[2] * linear[2]
         M[row, row] += table[row, ROTOR]
 
 
 @njit(cache=True)
-def _solve_spd(M: Array, x: Array) -> None:
+def solve_spd(M: Array, x: Array) -> None:
     """x := M^-1 x by Cholesky in M's lower half.
 
     As `vectors.solve`, by columns, and with the last digit of its own: m / sqrt(m) on the diagonal.
@@ -408,8 +437,8 @@ def forward_dynamics(
         _composite_inertia(table, row, x, inertia[row])
     for k in range(6):
         link[n, 6 + k] -= wrench_W[k]
-    _to_the_joints(link, vdot_out)
+    _to_the_joints(table, link, vdot_out)
     for row in range(n):
         vdot_out[row] = tau[row] - vdot_out[row] - table[row, DAMPING] * v[row]
     _mass_matrix(table, link, inertia, M)
-    _solve_spd(M, vdot_out)
+    solve_spd(M, vdot_out)

@@ -1,4 +1,4 @@
-"""A serial arm of revolute joints, read out of a finalized MultibodyPlant."""
+"""A serial arm of revolute and prismatic joints, read out of a finalized MultibodyPlant."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pydrake.multibody.tree import (
     Joint,
     JointActuator,
     ModelInstanceIndex,
+    PrismaticJoint,
     RevoluteJoint,
     RigidBody,
     SpatialInertia,
@@ -23,6 +24,7 @@ from drake_teleop.slave.arm import (
     PHI,
     ROTATION,
     ROTOR,
+    SLIDES,
     TRANSLATION,
     WIDTH,
     ArmModel,
@@ -47,7 +49,7 @@ def ArmModelFromPlant(
 
     Raises:
         DrakeTeleopError: there is no such frame, or what leads to it from the world is not a chain
-            of welds and revolute joints, or a link carries a further moving joint.
+            of welds, revolute and prismatic joints, or a link carries a further moving joint.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         raise DrakeTeleopError(
@@ -65,12 +67,13 @@ def ArmModelFromPlant(
     for row, joint in enumerate(joints):
         table[row, ROTOR] = _reflected_inertia(plant, joint)
         table[row, DAMPING] = joint.default_damping()
+        table[row, SLIDES] = isinstance(joint, PrismaticJoint)
     gravity = plant.gravity_field()
-    table[n, GRAVITY:] = gravity.gravity_vector() * gravity.is_enabled(model_instance)
+    table[n, GRAVITY:SLIDES] = gravity.gravity_vector() * gravity.is_enabled(model_instance)
 
     context = plant.CreateDefaultContext()
     # C turns the joint's axis into z.
-    C = [RigidTransform(RotationMatrix.MakeFromOneVector(j.revolute_axis(), 2)) for j in joints]
+    C = [RigidTransform(RotationMatrix.MakeFromOneVector(_axis(j), 2)) for j in joints]
     X_WS = frame_S.CalcPoseInWorld(context)
     X_WJ = [
         j.frame_on_parent().CalcPoseInWorld(context) @ X for j, X in zip(joints, C, strict=True)
@@ -107,23 +110,31 @@ def _per_joint(values: list[float]) -> Array:
     return np.array(values, dtype=np.float64)
 
 
-def _chain(inboard: dict[BodyIndex, Joint], body: RigidBody) -> list[RevoluteJoint]:
-    """The revolute joints from the world to ``body``, from the base outwards."""
-    joints: list[RevoluteJoint] = []
+def _axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
+    slides = isinstance(joint, PrismaticJoint)
+    axis: Array = joint.translation_axis() if slides else joint.revolute_axis()
+    return axis
+
+
+def _chain(
+    inboard: dict[BodyIndex, Joint], body: RigidBody
+) -> list[RevoluteJoint | PrismaticJoint]:
+    """The moving joints from the world to ``body``, from the base outwards."""
+    joints: list[RevoluteJoint | PrismaticJoint] = []
     while body.index() in inboard:
         joint = inboard[body.index()]
-        if isinstance(joint, RevoluteJoint):
+        if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
             joints.append(joint)
         elif not isinstance(joint, WeldJoint):
             raise DrakeTeleopError(
                 f"the arm hangs on a {joint.type_name()} joint",
                 where=joint.name(),
-                remedy="weld the arm's base to the world and use revolute joints up to the sensor",
+                remedy="weld the arm's base to the world; up to the sensor, use joints of one axis",
             )
         body = joint.parent_body()
     if not joints:
         raise DrakeTeleopError(
-            "no revolute joint between the world and the sensor frame", where=body.name()
+            "no moving joint between the world and the sensor frame", where=body.name()
         )
     return joints[::-1]
 

@@ -41,7 +41,12 @@ _ROUNDING = 1e-9
 
 
 class IkStatus(IntEnum):
-    """How `nearest_branch` came by its answer, worst case last."""
+    """How the inverse kinematics came by its answer; here in the words of the closed form.
+
+    The numeric one (`numeric_inverse_kinematics`) comes as near to the pose as it can, whatever
+    keeps it from it. By WRIST_SINGULAR it means that the last three axes nearly lie in a plane, by
+    SHOULDER_SINGULAR any other singularity; past either a part of the pose is met late.
+    """
 
     OK = 0
     """The pose is met."""
@@ -56,10 +61,12 @@ class IkStatus(IntEnum):
     BAD_POSE = 5
     """The pose is not finite, beyond 1e6 m, or its quaternion is zero: the reference is held,
     within limits. Or the reference is not finite: the answer is not either."""
+    SPEED_LIMIT = 6
+    """The pose is not met yet: a joint moves as fast as it may."""
 
 
 # Compiled code knows plain integers only.
-_OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE = map(
+_OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE, _ = map(
     int, IkStatus
 )
 

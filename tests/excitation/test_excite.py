@@ -512,8 +512,8 @@ def test_limits_and_inertias_of_nothing_are_assumptions(urdf):
         (["--sensor-frame", "l6", "--acceleration", "fast"], "--acceleration"),
         (["--sensor-frame", "l6", "--payload", "0.1"], "holds 0.9 kg beyond the sensor"),
         (["--sensor-frame", "l6", "--payload", "1e-9"], "1e-09 kg is outside 0.001 to 10000 kg"),
-        (["--sensor-frame", "finger"], "slide"),
-        (["--sensor-frame", "l0"], "no revolute joint"),
+        (["--sensor-frame", "finger"], "slide slides, and only turning joints"),
+        (["--sensor-frame", "l0"], "no moving joint"),
         ([], "--sensor-frame"),
     ],
 )

@@ -1,0 +1,337 @@
+"""The numeric inverse kinematics against the plants and the closed form, and where it cannot go."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from odd_arms import other_plant, rx90_plant, sliding_plant
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
+
+from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.simulation import simulate
+from drake_teleop.slave.arm import ArmModel, jacobian
+from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.slave.ik_methods import METHODS
+from drake_teleop.slave.inverse_kinematics import IkStatus, InverseKinematics, solve_pose_command
+from drake_teleop.slave.numeric_inverse_kinematics import (
+    MET,
+    SINGULAR,
+    STEPS,
+    NumericInverseKinematics,
+    find_posture,
+    follow_pose,
+    turn_length,
+)
+from drake_teleop.station import MakeTeleopStation
+
+# What compiles takes three seconds, once.
+pytestmark = pytest.mark.slow
+
+PERIOD = 5e-4
+#: The RX90 with its elbow well bent and its wrist stretched.
+STRETCHED = np.array([0.2, -0.5, -1.6, 0.7, 0.0, 0.4])
+BENT = np.array([0.2, -0.5, -1.6, 0.7, 0.8, 0.4])
+
+
+class Case(NamedTuple):
+    """An arm with the plant that says where it is."""
+
+    plant: object
+    context: object
+    frame: object
+    arm: ArmModel
+
+    def X_WS(self, q):
+        full = np.zeros(self.plant.num_positions())
+        full[self.arm.position_index] = q
+        self.plant.SetPositions(self.context, full)
+        return self.frame.CalcPoseInWorld(self.context)
+
+    def pose(self, q):
+        return pose_of(self.X_WS(q))
+
+    def errors(self, pose, q):
+        """[m], [rad]."""
+        X = self.X_WS(q)
+        R = RotationMatrix(X.rotation().inverse().matrix() @ quaternion(pose).matrix())
+        return np.linalg.norm(pose[4:] - X.translation()), R.ToAngleAxis().angle()
+
+
+def quaternion(pose):
+    return RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4])))
+
+
+def pose_of(X: RigidTransform):
+    return np.append(X.rotation().ToQuaternion().wxyz(), X.translation())
+
+
+def case_of(plant, instance, frame) -> Case:
+    arm = ArmModelFromPlant(plant, instance, frame)
+    return Case(plant, plant.CreateDefaultContext(), plant.GetFrameByName(frame), arm)
+
+
+@pytest.fixture(scope="module")
+def rx90():
+    return case_of(*rx90_plant())
+
+
+@pytest.fixture(scope="module")
+def seven():
+    return case_of(*other_plant())
+
+
+@pytest.fixture(scope="module")
+def sliding():
+    return case_of(*sliding_plant())
+
+
+def follow(case, pose, reference, *, max_step=np.inf, posture=None, pull=0.0):
+    arm, q = case.arm, np.empty(case.arm.num_joints)
+    far = np.broadcast_to(np.asarray(max_step, dtype=float), q.shape).copy()
+    posture = np.array(reference if posture is None else posture, dtype=float)
+    reference = np.array(reference, dtype=float)
+    status = follow_pose(
+        arm.table, turn_length(arm), pose, reference, arm.lower, arm.upper, far, posture, pull,
+        SINGULAR, STEPS, q,
+    )  # fmt: skip
+    return q, IkStatus(status)
+
+
+@pytest.mark.parametrize("name", ["rx90", "seven", "sliding"])
+def test_random_poses_are_met_from_afar(name, request):
+    case = request.getfixturevalue(name)
+    lower, upper = case.arm.lower, case.arm.upper
+    random = np.random.default_rng(2)
+    for _ in range(100):
+        pose = case.pose(random.uniform(lower, upper))
+        pose[:4] *= random.uniform(-3, 3)
+        q, status = find_posture(case.arm, pose, (lower + upper) / 2)
+        assert status == IkStatus.OK
+        assert max(case.errors(pose, q)) < MET
+        assert np.all((lower <= q) & (q <= upper))
+
+
+def test_on_the_rx90_it_is_the_closed_form(rx90):
+    arm, random = rx90.arm, np.random.default_rng(3)
+    closed = np.empty(6)
+    for _ in range(100):
+        q = BENT + random.uniform(-0.3, 0.3, 6)
+        reference = q + random.uniform(-0.05, 0.05, 6)
+        pose = rx90.pose(q)
+        assert solve_pose_command(pose, reference, arm.lower, arm.upper, 2.0, closed) == 0
+        found, status = follow(rx90, pose, reference)
+        assert status == IkStatus.OK
+        np.testing.assert_allclose(found, closed, rtol=0, atol=1e-9)
+
+
+def test_of_all_turns_the_one_nearest_to_the_reference(rx90):
+    """Joints 4 and 6 turn by more than 360 degrees."""
+    q = np.array([0.2, -0.5, -1.6, 0.7, 0.6, 4.0])
+    assert q[5] < rx90.arm.upper[5]
+    found, status = find_posture(rx90.arm, rx90.pose(q), np.append(q[:5], 3.9))
+    assert status == IkStatus.OK
+    np.testing.assert_allclose(found, q, atol=1e-9)
+    found, _ = find_posture(rx90.arm, rx90.pose(q), np.append(q[:5], 4.0 - 2 * np.pi))
+    np.testing.assert_allclose(found, [*q[:5], 4.0 - 2 * np.pi], atol=1e-9)
+
+
+def lost_axis(case, q):
+    J = np.empty((6, len(q)))
+    jacobian(case.arm.table, q, J)
+    axis = np.linalg.svd(J)[0][3:, 5]
+    return axis / np.linalg.norm(axis)
+
+
+def sweep(case, q, solve):
+    """S turns to and fro about the axis about which it can hardly turn at q.
+
+    Returns:
+        Largest step as part of what speeds allow; errors at the end; statuses.
+    """
+    axis = lost_axis(case, q)
+    X, largest, statuses = case.X_WS(q), 0.0, set()
+    for k in range(3000):
+        half = 0.15 * np.sin(min(k * PERIOD, 1.0) * 2 * np.pi)
+        turn = np.array([np.cos(half), *(np.sin(half) * axis)])
+        R = quaternion(turn) @ X.rotation()
+        pose = pose_of(RigidTransform(R, X.translation()))
+        before = q
+        q, status = solve(pose, before)
+        statuses.add(status)
+        largest = max(largest, np.abs((q - before) / (case.arm.velocity_limit * PERIOD)).max())
+    return largest, case.errors(pose, q), statuses
+
+
+@pytest.mark.parametrize("aside", [0.0, 1e-3])
+def test_through_a_singular_wrist_no_joint_is_faster_than_it_can_be(rx90, aside):
+    arm, start = rx90.arm, np.array([*STRETCHED[:4], aside, STRETCHED[5]])
+
+    def closed(pose, reference):
+        q = np.empty(6)
+        return q, solve_pose_command(pose, reference, arm.lower, arm.upper, 2.0, q)
+
+    def numeric(pose, reference):
+        return follow(rx90, pose, reference, max_step=arm.velocity_limit * PERIOD)
+
+    assert sweep(rx90, start, closed)[0] > 20  # it is a singularity that is crossed
+    largest, errors, statuses = sweep(rx90, start, numeric)
+    assert largest < 1 + 1e-9
+    assert max(errors) < 1e-5  # the rest of it goes slowly
+    assert {IkStatus.OK, IkStatus.WRIST_SINGULAR, IkStatus.SPEED_LIMIT} <= statuses
+    assert IkStatus.JOINT_LIMIT not in statuses
+
+
+def test_next_to_nothing_at_a_singularity_sets_nothing_in_motion(rx90):
+    """Joints 4 and 6 would turn far for 1e-7 rad."""
+    X, q = rx90.X_WS(STRETCHED), STRETCHED
+    turn = np.array([1.0, *(0.5e-7 * lost_axis(rx90, STRETCHED))])
+    pose = pose_of(RigidTransform(quaternion(turn) @ X.rotation(), X.translation()))
+    for _ in range(200):
+        q, _ = follow(rx90, pose, q, max_step=rx90.arm.velocity_limit * PERIOD)
+    assert np.abs(q - STRETCHED).max() < 2e-3
+
+
+@pytest.mark.parametrize(("max_step", "pull"), [(0.01, 0.02), (1e-3, 1.0)])
+def test_what_is_left_over_goes_to_the_posture(seven, max_step, pull):
+    """Away along what the pose leaves open, and back, while the pose is met."""
+    home, J = np.full(7, 0.4), np.empty((6, 7))
+    jacobian(seven.arm.table, home, J)
+    pose, q, away = seven.pose(home), home, []
+    for posture in (home + np.linalg.svd(J)[2][6], home):
+        for _ in range(1000):
+            q, status = follow(seven, pose, q, max_step=max_step, posture=posture, pull=pull)
+            assert status == IkStatus.OK
+        assert max(seven.errors(pose, q)) < 2 * MET
+        away.append(np.abs(q - home).max())
+    assert away[0] > 0.1 and away[1] < 1e-3
+
+
+def test_the_posture_does_not_shake_an_arm_that_cannot_reach(sliding):
+    home = np.array([0.2, 0.6, -0.4, 0.3, 0.9, -0.5, 0.4])
+    pose, q, moved = sliding.pose(home), home, 0.0
+    pose[4:] += [-3.0, 1.0, 2.0]
+    for k in range(1500):
+        before = q
+        q, status = follow(sliding, pose, q, max_step=0.01, posture=home, pull=1e-3)
+        moved += np.abs(q - before).max() if k >= 1000 else 0.0
+    assert status in (IkStatus.OUT_OF_REACH, IkStatus.JOINT_LIMIT)
+    assert moved < 1e-3
+
+
+def test_out_of_reach_it_comes_near_stands_still_and_comes_back(rx90):
+    start, max_step = BENT, rx90.arm.velocity_limit * PERIOD
+    pose = rx90.pose(start)
+    far = pose.copy()
+    far[4:] *= 3.0
+    q = start
+    for _ in range(3000):
+        before = q
+        q, status = follow(rx90, far, q, max_step=max_step)
+    assert status == IkStatus.OUT_OF_REACH
+    np.testing.assert_allclose(q, before, atol=1e-9)
+    assert abs(q[2]) < 1e-3  # the elbow is straight
+    for _ in range(3000):
+        q, status = follow(rx90, pose, q, max_step=max_step)
+    assert status == IkStatus.OK
+    np.testing.assert_allclose(q, start, atol=1e-8)
+
+
+def test_at_a_limit_the_others_do_what_they_can(rx90):
+    beyond = BENT.copy()
+    beyond[0] = rx90.arm.upper[0] + 0.2
+    pose, start = rx90.pose(beyond), BENT.copy()
+    start[0] = rx90.arm.upper[0] - 0.1
+    q, status = follow(rx90, pose, start)
+    assert status == IkStatus.JOINT_LIMIT
+    assert q[0] == rx90.arm.upper[0]
+    only_this_joint = np.append(q[0], beyond[1:])
+    L = turn_length(rx90.arm)
+    ours, simply = (np.hypot(p, L * turn) for p, turn in (
+        rx90.errors(pose, q), rx90.errors(pose, only_this_joint)))  # fmt: skip
+    assert ours < 0.8 * simply
+
+
+def test_faster_than_allowed_it_lags(sliding):
+    max_step = np.full(7, 1e-3)
+    start = np.full(7, 0.4)
+    q, status = follow(sliding, sliding.pose(start + 0.1), start, max_step=max_step)
+    assert status == IkStatus.SPEED_LIMIT
+    assert np.abs(q - start).max() == pytest.approx(1e-3, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"), [(0, np.nan), (5, np.inf), (5, 2e6), (slice(0, 4), 0.0)]
+)
+def test_what_is_no_pose_is_held_out(rx90, place, value):
+    pose = rx90.pose(BENT)
+    pose[place] = value
+    q, status = follow(rx90, pose, [BENT[0], 9.0, *BENT[2:]])
+    assert status == IkStatus.BAD_POSE
+    np.testing.assert_array_equal(q, [BENT[0], rx90.arm.upper[1], *BENT[2:]])
+    assert find_posture(rx90.arm, pose, BENT)[1] == IkStatus.BAD_POSE
+
+
+def test_from_nowhere_it_goes_nowhere(rx90):
+    q, status = follow(rx90, rx90.pose(BENT), np.full(6, np.nan))
+    assert status == IkStatus.BAD_POSE and np.isnan(q).all()
+
+
+def test_what_cannot_be_met_says_so(rx90):
+    pose = rx90.pose(BENT)
+    pose[4:] *= 3.0
+    assert find_posture(rx90.arm, pose, BENT)[1] in (IkStatus.OUT_OF_REACH, IkStatus.JOINT_LIMIT)
+
+
+def test_the_system_goes_on_from_its_last_command(rx90):
+    system = NumericInverseKinematics(rx90.arm, BENT, PERIOD)
+    context = system.CreateDefaultContext()
+    system.GetInputPort("joint_position").FixValue(context, BENT - 0.02)
+    goal = BENT + 0.01
+    system.GetInputPort("pose_command").FixValue(context, rx90.pose(goal))
+    command, status = (system.GetOutputPort(name) for name in ("joint_command", "ik_status"))
+    q = BENT
+    for k in range(40):
+        context.SetTime(k * PERIOD)
+        before, q = q, command.Eval(context).copy()
+        assert np.all(np.abs(q - before) <= rx90.arm.velocity_limit * PERIOD * (1 + 1e-9))
+        state = system.EvalUniquePeriodicDiscreteUpdate(context)
+        context.SetDiscreteState(state)
+        # Once taken, the command stays what it was.
+        np.testing.assert_array_equal(command.Eval(context), q)
+    np.testing.assert_allclose(q, goal, atol=1e-9)
+    system.GetInputPort("joint_position").FixValue(context, np.full(6, np.nan))
+    system.GetInputPort("pose_command").FixValue(context, rx90.pose(BENT))
+    context.SetTime(1.0)
+    np.testing.assert_array_equal(command.Eval(context), q)
+    assert status.Eval(context) == [IkStatus.BAD_POSE]
+    # From ports and states as from arrays: nothing is compiled for them alone.
+    assert len(follow_pose.signatures) == 1
+
+
+def test_methods_have_the_same_ports(rx90):
+    systems = [make(rx90.arm, BENT, PERIOD) for make in METHODS.values()]
+    assert {type(system) for system in systems} == {InverseKinematics, NumericInverseKinematics}
+    for ports in ("input", "output"):
+        names = [
+            [
+                (port.get_name(), port.size())
+                for k in range(getattr(system, f"num_{ports}_ports")())
+                for port in [getattr(system, f"get_{ports}_port")(k)]
+            ]
+            for system in systems
+        ]
+        assert names[0] == names[1]
+
+
+def test_in_the_station_both_lead_to_the_same(rx90):
+    scenario = LoadScenario("free_motion_force")
+    scenario = replace(scenario, simulation__duration=0.04, load_estimator__enabled=True)
+    commands = [
+        simulate(MakeTeleopStation(s), s.simulation)["joint_command"]
+        for s in (replace(scenario, slave__inverse_kinematics=method) for method in METHODS)
+    ]
+    assert np.ptp(commands[0], axis=0).max() > 1e-3
+    np.testing.assert_allclose(commands[1], commands[0], atol=1e-8)
