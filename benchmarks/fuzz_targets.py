@@ -28,7 +28,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_teleop import cli
 from drake_teleop.channel import network
 from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
-from drake_teleop.excitation.models import ParseModel, drakes_errors_said
 from drake_teleop.excitation.robot import RobotFromModel
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -44,6 +43,7 @@ from drake_teleop.result import Signal, SimulationResult
 from drake_teleop.scenario import LoadScenario, ScenarioFromData
 from drake_teleop.scenario_reference import commented
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
+from drake_teleop.slave.models import ParseModel, drakes_errors_said
 from drake_teleop.studies import study
 from drake_teleop.texts import read_json, yaml_data
 

@@ -37,10 +37,10 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.excitation.models import ParseModel
 from drake_teleop.slave.arm import ArmModel, forward_kinematics, jacobian
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.inverse_kinematics import IkStatus, InverseKinematics, solve_pose_command
+from drake_teleop.slave.models import ParseModel
 from drake_teleop.slave.numeric_inverse_kinematics import (
     SINGULAR,
     STEPS,

@@ -62,7 +62,7 @@ WRITING = {
     # What is kept for the next time, whole or not at all; and a temporary folder.
     ("_compiled.py", ".touch"), ("_compiled.py", ".write_bytes"), ("_compiled.py", "os.replace"),
     ("identified_load.py", 'open("wb'), ("identified_load.py", "np.savez"),
-    ("excitation/models.py", ".write_text"),
+    ("slave/meshes.py", ".write_text"),
     # A mark of one byte more.
     ("studies/store.py", 'open("ab'),
     # Functions of the package that write by `writing.py`.

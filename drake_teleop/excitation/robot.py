@@ -7,12 +7,11 @@ What a model lacks is assumed, and every assumption is named.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex
@@ -21,7 +20,6 @@ from pydrake.systems.framework import Diagram
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.criteria import Scales, characteristic_length
 from drake_teleop.excitation.limits import Limits
-from drake_teleop.excitation.models import ParseModel, drakes_errors_said
 from drake_teleop.excitation.prediction import SensorNoise, sensor_noise
 from drake_teleop.excitation.scene import CLEARANCE, Parse, Scene
 from drake_teleop.load.arrays import Array
@@ -31,6 +29,8 @@ from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.slave.arm import SLIDES, ArmModel
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.slave.assumed_limits import with_all_limits
+from drake_teleop.slave.models import ParseModel, drakes_errors_said
 from drake_teleop.slave.payload import AddPayload
 from drake_teleop.slave.plant import AddEnvironment, ParseSlave, finalize, home_position
 
@@ -45,8 +45,6 @@ _LOAD_FACTOR = 1.3
 _PAYLOAD_COM, _PAYLOAD_GYRATION = 0.08, 0.05
 _PAYLOAD = 2.0
 _LEAST_PAYLOAD, _MOST_PAYLOAD = 1e-3, 1e4
-# What a model without limits gets: range [rad], speed [rad/s], time to full speed [s].
-_RANGE, _SPEED, _TIME_TO_SPEED = np.pi, np.pi, 0.4
 
 # The station's wrist centre and ball tip, and where both may be: in front of the arm, above the
 # table.
@@ -146,15 +144,11 @@ def RobotFromModel(
     Raises:
         DrakeTeleopError: if the model cannot be read or is no such arm.
     """
-    efforts: dict[str, float] = {}
-    lost: dict[str, list[str]] = {}
     lacking: list[str] = []
     folders: list[TemporaryDirectory[str]] = []
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
-        efforts.update(model.efforts)
-        lost.update(model.lost)
         lacking[:] = model.assumptions
         folders.append(model.folder)
         return model.instance, model.sensor_frame
@@ -190,11 +184,10 @@ def RobotFromModel(
         reserve = _payload(mass - load[0])
     with drakes_errors_said(path):
         scene = Scene(parse, reserve, visuals_count=False, where=str(path))
-    assumptions += [
-        f"shapes are missing of {', '.join(links)}: {what}" for what, links in lost.items()
-    ]
     assumptions += lacking
-    scene.arm, completed = _completed(scene.arm, efforts, acceleration, str(path))
+    scene.arm, completed = with_all_limits(
+        scene.arm, str(path), acceleration, hint=" (--acceleration)"
+    )
     return _robot(
         scene,
         path.name,
@@ -283,63 +276,3 @@ def _payload(mass: float) -> Array:
     """(10,) phi of a compact load."""
     com = np.array([0.0, 0.0, _PAYLOAD_COM])
     return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION**2 * np.eye(3) * 2 / 3)
-
-
-def _completed(
-    arm: ArmModel, efforts: dict[str, float], acceleration: tuple[float, ...], where: str
-) -> tuple[ArmModel, list[str]]:
-    """The arm with a limit for everything, and what was assumed for it."""
-    n, assumptions = arm.num_joints, []
-    # From 0 to 0 is what exporters write when they do not know.
-    endless = ~(np.isfinite(arm.lower) & np.isfinite(arm.upper)) | (
-        (arm.lower == 0) & (arm.upper == 0)
-    )
-    stuck = ~endless & (arm.lower == arm.upper)
-    if stuck.any():
-        raise DrakeTeleopError(
-            f"{np.array(arm.joint_names)[stuck][0]} cannot move: both of its limits are "
-            f"{arm.lower[stuck][0]:g} rad",
-            where=where,
-            remedy="correct the limits, or make the joint a fixed one",
-        )
-    lower, upper = np.where(endless, -_RANGE, arm.lower), np.where(endless, _RANGE, arm.upper)
-    velocity = np.where(_given(arm.velocity_limit), arm.velocity_limit, _SPEED)
-    effort = np.array([efforts.get(name, np.inf) for name in arm.joint_names])
-    effort = np.where(_given(arm.effort_limit), arm.effort_limit, effort)
-    effort = np.where(_given(effort), effort, np.inf)
-    own = arm.acceleration_limit
-    if acceleration:
-        if len(acceleration) not in (1, n):
-            raise DrakeTeleopError(
-                f"{len(acceleration)} acceleration limits for {n} joints",
-                where=where,
-                remedy="give one for all joints or one for each",
-            )
-        own = np.broadcast_to(np.array(acceleration), n).copy()
-    chosen = np.where(_given(own), own, velocity / _TIME_TO_SPEED)
-    for missing, words in (
-        (endless, f"a range of +-{_RANGE:.4g} rad"),
-        (~_given(arm.velocity_limit), f"a speed limit of {_SPEED:.4g} rad/s"),
-        (
-            ~_given(own),
-            f"acceleration limits that reach full speed in {_TIME_TO_SPEED:g} s (--acceleration)",
-        ),
-        (~np.isfinite(effort), "no torque limit"),
-    ):
-        if missing.any():
-            names = ", ".join(np.array(arm.joint_names)[missing])
-            assumptions.append(f"{words} for {'all joints' if missing.all() else names}")
-    completed = replace(
-        arm,
-        lower=lower,
-        upper=upper,
-        velocity_limit=velocity,
-        acceleration_limit=chosen,
-        effort_limit=effort,
-    )
-    return completed, assumptions
-
-
-def _given(limits: Array) -> NDArray[np.bool_]:
-    """Which limits are limits; a zero is what exporters write when they do not know."""
-    return np.isfinite(limits) & (limits > 0)

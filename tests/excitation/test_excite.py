@@ -18,7 +18,6 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation.check import check, check_motion
 from drake_teleop.excitation.excite import excite, sensor_motion
 from drake_teleop.excitation.limits import LIMITS, empty_motions, motions_of, sensor_vectors
-from drake_teleop.excitation.models import ParseModel
 from drake_teleop.excitation.motion_film import write_motion_film
 from drake_teleop.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
@@ -45,6 +44,7 @@ from drake_teleop.sensor.sensor_chain import (
     without,
 )
 from drake_teleop.slave.arm import forward_kinematics
+from drake_teleop.slave.models import ParseModel
 
 
 @pytest.fixture(scope="module")
@@ -464,7 +464,7 @@ def test_a_package_may_have_the_name_of_drakes_own(tmp_path):
     text = _LINKS.replace("/>", f"><collision name='c'>{shape}</collision></link>", 1)
     model = tmp_path / "model.sdf"
     model.write_text(_SDF.format(text))
-    assert ParseModel(MultibodyPlant(0.0), model, "a").lost == {}
+    assert ParseModel(MultibodyPlant(0.0), model, "a").assumptions == []
 
 
 def test_a_floor_without_end_is_kept_clear_of(tmp_path):

@@ -1,0 +1,391 @@
+"""Reading robot models as they are found: meshes missing, base hanging free, packages elsewhere."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple, NoReturn
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    Frame,
+    Joint,
+    JointIndex,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+    WeldJoint,
+)
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.silence import silent_stderr
+from drake_teleop.slave.meshes import Packages, without_lost_meshes
+from drake_teleop.slave.model_check import WORLD, check_model, check_tree
+from drake_teleop.texts import read_text, read_yaml
+
+
+@dataclass(frozen=True)
+class ParsedModel:
+    """What `ParseModel` found.
+
+    Attributes:
+        instance: the arm's, of the joints from the world to S.
+        sensor_frame: S.
+        assumptions: on what is missing, and what is held.
+        folder: of converted meshes; Drake reads them when it needs them.
+    """
+
+    instance: ModelInstanceIndex
+    sensor_frame: Frame
+    assumptions: list[str]
+    folder: TemporaryDirectory[str]
+
+
+@dataclass(frozen=True)
+class ParsedTool:
+    """What `ParseTool` found: as of `ParsedModel`, and the body on the sensor frame."""
+
+    body: RigidBody
+    assumptions: list[str]
+    folder: TemporaryDirectory[str]
+
+
+def ParseModel(
+    plant: MultibodyPlant,
+    path: Path,
+    sensor_frame: str,
+    package_paths: tuple[Path, ...] = (),
+    X_WBase: RigidTransform | None = None,
+) -> ParsedModel:
+    """Parses the model of an arm, so that nothing of it moves but the joints that lead to S.
+
+    A base that hangs on nothing is welded to the world, and joints beside the way from there to S,
+    such as a gripper's, where they are by default. Each joint on the way has one actuator.
+
+    Args:
+        plant: not finalized.
+        path: a URDF or SDF, or anything else that Drake reads by its suffix.
+        sensor_frame: name of the frame or link at which the sensor measures.
+        package_paths: folders in which `package://` addresses are looked up.
+        X_WBase: where the base is welded to the world.
+
+    Raises:
+        DrakeTeleopError: if the file cannot be read, has no such frame, says what cannot be true of
+            an arm, see `check_model`, or fastens the base elsewhere than at `X_WBase`.
+    """
+    before = set(plant.GetJointIndices())
+    read = _read(plant, path, package_paths)
+    having = [i for i in read.instances if plant.HasFrameNamed(sensor_frame, i)]
+    if len(having) != 1:
+        frames = [
+            plant.get_frame(index).name()
+            for instance in read.instances
+            for index in plant.GetFrameIndices(instance)
+        ]
+        # Drake's own, of joints.
+        frames = [name for name in frames if not name.endswith(("_parent", "_child", "__model__"))]
+        raise DrakeTeleopError(
+            f"{len(having) or 'no'} frames are named {sensor_frame!r}",
+            where=str(path),
+            remedy=f"name one of {', '.join(sorted(set(frames)))}",
+        )
+    frame = plant.GetFrameByName(sensor_frame, having[0])
+    chain = _weld_base(plant, frame, _peculiar_joints(read.root), X_WBase, str(path))
+    with drakes_errors_said(path):
+        held = _hold_others(plant, before, chain)
+        _actuate(plant, chain, _efforts(read.root))
+    # Of a chain that is none, `ArmModelFromPlant` tells.
+    instances = {plant.get_joint(k).model_instance() for k in chain if _moves(plant, k)}
+    if len(instances) > 1:
+        names = sorted(map(plant.GetModelInstanceName, instances))
+        raise DrakeTeleopError(
+            f"its joints belong to several models, {', '.join(names)}",
+            where=str(path),
+            remedy="write the chain up to the sensor as one model",
+        )
+    instance = next(iter(instances), having[0])
+    return ParsedModel(instance, frame, [*read.assumptions, *held], read.folder)
+
+
+def ParseTool(
+    plant: MultibodyPlant, path: Path, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
+) -> ParsedTool:
+    """Parses what hangs on the sensor: its root is welded to S by the joint "sensor_weld".
+
+    Joints inside it are held where they are by default.
+
+    Args:
+        plant: not finalized, with the arm.
+        path: as for `ParseModel`.
+        sensor_frame: S.
+        package_paths: as for `ParseModel`.
+
+    Raises:
+        DrakeTeleopError: if the file cannot be read, or holds several things that do not hang on
+            each other.
+    """
+    before = set(plant.GetJointIndices())
+    read = _read(plant, path, package_paths)
+    held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
+    bodies = [index for instance in read.instances for index in plant.GetBodyIndices(instance)]
+    roots = [plant.get_body(index) for index in bodies if index not in held]
+    if len(roots) != 1:
+        names = ", ".join(body.name() for body in roots)
+        raise DrakeTeleopError(
+            f"{names or 'nothing'} can be put on the sensor",
+            where=str(path),
+            remedy="a tool is one tree of links, whose root is put on the sensor frame",
+        )
+    with drakes_errors_said(path):
+        assumptions = [*read.assumptions, *_hold_others(plant, before, [])]
+    weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
+    plant.AddJoint(weld)
+    return ParsedTool(roots[0], assumptions, read.folder)
+
+
+class _Read(NamedTuple):
+    """What stands in a file; the XML's root, if it is a URDF or SDF."""
+
+    instances: list[ModelInstanceIndex]
+    root: ElementTree.Element | None
+    assumptions: list[str]
+    folder: TemporaryDirectory[str]
+
+
+def _read(plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...]) -> _Read:
+    if not os.path.isfile(path):
+        raise DrakeTeleopError("there is no such file", where=str(path))
+    packages = Packages(path, package_paths)
+    parser = Parser(plant)
+    parser.SetAutoRenaming(True)
+    for name, folder in packages.found.items():
+        if parser.package_map().Contains(name):  # Drake's own, which theirs takes the place of
+            parser.package_map().Remove(name)
+        parser.package_map().Add(name, str(folder))
+    kind = path.suffix.lower().removeprefix(".")
+    assumptions: list[str] = []
+    converted = TemporaryDirectory(prefix="drake_teleop_")
+    root = _xml(path) if kind in ("urdf", "sdf") else None
+    if kind == "yaml":
+        read_yaml(path, tagged=True)  # Drake's parser overflows its stack over many brackets
+    elif kind == "xml":
+        read_text(path)  # or names cannot be said
+    with drakes_errors_said(path):
+        if root is None:
+            with _drakes_errors_raised():
+                instances = parser.AddModels(str(path))
+        else:
+            inertias = check_model(root, str(path))
+            lost = without_lost_meshes(root, packages, Path(converted.name))
+            assumptions = [
+                f"shapes are missing of {', '.join(links)}: {what}" for what, links in lost.items()
+            ]
+            assumptions += inertias
+            text = ElementTree.tostring(root, encoding="unicode")
+            with _drakes_errors_raised():
+                instances = parser.AddModelsFromString(text, kind)
+    return _Read(instances, root, assumptions, converted)
+
+
+def _moves(plant: MultibodyPlant, index: JointIndex) -> bool:
+    return plant.get_joint(index).num_velocities() > 0
+
+
+def _hold_others(
+    plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
+) -> list[str]:
+    """Welds what moves and is not on the chain, where it is by default; says so."""
+    names = []
+    for index in set(plant.GetJointIndices()) - before - set(chain):
+        if not _moves(plant, index):
+            continue
+        joint = plant.get_joint(index)
+        name, ends = joint.name(), (joint.frame_on_parent(), joint.frame_on_child())
+        X_FM = _default_pose(joint)
+        for k in plant.GetJointActuatorIndices():
+            if plant.get_joint_actuator(k).joint().index() == index:
+                plant.RemoveJointActuator(plant.get_joint_actuator(k))
+        plant.RemoveJoint(joint)
+        plant.AddJoint(WeldJoint(f"{name}_held", *ends, X_FM))
+        names.append(name)
+    return [f"held: {', '.join(sorted(names))}"] if names else []
+
+
+def _default_pose(joint: Joint) -> RigidTransform:
+    """X_FM where the joint is by default; Drake has it for few kinds."""
+    q = joint.default_positions()
+    if isinstance(joint, RevoluteJoint):
+        return RigidTransform(AngleAxis(q[0], joint.revolute_axis()), np.zeros(3))
+    if isinstance(joint, PrismaticJoint):
+        return RigidTransform(q[0] * joint.translation_axis())
+    return joint.GetDefaultPose() if np.any(q) else RigidTransform()
+
+
+def _actuate(plant: MultibodyPlant, chain: list[JointIndex], efforts: dict[str, float]) -> None:
+    """One actuator for each moving joint of the chain, in its order, as a state has them."""
+    moving = [index for index in chain if _moves(plant, index)]
+    actuators = [plant.get_joint_actuator(k) for k in plant.GetJointActuatorIndices()]
+    own = [each for each in actuators if each.joint().index() in chain]
+    if [each.joint().index() for each in own] == moving:
+        return
+    known = {
+        each.joint().index(): (
+            each.effort_limit(),
+            each.default_rotor_inertia(),
+            each.default_gear_ratio(),
+        )
+        for each in own
+    }
+    for each in own:
+        plant.RemoveJointActuator(each)
+    for index in moving:
+        joint = plant.get_joint(index)
+        effort, rotor, gear = known.get(index, (efforts.get(joint.name(), 0.0), 0.0, 1.0))
+        effort = effort if effort > 0.0 else np.inf
+        actuator = plant.AddJointActuator(joint.name(), joint, effort)
+        actuator.set_default_rotor_inertia(rotor)
+        actuator.set_default_gear_ratio(gear)
+
+
+@contextmanager
+def drakes_errors_said(path: Path) -> Iterator[None]:
+    """Makes one error, with the file, of what Drake raises over a model: at parsing or later."""
+    try:
+        yield
+    except DrakeTeleopError:
+        raise
+    # SystemExit: a condition of Drake's; LookupError: of the containers of C++.
+    except (RuntimeError, SystemExit, ValueError, LookupError) as error:
+        reason = str(error).replace("<literal-string>", "")
+        raise DrakeTeleopError(
+            f"cannot be read as a robot ({reason.strip()})",
+            where=str(path),
+            remedy="give a URDF, SDF, MJCF or .dmd.yaml model, with --package-path for package://",
+        ) from None
+
+
+@contextmanager
+def _drakes_errors_raised() -> Iterator[None]:
+    """Raises RuntimeError for an error that Drake only logs, going on without what it cannot read.
+
+    Its warnings are of elements that it does not know; they are not said.
+    """
+    errors: list[str] = []
+
+    def keep(record: logging.LogRecord) -> bool:
+        if record.levelno >= logging.ERROR:
+            errors.append(record.getMessage())
+        return False
+
+    log = logging.getLogger("drake")
+    log.addFilter(keep)
+    try:
+        with silent_stderr():  # where the parsers below it write some more
+            yield
+    finally:
+        log.removeFilter(keep)
+    if errors:
+        raise RuntimeError(errors[0])
+
+
+def _xml(path: Path) -> ElementTree.Element:
+    """The root of an XML file, with names as they stand there: Drake knows its own by `drake:`.
+
+    Drake's parser reads what is no XML too. That would be checked by nobody, so it is an error.
+    """
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.CharacterDataHandler = builder.data
+
+    def unread(name: str | None, *_: object) -> NoReturn:
+        raise ValueError(f"the entity {name} is not in this file")
+
+    parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = unread
+    try:
+        parser.Parse(path.read_bytes(), True)
+        return builder.close()
+    except (expat.ExpatError, ValueError, LookupError) as error:  # the last two of its encoding
+        remedy = "give a URDF or SDF that other readers of XML take too"
+        raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
+
+
+def _weld_base(
+    plant: MultibodyPlant,
+    frame: Frame,
+    peculiar: dict[str, str],
+    X_WBase: RigidTransform | None,
+    where: str,
+) -> list[JointIndex]:
+    """Welds the base to the world if it hangs on nothing; returns the joints to S, outwards."""
+
+    def name_of(body: RigidBody) -> str:
+        is_world = body.index() == plant.world_body().index()
+        return WORLD if is_world else body.scoped_name().get_full()
+
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    # Once more, because `check_model` looks neither into other files nor beyond URDF and SDF.
+    check_tree(
+        ((each.name(), name_of(each.parent_body()), name_of(each.child_body())) for each in joints),
+        where,
+    )
+    inboard = {joint.child_body().index(): joint for joint in joints}
+    body, chain = frame.body(), list[Joint]()
+    while body.index() in inboard:
+        chain.append(inboard[body.index()])
+        body = inboard[body.index()].parent_body()
+    for name in (*(joint.name() for joint in chain), body.name()):
+        if name in peculiar:
+            raise DrakeTeleopError(
+                f"{name} {peculiar[name]}",
+                where=where,
+                remedy="the arm up to the sensor has to be a chain of independent revolute joints",
+            )
+    if body.index() != plant.world_body().index():
+        X_WB = RigidTransform() if X_WBase is None else X_WBase
+        plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WB)
+    elif X_WBase is not None and not X_WBase.IsExactlyIdentity():
+        raise DrakeTeleopError(
+            f"the model fastens {chain[-1].child_body().name()} to the world itself",
+            where=where,
+            remedy="leave the base pose out, or take that joint out of the model",
+        )
+    return [joint.index() for joint in reversed(chain)]
+
+
+def _peculiar_joints(root: ElementTree.Element | None) -> dict[str, str]:
+    """Joints that move with another one, and links that float on another link: Drake ignores both.
+
+    By the name of joint or link, what it does.
+    """
+    found: dict[str, str] = {}
+    for joint in () if root is None else root.iter("joint"):
+        if joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
+            found[joint.get("name", "")] = "moves with another joint (mimic)"
+        for parent, child in zip(joint.findall("parent"), joint.findall("child"), strict=False):
+            if joint.get("type") == "floating" and parent.get("link") != "world":
+                found[child.get("link", "")] = f"floats on {parent.get('link')}"
+    return found
+
+
+def _efforts(root: ElementTree.Element | None) -> dict[str, float]:
+    """Torque limits of URDF joints, which Drake drops where there is no transmission."""
+    if root is None:
+        return {}
+    limits = ((joint.get("name"), joint.find("limit")) for joint in root.findall("joint"))
+    return {
+        name: float(limit.get("effort", "0"))
+        for name, limit in limits
+        if name is not None and limit is not None
+    }
