@@ -464,7 +464,8 @@ def test_a_package_may_have_the_name_of_drakes_own(tmp_path):
     text = _LINKS.replace("/>", f"><collision name='c'>{shape}</collision></link>", 1)
     model = tmp_path / "model.sdf"
     model.write_text(_SDF.format(text))
-    assert ParseModel(MultibodyPlant(0.0), model, "a").assumptions == []
+    found = ParseModel(MultibodyPlant(0.0), model, "a")
+    assert not any("shapes" in words for words in found.assumptions)
 
 
 def test_a_floor_without_end_is_kept_clear_of(tmp_path):
