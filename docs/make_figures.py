@@ -12,13 +12,16 @@ from __future__ import annotations
 import shutil
 import subprocess
 import tempfile
+from base64 import b64decode
 from itertools import pairwise
 from pathlib import Path
 
 import matplotlib as mpl
+import nbformat
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyBboxPatch
+from nbclient import NotebookClient
 from scipy.signal import welch
 
 from drake_teleop.excitation.command import excite_command
@@ -47,6 +50,7 @@ from drake_teleop.sensor.sensor_noise import (
 )
 
 FIGURES = Path(__file__).parent / "figures"
+NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
 # Inches: columns from the operator to the slave, rows for motion, force and what serves them.
 COLUMNS = (0.72, 2.2, 3.68, 5.16, 6.64, 8.12, 9.82)
@@ -262,8 +266,22 @@ def film_picture(film: Path, time: float, target: Path) -> None:
     )  # fmt: skip
 
 
+def notebook_picture(name: str, cell: int, target: Path) -> None:
+    """The picture that a cell of an executed notebook shows."""
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    NotebookClient(notebook, resources={"metadata": {"path": str(NOTEBOOKS)}}).execute()
+    (picture,) = (
+        output.data["image/png"]
+        for output in notebook.cells[cell].outputs
+        if "image/png" in output.get("data", {})
+    )
+    target.write_bytes(b64decode(picture))
+
+
 def main() -> None:
     FIGURES.mkdir(exist_ok=True)
+    notebook_picture("02_delay_and_passivity", 3, FIGURES / "round_trips.png")
+    notebook_picture("03_stability_and_transparency", 15, FIGURES / "stability_map.png")
     # Without date and random ids, so that the same script draws the same file.
     with mpl.rc_context({"svg.hashsalt": "drake_teleop"}):
         station_figure().savefig(FIGURES / "station.svg", metadata={"Date": None})

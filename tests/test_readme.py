@@ -54,7 +54,7 @@ def test_ci_runs_the_readmes_test_commands(tmp_path):
     fake.mkdir()
     (fake / "python3").write_text(
         f"#!/bin/sh\necho python3 $*\nmkdir -p {programs}\n"
-        "for name in pip pytest python; do\n"
+        "for name in pip pytest python sphinx-build; do\n"
         f"printf '#!/bin/sh\\necho '$name' $*\\n' > {programs}/$name\n"
         f"chmod +x {programs}/$name; done\n"
     )
@@ -71,7 +71,8 @@ def test_ci_runs_the_readmes_test_commands(tmp_path):
     assert answer.stderr == commands + "\n"  # as it says what it runs
     assert answer.stdout.splitlines() == [
         "python3 -m venv .venv-test",
-        "pip install -q -e .[test]",
+        "pip install -q -e .[test,docs]",
         "pytest -n 2 --dist worksteal",
         "python benchmarks/fuzz.py --seconds 60 --seed 1",
+        "sphinx-build -q -W --keep-going docs out/site",
     ]

@@ -1,7 +1,7 @@
 """Which method for which network, in a word: a cell of the decision table for each.
 
 The first of these that is so, of the whole station before all leaves, and for energy of the hands
-(`hands`) as well:
+(`hands`) as well::
 
     unstable      it does not come to rest, or the run ended early
     left behind   the slave is more than 5 mm from the master 2 s after contact

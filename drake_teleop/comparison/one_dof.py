@@ -2,7 +2,7 @@
 
 Hand and device are one mass on the hand's spring and damper, the slave is a mass behind a position
 servo, the environment a stiff wall. Between them is the station's own channel,
-`drake_teleop.channel.channel.channel_step`, with motion along x alone:
+`drake_teleop.channel.channel.channel_step`, with motion along x alone::
 
     (m_h + m_m) a = K_h (x_i - x) + B_h (v_i - v) - f_c tanh(v / v_c) + f    hand and device
     m_s a_s = K (x_cmd - x_s) - D v_s + f_w                                  slave and its servo,
@@ -16,7 +16,7 @@ or does as he is told; grip, wall and network may change on the way.
 
 Four accounts are kept of what goes into the station between hand and environment, in the master's
 power units, positive inwards [J]. What comes out of a passive one never exceeds what its stores
-held at the start: the hand's account plus any one of the others never falls below -E_0 then.
+held at the start: the hand's account plus any one of the others never falls below -E_0 then::
 
     hand      -sum f_(k-1) (x_k - x_(k-1))      the held force, exact
     command    sum w_k (c_k - c_(k-1))          the wrench f_e that is sent, along the command; no

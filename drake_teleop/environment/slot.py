@@ -1,6 +1,6 @@
 r"""A chamfered slot that the tool is put into as a peg: walls, chamfers, floor, nothing that moves.
 
-Seen along the slot, M being the middle of its mouth, z up:
+Seen along the slot, M being the middle of its mouth, z up::
 
     top                       top        2 sides of y_M, 3 boxes each, and the floor. A box is
     ------.       M       .------        convex and the contact of a ball with it is a spring; where

@@ -1,5 +1,6 @@
-"""Gradients of whatever depends on the motion of a serial arm's links: one sweep from the hand to
-the base, the adjoint of the forward recursion of `slave/arm.py`.
+"""Gradients of whatever depends on the motion of a serial arm's links, in one sweep.
+
+It goes from the hand to the base, as the adjoint of the forward recursion of `slave/arm.py`.
 
 A scalar J depends on each link's motion ``[s, omega, alpha, p, R]`` (world coordinates). Its
 derivatives with respect to them are the seeds; the one with respect to R is the vector g of
@@ -91,7 +92,7 @@ def seed_wrench(motion, phi, g_force, g_torque, seed):
 
 @njit(cache=True)
 def seed_joint_torque(table, motions, c, virtual, seeds):
-    """J is ``c . tau``, the joint torques without those of rotors and damping.
+    """J is c . tau, the joint torques without those of rotors and damping.
 
     Args:
         table: `ArmModel.table`.

@@ -15,11 +15,12 @@ and the slave hardly moves until the hand has gone about 0.1 m.
 ===================  ====================================  ========================================
 port                 promise                               assumption
 ===================  ====================================  ========================================
-hand (held), slave's E_act >= -E_0, whatever network,      the slave has at most the mass that was
-actual motion        hand and environment do               told; K and D of its servo are within
+hand (held), actual  E_act >= -E_0, whatever network,      the slave has at most the mass that was
+motion of the slave  hand and environment do               told; K and D of its servo are within
                                                            20 %; w is the wrench at the contact; a
                                                            step each millisecond
-hand, slave's motors E_mot >= -E_0 - friction's work       the same
+hand, motors of the  E_mot >= -E_0 - friction's work       the same
+slave
 hand, command        none: it lies beyond the servo's
                      spring, and means no energy
 hand alone           let go, it gets no more than          the device displays what it is told
@@ -37,9 +38,9 @@ if k_c exceeds half of the wall's stiffness.
 
 At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
 
-M1. L_m -= f_(k-1) . dx; below zero it is a debt, never written off. While something is touched,
+:M1: L_m -= f_(k-1) . dx; below zero it is a debt, never written off. While something is touched,
     what the hand pays is sent instead: the slave presses with it. L_m += what came.
-M2. What is touched pushes along one unit wrench n, the mean of w over two round trips and 3 s
+:M2: What is touched pushes along one unit wrench n, the mean of w over two round trips and 3 s
     at least: force and torque together, so that a point that is touched far from So is one spring
     and not two. With w_n = w . n and x_n = n . x, where a torque counts as a force at 0.1 m,
 
@@ -57,16 +58,16 @@ M2. What is touched pushes along one unit wrench n, the mean of w over two round
     tau thirty round trips, but 0.6 s at least. Both means are so slow because what they pass on of
     the slave's friction, a round trip late, moves the hand, and that turns the friction round: with
     0.8 s and ten round trips the tip stuck and slipped on for good over 100 ms.
-M3. The wall is remembered, so that fast taps are felt: while nothing else is heard,
+:M3: The wall is remembered, so that fast taps are felt: while nothing else is heard,
     u_n = -k_c (x_m - x_w)_n. It is dropped when the slave was so deep in it that it should
     have met 1 N, 1 to 3 mm, and met nothing: a hard wall that has gone stops the hand before 3 mm.
-M4. A hand that moves fast along u, as one that has let go, is pushed less: module `retreat`,
+:M4: A hand that moves fast along u, as one that has let go, is pushed less: module `retreat`,
     after M6. The next step counts what was held.
-M5. u may spend a share of L_m; what was shortened comes back in 20 ms. With L_m at its end there is
-    a force only at steps in which the hand is seen to move against it, likewise for M6: a reversal
-    is seen late, by a step of the encoder at least, and nothing could pay for it.
-M6. Drag on the hand until both reserves are full, and on one that was pushed, while it is fast.
-M7. What L_m has beyond its reserve R_m (in contact R_m + 0.7 R_s) is sent.
+:M5: u may spend a share of L_m; what was shortened comes back in 20 ms. With L_m at its end there
+    is a force only at steps in which the hand is seen to move against it, likewise for M6: a
+    reversal is seen late, by a step of the encoder at least, and nothing could pay for it.
+:M6: Drag on the hand until both reserves are full, and on one that was pushed, while it is fast.
+:M7: What L_m has beyond its reserve R_m (in contact R_m + 0.7 R_s) is sent.
 
 Translation and rotation are two groups with a ledger each; what is touched is one for both. Where
 packets were missing, or it has changed, the wrench goes over gradually. A wrench against n is

@@ -3,11 +3,11 @@
 At each step, w the contact's wrench, l what is felt of the load, x and v the slave's actual motion,
 m, K, D mass and servo as they are believed, all in the master's power units:
 
-S1. L_s += min((w + l)_k . dx, (w + l)_(k-1) . dx) + what came; likewise Q, from zero at each
+:S1: L_s += min((w + l)_k . dx, (w + l)_(k-1) . dx) + what came; likewise Q, from zero at each
     contact's onset; A = L_s - m v^2 / 2.
-S2. To the master goes what is above the reserve R_s, if it is short; in contact and nearly at rest
+:S2: To the master goes what is above the reserve R_s, if it is short; in contact and nearly at rest
     what is above 0.3 R_s, because pushing back takes energy then and moving does not.
-S3. The contact's direction n is the mean of w, as in M2; its stiffness k and damping b follow from
+:S3: The contact's direction n is the mean of w, as in M2; its stiffness k and damping b follow from
     w_n, way and speed along n, over the last 1 to 10 mm of way since the onset. Of k the slave
     shows the share rho = min(1, k_d / k), k_d = max(k_0, 2 c R_m / (v_p R)^2) with the largest
     round trip R: a hand goes v_p R deep before it feels anything, and R_m has to push it back. A
@@ -17,12 +17,13 @@ S3. The contact's direction n is the mean of w, as in M2; its stiffness k and da
     last one, so that a bounce does not stiffen the wall. Beyond the wall x_w the target is
     x_w + rho (x_received - x_w), along n. rho is left alone while it would change by less than a
     tenth: it moves the slave, and friction makes a new k of that.
-S4. The command follows the target with bounded acceleration, and m v^2 / 2 <= L_s.
-S5. Motors that push with the motion, f . v > 0, spend at most what A holds in 4 ms; pressing on the
-    wall what was paid since the onset, Q, and c F_u^2 / 2 k that nobody paid. With A at its end
+:S4: The command follows the target with bounded acceleration, and m v^2 / 2 <= L_s.
+:S5: Motors that push with the motion, f . v > 0, spend at most what A holds in 4 ms; pressing on
+    the wall what was paid since the onset, Q, and c F_u^2 / 2 k that nobody paid. With A at its end
     they brake. Standing still may always hold. It is done through the command, x + (f + D v) / K.
-S6. Sent: w, L_s, z and z' = the servo's model of the received pose, k_c = rho k / (1 + k / K) along
-    n, b, R; and l, smoothed over R and the servo's lag: inertia that is felt late drives a hand.
+:S6: Sent: w, L_s, z and z' = the servo's model of the received pose, k_c = rho k / (1 + k / K)
+    along n, b, R; and l, smoothed over R and the servo's lag: inertia that is felt late drives
+    a hand.
 """
 
 from __future__ import annotations

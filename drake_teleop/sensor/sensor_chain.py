@@ -1,7 +1,7 @@
 """The wrist sensor as a chain of small parts (long: their parameters beside what they do).
 
 The truth is rigid-body mechanics: the wrench that the sensor exerts on the tool, the motion of the
-sensor frame S, and the joints' angles. A reading is what the electronics put out. Between them:
+sensor frame S, and the joints' angles. A reading is what the electronics put out. Between them::
 
     wrench at So in S        -> calibration errors ----.
     motion of S -> moved to Ao, turned into A          |

@@ -101,7 +101,7 @@ class PairMeans:
     fields: tuple[str, str]
     names: tuple[list[str], list[str]]
     mean: Array
-    why: NDArray[np.str_]
+    why: NDArray[Any]
     compared: int
     left_out: int
     fitted: bool

@@ -29,7 +29,7 @@ effects.csv  of each level of each factor: its successful runs, mean of each mea
              over the seeds, and if the design is not factorial over the design; over how many
              combinations of the other factors' levels, how many were left out, and why a level has
              no value, see `effects.py`
-*.png        main_effects, interactions of two factors, and the front of effort against task time
+pictures     main_effects, interactions of two factors, and the front of effort against task time
              and overshoot of the contact force, as far as the study has what they show
 ============ =====================================================================================
 

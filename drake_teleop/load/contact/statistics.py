@@ -1,4 +1,4 @@
-"""What tells contact in the eliminated wrench, sample by sample, each compared with a threshold:
+"""What tells contact in the eliminated wrench, sample by sample, each compared with a threshold::
 
     level    |z|, the plain threshold; its square is chi-squared of six degrees of freedom
     cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|): the cumulative sum for a shift of the

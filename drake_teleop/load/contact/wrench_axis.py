@@ -19,10 +19,9 @@ def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
         wrench: (..., 6) about So in S [N, N m].
 
     Returns:
-        direction: (..., 3) f / |f|; NaN where f = 0, as for the others.
-        point: (..., 3) of the axis nearest to So [m].
-        pitch: (...) f . tau / |f|^2 [m]; of a pure force 0, so it says how much of a couple is in
-            the contact, or of the load's error.
+        direction: (..., 3) f / |f|; NaN where f = 0, as for the others;
+        point: (..., 3) of the axis nearest to So [m];
+        pitch: (...) f . tau / |f|^2 [m]: the couple in the contact or in the load's error.
     """
     w = checked("wrench", wrench, 6, leading=True)
     f, tau = w[..., :3], w[..., 3:]
@@ -43,8 +42,7 @@ def point_on_tool(wrench: ArrayLike, origin: ArrayLike, axis: ArrayLike) -> tupl
         axis: (3,) its direction u in S, of any length.
 
     Returns:
-        x: (...) distance from `origin` along the axis [m]; NaN for a force along the axis, which
-            acts at all of its points alike.
+        x: (...) distance from `origin` along the axis [m]; NaN for a force along the axis;
         rest: (...) |moment| that no point of the axis explains [N m].
 
     Raises:

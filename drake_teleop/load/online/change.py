@@ -20,7 +20,7 @@ noise of up to sqrt(2) times the stated one is thus tolerated.
 
 **Contact or load?** After the alarm a second filter explains the wrench by a new load: its prior
 are the known offsets and the known load, the latter widened by `WIDE`. Its innovations pass the
-same test:
+same test::
 
     known       the known load explains the wrench
     disturbed   neither it nor a new load does: contact, or the very moment of a grasp. Whenever the

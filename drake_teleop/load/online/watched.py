@@ -1,7 +1,7 @@
 """A known load while it is watched: what the elimination is given of it, sample by sample.
 
 The load was learnt and is frozen. `change.change_update` tells whether it is still there; this
-module draws the conclusions:
+module draws the conclusions::
 
     settled     the known load explains the wrench. It is handed out as it is
     disturbed   something is touched, or it is the moment of a grasp. The known load is handed out:

@@ -1,0 +1,68 @@
+"""What lies beside `docs` in the repository comes into the site: notebooks, changes, benchmarks.
+
+They are copied before a build reads anything, and links between them and `docs` are made to fit:
+written so as to be right in the repository, they are right on the site as well.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import nbformat
+from notebook_checks import CHECKS
+from sphinx.application import Sphinx
+from sphinx.config import Config
+
+DOCS = Path(__file__).parents[1]
+ROOT = DOCS.parent
+#: Pages of the site whose source is elsewhere.
+PAGES = {
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "benchmarks/README.md": "benchmarks.md",
+}
+#: What links begin with in the repository, and on the site.
+LINKS = {
+    "](../docs/": "](../",
+    "](docs/": "](",
+    "](../notebooks/": "](notebooks/",
+    "](../benchmarks/README.md": "](benchmarks.md",
+}
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Copies as soon as the settings are read, before Sphinx looks for sources."""
+    app.connect("config-inited", _copy)
+    app.connect("source-read", _pages_link)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+def _copy(_app: Sphinx, _config: Config) -> None:
+    (DOCS / "notebooks").mkdir(exist_ok=True)
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        _write(DOCS / "notebooks" / path.name, nbformat.writes(_checked(path)))
+    for source, page in PAGES.items():
+        text = (ROOT / source).read_text(encoding="utf-8")
+        _write(DOCS / page, text.replace("](../docs/", "](").replace("](docs/", "]("))
+
+
+def _checked(path: Path) -> nbformat.NotebookNode:
+    """With its checks as a last cell that is run, and not shown."""
+    notebook = nbformat.read(path, as_version=4)
+    check = nbformat.v4.new_code_cell(
+        CHECKS[path.stem], id="checks", metadata={"tags": ["remove-cell"]}
+    )
+    notebook.cells.append(check)
+    return notebook
+
+
+def _write(path: Path, text: str) -> None:
+    """Only what is new, so that a second build finds the rest unchanged."""
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
+
+
+def _pages_link(_app: Sphinx, _name: str, source: list[str]) -> None:
+    for there, here in LINKS.items():
+        source[0] = source[0].replace(there, here)

@@ -1,0 +1,101 @@
+"""The documentation as a site: `sphinx-build -W docs out/site`, with the extra `docs`.
+
+Notebooks and the gallery's scripts are run at every build, so that what is shown is what the code
+does; any warning is an error. Nothing is loaded from elsewhere: the site can be read offline.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import metadata
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+
+project = "drake_teleop"
+author = "The drake_teleop authors"
+copyright = author
+version = release = metadata.version("drake_teleop")
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_gallery.gen_gallery",
+    "myst_nb",
+    "mathml",
+    "pydrake_system",
+    "repository",
+]
+exclude_patterns = [
+    "gallery",
+    "sg_execution_times.rst",
+    "examples/*.json",
+    "examples/*.ipynb",
+    "examples/*.py*",
+    "examples/*.zip",
+]
+default_role = "literal"
+templates_path = ["_templates"]
+
+# Markdown
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_heading_anchors = 4
+
+# What is run
+nb_execution_mode = "force"
+nb_execution_timeout = 240
+nb_execution_raise_on_error = True
+nb_execution_show_tb = True
+nb_merge_streams = True
+sphinx_gallery_conf = {
+    "examples_dirs": ["gallery"],
+    "gallery_dirs": ["examples"],
+    "filename_pattern": r"/.*\.py$",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_memory": False,
+    "min_reported_time": 1e9,
+    "matplotlib_animations": False,
+    "parallel": 2,
+}
+
+# The reference
+autosummary_generate = True
+autodoc_default_options = {"members": True, "member-order": "bysource", "exclude-members": "set"}
+autodoc_typehints = "signature"
+autodoc_preserve_defaults = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+# Two classes may have one name; a bare name in an annotation then leads nowhere.
+suppress_warnings = ["ref.python"]
+
+# Looks
+html_theme = "pydata_sphinx_theme"
+html_title = "drake_teleop"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_sourcelink = False
+html_copy_source = False
+html_theme_options = {
+    "show_prev_next": False,
+    "navigation_with_keys": False,
+    "footer_start": ["copyright"],
+    "footer_end": [],
+    "secondary_sidebar_items": ["page-toc"],
+}
+
+
+def _as_rst(_app, _what, _name, _object, _options, lines: list[str]) -> None:
+    """|x| is an absolute value in docstrings, no substitution, and `Range`s is a word with an s."""
+    for i, line in enumerate(lines):
+        parts = line.split("`")
+        parts[::2] = [part.replace("|", r"\|") for part in parts[::2]]
+        parts[2::2] = ["\\ " * part[:1].isalpha() + part for part in parts[2::2]]
+        lines[i] = "`".join(parts)
+
+
+def setup(app) -> None:
+    """What no extension does."""
+    app.connect("autodoc-process-docstring", _as_rst)
