@@ -28,6 +28,7 @@ from posed_record import (
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
+from drake_teleop.logs.pose_motion.levels import Levels
 from drake_teleop.logs.pose_motion.noise import noise_moments
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
@@ -41,7 +42,7 @@ from drake_teleop.logs.pose_motion.rigid import (
     gain_effects,
     motion_map,
 )
-from drake_teleop.logs.pose_motion.saturated import best_delay, spectra_of
+from drake_teleop.logs.pose_motion.saturated import best_delay, saturated, spectra_of, wandering
 from drake_teleop.logs.pose_motion.spectra import Grid, bands, end_taper, moments, signal_spectrum
 from drake_teleop.logs.pose_motion.spectra import without as taper_without
 from drake_teleop.logs.pose_motion.splines import PoseSplines
@@ -119,7 +120,9 @@ def test_noise_of_poses_adds_to_the_moments_what_is_said():
         spectrum = signal_spectrum(grid, taper, error, len(of.frequency))
         sums += moments(spectrum, none, of) / 12
     # Below 2 Hz what is faster and turned into it by the motion is more than what is said.
-    well = of.sums(of.frequency) / of.sizes > 2.0
+    whole = Levels.flat(of).grouped
+    well = whole(of.sums(of.frequency)) / whole(of.sizes) > 2.0
+    sums, Q = whole(sums), whole(Q)
     size = np.sqrt(np.einsum("bii,bjj->bij", Q, Q))
     error = np.abs(sums - Q)[well] / np.where(size > 0.0, size, np.inf)[well]
     assert error.max() < 0.45
@@ -215,7 +218,9 @@ def test_noise_in_the_signals_makes_no_load_lighter():
     free, start = np.arange(23) < 17, State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     inertias = []
     for noise in (Q, np.zeros_like(Q)):
-        record_ = _Record(spectra.moments(), noise, spectra.of.sizes, free, spectra.fit().power)
+        record_ = _Record(
+            spectra.moments(), noise, Levels.flat(spectra.of), free, spectra.fit().power
+        )
         inertias.append(_solve(record_, start).state.theta[[10, 13]] / PHI[[4, 7]] - 1.0)
     compensated, plain = np.abs(inertias)
     assert (compensated < 0.5 * plain).all()
@@ -257,7 +262,7 @@ def test_weights_of_a_poor_start_do_not_stay():
     Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
     start = State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     fit = fit_rigid(
-        spectra.moments(), Q, spectra.of.sizes, start, np.arange(23) < 17, spectra.fit()
+        spectra.moments(), Q, Levels.flat(spectra.of), start, np.arange(23) < 17, spectra.fit()
     )
     assert not fit.one_weight
     assert np.abs(fit.state.theta[6] - PHI[0]) < 4 * np.sqrt(fit.covariance[6, 6]) < 0.01
@@ -313,18 +318,53 @@ def test_gains_enter_as_they_move_the_estimate():
     grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
     spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
-    Z, sizes, free = spectra.moments(), spectra.of.sizes, np.ones(23, bool)
+    Z, levels, free = spectra.moments(), Levels.flat(spectra.of), np.ones(23, bool)
     none, start = np.zeros_like(Z), State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     power = spectra.fit().power
-    solution = _solve(_Record(Z, none, sizes, free, power), start)
+    solution = _solve(_Record(Z, none, levels, free, power), start)
     effects = gain_effects(solution.B, Z, solution.W, solution.inverse).reshape(23, 6, 6)
     size = np.sqrt(np.sum(effects**2, axis=(1, 2)))
     for d, k in ((0, 2), (2, 2), (4, 0), (1, 5)):
         A = np.eye(38)
         A[16 + d, 16 + k] += 1e-3 * UNITS[d, k]
-        other = _solve(_Record(A @ Z @ A.T, none, sizes, free, power), solution.state).state
+        other = _solve(_Record(A @ Z @ A.T, none, levels, free, power), solution.state).state
         moved = 1e3 * (other.theta - solution.state.theta)
         np.testing.assert_allclose(moved / size[:16], effects[:16, d, k] / size[:16], atol=0.1)
+
+
+def test_channels_that_wander_are_told_and_weigh_less_where_they_do():
+    """Two of six, as random walks whose power is that of the white noise at 1.6 Hz."""
+    t, wrench, poses = record(Kind(seed=12))
+    walk = np.cumsum(np.random.default_rng(12).normal(size=(len(t), 6)), axis=0)
+    both, step = np.repeat([0.1, 0.004], 3), 2.0 * np.pi * 1.6 / 200.0
+    wrench = wrench + walk * both * step * np.array([0, 0, 1, 1, 0, 0])
+    grid, taper = Grid.of(t, wrench), end_taper(t[::2], 0.3, SECONDS - 0.3)
+    splines = PoseSplines(poses.continued(), 0.1)
+    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
+    levels = wandering(spectra.moments(), spectra.of)
+    at = spectra.of.sums(spectra.of.frequency) / spectra.of.sizes
+    corner = np.sqrt(levels.shape - 1.0)[5] * at[5]
+    assert (corner[[2, 3]] > 0.7).all() and (corner[[2, 3]] < 3.3).all()
+    np.testing.assert_array_equal(corner[[0, 1, 4, 5]], 0.0)
+    power = saturated(spectra.moments(), levels).power
+    assert (power[0, 2:4] > 30.0 * power[-1, 2:4]).all()
+    assert (np.diff(power[levels.group == 0, 2]) < 0.0).all()
+
+
+def test_deviations_count_that_the_weights_are_estimated():
+    """One offset in white noise in four groups of alike weight: Meier's factor in closed form."""
+    n, power = 10.0, 0.3
+    levels = Levels(np.full(4, n), np.arange(4), np.ones((4, 6)))
+    Z = np.zeros((4, 38, 38))
+    Z[:, 0, 0] = n
+    for c in range(6):
+        Z[:, 16 + c, 16 + c] = n * power
+    start = State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
+    best = saturated(Z, levels)
+    fit = fit_rigid(Z, np.zeros_like(Z), levels, start, np.arange(23) == 0, best)
+    level = power * n / (n - 0.5 / 4)
+    variance = level / (2 * 4 * n) * (1 + 4 * 4 * (1 / 4) * (3 / 4) / (2 * n))
+    assert fit.covariance[0, 0] == pytest.approx(variance, rel=1e-3)
 
 
 def test_a_delay_that_is_given_stays():

@@ -36,7 +36,9 @@ from drake_teleop.logs.pose_motion.saturated import (
     Spectra,
     best_spacing,
     first_guess,
+    saturated,
     spectra_of,
+    wandering,
 )
 from drake_teleop.logs.pose_motion.spectra import TOP, Grid, end_taper, without
 from drake_teleop.logs.pose_motion.splines import PoseSplines
@@ -178,10 +180,11 @@ def estimate_from_poses(
     zeta = splines.signals(grid.t + spectra.delay, gravity)
     Z = spectra.moments()
     Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
-    sizes, best = spectra.of.sizes, spectra.fit()
+    levels = wandering(Z, spectra.of)
+    best = saturated(Z, levels)
 
     def fitted(start: State, free: NDArray[np.bool_]) -> RigidFit:
-        return fit_rigid(Z, Q, sizes, start, free, best, gain=gain)
+        return fit_rigid(Z, Q, levels, start, free, best, gain=gain)
 
     seen = read_off(best)
     start = _start(p_SoPo_S, R_SP, seen)

@@ -15,17 +15,18 @@ all that is needed: the residual of the wrench is e = L(theta) M(R, r) y. Unknow
 on moments that are compensated for the noise Q of the poses (`noise`), which leaves the errors of
 the wrench alone: errors in variables, band by band. The weights are the inverse of
 
-    R_b = P_b + diag(residual's power - diag P_b, at least 10 % of it),   P_b = L M Q_b (L M)^T,
+    R_b = P_b + diag(power of the residual's rest, at least 10 % of all),   P_b = L M Q_b (L M)^T,
 
-renewed in every step. The power of a band is that of its numbers less the parameters that they pay
-for. Why r and R can be told: the torque at rest gives m c about So, the force in motion m (r + R c)
-about Po; and f = m R^T s shows R by gravity.
+renewed in every step: P_b is known band by band, the rest has a level for each group of bands
+(`levels`), from the powers of its numbers less the parameters that they pay for. Why r and R can
+be told: the torque at rest gives m c about So, the force in motion m (r + R c) about Po; and
+f = m R^T s shows R by gravity.
 
-The covariance counts what a stated error of the sensor's gains would do, and is enlarged by what no
-rigid load explains: twice the difference of the log likelihoods to the saturated model is a
-chi-square with as many degrees of freedom as that has more parameters, if the model holds. If it
-is far from it the higher bands, which rest on accelerations, must not decide: one weight for
-all bands.
+The covariance counts that the weights are estimated and what a stated error of the sensor's gains
+would do. It is enlarged by what no rigid load explains: twice the difference of the log likelihoods
+to the saturated model is a chi-square with as many degrees of freedom as that has more parameters,
+if the model holds. If it is far from it the higher bands, which rest on accelerations, must not
+decide: one weight for all bands.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.batch.moments import coefficients
-from drake_teleop.logs.pose_motion.saturated import Saturated, cost_of, least_power
+from drake_teleop.logs.pose_motion.levels import Levels
+from drake_teleop.logs.pose_motion.saturated import Saturated, least_power
 from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH
 from drake_teleop.logs.pose_motion.splines import SIGNALS
 from drake_teleop.vectors import cross_matrix
@@ -51,7 +53,7 @@ ARM = 0.06
 _STEPS, _CONVERGED = 40, 1e-4
 _RIGID, _NOISE = 4.0, 1.5
 _LIMITS = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
-_LEAST_SHARE, _LEAST_LEFT = 0.1, 0.25
+_LEAST_SHARE = 0.1
 _SMALL = 1e-4  # rad, of a numerical derivative
 _RANK = 1e-12
 
@@ -139,7 +141,7 @@ def _turned_products(R: Array) -> Array:
 def fit_rigid(
     Z: Array,
     Q: Array,
-    sizes: Array,
+    levels: Levels,
     start: State,
     free: NDArray[np.bool_],
     saturated: Saturated,
@@ -151,7 +153,7 @@ def fit_rigid(
     Args:
         Z: (bands, 38, 38) `spectra.moments`.
         Q: (bands, 38, 38) `noise.noise_moments`.
-        sizes: (bands,) of the bands.
+        levels: of the bands' noise.
         start: where to start.
         free: (23,) which parameters are estimated.
         saturated: of the same moments: its residual gives the weights of the first step. With those
@@ -159,11 +161,13 @@ def fit_rigid(
         gain: standard deviation of each entry of the sensor's matrix of gains, of a torque's as at
             `ARM`; 0 for an exact sensor.
     """
-    record = _Record(Z, Q, sizes, free, saturated.power)
+    record = _Record(Z, Q, levels, free, saturated.power)
     solution = _solve(record, start)
     # The saturated model is not compensated: nor must be what is compared with it.
     plain = _solve(replace(record, Q=np.zeros_like(Q)), solution.state).state
-    misfit = 2.0 * (cost_of(_plain_power(record, plain), sizes) - saturated.cost)
+    least = least_power(record.Z, levels.sizes)
+    power = np.maximum(levels.power(_sums(record, plain)), least)
+    misfit = 2.0 * (float(levels.costs(power).sum()) - saturated.cost)
     fit = RigidFit(solution.state, np.zeros((0, 0)), misfit, 6.0 * SIGNALS - float(free.sum()))
     if not fit.rigid:
         solution = _solve(record, solution.state, one_weight=True)
@@ -173,12 +177,12 @@ def fit_rigid(
 
 @dataclass(frozen=True, eq=False)
 class _Record:
-    """Moments, those of the noise, sizes of the bands, and what is free, as in `fit_rigid`; and
-    (bands, 6) powers of the residual to begin with."""
+    """Moments, those of the noise, its levels, and what is free, as in `fit_rigid`; and (bands, 6)
+    powers to begin with."""
 
     Z: Array
     Q: Array
-    sizes: Array
+    levels: Levels
     free: NDArray[np.bool_]
     power: Array
 
@@ -198,8 +202,8 @@ class _Solution:
 
 def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solution:
     """Gauss-Newton."""
-    sizes, clean = record.sizes, record.Z - record.Q
-    R = _residual_covariances(record, state, record.power)
+    sizes, clean = record.levels.sizes, record.Z - record.Q
+    R = _residual_covariances(record, state, record.power * sizes[:, None])
     for _ in range(_STEPS):
         W: Array = np.linalg.inv(R).astype(np.float64)
         if one_weight:
@@ -211,8 +215,8 @@ def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solut
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
         step *= min(1.0, float(np.min(_LIMITS / np.maximum(np.abs(step), 1e-300))))
         state = _moved(state, step)
-        power = _power(record, state, _shares(B, record.Z, W, inverse))
-        R = _residual_covariances(record, state, power)
+        taken = _shares(B, record.Z, W, inverse)
+        R = _residual_covariances(record, state, _sums(record, state), taken)
         if np.max(np.abs(step) / size) < _CONVERGED:
             break
     return _Solution(state, B, W, inverse, R, lost)
@@ -226,6 +230,7 @@ def _covariance(record: _Record, solution: _Solution, inflation: float, gain: fl
     B, W, inverse, lost = solution.B, solution.W, solution.inverse, solution.lost
     middle = _normal(B, np.zeros((6, WIDTH)), record.Z, W @ solution.R @ W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
+    covariance *= np.outer(*2 * [_by_weights(record, solution)])
     larger = covariance * inflation**2
     if gain:
         effects = gain * gain_effects(B, record.Z - record.Q, W, inverse)
@@ -236,6 +241,24 @@ def _covariance(record: _Record, solution: _Solution, inflation: float, gain: fl
     larger[lost], larger[:, lost] = 0.0, 0.0
     larger[lost, lost] = np.inf
     return larger
+
+
+def _by_weights(record: _Record, solution: _Solution) -> Array:
+    """(23,) factors on deviations because the weights are estimated too.
+
+    For a mean of groups weighted by their own scatter, the g-th having the share p_g of the weight
+    and nu_g degrees of freedom, the variance is 1 + 4 sum of p_g (1 - p_g) / nu_g times as large as
+    with known weights (P. Meier, Variance of a weighted mean, Biometrics 9, 1953). Groups here are
+    those of the levels in each channel, shares those of each parameter's variance.
+    """
+    levels, B = record.levels, solution.B
+    half = np.einsum("cjk,ji->cik", B, solution.inverse)
+    weight = np.diagonal(solution.W, axis1=1, axis2=2)
+    part = np.einsum("cik,bkm,cim->bci", half, record.Z, half, optimize=True) * weight[..., None]
+    part = levels.grouped(part).reshape(-1, PARAMETERS)
+    share = part / np.maximum(part.sum(axis=0), 1e-300)
+    freedom = np.repeat(2.0 * levels.grouped(levels.sizes), 6)
+    return np.sqrt(1.0 + 4.0 * np.sum(share * (1.0 - share) / freedom[:, None], axis=0))
 
 
 def _map(state: State) -> Array:
@@ -294,24 +317,22 @@ def _residual_powers(Z: Array, state: State) -> Array:
     return np.asarray(Le @ Z @ Le.T)
 
 
-def _plain_power(record: _Record, state: State) -> Array:
-    """(bands, 6) mean power of the residual."""
-    powers = np.diagonal(_residual_powers(record.Z, state), axis1=1, axis2=2)
-    return np.maximum(powers / record.sizes[:, None], least_power(record.Z, record.sizes))
+def _sums(record: _Record, state: State) -> Array:
+    """(bands, 6) powers of the residual, summed over each band."""
+    return np.asarray(np.diagonal(_residual_powers(record.Z, state), axis1=1, axis2=2))
 
 
-def _power(record: _Record, state: State, shares: Array) -> Array:
-    """(bands, 6) mean power of the residual's noise: `shares` of its numbers the fit took."""
-    sizes = record.sizes[:, None]
-    left = np.maximum(sizes - 0.5 * shares, _LEAST_LEFT * sizes)
-    return np.asarray(_plain_power(record, state) * sizes / left)
-
-
-def _residual_covariances(record: _Record, state: State, power: Array) -> Array:
-    """(bands, 6, 6) R_b of a number, with the residual's power (bands, 6)."""
-    P = _residual_powers(record.Q, state) / record.sizes[:, None, None]
-    own = np.diagonal(P, axis1=1, axis2=2)
-    rest = np.maximum(power - own, _LEAST_SHARE * power)
+def _residual_covariances(
+    record: _Record, state: State, sums: Array, taken: Array | float = 0.0
+) -> Array:
+    """(bands, 6, 6) R_b of a number, from the residual's powers and what the fit took of them."""
+    levels, sizes = record.levels, record.levels.sizes[:, None]
+    P = _residual_powers(record.Q, state) / sizes[..., None]
+    own = np.diagonal(P, axis1=1, axis2=2) * (sizes - 0.5 * taken)
+    least = np.maximum(
+        _LEAST_SHARE * levels.power(sums, taken), least_power(record.Z, levels.sizes)
+    )
+    rest = np.maximum(levels.power(sums - own, taken), least)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
 
 

@@ -2,8 +2,8 @@
 
 The wrench of a rigid load is linear in the 16 signals of `splines`, whatever the frames, units and
 axes of wrench and pose are. So 6 x 16 free coefficients C, F = C zeta, have no hypotheses in them.
-Each channel is fitted with weights of 1 / (power of its residual) in every band, in turn with these
-powers. At the end
+Each channel is fitted with weights of 1 / (power of its noise) in every band, in turn with these
+powers (`levels`). At the end
 
     L = sum over channels and bands of n log(power)
 
@@ -14,11 +14,12 @@ then the accelerations are noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drake_teleop.load.arrays import Array
+from drake_teleop.logs.pose_motion.levels import Levels, wander
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (
     FORCES,
@@ -38,7 +39,7 @@ from drake_teleop.logs.pose_motion.splines import (
 )
 
 SPACINGS = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
-"""Distances of the knots that are tried [s]."""
+"""Distances of the knots that are tried [s], and then two beside the best of them."""
 REACH = 0.25
 """Delays are looked for so far on either side, or a tenth of the record [s]."""
 ROUNDING = 1e-7
@@ -47,6 +48,9 @@ _COARSE, _FINEST = 0.016, 1e-5
 _ITERATIONS = 4
 _SEARCH_RATE = 125.0
 _RANK = 1e-12
+# Corners of a wandering offset [Hz], and by how much one has to lower a channel's L.
+_CORNERS = tuple(0.05 * 2.0**k for k in range(9))
+_WORTH = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,18 +60,24 @@ class Saturated:
     Attributes:
         coefficients: (6, 16) C; zero for signals that never change.
         covariance: (6, 16, 16) of the rows of C.
-        power: (bands, 6) mean power of the residual, of a number of the spectrum.
-        cost: L.
+        power: (bands, 6) mean power of the noise, of a number of the spectrum.
+        costs: (6,) what each channel adds to L.
     """
 
     coefficients: Array
     covariance: Array
     power: Array
-    cost: float
+    costs: Array
+
+    @property
+    def cost(self) -> float:
+        """L."""
+        return float(self.costs.sum())
 
 
-def saturated(Z: Array, sizes: Array) -> Saturated:
-    """The fit to moments (bands, 38, 38) of bands of these sizes (bands,)."""
+def saturated(Z: Array, levels: Levels) -> Saturated:
+    """The fit to moments (bands, 38, 38) of bands with such noise."""
+    sizes = levels.sizes
     zz, zf = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES]
     ff = np.diagonal(Z[:, FORCES, FORCES], axis1=1, axis2=2)
     floor = least_power(Z, sizes)
@@ -86,12 +96,12 @@ def saturated(Z: Array, sizes: Array) -> Saturated:
         )
         C = np.einsum("cij,cj->ci", inverse, right)
         explained = 2.0 * np.einsum("ci,bic->bc", C, zf) - np.einsum("ci,bij,cj->bc", C, zz, C)
-        power = np.maximum((ff - explained) / sizes[:, None], floor)
+        power = np.maximum(levels.power(ff - explained), floor)
     return Saturated(
         coefficients=C * scale,
         covariance=0.5 * inverse * np.outer(scale, scale),
         power=power,
-        cost=cost_of(power, sizes),
+        costs=levels.costs(power),
     )
 
 
@@ -102,9 +112,16 @@ def least_power(Z: Array, sizes: Array) -> Array:
     return np.maximum(ROUNDING**2 * both, 1e-60)
 
 
-def cost_of(power: Array, sizes: Array) -> float:
-    """L of mean powers (bands, 6)."""
-    return float(sizes @ np.log(power).sum(axis=1))
+def wandering(Z: Array, of: Bands) -> Levels:
+    """The levels of moments (bands, 38, 38), channels rising at low frequencies as they do."""
+    levels = Levels.flat(of)
+    least, shape = saturated(Z, levels).costs - _WORTH, levels.shape.copy()
+    for corner in _CORNERS:
+        rising = np.repeat(wander(of, corner)[:, None], 6, axis=1)
+        costs = saturated(Z, replace(levels, shape=rising)).costs
+        better = costs < least
+        least, shape = np.where(better, costs, least), np.where(better, rising, shape)
+    return replace(levels, shape=shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +151,7 @@ class Spectra:
 
     def fit(self) -> Saturated:
         Z = moments(self.signals, self.wrench, self.of, rates=False)
-        return saturated(Z, self.of.sizes)
+        return saturated(Z, Levels.flat(self.of))
 
 
 def spectra_of(
@@ -222,6 +239,10 @@ def best_spacing(
         return spectra_of(PoseSplines(few, h), grid, taper, gravity_W, late, top)
 
     costs = {h: spectra(h, delay).fit().cost for h in _allowed(few)}
+    middle = min(costs, key=lambda h: costs[h])
+    for other in _neighbours(middle, list(costs)):
+        h = float(np.sqrt(middle * other))
+        costs[h] = spectra(h, delay).fit().cost
     best = min(costs, key=lambda h: costs[h])
     if not known:
         delay, _ = best_delay(spectra(best, delay), _COARSE)
@@ -230,6 +251,11 @@ def best_spacing(
 
 def _for_search(poses: Poses) -> Poses:
     return poses.averaged(max(1, int(poses.rate / _SEARCH_RATE + 1e-6)))
+
+
+def _neighbours(h: float, of: list[float]) -> list[float]:
+    k = of.index(h)
+    return of[max(0, k - 1) : k] + of[k + 1 : k + 2]
 
 
 def _allowed(poses: Poses) -> list[float]:

@@ -2,9 +2,10 @@
 
 Wrench F and signals zeta (`splines.PoseSplines.signals`) are multiplied by the same taper w(t), 0
 where a sample is not to count, and transformed. What is linear at every instant stays so at every
-frequency, the tapered constant included; and noise that is coloured, or wanders, is nearly white
-within a band. Above `TOP` nothing is used. The wrench is transformed at its full rate, the signals
-at about 100 Hz over the same span, so that the frequencies are the same.
+frequency, the tapered constant included; and noise that is coloured is nearly white within a group
+of bands. Noise that wanders is not: the bands of a group are narrow at low frequencies, so that it
+may rise there (`levels`). Above `TOP` nothing is used. The wrench is transformed at its full rate,
+the signals at about 100 Hz over the same span, so that the frequencies are the same.
 
 White noise of variance v has the power v sum(w^2) in each frequency. Neighbours of a tapered record
 are alike, so that they count less: as many as (sum w^2)^2 / sum w^4 samples give. A complex number
@@ -33,7 +34,9 @@ EDGE = 0.2
 """Length of its rise beside samples that do not count [s]."""
 _GRID = 100.0
 _EDGES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, TOP)
-_FEWEST_IN_BAND = 8.0
+_FEWEST_IN_GROUP = 8.0
+# Bands below this frequency [Hz] are at most so wide, as a ratio of their ends.
+_NARROW, _RATIO = 3.0, 4.0 / 3.0
 FORCES = slice(SIGNALS, SIGNALS + 6)
 """Where the wrench stands in the moments, and the signals' derivatives."""
 RATES = slice(SIGNALS + 6, 2 * SIGNALS + 6)
@@ -85,11 +88,13 @@ class Bands:
         frequency: (K,) those that are used [Hz].
         band: (K,) number of the band of each.
         weight: (K,) how many numbers each is worth, over two.
+        group: (count,) number of the group of each band.
     """
 
     frequency: Array
     band: NDArray[np.intp]
     weight: Array
+    group: NDArray[np.intp]
 
     @property
     def count(self) -> int:
@@ -108,19 +113,22 @@ class Bands:
 
 
 def bands(grid: Grid, taper: Array, top: float) -> Bands:
-    """Of a grid and its taper (M,), up to a frequency; bands of too few are one with the next."""
+    """Of a grid and its taper (M,), up to a frequency; groups of too few are one with the next."""
     frequency = grid.frequency[grid.frequency <= top]
     worth = (taper**2).sum() ** 2 / ((taper**4).sum() * grid.length)
     weight = np.full(len(frequency), worth)
     weight[0] *= 0.5
-    band = np.searchsorted(np.array(_EDGES[1:]), frequency, side="right")
+    group = np.searchsorted(np.array(_EDGES[1:]), frequency, side="right")
     for k in range(len(_EDGES)):
-        if 0.0 < weight[band == k].sum() < _FEWEST_IN_BAND:
-            band[band == k] = k + 1
-    last = band == band[-1]
-    if weight[last].sum() < _FEWEST_IN_BAND and not last.all():
-        band[last] = band[~last][-1]
-    return Bands(frequency, np.unique(band, return_inverse=True)[1], weight)
+        if 0.0 < weight[group == k].sum() < _FEWEST_IN_GROUP:
+            group[group == k] = k + 1
+    last = group == group[-1]
+    if weight[last].sum() < _FEWEST_IN_GROUP and not last.all():
+        group[last] = group[~last][-1]
+    narrow = np.log(np.clip(frequency, frequency[1], _NARROW) / frequency[1]) // np.log(_RATIO)
+    first = np.concatenate([[True], (np.diff(group) > 0) | (np.diff(narrow) > 0)])
+    group = np.unique(group[first], return_inverse=True)[1]
+    return Bands(frequency, np.cumsum(first) - 1, weight, group)
 
 
 def end_taper(t: Array, start: float, stop: float) -> Array:
