@@ -58,7 +58,7 @@ DELAY, TIMEOUT = 0.005, 0.1  # s
 STEP = 0.5  # N
 RANGE = 60.0  # N, of the sensor: so it saturates at what a hand still bears
 LATE = 2 * DELAY + 0.01  # s, for a packet there and back, and steps
-STATE = ("slave_plant", "rx90_state")
+STATE = ("slave_plant", "arm_state")
 #: Wires (system, port, system) by what they carry.
 PLACES: dict[str, tuple[tuple[str, str, str], ...]] = {
     "sensor": ((*STATE, "wrist_sensor"),),

@@ -88,7 +88,7 @@ def described() -> Path | None:
 def arms(models: Path | None) -> dict[str, tuple[ArmModel, MultibodyPlant, Frame]]:
     found = {}
     plant = MultibodyPlant(0.0)
-    instance, _ = ParseSlave(plant)
+    instance = ParseSlave(plant).instance
     finalize(plant)
     found["rx90"] = ArmModelFromPlant(plant, instance), plant, plant.GetFrameByName("sensor")
     with tempfile.TemporaryDirectory() as folder:

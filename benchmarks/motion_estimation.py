@@ -45,6 +45,7 @@ from drake_teleop.sensor.sensor_chain import (
 from drake_teleop.slave.arm import sensor_motion
 from drake_teleop.slave.inverse_kinematics import nearest_branch
 from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, home_position
+from drake_teleop.slave.slave_config import Slave
 
 Array = NDArray[np.float64]
 
@@ -224,7 +225,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
-    arm = AddSlavePlant(DiagramBuilder(), list(START), None).arm
+    arm = AddSlavePlant(DiagramBuilder(), Slave(), None).arm
     sources = by_source(Record(arm, motion(arm, 2.63, AMPLITUDE)))
     mismatches = {}
     for frequency in (2.63, 10.0, 20.0, 40.0):

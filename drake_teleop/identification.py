@@ -103,7 +103,7 @@ class LoadIdentification:
 def slave_arm(scenario: Scenario) -> ArmModel:
     """The arm of a scenario's slave, with tool and payload as its load."""
     check_scenario(scenario)
-    return NominalSlave(scenario.slave.payload).arm
+    return NominalSlave(scenario.slave).arm
 
 
 def true_load(scenario: Scenario) -> Array:

@@ -123,7 +123,8 @@ def _key(before: Scenario, detects: bool) -> str:
 
     computed_by = [f"{name} {version(name)}" for name in _LIBRARIES]
     computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCES]
-    what = (__version__, dataclasses.asdict(before), detects, computed_by)
+    models = [sha256(path.read_bytes()).hexdigest() for path in before.slave.files()]
+    what = (__version__, dataclasses.asdict(before), detects, computed_by, models)
     return sha256(repr(what).encode()).hexdigest()
 
 

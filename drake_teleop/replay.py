@@ -34,7 +34,7 @@ from drake_teleop.resources import models_dir
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario
 from drake_teleop.scenario_reference import commented
-from drake_teleop.slave.plant import AddEnvironment, ParseSlave, finalize
+from drake_teleop.slave.plant import AddEnvironment, NominalSlave, ParseSlave, finalize
 from drake_teleop.writing import output_folder, write_json, write_text
 
 Array = NDArray[np.float64]
@@ -207,7 +207,10 @@ class ReplayScene:
         """What was not `recorded` is not shown."""
         builder = DiagramBuilder()
         self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
-        self._slave, _ = ParseSlave(self.plant)
+        self._parsed = ParseSlave(self.plant, scenario.slave)
+        self._slave, self._sensor = self._parsed.instance, self._parsed.sensor_frame
+        nominal = NominalSlave(scenario.slave)
+        self._joints, self._tip = nominal.arm.num_joints, nominal.tip
         self._sheet = None
         if scenario.environment is not None:
             touched = AddEnvironment(self.plant, scenario.environment)
@@ -238,7 +241,7 @@ class ReplayScene:
         """Shows a sample (its index) of signals of a run, at a time of the recording [s]."""
         self._root.SetTime(film_time)
         plant, context = self.plant, self.context
-        plant.SetPositions(context, self._slave, signals["slave_state"][sample, :6])
+        plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
         if self._master is not None:
             master = signals["master_state"][sample, :6]
             if self._is_phantom:
@@ -254,7 +257,7 @@ class ReplayScene:
 
     def _forces(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
         """In W. Eq. (1) is what the sensor exerts on the load; these are what the load exerts."""
-        R_WS = self.plant.GetFrameByName("sensor").CalcPoseInWorld(self.context).rotation().matrix()
+        R_WS = self._sensor.CalcPoseInWorld(self.context).rotation().matrix()
         offset = signals["load_estimate"][sample, :3]
         forces = {"measured": -R_WS @ (signals["measured_wrench_S"][sample, :3] - offset)}
         if "contact_wrench_S" in signals:
@@ -264,15 +267,14 @@ class ReplayScene:
     def _places(self) -> dict[str, Array]:
         """Where arrows begin, in W."""
 
-        def pose(frame: str) -> RigidTransform:
-            return self.plant.GetFrameByName(frame).CalcPoseInWorld(self.context)
-
+        X_WS = self._sensor.CalcPoseInWorld(self.context)
         places = {
-            "wrist": pose("sensor") @ _WRIST_S + _BESIDE_WRIST_W,
-            "tip": pose("tip").translation() + _BESIDE_TIP_W,
+            "wrist": X_WS @ _WRIST_S + _BESIDE_WRIST_W,
+            "tip": X_WS @ self._tip + _BESIDE_TIP_W,
         }
         if self._master is not None:
-            places["stylus"] = pose("stylus") @ _GRIP_E
+            stylus = self.plant.GetFrameByName("stylus", self._master)
+            places["stylus"] = stylus.CalcPoseInWorld(self.context) @ _GRIP_E
         return places
 
 

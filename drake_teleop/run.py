@@ -27,6 +27,7 @@ failure                     with a task: why it failed, in words; null if it did
 peak_force_to_master_N      largest force that the device displayed
 joint_speed_use             largest share of a joint's speed limit; likewise joint_torque_use
 mass_error_percent          of the estimate at the end; likewise com_error_mm
+assumed                     what the models of arm and tool do not say, if anything
 warnings                    what was not as it should be, and when, see `drake_teleop.run_warnings`
 =========================== =====================================================================
 
@@ -66,6 +67,7 @@ from drake_teleop.replay import write_replay, write_scenario
 from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.run_warnings import run_warnings
 from drake_teleop.scenario import LoadScenario, Scenario, check_scenario, replace
+from drake_teleop.slave.plant import NominalSlave
 from drake_teleop.station import MakeTeleopStation
 from drake_teleop.task_measures import task_failure, task_measures
 from drake_teleop.writing import (
@@ -260,7 +262,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     mass, com = _mass_and_com(estimate[6:])
     true_mass, true_com = _mass_and_com(arm.phi_load)
     n = arm.num_joints
-    summary = {
+    summary: dict[str, Any] = {
         "description": run.scenario.description,
         "seed": run.scenario.simulation.seed,
         "duration_s": round(float(result.t[-1]), 6),
@@ -282,6 +284,9 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         figures = task_measures(result, run.scenario)
         summary |= {name: None if np.isnan(x) else x for name, x in figures.items()}
         summary["failure"] = task_failure(result, run.scenario) or None
+    assumed = NominalSlave(run.scenario.slave).assumptions
+    if assumed:
+        summary["assumed"] = list(assumed)
     return summary | {"warnings": run_warnings(result, run.scenario, arm)}
 
 
@@ -372,6 +377,8 @@ def _print(summary: dict[str, Any], out: Path) -> None:
         console.print(f"contact from {start:.4f} to {stop:.4f} s{noticed}", highlight=False)
     if summary.get("failure"):
         console.print(f"[bold red]the task failed:[/] {summary['failure']}", highlight=False)
+    for words in summary.get("assumed", ()):
+        console.print(f"assumed: {words}", highlight=False, markup=False)
     for warning in summary["warnings"]:
         console.print(f"[bold yellow]warning:[/] {warning}", highlight=False)
     console.print(

@@ -40,9 +40,8 @@ from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.sensor.presets import preset_of
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.slave.ik_methods import METHODS
 from drake_teleop.slave.joint_control import JointControlConfig
-from drake_teleop.slave.payload import Payload
+from drake_teleop.slave.slave_config import Slave
 from drake_teleop.texts import read_yaml
 
 #: What fixed steps need in contact [s]: ball on leaf vibrate at up to 700 Hz.
@@ -89,18 +88,6 @@ class Simulation:
         "continue",
         ("continue", "stop"),
         "after a fault (docs/station.md) the run goes on in its safe state, or ends with an error",
-    )
-
-
-@settings
-@dataclass
-class Slave:
-    """Where the tool starts: S points down at this position; and what it holds."""
-
-    position: list[float] = quantity([0.55, 0.0, 0.45], "m", -1.5, 1.5, "p_WS at the start")
-    payload: Payload = field(default_factory=Payload)
-    inverse_kinematics: str = choice(
-        "closed_form", tuple(METHODS), "how a pose becomes joint angles; numeric keeps their speeds"
     )
 
 
@@ -157,6 +144,7 @@ class Scenario:
         self.force_scaling.scales(f"{where}:force_scaling")
         self.load_estimator.check(f"{where}:load_estimator")
         self.master.check(f"{where}:master")
+        self.slave.check(f"{where}:slave")
         self.wrist_sensor.check(f"{where}:wrist_sensor", self.rates.sensor_hz)
         if len(self._environments) > 1:
             raise DrakeTeleopError(
@@ -190,13 +178,15 @@ def ScenarioNames() -> list[str]:
 def LoadScenario(name_or_path: str | Path) -> Scenario:
     """Loads a scenario that is shipped, by its name, or a YAML file.
 
-    Fields that the file leaves out keep their defaults.
+    Fields that the file leaves out keep their defaults. Files of models are found from its folder.
 
     Raises:
         DrakeTeleopError: if there is no such scenario, or naming file and field of what is wrong.
     """
     data, where = ReadScenario(name_or_path)
-    return ScenarioFromData(data, where)
+    scenario = ScenarioFromData(data, where)
+    scenario.slave = scenario.slave.found_from(Path(where).parent)
+    return scenario
 
 
 def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:

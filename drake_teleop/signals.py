@@ -16,11 +16,24 @@ def _signal(name: str, components: str, units: str, description: str) -> Signal:
 _WRENCH = ("f_x f_y f_z tau_x tau_y tau_z", "N,N,N,N m,N m,N m")
 _POSE = ("q_w q_x q_y q_z p_x p_y p_z", "1,1,1,1,m,m,m")
 _TWIST = ("v_x v_y v_z omega_x omega_y omega_z", "m/s,m/s,m/s,rad/s,rad/s,rad/s")
-_STATE = " ".join([f"q_{i}" for i in range(1, 7)] + [f"v_{i}" for i in range(1, 7)])
-_STATE_UNITS = "rad,rad,rad,rad,rad,rad,rad/s,rad/s,rad/s,rad/s,rad/s,rad/s"
-_JOINTS = "joint_1 joint_2 joint_3 joint_4 joint_5 joint_6"
 
-#: Everything that a station can record, in the order of the log.
+
+def _state(joints: int) -> tuple[str, str]:
+    names = [f"{letter}_{i + 1}" for letter in "qv" for i in range(joints)]
+    return " ".join(names), ",".join(joints * ["rad"] + joints * ["rad/s"])
+
+
+def _joints(joints: int) -> str:
+    return " ".join(f"joint_{i + 1}" for i in range(joints))
+
+
+_STATE, _STATE_UNITS = _state(6)
+_JOINTS = _joints(6)
+# Those of the slave have as many components as its arm has joints.
+_OF_JOINTS = ("joint_position", "joint_torque", "joint_command")
+
+
+#: Everything that a station can record, in the order of the log; of an arm with six joints.
 SIGNALS = {
     signal.name: signal
     for signal in (
@@ -93,3 +106,18 @@ SIGNALS = {
         _signal("contact_at_hand", "contact", "1", "the same as it has arrived at the hand"),
     )
 }
+
+
+def signal_of(name: str, size: int) -> Signal:
+    """The signal of that name in a station whose port has so many components.
+
+    Where a joint slides, rad stands for m and N m for N.
+    """
+    signal = SIGNALS[name]
+    if size == len(signal.components):
+        return signal
+    if name in _OF_JOINTS:
+        return _signal(name, _joints(size), signal.units[0], signal.description)
+    if name == "slave_state":
+        return _signal(name, *_state(size // 2), signal.description)
+    return signal

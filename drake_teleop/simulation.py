@@ -17,7 +17,7 @@ from drake_teleop.pages.progress import Progress, show_progress
 from drake_teleop.quantities import check_ranges
 from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.scenario import Simulation
-from drake_teleop.signals import LOG, SIGNALS
+from drake_teleop.signals import LOG, signal_of
 
 # In milliseconds; long enough to keep progress cheap, short enough to look alive.
 _PROGRESS_STEP = 20
@@ -183,4 +183,5 @@ def read_log(simulator: Simulator, start: float) -> SimulationResult:
     signals = {name: data[:, column] for name, column in _columns(diagram).items()}
     if "sample_time" in signals:
         signals["sample_time"] -= start
-    return SimulationResult(t[kept], signals, [SIGNALS[name] for name in signals])
+    specs = [signal_of(name, values.shape[1]) for name, values in signals.items()]
+    return SimulationResult(t[kept], signals, specs)

@@ -43,7 +43,7 @@ from drake_teleop.operator.task import Insert, Press, Reach, Task, Touch
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario
 from drake_teleop.slave.arm import forward_kinematics
-from drake_teleop.slave.plant import R_WS_HOME, NominalSlave
+from drake_teleop.slave.plant import NominalSlave
 
 Array = NDArray[np.float64]
 
@@ -210,9 +210,10 @@ def _force_and_place(result: SimulationResult, scenario: Scenario, task: Task, e
 
 def _tip_from_target(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> Array:
     """(3,) from the target to the tool's tip, in W [m]."""
-    slave = NominalSlave(scenario.slave.payload)
+    slave = NominalSlave(scenario.slave)
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
-    forward_kinematics(slave.arm.table, result["slave_state"][ended, :6], R_WS, p_WS)
-    start = np.array(scenario.slave.position) + R_WS_HOME.matrix() @ slave.tip
-    off: Array = p_WS + R_WS @ slave.tip - start - np.array(task.translation)
+    forward_kinematics(
+        slave.arm.table, result["slave_state"][ended, : slave.arm.num_joints], R_WS, p_WS
+    )
+    off: Array = p_WS + R_WS @ slave.tip - slave.start_tip - np.array(task.translation)
     return off

@@ -43,6 +43,7 @@ from drake_teleop.sensor.sensor_chain import NOISE_BLOCK
 from drake_teleop.simulation import MakeSimulator, advance, read_log
 from drake_teleop.slave.joint_control import JointControlConfig
 from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
 from drake_teleop.station import MakeTeleopStation
 
 ALIGNMENT = [0.5, -0.4, 0.8]
@@ -82,7 +83,7 @@ class Recorded:
 
 @pytest.fixture(scope="module")
 def slave():
-    return AddSlavePlant(DiagramBuilder(), SLAVE_START, None)
+    return AddSlavePlant(DiagramBuilder(), Slave(position=SLAVE_START), None)
 
 
 def turned(**changes: object) -> Scenario:

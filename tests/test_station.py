@@ -29,6 +29,7 @@ from drake_teleop.simulation import MakeSimulator, advance, simulate
 from drake_teleop.slave.arm import MOTION_SIZE, sensor_motion
 from drake_teleop.slave.inverse_kinematics import IkStatus
 from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
 from drake_teleop.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
 
 FORCE_SCALE = 1 / 17.5
@@ -37,7 +38,7 @@ MASS = 3.13
 
 @pytest.fixture(scope="module")
 def slave():
-    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None)
+    return AddSlavePlant(DiagramBuilder(), Slave(), None)
 
 
 def true_estimate(slave, offset=(0.0,) * 6) -> np.ndarray:

@@ -55,7 +55,7 @@ from drake_teleop.analysis.figures import (
 from drake_teleop.analysis.linearization import AXES, Linearization, delays, hybrid_along, linearize
 from drake_teleop.analysis.period_map import Sampling
 from drake_teleop.analysis.report import Curves, print_tables, write_report
-from drake_teleop.analysis.task_direction import TIP, TaskDirection, task_direction
+from drake_teleop.analysis.task_direction import TaskDirection, task_direction
 from drake_teleop.analysis.two_port import absorb, hybrid
 from drake_teleop.analysis.verdict import verdict
 from drake_teleop.errors import DrakeTeleopError
@@ -65,6 +65,7 @@ from drake_teleop.operator.operator import GRIPS
 from drake_teleop.pages.progress import Stage, show_progress
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.slave.plant import NominalSlave
 from drake_teleop.writing import make_folder, output_folder, write_json
 
 DIRECTIONS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -220,7 +221,7 @@ def pressing(scenario: Scenario) -> list[float]:
             where="kinematic_scaling.translation_scale",
             remedy="choose a scale above 0, or leave the sheet_spring out",
         )
-    tip = np.array(scenario.slave.position) - [0.0, 0.0, TIP[2]]  # the tool points down
+    tip = NominalSlave(scenario.slave).start_tip
     way = np.array(scenario.sheet_spring.position) - [0.0, 0.0, _PRESSED] - tip
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
     return list(R_WB.T @ way / scaling.translation_scale)

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.analysis.linearization import delays, linearize_station
 from drake_teleop.analysis.one_axis import Complex
@@ -28,7 +27,7 @@ from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, check_scenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import ArmModel, jacobian
-from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.plant import NominalSlave
 from drake_teleop.station import MakeTeleopStation
 
 Array = NDArray[np.float64]
@@ -246,7 +245,7 @@ def predict_frequency_response(
 
 
 def _signals(result: SimulationResult, scenario: Scenario, task: TaskDirection) -> dict[str, Array]:
-    arm = AddSlavePlant(DiagramBuilder(), scenario.slave.position, None).arm
+    arm = NominalSlave(scenario.slave).arm
     return {
         "hand_force": result["hand_wrench_E"] @ task.hand,
         "hand_velocity": result["twist_master"] @ task.hand,
@@ -257,8 +256,9 @@ def _signals(result: SimulationResult, scenario: Scenario, task: TaskDirection) 
 
 def _twists(arm: ArmModel, states: Array) -> Array:
     """(N, 6) of So in W."""
-    J, twists = np.empty((6, 6)), np.empty((len(states), 6))
+    n = arm.num_joints
+    J, twists = np.empty((6, n)), np.empty((len(states), 6))
     for state, twist in zip(states, twists, strict=True):
-        jacobian(arm.table, np.ascontiguousarray(state[:6]), J)
-        twist[:] = J @ state[6:]
+        jacobian(arm.table, np.ascontiguousarray(state[:n]), J)
+        twist[:] = J @ state[n:]
     return twists

@@ -50,7 +50,8 @@ from drake_teleop.scenario import Scenario, check_scenario, replace
 from drake_teleop.sensor.sensor_chain import without
 from drake_teleop.simulation import MakeSimulator
 from drake_teleop.slave.arm import jacobian
-from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.slave.ik_methods import AUTOMATIC, method_of
+from drake_teleop.slave.plant import ARM, NominalSlave
 from drake_teleop.station import GetBlock, MakeTeleopStation
 
 Array = NDArray[np.float64]
@@ -387,10 +388,11 @@ class _Period:
         self._simulator = MakeSimulator(self._diagram, smooth.simulation)
         # Steps that followed the error would follow the displacements too.
         self._simulator.get_mutable_integrator().set_fixed_step_mode(True)
-        plant = self._system("slave_plant")
-        self._arm = ArmModelFromPlant(plant, plant.GetModelInstanceByName("rx90")).table
+        slave = NominalSlave(smooth.slave)
+        self._arm, self._joints = slave.arm.table, slave.arm.num_joints
+        self._remembers = method_of(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
         self._push = ExternallyAppliedSpatialForce()
-        self._push.body_index = plant.GetBodyByName("tool").index()
+        self._push.body_index = slave.tool
         self._sensor = self._system("wrist_sensor")
         servo = smooth.joint_control
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
@@ -443,10 +445,17 @@ class _Period:
             whole("master_device", 2, np.full(6, _RATE)),
             # The angles again, for the display; what else it remembers acts after faults alone.
             _States("master_device", 3, slice(0, 6), np.full(6, _ANGLE)),
-            whole("joint_control", 0, np.full(6, _OTHER)),
+            whole("joint_control", 0, np.full(self._joints, _OTHER)),
             _States("slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE], joints)),
             _States("wrist_sensor", 0, self._sensor.remembered, remembered),
+            *self._last_command(),
         ]
+
+    def _last_command(self) -> list[_States]:
+        """From which the numeric inverse kinematics goes on; the closed form remembers nothing."""
+        steps = np.full(self._joints, self._joint_step)
+        command = _States("inverse_kinematics", 0, slice(0, self._joints), steps)
+        return [command] if self._remembers else []
 
     def get(self) -> Array:
         """The states now."""
@@ -481,13 +490,16 @@ class _Period:
         self._fix("wrist_sensor", "applied_wrench_W", push)
 
     def _slave_state(self) -> Array:
-        return self._eval("slave_plant", "rx90_state")
+        return self._eval("slave_plant", f"{ARM}_state")
 
     def _run(self) -> Array:
         """The states after a period, from those now."""
         # The sample of noise, which is 0, and the log have other instants.
         context = self._simulator.get_mutable_context()
         context.SetTime(self.dt)
+        if self._remembers:  # when its last command was
+            command = self._context("inverse_kinematics").get_mutable_discrete_state(0)
+            command.get_mutable_value()[-1] = 0.0
         self._sensor.bring_up_to_date(self._context("wrist_sensor"))
         self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         self._simulator.AdvanceTo(2 * self.dt)
@@ -496,15 +508,15 @@ class _Period:
 
     def _outputs(self) -> Array:
         pose, state = self._eval("kinematic_scaling", "pose_command"), self._slave_state()
-        J = np.empty((6, 6))
-        jacobian(self._arm, state[:6], J)
+        J = np.empty((6, self._joints))
+        jacobian(self._arm, state[: self._joints], J)
         return np.concatenate(
             [
                 self._eval("operator", "hand_wrench_E"),
                 _difference(pose, self._pose),
                 self._eval("force_scaling", "wrench_B"),
                 self._eval("master_device", "twist_master"),
-                J @ state[6:],
+                J @ state[self._joints :],
             ]
         )
 
@@ -621,8 +633,8 @@ def _smooth(scenario: Scenario) -> Scenario:
         wrist_sensor=without(scenario.wrist_sensor, *parts),
         master=scenario.master.without_coulomb_friction(),
         load_estimator__enabled=False,
-        # The other ways lead to the same angles, and some remember what the period's map would not.
-        slave__inverse_kinematics="closed_form",
+        # For an arm that has a closed form, which leads to the same angles and remembers nothing.
+        slave__inverse_kinematics=AUTOMATIC,
     )
 
 

@@ -15,21 +15,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RollPitchYaw
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RollPitchYaw, RotationMatrix
 
 from drake_teleop.analysis.one_axis import OneAxis
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import checked
 from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.slave.arm import ArmModel, forward_kinematics, inverse_dynamics, jacobian
-from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
-from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, home_position
+from drake_teleop.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
+from drake_teleop.slave.numeric_inverse_kinematics import find_posture
+from drake_teleop.slave.plant import NominalSlave, SlavePlant
 
 Array = NDArray[np.float64]
-
-#: m, p_SoTip_S: where the ball touches (models/tool.sdf).
-TIP = np.array([0.0, 0.0, 0.2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,14 +102,14 @@ def task_direction(
     moved_B = checked("displacement", displacement, 3)
     hand_B = np.concatenate([R_WB.T @ n_W, np.zeros(3)])
     device_mass, device_damping = _device(scenario, moved_B, hand_B)
-    slave = scenario.slave
-    arm = AddSlavePlant(DiagramBuilder(), slave.position, None, payload=slave.payload).arm
+    slave = NominalSlave(scenario.slave)
+    arm = slave.arm
     moved_W = scaling.translation_scale * R_WB @ moved_B
-    q = _slave_posture(arm, scenario.slave.position, moved_W)
-    J, R_WS, p_WS = np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
+    q = _slave_posture(slave, moved_W)
+    J, R_WS, p_WS = np.empty((6, arm.num_joints)), np.empty((3, 3)), np.empty(3)
     jacobian(arm.table, q, J)
     forward_kinematics(arm.table, q, R_WS, p_WS)
-    tool_W = np.concatenate([n_W, np.cross(R_WS @ TIP, n_W)])
+    tool_W = np.concatenate([n_W, np.cross(R_WS @ slave.tip, n_W)])
     # Acceleration of S for a unit push at the tip, while no motor reacts.
     a, alpha = np.split(J @ np.linalg.solve(_mass_matrix(arm, q), J.T @ tool_W), 2)
     mass, first_moment_S = arm.phi_load[0], arm.phi_load[1:4]
@@ -155,11 +153,14 @@ def _device(scenario: Scenario, moved_B: Array, n: Array) -> tuple[float, float]
     return float(1 / mobility - hand.mass), float(damping)
 
 
-def _slave_posture(arm: ArmModel, position: Sequence[float], moved: Array) -> Array:
-    home = home_position(arm, list(position))
-    q, status = nearest_branch(
-        R_WS_HOME.matrix(), np.array(position) + moved, home, arm.lower, arm.upper
-    )
+def _slave_posture(slave: SlavePlant, moved: Array) -> Array:
+    arm, pose = slave.arm, slave.X_WS_start.copy()
+    pose[4:] += moved
+    if has_closed_form(arm):
+        R_WS = RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))).matrix()
+        q, status = nearest_branch(R_WS, pose[4:], slave.start, arm.lower, arm.upper)
+    else:
+        q, status = find_posture(arm, pose, slave.start)
     if status != IkStatus.OK:
         raise DrakeTeleopError(
             f"the arm cannot follow by {moved} m ({IkStatus(status).name})", where="displacement"

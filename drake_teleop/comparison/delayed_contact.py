@@ -24,10 +24,9 @@ from drake_teleop.quaternions import quaternion_of
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.slave.arm import forward_kinematics
+from drake_teleop.slave.plant import NominalSlave
 from drake_teleop.vectors import put
 
-#: m, from the ball's tip to the origin of S (models/tool.sdf).
-_TIP = 0.2
 _GAP, _DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; how deep the operator presses
 #: Leaves by name: thickness [m] of a leaf of 120 mm x 50 mm, which is light enough not to rattle.
 LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
@@ -76,10 +75,8 @@ def delayed_contact(
             (task.release, task.released, [-x for x in reach]),
         )
     )
-    x, y, z = base.slave.position
-    sheet = SheetSpring(
-        position=[x, y, z - _TIP - _GAP], length=0.12, width=0.05, thickness=LEAVES[leaf]
-    )
+    x, y, z = NominalSlave(base.slave).start_tip.tolist()
+    sheet = SheetSpring(position=[x, y, z - _GAP], length=0.12, width=0.05, thickness=LEAVES[leaf])
     return (
         replace(
             base,
@@ -137,8 +134,9 @@ def _slave_motion(
     result: SimulationResult, scenario: Scenario
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(N,) height of So [m] and (N, 3) rotation vector since the start of the log [rad]."""
-    table, q = slave_arm(scenario).table, np.ascontiguousarray(result["slave_state"][:, :6])
-    poses = _poses(table, q)
+    arm = slave_arm(scenario)
+    q = np.ascontiguousarray(result["slave_state"][:, : arm.num_joints])
+    poses = _poses(arm.table, q)
     rotations = Rotation.from_quat(poses[:, [1, 2, 3, 0]])
     return poses[:, 6], (rotations * rotations[0].inv()).as_rotvec()
 

@@ -60,8 +60,9 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
             where="accounts",
             remedy="run a station over a network, or with a method",
         )
-    t, q = result.t, np.ascontiguousarray(result["slave_state"][:, :6])
-    poses, motor = _motors(scenario, q, result["joint_torque"])
+    t, torque = result.t, result["joint_torque"]
+    q = np.ascontiguousarray(result["slave_state"][:, : torque.shape[1]])
+    poses, motor = _motors(scenario, q, torque)
     contact = np.zeros_like(motor)
     if "true_contact_wrench_W" in result:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
@@ -100,12 +101,17 @@ def _motion_scale(scenario: Scenario) -> Array:
 
 
 def _motors(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
-    """(N, 7) X_WS; (N, 6) what the motors do beside bearing the weight, as a wrench at So in W."""
-    arm, still = slave_arm(scenario).table, np.zeros(6)
-    poses, weight, J = np.empty((len(q), 7)), np.empty_like(q), np.empty((len(q), 6, 6))
+    """(N, 7) X_WS; (N, 6) what the motors do beside bearing the weight, as a wrench at So in W.
+
+    Of a redundant arm, what comes nearest: the rest of its torques moves it within itself.
+    """
+    n = q.shape[1]
+    arm, still = slave_arm(scenario).table, np.zeros(n)
+    poses, weight, J = np.empty((len(q), 7)), np.empty_like(q), np.empty((len(q), 6, n))
     for k in range(len(q)):
         pose_into(arm, q[k], poses[k])
         inverse_dynamics(arm, q[k], still, still, weight[k])
         jacobian(arm, q[k], J[k])
-    wrench = np.linalg.solve(J.swapaxes(1, 2), (torque - weight)[:, :, np.newaxis])
+    to_torque, beside = J.swapaxes(1, 2), (torque - weight)[:, :, np.newaxis]
+    wrench = np.linalg.solve(to_torque, beside) if n == 6 else np.linalg.pinv(to_torque) @ beside
     return poses, wrench[:, :, 0]

@@ -31,8 +31,7 @@ from drake_teleop.slave.arm import SLIDES, ArmModel
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.assumed_limits import with_all_limits
 from drake_teleop.slave.models import ParseModel, drakes_errors_said
-from drake_teleop.slave.payload import AddPayload
-from drake_teleop.slave.plant import AddEnvironment, ParseSlave, finalize, home_position
+from drake_teleop.slave.plant import AddEnvironment, NominalSlave, ParseSlave, finalize
 
 _POSTURES = 1000  # random ones, in which distances of shapes are looked at
 # Of the joints' ranges, speeds and torques; the rest is for tracking errors and feedback.
@@ -94,25 +93,30 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     check_scenario(scenario)
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
-        instance, tool = ParseSlave(plant)
-        AddPayload(plant, tool, scenario.slave.payload)
+        parsed = ParseSlave(plant, scenario.slave)
         if scenario.environment is not None:
             AddEnvironment(plant, scenario.environment)
-        return instance, plant.GetFrameByName("sensor", instance)
+        folders.extend(parsed.folders)
+        return parsed.instance, parsed.sensor_frame
 
-    load = _arm_of(parse).phi_load
-    scene = Scene(parse, (_LOAD_FACTOR - 1) * load, visuals_count=True)
+    slave, folders = NominalSlave(scenario.slave), list[TemporaryDirectory[str]]()
+    own = scenario.slave.model != ""
+    scene = Scene(parse, (_LOAD_FACTOR - 1) * slave.arm.phi_load, visuals_count=not own)
+    scene.arm, _ = with_all_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_BOX_W)
+    box = (upper + lower) / 2, (upper - lower) / 2
+    endless = np.zeros(3), np.full(3, np.inf)
     return _robot(
         scene,
         "the station's slave",
         scenario.wrist_sensor,
         scenario.motion_estimation,
         scenario.rates.sensor_hz,
-        home=home_position(scene.arm, scenario.slave.position),
-        points_S=np.array(_POINTS_S),
-        box=((upper + lower) / 2, (upper - lower) / 2),
-        assumptions=["a table at z = 0"],
+        home=slave.start,
+        points_S=np.array([np.zeros(3), slave.tip] if own else _POINTS_S),
+        box=endless if own else box,
+        assumptions=["a table at z = 0", *slave.assumptions],
+        folders=folders,
     )
 
 

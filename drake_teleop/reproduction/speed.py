@@ -26,7 +26,7 @@ _SPAN = 0.1  # simulated seconds a turn
 def MakeBarePlant(scenario: Scenario) -> Simulator:
     """Arm and tool under the torque that holds them, see the module."""
     builder = DiagramBuilder()
-    slave = AddSlavePlant(builder, scenario.slave.position, None)
+    slave = AddSlavePlant(builder, scenario.slave, None)
     diagram = builder.Build()
     step = 1 / scenario.rates.sensor_hz
     simulation = Simulation(integrator="runge_kutta2", max_step=step)

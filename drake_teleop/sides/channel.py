@@ -14,7 +14,7 @@ from drake_teleop.channel.channel import TeleopChannel
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sides.ports import export
-from drake_teleop.slave.plant import R_WS_HOME, NominalSlave, home_position
+from drake_teleop.slave.plant import NominalSlave, start_pose
 from drake_teleop.slave.servo import servo_at_tool
 
 Array = NDArray[np.float64]
@@ -63,7 +63,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
             scenario.force_scaling.force_scale,
-            np.array([*R_WS_HOME.ToQuaternion().wxyz(), *scenario.slave.position]),
+            start_pose(scenario.slave),
             1 / scenario.rates.hand_hz,
             scenario.simulation.seed,
         ),
@@ -103,9 +103,8 @@ def told_of_the_arm(scenario: Scenario) -> PassivityConfig:
     passivity = scenario.passivity
     if passivity.method != "ledger" or passivity.slave_mass is not None:
         return passivity
-    arm = NominalSlave(scenario.slave.payload).arm
-    start = home_position(arm, scenario.slave.position)
-    servo = servo_at_tool(arm, start, scenario.joint_control)
+    slave = NominalSlave(scenario.slave)
+    servo = servo_at_tool(slave.arm, slave.start, scenario.joint_control)
     return dataclasses.replace(
         passivity,
         servo_stiffness=servo.stiffness,

@@ -15,7 +15,7 @@ from drake_teleop.operator.operator import Operator
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sides.ports import export
-from drake_teleop.slave.plant import R_WS_HOME, NominalSlave
+from drake_teleop.slave.plant import NominalSlave, start_pose
 
 #: How often the clutch is looked at [s]; an event at 2 kHz would cost time.
 CLUTCH_PERIOD = 0.01
@@ -47,7 +47,7 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
     check_scenario(scenario)
     hand, scaling = scenario.operator.hand, scenario.kinematic_scaling
     start_B = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
-    start_W = np.array([*R_WS_HOME.ToQuaternion().wxyz(), *scenario.slave.position])
+    start_W = start_pose(scenario.slave)
     builder = DiagramBuilder()
 
     operator = builder.AddNamedSystem("operator", _operator(scenario, start_B))
@@ -97,8 +97,8 @@ def _operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator:
         backward,
         scenario.simulation.seed,
     )
-    slave = NominalSlave(scenario.slave.payload)
-    tip_W = np.array(scenario.slave.position) + R_WS_HOME.matrix() @ slave.tip
+    slave = NominalSlave(scenario.slave)
+    tip_W = slave.start_tip
     return Operator(
         scenario.operator, start_B, training, slave.arm, np.concatenate([slave.tip, tip_W])
     )

@@ -21,7 +21,7 @@ from drake_teleop.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.sensor.wrist_sensor import AddWristSensor
 from drake_teleop.sides.ports import export
 from drake_teleop.slave.forward_kinematics import ForwardKinematics
-from drake_teleop.slave.ik_methods import METHODS
+from drake_teleop.slave.ik_methods import METHODS, method_of
 from drake_teleop.slave.joint_control import JointControl
 from drake_teleop.slave.joint_trajectory import JointTrajectory
 from drake_teleop.slave.monitor import SlaveMonitor
@@ -77,8 +77,8 @@ def MakeSlaveSide(
     body = _add_body(builder, scenario, load_estimate, load_covariance)
     arm = body.slave.arm
 
-    start = body.slave.plant.GetDefaultPositions(body.slave.instance)
-    make_ik = METHODS[scenario.slave.inverse_kinematics]
+    start = body.slave.start
+    make_ik = METHODS[method_of(scenario.slave.inverse_kinematics, arm)]
     ik = builder.AddNamedSystem(
         "inverse_kinematics", make_ik(arm, start, 1 / scenario.rates.joint_control_hz)
     )
@@ -174,15 +174,8 @@ def _add_body(
 ) -> _Body:
     """Adds what every slave has; the joint command is left open."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
-    slave = AddSlavePlant(
-        builder,
-        scenario.slave.position,
-        scenario.environment,
-        q_start,
-        scenario.slave.payload,
-    )
-    arm, plant = slave.arm, slave.plant
-    start = plant.GetDefaultPositions(slave.instance)
+    slave = AddSlavePlant(builder, scenario.slave, scenario.environment, q_start)
+    arm, plant, start = slave.arm, slave.plant, slave.start
     state = plant.get_state_output_port(slave.instance)
     builder.ExportOutput(state, "slave_state")
 

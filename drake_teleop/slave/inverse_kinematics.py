@@ -21,6 +21,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_teleop._compiled import njit
 from drake_teleop.fault import sound
 from drake_teleop.lifetime import ONE_DICT, weak_callback
+from drake_teleop.slave.arm import SLIDES, ArmModel, forward_kinematics
 from drake_teleop.vectors import put
 
 Array = NDArray[np.float64]
@@ -262,6 +263,19 @@ def nearest_branch(
     R = np.ascontiguousarray(R_WS)
     status = _nearest_branch(R, p_WS, q_reference, lower, upper, max_step, q)
     return q, IkStatus(status)
+
+
+def has_closed_form(arm: ArmModel) -> bool:
+    """Whether this closed form is that of an arm: it leads back to joint angles of its poses."""
+    if arm.num_joints != 6 or arm.table[:, SLIDES].any():
+        return False
+    R_WS, p_WS, endless = np.empty((3, 3)), np.empty(3), np.full(6, np.inf)
+    for q in ([0.3, -0.5, -1.1, 0.7, 0.9, -0.4], [-1.0, 0.6, 1.3, -0.8, 0.5, 1.2]):
+        forward_kinematics(arm.table, np.array(q), R_WS, p_WS)
+        found, _ = nearest_branch(R_WS, p_WS, np.array(q), -endless, endless)
+        if not np.allclose(found, q, rtol=0.0, atol=1e-9):
+            return False
+    return True
 
 
 class InverseKinematics(LeafSystem):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,6 +36,9 @@ from drake_teleop.slave.meshes import Packages, without_lost_meshes
 from drake_teleop.slave.model_check import WORLD, check_model, check_tree
 from drake_teleop.texts import read_text, read_yaml
 
+# What ties links to each other besides joints: Drake's tags in URDF and SDF, MJCF's.
+_LOOP = re.compile(rb"<(drake:ball_constraint|drake:linear_bushing_rpy|connect|weld|distance)\b")
+
 
 @dataclass(frozen=True)
 class ParsedModel:
@@ -59,7 +63,7 @@ class ParsedTool:
 
     body: RigidBody
     assumptions: list[str]
-    folder: TemporaryDirectory[str]
+    folder: TemporaryDirectory[str] | None = None
 
 
 def ParseModel(
@@ -182,6 +186,7 @@ def _read(plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...]) ->
         read_yaml(path, tagged=True)  # Drake's parser overflows its stack over many brackets
     elif kind == "xml":
         read_text(path)  # or names cannot be said
+    _check_no_loop(path, kind)
     with drakes_errors_said(path):
         if root is None:
             with _drakes_errors_raised():
@@ -199,6 +204,20 @@ def _read(plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...]) ->
     return _Read(instances, root, assumptions, converted)
 
 
+def _check_no_loop(path: Path, kind: str) -> None:
+    """Refuses what closes loops in a tree of links: Drake would drop it, or the chain be another.
+
+    Of joints that move together, `_peculiar_joints` tells.
+    """
+    found = None if kind == "yaml" else _LOOP.search(path.read_bytes())
+    if found:
+        raise DrakeTeleopError(
+            f"its links form a loop, by {found[1].decode()}",
+            where=str(path),
+            remedy="cut the loop, or model the chain to the sensor alone",
+        )
+
+
 def _moves(plant: MultibodyPlant, index: JointIndex) -> bool:
     return plant.get_joint(index).num_velocities() > 0
 
@@ -207,6 +226,8 @@ def _hold_others(
     plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
 ) -> list[str]:
     """Welds what moves and is not on the chain, where it is by default; says so."""
+    for constraint in plant.GetConstraintIds():  # such as of fingers that move together
+        plant.RemoveConstraint(constraint)
     names = []
     for index in set(plant.GetJointIndices()) - before - set(chain):
         if not _moves(plant, index):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, SpatialInertia, WeldJoint
+from pydrake.multibody.tree import Frame, SpatialInertia, WeldJoint
 
 from drake_teleop.fields import settings
 from drake_teleop.quantities import quantity
@@ -27,15 +27,15 @@ class Payload:
     com: list[float] = quantity([0.0, 0.0, 0.15], "m", -0.5, 0.5, "its centre, p_SoBcm_S")
 
 
-def AddPayload(plant: MultibodyPlant, tool: BodyIndex, payload: Payload) -> None:
-    """Adds it to a plant that is not finalized; nothing if it has no mass."""
+def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
+    """Welds it to a frame that coincides with S; nothing if it has no mass.
+
+    The plant is not finalized.
+    """
     if payload.mass == 0.0:
         return
     radius = (payload.mass / _STEEL * 3 / (4 * math.pi)) ** (1 / 3)
     inertia = SpatialInertia.SolidSphereWithMass(payload.mass, radius)
-    holder = plant.get_body(tool)
     body = plant.AddRigidBody("payload", holder.model_instance(), inertia)
-    weld = WeldJoint(
-        "payload_weld", holder.body_frame(), body.body_frame(), RigidTransform(payload.com)
-    )
+    weld = WeldJoint("payload_weld", holder, body.body_frame(), RigidTransform(payload.com))
     plant.AddJoint(weld)

@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from functools import lru_cache
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import SceneGraph
-from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.parsing import Parser
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.geometry import Role, SceneGraph
+from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, WeldJoint
+from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.environment.environment import Environment
 from drake_teleop.environment.point_contact import WIDTH, ContactPairs
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.resources import models_dir
-from drake_teleop.slave.arm import ArmModel
+from drake_teleop.slave.arm import SLIDES, ArmModel, inverse_dynamics
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
-from drake_teleop.slave.payload import AddPayload, Payload
+from drake_teleop.slave.assumed_limits import with_all_limits
+from drake_teleop.slave.forward_kinematics import pose_into
+from drake_teleop.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
+from drake_teleop.slave.models import ParseModel, drakes_errors_said
+from drake_teleop.slave.numeric_inverse_kinematics import find_posture
+from drake_teleop.slave.payload import AddPayload
+from drake_teleop.slave.slave_config import Slave
+from drake_teleop.slave.tool import AddTool, shapes_reach
 
+#: What the arm's model instance is called in a plant, whatever its file says.
+ARM = "arm"
 #: S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
 #: Elbow up, reaching forward (negative q2 and q3 lean to +x); home is the branch nearest to it.
@@ -35,22 +44,30 @@ class SlavePlant:
 
     Args:
         plant: continuous MultibodyPlant, finalized.
-        instance: the arm with its tool.
-        tool: the tool's body.
-        arm: kinematics and dynamics up to S, with the tool as its load.
+        instance: the arm's joints.
+        tool: the body on the sensor.
+        arm: kinematics and dynamics up to S, with all that hangs there as its load.
+        start: (n,) joint positions at the start [rad].
+        X_WS_start: (7,) see `start_pose`.
+        tip: (3,) p_STip, where the tool makes contact [m].
         sheet: model instance of what moves when it is touched, such as the leaf, if anything does.
         contact_pairs: (k, 27) what may touch, see `ContactPairs`; none without an environment.
         leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] of the leaf, and its acceleration by
             gravity [m/s^2]; without one, a mass that nothing moves.
+        assumptions: what the models do not say.
     """
 
     plant: MultibodyPlant
     instance: ModelInstanceIndex
     tool: BodyIndex
     arm: ArmModel
+    start: NDArray[np.float64]
+    X_WS_start: NDArray[np.float64]
+    tip: NDArray[np.float64]
     sheet: ModelInstanceIndex | None
     contact_pairs: NDArray[np.float64]
     leaf: NDArray[np.float64]
+    assumptions: tuple[str, ...]
 
     @property
     def can_touch(self) -> bool:
@@ -58,42 +75,72 @@ class SlavePlant:
         return len(self.contact_pairs) > 0
 
     @property
-    def tip(self) -> NDArray[np.float64]:
-        """(3,) p_STip, where the tool makes contact [m]."""
-        return self.plant.GetFrameByName("tip").GetFixedPoseInBodyFrame().translation()
+    def start_tip(self) -> NDArray[np.float64]:
+        """(3,) p_WTip at the start [m]."""
+        start = self.X_WS_start
+        R_WS = RotationMatrix(Quaternion(start[:4] / np.linalg.norm(start[:4])))
+        return start[4:] + R_WS.matrix() @ self.tip
 
 
-def NominalSlave(payload: Payload) -> SlavePlant:
-    """The slave by itself, with nothing to touch, for its numbers: arm and tip."""
-    return _nominal_slave(payload.mass, *payload.com)
+def start_pose(slave: Slave) -> NDArray[np.float64]:
+    """(7,) X_WS [qw qx qy qz px py pz] at the start; without `home` as it was asked for.
+
+    Raises:
+        DrakeTeleopError: as `NominalSlave`, if `home` is given.
+    """
+    if slave.home:
+        return NominalSlave(slave).X_WS_start
+    return np.array([*R_WS_HOME.ToQuaternion().wxyz(), *slave.position])
+
+
+def NominalSlave(slave: Slave) -> SlavePlant:
+    """The slave by itself, with nothing to touch, for its numbers: arm, start and tip.
+
+    Raises:
+        DrakeTeleopError: as `AddSlavePlant`.
+    """
+    written = tuple(path.stat().st_mtime_ns for path in slave.files())
+    return _nominal_slave(_Known(slave), written)
+
+
+class _Known:
+    """A slave that can be looked up: by all of its values."""
+
+    def __init__(self, slave: Slave) -> None:
+        self.slave, self._values = copy.deepcopy(slave), repr(slave)
+
+    def __hash__(self) -> int:
+        return hash(self._values)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Known) and self._values == other._values
 
 
 @lru_cache(maxsize=4)  # to parse the models takes longer than to build a station of them
-def _nominal_slave(mass: float, *com: float) -> SlavePlant:
-    payload = Payload(mass=mass, com=list(com))
-    return AddSlavePlant(DiagramBuilder(), [], None, np.zeros(6), payload)
+def _nominal_slave(known: _Known, _: tuple[int, ...]) -> SlavePlant:
+    return AddSlavePlant(DiagramBuilder(), known.slave, None)
 
 
 def AddSlavePlant(
     builder: DiagramBuilder,
-    position: list[float],
+    slave: Slave,
     environment: Environment | None,
     q_start: NDArray[np.float64] | None = None,
-    payload: Payload | None = None,
 ) -> SlavePlant:
     """Adds the slave's plant, at rest.
 
-    A scene graph, which costs time at every step, comes only with something to touch.
+    A scene graph, which costs time at every step, comes only with something to touch. Of the slave
+    itself only the tool touches, not the arm.
 
     Args:
         builder: the diagram.
-        position: (3,) p_WS at the start [m]; the tool points down.
+        slave: arm, tool, payload and where they start.
         environment: what there is to touch, or None.
-        q_start: (6,) joint angles to start at instead [rad].
-        payload: what the tool holds, if anything.
+        q_start: (n,) joint positions to start at instead [rad].
 
     Raises:
-        DrakeTeleopError: if the arm cannot reach the start.
+        DrakeTeleopError: if a model cannot be read, the arm cannot reach the start or not hold the
+            tool there.
     """
     if environment is None:
         plant = builder.AddNamedSystem("slave_plant", MultibodyPlant(time_step=0.0))
@@ -102,14 +149,15 @@ def AddSlavePlant(
         plant.set_name("slave_plant")
         plant.set_contact_model(ContactModel.kPoint)
         plant.set_stiction_tolerance(environment.slip)
-    instance, tool = ParseSlave(plant)
-    if payload is not None:
-        AddPayload(plant, tool, payload)
+    parsed = ParseSlave(plant, slave)
+    instance, tool = parsed.instance, parsed.tool
     touched = None if environment is None else AddEnvironment(plant, environment)
-    finalize(plant)
+    with drakes_errors_said(slave.path):
+        finalize(plant)
     pairs, leaf = np.zeros((0, WIDTH)), np.array([1.0, 0.0, 0.0, 0.0])
     if environment is not None and touched is not None:
         _remove_visuals(plant, scene_graph)
+        _remove_shapes(plant, scene_graph, instance, tool)
         environment.PrepareTool(plant, scene_graph)
         inspector = scene_graph.model_inspector()
         pairs = ContactPairs(plant, inspector, tool, touched, environment.slip)
@@ -117,10 +165,27 @@ def AddSlavePlant(
     if environment is not None and environment.moving_part is not None:
         sheet = touched
         leaf = np.array([*environment.moving_part, plant.gravity_field().gravity_vector()[2]])
-    arm = ArmModelFromPlant(plant, instance, "sensor")
-    start = home_position(arm, position) if q_start is None else q_start
+    arm, assumptions = parsed.arm()
+    start = start_posture(slave, arm) if q_start is None else q_start
+    if q_start is None:
+        check_strength(arm, start)
     plant.SetDefaultPositions(instance, start)
-    return SlavePlant(plant, instance, tool, arm, sheet, pairs, leaf)
+    X_WS_start = np.empty(7) if slave.home else start_pose(slave)
+    if slave.home:
+        pose_into(arm.table, start, X_WS_start)
+    return SlavePlant(
+        plant,
+        instance,
+        tool,
+        arm,
+        start,
+        X_WS_start,
+        _tip(plant, slave, parsed, arm),
+        sheet,
+        pairs,
+        leaf,
+        (*parsed.assumptions, *assumptions),
+    )
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> ModelInstanceIndex:
@@ -128,21 +193,85 @@ def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> ModelInst
     return environment.AddTo(plant)
 
 
-def ParseSlave(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, BodyIndex]:
-    """Parses arm and tool; the tool hangs on the wrist sensor through the joint "sensor_weld".
+@dataclass(frozen=True)
+class ParsedSlave:
+    """Arm and tool in a plant that is not finalized.
 
-    Returns:
-        The arm's model instance and the tool's body.
+    Attributes:
+        slave: what was asked for.
+        plant: where they are.
+        instance: the arm's joints.
+        sensor_frame: S.
+        tool: the body on the sensor.
+        assumptions: what the models do not say, but for limits.
+        folders: of converted meshes, to be kept as long as shapes are looked at.
     """
-    parser = Parser(plant)
-    parser.package_map().AddPackageXml(str(models_dir() / "package.xml"))
-    (arm,) = parser.AddModelsFromUrl("package://drake_teleop/rx90.sdf")
-    parser.AddModelsFromUrl("package://drake_teleop/tool.sdf")
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", arm))
-    tool = plant.GetBodyByName("tool")
-    sensor = plant.GetFrameByName("sensor", arm)
-    plant.AddJoint(WeldJoint("sensor_weld", sensor, tool.body_frame(), RigidTransform.Identity()))
-    return arm, tool.index()
+
+    slave: Slave
+    plant: MultibodyPlant
+    instance: ModelInstanceIndex
+    sensor_frame: Frame
+    tool: BodyIndex
+    assumptions: tuple[str, ...]
+    folders: list[TemporaryDirectory[str]]
+
+    def arm(self) -> tuple[ArmModel, list[str]]:
+        """Its numbers once the plant is finalized, and what is assumed of its limits.
+
+        Raises:
+            DrakeTeleopError: if it is no arm, or nothing hangs on its sensor.
+        """
+        frame = self.sensor_frame
+        arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
+        if not arm.phi_load[0] > 0.0:
+            raise DrakeTeleopError(
+                f"nothing with a mass hangs on {frame.name()}",
+                where="slave.tool",
+                remedy="give the tool, or a sensor_frame before the model's own",
+            )
+        return with_all_limits(arm, str(self.slave.path))
+
+
+def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave:
+    """Parses arm and tool and adds the payload; the tool hangs on S by the joint "sensor_weld".
+
+    Whatever its file says, the arm's model instance is called "arm".
+
+    Args:
+        plant: not finalized.
+        slave: which; by default the paper's.
+
+    Raises:
+        DrakeTeleopError: as `ParseModel` and `AddTool`.
+    """
+    slave = Slave() if slave is None else slave
+    model = ParseModel(plant, slave.path, slave.sensor_frame, slave.packages, slave.X_WBase)
+    if plant.HasModelInstanceNamed(ARM):
+        plant.RenameModelInstance(plant.GetModelInstanceByName(ARM), f"{ARM}_of_model")
+    plant.RenameModelInstance(model.instance, ARM)
+    frame, own = model.sensor_frame, _beyond(plant, model.sensor_frame.body())
+    assumptions, folders = [*model.assumptions], [model.folder]
+    if slave.tool is not None:
+        tool = AddTool(plant, slave.tool, frame, slave.packages)
+        assumptions += tool.assumptions
+        folders += [tool.folder] if tool.folder is not None else []
+        if own:
+            names = ", ".join(body.name() for body in own)
+            assumptions.append(f"{names} of the model on the sensor beside the tool")
+        on_sensor, holder = tool.body, tool.body.body_frame()
+    else:
+        on_sensor, holder = own[0] if own else frame.body(), frame
+    AddPayload(plant, holder, slave.payload)
+    return ParsedSlave(
+        slave, plant, model.instance, frame, on_sensor.index(), tuple(assumptions), folders
+    )
+
+
+def _beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
+    """What hangs on a body, from the nearest outwards."""
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
+    return near + [far for each in near for far in _beyond(plant, each)]
 
 
 def finalize(plant: MultibodyPlant) -> None:
@@ -168,19 +297,99 @@ def _remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
             scene_graph.RemoveGeometry(plant.get_source_id(), shape)
 
 
+def _remove_shapes(
+    plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, tool: BodyIndex
+) -> None:
+    """Of the arm itself nothing touches: a model's hulls overlap, and would push it about."""
+    for index in plant.GetBodyIndices(arm):
+        for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
+            if index != tool:
+                scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
+
+
 def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
-    """Joint angles [rad] with S at `position` [m, in W], tool down, elbow bent upwards.
+    """Joint positions [rad] with S at `position` [m, in W], z_S down; an RX90's elbow bent upwards.
 
     Raises:
         DrakeTeleopError: if the arm cannot reach it.
     """
-    q, status = nearest_branch(
-        R_WS_HOME.matrix(), np.array(position), _Q_NEAR_HOME, arm.lower, arm.upper
-    )
+    if has_closed_form(arm):
+        q, status = nearest_branch(
+            R_WS_HOME.matrix(), np.array(position), _Q_NEAR_HOME, arm.lower, arm.upper
+        )
+        remedy = "move it nearer to (0.55, 0, 0.45)"
+    else:
+        pose = np.array([*R_WS_HOME.ToQuaternion().wxyz(), *position])
+        q, status = find_posture(arm, pose, (arm.lower + arm.upper) / 2)
+        remedy = "move it, or give slave.home: joint positions of a posture that the arm can take"
     if status != IkStatus.OK:
         raise DrakeTeleopError(
             f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})",
             where="slave.position",
-            remedy="move it nearer to (0.55, 0, 0.45)",
+            remedy=remedy,
         )
     return q
+
+
+def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
+    """(n,) where the arm starts [rad].
+
+    Raises:
+        DrakeTeleopError: if it cannot be there.
+    """
+    if not slave.home:
+        return home_position(arm, slave.position)
+    if len(slave.home) != arm.num_joints:
+        raise DrakeTeleopError(
+            f"{len(slave.home)} joint positions for {arm.num_joints} joints",
+            where="slave.home",
+            remedy=f"give one for each of {', '.join(arm.joint_names)}",
+        )
+    q = np.array(slave.home, dtype=np.float64)
+    outside = (q < arm.lower) | (q > arm.upper)
+    if outside.any():
+        k = int(outside.argmax())
+        raise DrakeTeleopError(
+            f"{arm.joint_names[k]} at {q[k]:g} is outside {arm.lower[k]:.4g} to {arm.upper[k]:.4g}",
+            where="slave.home",
+        )
+    return q
+
+
+def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
+    """Refuses a posture that the motors cannot hold.
+
+    Raises:
+        DrakeTeleopError: naming the joint that cannot.
+    """
+    still, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
+    inverse_dynamics(arm.table, q, still, still, torque)
+    share = np.abs(torque) / arm.effort_limit
+    k = int(share.argmax())
+    if share[k] > 1.0:
+        unit = "N" if arm.table[k, SLIDES] else "N m"
+        raise DrakeTeleopError(
+            f"the arm cannot hold its {arm.phi_load[0]:.3g} kg at the start: {arm.joint_names[k]} "
+            f"needs {abs(torque[k]):.3g} of its {arm.effort_limit[k]:.3g} {unit}",
+            where="slave.tool",
+            remedy="give a lighter tool or payload, or start nearer to the base",
+        )
+
+
+def _tip(
+    plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel
+) -> NDArray[np.float64]:
+    if slave.tip:
+        return np.array(slave.tip, dtype=np.float64)
+    instance = plant.get_body(parsed.tool).model_instance()
+    if plant.HasFrameNamed("tip", instance):
+        tip = plant.GetFrameByName("tip", instance)
+        if slave.tool is not None and tip.body().index() == parsed.tool:  # whose frame is S
+            return tip.GetFixedPoseInBodyFrame().translation()
+        X_WS, X_WTip = (
+            frame.CalcPoseInWorld(plant.CreateDefaultContext())
+            for frame in (parsed.sensor_frame, tip)
+        )
+        return X_WS.InvertAndCompose(X_WTip).translation()
+    reach = None if slave.tool is None else shapes_reach(slave.tool)
+    return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)

@@ -20,12 +20,13 @@ from drake_teleop.scenario import Scenario, replace
 from drake_teleop.sides.channel import MakeChannel
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
 from drake_teleop.station import MakeTeleopStation
 
 
 @pytest.fixture(scope="module")
 def load_estimate():
-    arm = AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm
+    arm = AddSlavePlant(DiagramBuilder(), Slave(), None).arm
     return np.concatenate([np.zeros(6), arm.phi_load])
 
 

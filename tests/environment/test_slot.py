@@ -29,12 +29,13 @@ from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import forward_kinematics, jacobian
 from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
 from drake_teleop.slave.plant import R_WS_HOME, AddEnvironment, AddSlavePlant, ParseSlave
+from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.tool_contact import environment_wrench
 from drake_teleop.station import MakeTeleopStation
 
 
 def slave_at(slot: Slot):
-    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], slot)
+    return AddSlavePlant(DiagramBuilder(), Slave(), slot)
 
 
 def pairs_of_a_ball(slot: Slot) -> np.ndarray:
@@ -53,7 +54,7 @@ def pairs_of_a_ball(slot: Slot) -> np.ndarray:
 
 def test_the_peg_is_the_tools_ball_and_another_of_its_size():
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
-    _, tool = ParseSlave(plant)
+    tool = ParseSlave(plant).tool
     mass = plant.get_body(tool).default_mass()
     AddEnvironment(plant, Slot())
     plant.Finalize()

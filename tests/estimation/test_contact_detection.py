@@ -19,6 +19,7 @@ from drake_teleop.scenario import LoadScenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import accelerations
 from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
 from drake_teleop.station import MakeTeleopStation
 
 NOISE = np.repeat([0.1, 0.01], 3)
@@ -27,7 +28,7 @@ OFFSETS = np.array([5.0, -3.0, 2.0, 0.1, 0.2, 0.3])
 
 @pytest.fixture(scope="module")
 def arm():
-    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm
+    return AddSlavePlant(DiagramBuilder(), Slave(), None).arm
 
 
 def floor() -> NoiseFloor:

@@ -62,7 +62,7 @@ TRAJECTORY = FourierTrajectory(
 @pytest.fixture(scope="module")
 def tool():
     """phi of the plant's tool, which only the tests know."""
-    return AddSlavePlant(DiagramBuilder(), SCENARIO.slave.position, None).arm.phi_load
+    return AddSlavePlant(DiagramBuilder(), SCENARIO.slave, None).arm.phi_load
 
 
 def grasp(station, simulator):

@@ -33,6 +33,7 @@ from drake_teleop.load.regressor import regressor
 from drake_teleop.sensor.motion_estimation import MotionEstimationConfig, motion_gains
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
 
 PHI = phi_from_mass_com_inertia(3.0, [0.01, -0.02, 0.08], np.diag([0.012, 0.0115, 0.0045]))
 SCALES = Scales((0.3, 0.02), 0.07, PHI)
@@ -156,7 +157,7 @@ def limits_of(arm) -> Limits:
 
 @pytest.fixture(scope="module")
 def arm():
-    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm
+    return AddSlavePlant(DiagramBuilder(), Slave(), None).arm
 
 
 @pytest.mark.parametrize("name", CRITERIA)

@@ -10,13 +10,14 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.scaling.force_scaling import ForceScaling, ForceScalingConfig
 from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
 
 GRIPPER = [2.0, 0.01, -0.02, 0.15, 0.02, 0.0, 0.0, 0.02, 0.0, 0.01]
 
 
 @pytest.fixture(scope="module")
 def arm():
-    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm
+    return AddSlavePlant(DiagramBuilder(), Slave(), None).arm
 
 
 def outputs(

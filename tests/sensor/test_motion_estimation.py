@@ -40,12 +40,13 @@ from drake_teleop.sensor.sensor_chain import (
 from drake_teleop.slave.arm import sensor_motion
 from drake_teleop.slave.inverse_kinematics import nearest_branch
 from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, home_position
+from drake_teleop.slave.slave_config import Slave
 
 Array = NDArray[np.float64]
 
 T = 1 / 8000
 SOURCES = ("encoders", "accelerometer", "fused")
-ARM = AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None, np.zeros(6)).arm
+ARM = AddSlavePlant(DiagramBuilder(), Slave(), None, np.zeros(6)).arm
 JR3 = PRESETS["jr3_85m35a3"]
 #: Nothing but its low-pass, and an accelerometer that is somewhere and looks somewhere else.
 QUIET = dataclasses.replace(

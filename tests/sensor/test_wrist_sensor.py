@@ -22,6 +22,7 @@ from drake_teleop.sensor.sensor_chain import (
 from drake_teleop.sensor.wrist_sensor import WristSensor
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
 from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
 
 QUIET = without(
@@ -41,7 +42,7 @@ def at_rest(config: WristSensorConfig, **changes):
         simulation__duration=0.5,
         **changes,
     )
-    arm = AddSlavePlant(DiagramBuilder(), scenario.slave.position, None).arm
+    arm = AddSlavePlant(DiagramBuilder(), scenario.slave, None).arm
     estimate = np.concatenate([config.offset, arm.phi_load])
     return simulate(MakeTeleopStation(scenario, load_estimate=estimate), scenario.simulation)
 
@@ -146,7 +147,7 @@ def test_the_log_says_of_which_instant_a_sample_is():
     the sample, those of the row itself are not.
     """
     result = swinging(8000.0)
-    slave = AddSlavePlant(DiagramBuilder(), Scenario().slave.position, None)
+    slave = AddSlavePlant(DiagramBuilder(), Slave(), None)
     plant, context = slave.plant, slave.plant.CreateDefaultContext()
     weld = plant.GetJointByName("sensor_weld")
     place = list(plant.GetJointIndices()).index(weld.index())

@@ -9,11 +9,12 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.slave.arm import inverse_dynamics
 from drake_teleop.slave.joint_control import JointControl, JointControlConfig, joint_control_torque
 from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
 
 
 @pytest.fixture(scope="module")
 def arm():
-    return AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm
+    return AddSlavePlant(DiagramBuilder(), Slave(), None).arm
 
 
 def torque(arm, command, q, v):

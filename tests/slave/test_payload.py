@@ -17,13 +17,14 @@ from drake_teleop.scenario import Scenario, replace
 from drake_teleop.simulation import MakeSimulator, advance
 from drake_teleop.slave.payload import Payload
 from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
 from drake_teleop.station import GetBlock, MakeTeleopStation
 
 HELD = Payload(mass=2.0, com=[0.02, -0.03, 0.16])
 
 
 def test_it_adds_to_the_tools_parameters():
-    bare = AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.45], None).arm.phi_load
+    bare = AddSlavePlant(DiagramBuilder(), Slave(), None).arm.phi_load
     phi = slave_arm(replace(Scenario(), slave__payload=HELD)).phi_load
     # A steel ball of 2 kg has a radius of 39.3 mm.
     ball = phi_from_mass_com_inertia(2.0, np.array(HELD.com), 0.4 * 2.0 * 0.03933**2 * np.eye(3))

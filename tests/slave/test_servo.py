@@ -18,7 +18,7 @@ SCENARIO = Scenario()
 
 @pytest.fixture(scope="module")
 def arm():
-    return NominalSlave(SCENARIO.slave.payload).arm
+    return NominalSlave(SCENARIO.slave).arm
 
 
 @pytest.fixture(scope="module")

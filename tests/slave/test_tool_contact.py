@@ -15,6 +15,7 @@ from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.tool_contact import environment_wrench
 
 
@@ -36,7 +37,7 @@ def drakes(plant, context, tool) -> np.ndarray:
 )
 def test_it_is_drakes_law(place, most):
     builder = DiagramBuilder()
-    slave = AddSlavePlant(builder, [0.55, 0.0, 0.36], SheetSpring(position=place))
+    slave = AddSlavePlant(builder, Slave(position=[0.55, 0.0, 0.36]), SheetSpring(position=place))
     root = builder.Build().CreateDefaultContext()
     plant, context = slave.plant, slave.plant.GetMyMutableContextFromRoot(root)
     random, home = np.random.default_rng(0), slave.plant.GetPositions(context, slave.instance)
@@ -62,7 +63,7 @@ def test_a_peg_in_a_slot_is_drakes_law_with_many_pairs_at_once():
     """Near the floor, tilted: both balls on floor, walls and chamfers."""
     builder = DiagramBuilder()
     slot = Slot(position=[0.55, 0.0, 0.2], yaw=0.4, clearance=5e-4, friction=0.3)
-    slave = AddSlavePlant(builder, [0.55, 0.0, 0.362], slot)
+    slave = AddSlavePlant(builder, Slave(position=[0.55, 0.0, 0.362]), slot)
     root = builder.Build().CreateDefaultContext()
     plant, context = slave.plant, slave.plant.GetMyMutableContextFromRoot(root)
     random, home = np.random.default_rng(0), slave.plant.GetPositions(context, slave.instance)
@@ -82,7 +83,7 @@ def test_a_peg_in_a_slot_is_drakes_law_with_many_pairs_at_once():
 
 
 def test_a_push_is_moved_to_the_worlds_origin():
-    slave = AddSlavePlant(DiagramBuilder(), [0.55, 0.0, 0.36], None)
+    slave = AddSlavePlant(DiagramBuilder(), Slave(position=[0.55, 0.0, 0.36]), None)
     push, found = np.array([1.0, -2.0, 3.0, 0.1, 0.2, 0.3]), np.zeros(6)
     q = slave.plant.GetPositions(slave.plant.CreateDefaultContext(), slave.instance)
     environment_wrench(slave.arm.table, slave.contact_pairs, push, q, 0 * q, np.zeros(2), found)

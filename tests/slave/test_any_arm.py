@@ -1,0 +1,194 @@
+"""Foreign arms in the station: seven joints, one of which slides, and what may be wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from odd_arms import other_arm_urdf
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identification import true_load
+from drake_teleop.resources import models_dir
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.signals import SIGNALS
+from drake_teleop.simulation import MakeSimulator, simulate
+from drake_teleop.slave.ik_methods import method_of
+from drake_teleop.slave.plant import AddSlavePlant, NominalSlave, start_pose
+from drake_teleop.slave.slave_config import Slave
+from drake_teleop.slave.tool import Ball, Block, Tool
+from drake_teleop.station import GetBlock, MakeTeleopStation
+
+HOME = [0.3, 0.4, -0.2, 0.1, 0.5, -0.3, 0.2]
+SCENARIO = """
+simulation: {duration: 0.06, settle: 0.02}
+operator:
+  intent: [!Sine {duration: 10.0, ramp: 0.05, frequency: 3.0, translation: [0.01, 0.01, 0.02]}]
+slave:
+  model: arm.urdf
+  sensor_frame: ft
+  home: [0.3, 0.4, -0.2, 0.1, 0.5, -0.3, 0.2]
+  tool: null
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A scenario and beside it an arm that has a gripper, and strong motors."""
+    folder = tmp_path_factory.mktemp("station")
+    text = other_arm_urdf(slides=4).replace('effort="40"', 'effort="400"')
+    text = text.replace('ixy="0.001" ixz="-0.002" iyz="0.0015"', 'ixy="0" ixz="0" iyz="0"')
+    # Of one joint nobody says that it has a motor.
+    motor = text[text.index('<transmission type="SimpleTransmission"><joint name="j3"/>') :]
+    text = text.replace(motor[: motor.index("</transmission>") + len("</transmission>")], "")
+    (folder / "arm.urdf").write_text(text)
+    (folder / "station.yaml").write_text(SCENARIO)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scenario(folder):
+    return LoadScenario(folder / "station.yaml")
+
+
+def test_the_wrench_is_the_reaction_of_the_weld_to_what_hangs_there(scenario):
+    scenario = replace(scenario, wrist_sensor__ideal=True)
+    station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
+    simulator = MakeSimulator(station, scenario.simulation)
+    simulator.Initialize()
+    plant, sensor = (GetBlock(station, name) for name in ("slave_plant", "wrist_sensor"))
+    context = plant.GetMyContextFromRoot(simulator.get_mutable_context())
+    sensed = sensor.GetMyContextFromRoot(simulator.get_mutable_context())
+    weld = plant.GetJointByName("to_hand")
+    place = list(plant.GetJointIndices()).index(weld.index())
+    X_SJ = (
+        plant.GetFrameByName("ft")
+        .CalcPoseInWorld(context)
+        .InvertAndCompose(weld.frame_on_child().CalcPoseInWorld(context))
+    )
+    for k in range(1, 60):
+        simulator.AdvanceTo(1e-3 * k)
+        at_J = plant.get_reaction_forces_output_port().Eval(context)[place]
+        f, p = X_SJ.rotation() @ at_J.translational(), X_SJ.translation()
+        tau = X_SJ.rotation() @ at_J.rotational() + np.cross(p, f)
+        simulator.AdvancePendingEvents()
+        sample = sensed.get_discrete_state_vector().value()[:6]
+        np.testing.assert_allclose(sample, [*f, *tau], rtol=0, atol=1e-11)
+    assert np.abs(sample).max() > 5.0
+
+
+def test_a_run_has_as_many_components_as_the_arm_has_joints(scenario):
+    station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
+    result = simulate(station, scenario.simulation, progress=False)
+    for name in ("joint_position", "joint_torque", "joint_command"):
+        assert result[name].shape == (61, 7)
+    assert result["slave_state"].shape == (61, 14)
+    assert result.specs[result.signals.index("slave_state")].components[-1] == "v_7"
+    assert result["slave_state.q_4"][0] == pytest.approx(HOME[3], abs=5e-3)
+    assert np.all(result["ik_status"] == 0)
+    assert np.ptp(result["pose_command"][:, 6]) > 2e-3
+    assert len(SIGNALS["slave_state"].components) == 12
+
+
+def test_what_it_starts_with(scenario):
+    slave = NominalSlave(scenario.slave)
+    assert NominalSlave(scenario.slave) is slave
+    np.testing.assert_array_equal(slave.start, HOME)
+    plant, context = slave.plant, slave.plant.CreateDefaultContext()
+    X_WS = plant.GetFrameByName("ft").CalcPoseInWorld(context)
+    expected = [*X_WS.rotation().ToQuaternion().wxyz(), *X_WS.translation()]
+    np.testing.assert_allclose(start_pose(scenario.slave), expected, atol=1e-12)
+    # Of nothing that says where it touches, the centre of mass; here of hand and finger.
+    assert slave.arm.phi_load[0] == pytest.approx(0.9)
+    np.testing.assert_allclose(slave.tip, slave.arm.phi_load[1:4] / 0.9)
+    assert "held: to_finger" in slave.assumptions
+    assert slave.arm.joint_names == tuple(f"j{k}" for k in range(1, 8))
+    assert plant.num_actuators() == plant.num_positions() == 7
+    np.testing.assert_array_equal(slave.arm.effort_limit, 400.0)
+
+
+def test_an_arm_of_the_rx90s_numbers_is_moved_by_its_closed_form():
+    copy = Slave(model=str(models_dir() / "rx90.sdf"))
+    arm = NominalSlave(copy).arm
+    assert method_of("automatic", arm) == "closed_form"
+    np.testing.assert_array_equal(NominalSlave(copy).start, NominalSlave(Slave()).start)
+    np.testing.assert_array_equal(NominalSlave(copy).tip, [0.0, 0.0, 0.2])
+    moved = Slave(base_pose=[0.1, -0.2, 0.3, 0.0, 0.0, 0.5])
+    arm = NominalSlave(moved).arm
+    assert method_of("automatic", arm) == "numeric"
+    with pytest.raises(DrakeTeleopError, match="closed form is that of an RX90"):
+        method_of("closed_form", arm)
+    plant, context = NominalSlave(moved).plant, NominalSlave(moved).plant.CreateDefaultContext()
+    found = plant.GetFrameByName("sensor").CalcPoseInWorld(context)
+    np.testing.assert_allclose(found.translation(), [0.55, 0.0, 0.45], atol=1e-8)
+    np.testing.assert_allclose(found.rotation().matrix(), np.diag([1, -1, -1]), atol=1e-8)
+    base = plant.GetBodyByName("base").EvalPoseInWorld(context)
+    np.testing.assert_allclose(base.translation(), [0.1, -0.2, 0.3], atol=1e-15)
+
+
+def test_a_tool_of_numbers():
+    inertia = [0.02, 1e-3, -2e-3, 0.03, 1.5e-3, 0.025]
+    shapes = [Ball(0.02, [0, 0, 0.1]), Block([0.02, 0.06, 0.1], [0, 0.01, 0.1], [np.pi / 2, 0, 0])]
+    tool = Tool(mass=2.0, com=[0.01, -0.02, 0.06], inertia=inertia, shapes=shapes)
+    slave = NominalSlave(Slave(tool=tool))
+    m, c = 2.0, np.array(tool.com)
+    about_S = np.zeros((3, 3))
+    about_S[np.triu_indices(3)] = inertia
+    about_S = about_S + np.triu(about_S, 1).T + m * (c @ c * np.eye(3) - np.outer(c, c))
+    expected = [m, *(m * c), *about_S[np.triu_indices(3)]]
+    np.testing.assert_allclose(slave.arm.phi_load, expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(slave.tip, [0.0, 0.01, 0.13], atol=1e-15)  # half of 0.06, turned
+    touching = AddSlavePlant(
+        DiagramBuilder(), Slave(tool=Tool(mass=2.0, shapes=shapes[:1])), SheetSpring()
+    )
+    np.testing.assert_allclose(touching.contact_pairs[0, :4], [0, 0, 0.1, 0.02], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"sensor_frame": "nose"}, "no frames are named 'nose'"),
+        ({"home": HOME[:6]}, "6 joint positions for 7 joints"),
+        ({"home": [9.0, *HOME[1:]]}, "j1 at 9 is outside -2 to 2.5"),
+        ({"home": [], "position": [4.0, 0.0, 0.4]}, "cannot reach.*slave.home"),
+        ({"base_pose": [0.1, 0, 0, 0, 0, 0]}, "fastens base to the world itself"),
+        ({"inverse_kinematics": "closed_form"}, "closed form is that of an RX90"),
+        ({"tool": Tool(mass=90.0)}, "hold its 90.9 kg at the start: j4 needs 566 of its 400 N;"),
+        ({"sensor_frame": "finger"}, "nothing with a mass hangs on finger"),
+        ({"model": "absent.urdf"}, "absent.urdf: there is no such file"),
+        ({"tool": Tool(model="a.sdf", mass=1.0)}, "slave.tool.mass: both a file and a mass"),
+        ({"tool": Tool(shapes=[Ball()])}, "needs a mass"),
+        ({"tool": Tool(mass=1.0, inertia=[1, 0, 0, 1, 0, 3])}, "no body has this inertia"),
+        ({"tip": [0.0, 0.1]}, "slave.tip: has to be a list of finite numbers, 3 of them"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_one_error(scenario, change, expected):
+    changed = replace(scenario, **{f"slave__{name}": value for name, value in change.items()})
+    with pytest.raises(DrakeTeleopError, match=expected):
+        MakeTeleopStation(changed, load_estimate=np.ones(16))
+
+
+def test_a_loop_is_refused(folder, tmp_path, scenario):
+    text = (folder / "arm.urdf").read_text()
+    loop = (
+        '<drake:ball_constraint><drake:ball_constraint_body_A name="l3"/></drake:ball_constraint>'
+    )
+    path = tmp_path / "looped.urdf"
+    path.write_text(text.replace("</robot>", f"{loop}</robot>"))
+    with pytest.raises(DrakeTeleopError, match="form a loop, by drake:ball_constraint"):
+        NominalSlave(Slave(model=str(path), sensor_frame="ft", home=HOME))
+
+
+def test_an_edited_model_is_read_again(folder, tmp_path):
+    path, text = tmp_path / "arm.urdf", (folder / "arm.urdf").read_text()
+    path.write_text(text)
+    slave = Slave(model=str(path), sensor_frame="ft", home=HOME, tool=None)
+    before = NominalSlave(slave).arm.phi_load[0]
+    path.write_text(text.replace('mass value="0.8"', 'mass value="1.8"'))
+    assert NominalSlave(slave).arm.phi_load[0] == pytest.approx(before + 1.0)
+
+
+def test_without_an_arm_the_scenario_is_the_papers():
+    assert Scenario().slave.path == models_dir() / "rx90.sdf"
+    assert NominalSlave(Slave()).assumptions == ()
