@@ -90,7 +90,7 @@ def sensor_vectors(motions, out):
 
 
 @njit(cache=True)
-def criterion_gradient(motions, qd, qdd, g_V, gradient):
+def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
     """From dJ/dV (T, 6, 10) to dJ/d(q, qd, qdd), (3, T, n), which is added to."""
     rows = motions.shape[1]
     seeds = np.zeros((rows, SEED_SIZE))
@@ -104,7 +104,7 @@ def criterion_gradient(motions, qd, qdd, g_V, gradient):
         for k in range(3):
             seed_vector(motion, 3 * k, (g[k, 0], g[k, 1], g[k, 2]), seeds[-1])
         pull_back(
-            motions[t], qd[t], qdd[t], c, virtual, seeds,
+            table, motions[t], qd[t], qdd[t], c, virtual, seeds,
             gradient[0, t], gradient[1, t], gradient[2, t],
         )  # fmt: skip
 
@@ -142,9 +142,9 @@ def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, g
     _torque(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[3], work)
     work[1][:] = 0.0
     work[2][:] = 0.0
-    _sensor(qd, qdd, motions, limits, sharpness, smooth, largest, gradient[4], work)
-    _workspace(qd, qdd, motions, limits, sharpness, smooth, largest, gradient[5], work)
-    _clearance(qd, qdd, motions, limits, sharpness, smooth, largest, gradient[6], work)
+    _sensor(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[4], work)
+    _workspace(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[5], work)
+    _clearance(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[6], work)
 
 
 @njit(cache=True)
@@ -184,19 +184,20 @@ def _torque(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, grad
             gradient[2, t, j] += c[j] * table[j, 22]
             gradient[1, t, j] += c[j] * table[j, 23]
         seed_joint_torque(table, motions[t], c, virtual, seeds)
-        _pull(motions, qd, qdd, t, gradient, work)
+        _pull(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
-def _pull(motions, qd, qdd, t, gradient, work):
+def _pull(table, motions, qd, qdd, t, gradient, work):
     seeds, c, virtual = work
     pull_back(
-        motions[t], qd[t], qdd[t], c, virtual, seeds, gradient[0, t], gradient[1, t], gradient[2, t]
-    )
+        table, motions[t], qd[t], qdd[t], c, virtual, seeds,
+        gradient[0, t], gradient[1, t], gradient[2, t],
+    )  # fmt: skip
 
 
 @njit(cache=True)
-def _sensor(qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
+def _sensor(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
     seeds = work[0]
     T = len(motions)
     use, size = np.empty((T, 4)), np.empty((T, 4))
@@ -227,11 +228,11 @@ def _sensor(qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work
         seed_wrench(motion, limits.phi, force, torque, seeds[-1])
         seed_vector(motion, 0, (g[2, 0], g[2, 1], g[2, 2]), seeds[-1])
         seed_vector(motion, 6, (g[3, 0], g[3, 1], g[3, 2]), seeds[-1])
-        _pull(motions, qd, qdd, t, gradient, work)
+        _pull(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
-def _workspace(qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
+def _workspace(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
     seeds = work[0]
     T, P = len(motions), len(limits.points_S)
     use, sign = np.empty((T, 3 * P)), np.empty((T, 3 * P))
@@ -256,11 +257,11 @@ def _workspace(qd, qdd, motions, limits, sharpness, smooth, largest, gradient, w
                 use[t, i + 2] * sign[t, i + 2],
             )
             seed_point(motions[t, -1], limits.points_S[k], g, seeds[-1])
-        _pull(motions, qd, qdd, t, gradient, work)
+        _pull(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
-def _clearance(qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
+def _clearance(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
     seeds = work[0]
     T, K = len(motions), len(limits.pairs)
     if K == 0:
@@ -299,7 +300,7 @@ def _clearance(qd, qdd, motions, limits, sharpness, smooth, largest, gradient, w
                 )
                 g = (factor * nearest[2], factor * nearest[3], factor * nearest[4])
                 seed_point(motions[t, row], point, g, seeds[row])
-        _pull(motions, qd, qdd, t, gradient, work)
+        _pull(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)

@@ -114,7 +114,7 @@ class Problem:
         self._gradients[0] = 0.0
         s, omega, alpha = self._vectors
         value, g_V = task.criterion.smooth(s, omega, alpha, of_criterion)
-        criterion_gradient(self._motions, joints[1], joints[2], g_V, self._gradients[0])
+        criterion_gradient(task.table, self._motions, joints[1], joints[2], g_V, self._gradients[0])
         smooth, largest = np.empty((2, len(LIMITS)))
         limit_uses(
             task.table, *joints, self._motions, task.limits, of_maxima,

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from drake_teleop._compiled import njit
-from drake_teleop.slave.arm import MOTION_SIZE
+from drake_teleop.slave.arm import MOTION_SIZE, SLIDES
 from drake_teleop.vectors import (
     add_into,
     apply,
@@ -109,7 +109,11 @@ def seed_joint_torque(table, motions, c, virtual, seeds):
         v = plus(v, cross(w, minus(here, p)))
         p = here
         if row < n:
-            w = plus(w, times(c[row], (motion[14], motion[17], motion[20])))
+            along = times(c[row], (motion[14], motion[17], motion[20]))
+            if table[row, SLIDES] != 0.0:
+                v = plus(v, along)
+            else:
+                w = plus(w, along)
         virtual[row, 0], virtual[row, 1], virtual[row, 2] = v
         virtual[row, 3], virtual[row, 4], virtual[row, 5] = w
         v_L, w_L = to_link(motion, v), to_link(motion, w)
@@ -127,10 +131,11 @@ def seed_joint_torque(table, motions, c, virtual, seeds):
 
 
 @njit(cache=True)
-def pull_back(motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
+def pull_back(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
     """Adds dJ/dq, dJ/dqd and dJ/dqdd of the seeds to `g_q`, `g_qd`, `g_qdd`, (n,) each.
 
     Args:
+        table: `ArmModel.table`.
         motions: (n+1, 21), `link_motions` at (q, qd, qdd).
         qd, qdd: (n,) [rad/s], [rad/s^2].
         c: (n,) as in `seed_joint_torque`, or zeros.
@@ -148,8 +153,14 @@ def pull_back(motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
         ga, gp = plus(ga, three(seed, _ALPHA)), plus(gp, three(seed, _P))
         gt, gv = plus(gt, three(seed, _THETA)), plus(gv, three(seed, _V))
         go = plus(go, three(seed, _W))
-        if row < n:
-            z = (motion[14], motion[17], motion[20])
+        z, slides = (motion[14], motion[17], motion[20]), table[row, SLIDES] != 0.0
+        if row < n and slides:
+            gz = plus(times(qdd[row], gs), times(2.0 * qd[row], cross(gs, w)))
+            gz = plus(gz, times(c[row], gv))
+            g_qd[row] += 2.0 * dot(cross(w, z), gs)
+            g_qdd[row] += dot(z, gs)
+            gt = plus(gt, cross(z, gz))
+        elif row < n:
             gz = plus(times(qd[row], plus(gw, cross(ga, w))), times(qdd[row], ga))
             gz = plus(gz, times(c[row], go))
             g_qd[row] += dot(z, gw) + dot(cross(w, z), ga)
@@ -157,12 +168,17 @@ def pull_back(motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
             gt = plus(gt, cross(z, gz))
             g_q[row] += dot(z, gt)
             gw = plus(gw, times(qd[row], cross(z, ga)))
+        turned, gr = cross(gs, w), gp
         if row > 0:
-            r = minus(three(motion, _P), three(inboard, _P))
-            turned = cross(gs, w)
             gr = plus(gp, plus(cross(gs, a), cross(turned, w)))
             gr = plus(gr, cross(gv, three(virtual[row - 1], 3)))
+        if row < n and slides:
+            g_q[row] += dot(z, gr)
+        if row > 0:
+            r = minus(three(motion, _P), three(inboard, _P))
             gw = plus(gw, plus(cross(cross(w, r), gs), cross(r, turned)))
             ga = plus(ga, cross(r, gs))
             go = plus(go, cross(r, gv))
             gt = plus(gt, cross(r, gr))
+            if row < n and slides:
+                gw = plus(gw, times(2.0 * qd[row], cross(z, gs)))

@@ -27,7 +27,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.slave.arm import SLIDES, ArmModel
+from drake_teleop.slave.arm import ArmModel
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.assumed_limits import with_all_limits
 from drake_teleop.slave.models import ParseModel, drakes_errors_said
@@ -131,7 +131,7 @@ def RobotFromModel(
     acceleration: tuple[float, ...] = (),
     payload: float | None = None,
 ) -> Robot:
-    """Any serial arm of revolute joints.
+    """Any serial arm of revolute and prismatic joints.
 
     A base that hangs on nothing is welded to the world, joints beyond the sensor are held.
 
@@ -160,13 +160,6 @@ def RobotFromModel(
     assumptions = ["a table at z = 0"]
     with drakes_errors_said(path):
         arm = _arm_of(parse)
-    sliding = np.flatnonzero(arm.table[:, SLIDES])
-    if sliding.size:
-        raise DrakeTeleopError(
-            f"{arm.joint_names[sliding[0]]} slides, and only turning joints can be excited",
-            where=str(path),
-            remedy="fix that joint in the model where the arm shall stand",
-        )
     load = arm.phi_load
     if payload is None and load[0] > 0:
         reserve = (_LOAD_FACTOR - 1) * load

@@ -77,7 +77,7 @@ def _fault(shape: ElementTree.Element, packages: Packages, folder: Path) -> str 
     address = mesh.get("filename") or mesh.findtext("uri") or ""
     file = packages.file(address.strip())
     if file is None:
-        return "meshes were not found (--package-path)"
+        return "meshes were not found (--package-path, slave.package_paths)"
     if file.suffix.lower() == ".stl":
         file = _hull_of_stl(file, folder)
     if file is None or file.suffix.lower() not in _READABLE:

@@ -32,6 +32,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import regressor
 from drake_teleop.sensor.motion_estimation import MotionEstimationConfig, motion_gains
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
+from drake_teleop.slave.arm import SLIDES
 from drake_teleop.slave.plant import AddSlavePlant
 from drake_teleop.slave.slave_config import Slave
 
@@ -160,11 +161,14 @@ def arm():
     return AddSlavePlant(DiagramBuilder(), Slave(), None).arm
 
 
-@pytest.mark.parametrize("name", CRITERIA)
-def test_gradients_of_criterion_and_limits(arm, name):
-    # With damping, which the station's arm has not.
+@pytest.mark.parametrize(
+    ("name", "sliding"), [*((name, []) for name in CRITERIA), ("kappa_w10", [0, 3])]
+)
+def test_gradients_of_criterion_and_limits(arm, name, sliding):
+    # With damping, which the station's arm has not; and as if some of its joints slid.
     table = arm.table.copy()
     table[:-1, 23] = 0.5
+    table[sliding, SLIDES] = 1.0
     home = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0])
     task = Task(table, limits_of(arm), Criterion(name, SCALES), home, 6.0, 3)
     problem = Problem(task)
