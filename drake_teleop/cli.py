@@ -49,13 +49,23 @@ def reproduce(out: Path, seed: int | None, quiet: bool) -> int:
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO)
+@click.argument("scenario", type=option.SCENARIO, required=False)
+@click.option(
+    "--inputs", type=option.PATH, metavar="DIR", help="Repeat a recorded drive, to the same bytes."
+)
 @option.out("run")
 @option.seed
 @click.option("--fresh", is_flag=True, help="Identify the load anew, also if it is in the cache.")
 @option.quiet
-def run(scenario: str, out: Path, seed: int | None, fresh: bool, quiet: bool) -> None:
-    """Simulate one scenario.
+def run(
+    scenario: str | None,
+    inputs: Path | None,
+    out: Path,
+    seed: int | None,
+    fresh: bool,
+    quiet: bool,
+) -> None:
+    """Simulate one scenario, or repeat a drive.
 
     SCENARIO is the name of a shipped one or a YAML file. Writes its log, its pictures and its film
     in 3D. The load that it identifies first is kept in the user's cache folder, or in
@@ -63,7 +73,9 @@ def run(scenario: str, out: Path, seed: int | None, fresh: bool, quiet: bool) ->
     """
     from drake_teleop.run import run_command
 
-    run_command(scenario, out, seed=seed, fresh=fresh, quiet=quiet)
+    if (scenario is None) == (inputs is None):
+        raise click.UsageError("give a SCENARIO, or --inputs with the folder of a drive")
+    run_command(scenario, out, inputs=inputs, seed=seed, fresh=fresh, quiet=quiet)
 
 
 @cli.command("scenario")

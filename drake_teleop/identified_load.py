@@ -89,13 +89,13 @@ def identified_load(
     before = identification_scenario(scenario, scenario.simulation.seed + 1)
     detects = scenario.contact_detection is not None
     path = (folder or cache_folder()) / f"load-{_key(before, detects)}.npz"
-    if not fresh and (kept := _read(path)) is not None:
+    if not fresh and (kept := read_load(path)) is not None:
         return kept
     found = identify_load(before, progress)
     floor = found.noise_floor(slave_arm(scenario)) if detects else None
     load = IdentifiedLoad(found.identification, floor, from_cache=False)
     with suppress(CannotWrite, OSError):  # a full disk: it is identified again next time
-        _write(path, load)
+        write_load(path, load)
     return load
 
 
@@ -128,7 +128,7 @@ def _key(before: Scenario, detects: bool) -> str:
     return sha256(repr(what).encode()).hexdigest()
 
 
-def _write(path: Path, load: IdentifiedLoad) -> None:
+def write_load(path: Path, load: IdentifiedLoad) -> None:
     """Writes it, complete or not at all, whoever else does the same now."""
     columns = {
         f"{name}.{field.name}": getattr(part, field.name)
@@ -144,7 +144,7 @@ def _write(path: Path, load: IdentifiedLoad) -> None:
         old.unlink(missing_ok=True)
 
 
-def _read(path: Path) -> IdentifiedLoad | None:
+def read_load(path: Path) -> IdentifiedLoad | None:
     """What `_write` wrote; None if there is nothing that can be read. The file has checksums."""
     try:
         with np.load(path, allow_pickle=False) as archive:

@@ -35,13 +35,14 @@ The same scenario gives the same bytes in every file but `session.json`, which h
 
 =========================== =====================================================================
 load_source                 which load was used: "learnt while it ran", "identified before the run",
-                            or "cache", identified before an earlier run
+                            "cache", identified before an earlier run, or "of the drive"
 real_time_factor            simulated over elapsed time, this machine, compilation included
 =========================== =====================================================================
 """
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,7 @@ from drake_teleop.identification import (
     timed,
 )
 from drake_teleop.identified_load import identified_load
+from drake_teleop.live.session import Drive, read_drive, repeat
 from drake_teleop.load.arrays import learnt
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
@@ -113,9 +115,10 @@ class ScenarioRun:
 
 
 def run_command(
-    scenario: str | Path,
+    scenario: str | Path | None,
     out: Path,
     *,
+    inputs: Path | None = None,
     seed: int | None = None,
     fresh: bool = False,
     quiet: bool = False,
@@ -133,6 +136,7 @@ def run_command(
     Args:
         scenario: the name of a shipped one, or a YAML file.
         out: the folder.
+        inputs: instead of the scenario, the folder of a recorded drive, which is repeated.
         seed: instead of the scenario's.
         fresh: whether to identify the load anew although it was kept.
         quiet: no progress bars and no table.
@@ -146,13 +150,18 @@ def run_command(
             be written; then saying what was.
         KeyboardInterrupt: saying what was recorded until then.
     """
-    setup = LoadScenario(scenario)
+    drive = None if inputs is None else read_drive(inputs)
+    if drive is not None and (seed is not None or fresh):
+        raise DrakeTeleopError("a drive has its own seed and load", where="run --inputs")
+    if inputs is not None and out.resolve() == inputs.resolve():
+        raise DrakeTeleopError("is the drive itself", where=str(out), remedy="give another --out")
+    setup = LoadScenario(scenario or "") if drive is None else drive.scenario
     if seed is not None:
         setup = replace(setup, simulation__seed=seed)
     with output_folder(out):
         with show_progress(progress and not quiet) as stage:
-            run = _logged(setup, out, stage, fresh)
-        summary = {"scenario": str(scenario)} | summarise(run)
+            run = _logged(setup, out, stage, fresh, drive)
+        summary = {"scenario": str(scenario or inputs)} | summarise(run)
         session = {"load_source": run.load_source, "real_time_factor": run.real_time_factor}
         write_table(out / "sensor_log.parquet", run.result.sensor_log())
         if run.identification is not None:
@@ -166,7 +175,9 @@ def run_command(
     return summary | session
 
 
-def _logged(setup: Scenario, out: Path, stage: Stage, fresh: bool) -> ScenarioRun:
+def _logged(
+    setup: Scenario, out: Path, stage: Stage, fresh: bool, drive: Drive | None
+) -> ScenarioRun:
     """Runs it with its log and its scenario in a folder, without what an earlier run left there."""
     log, its_scenario = out / "log.parquet", out / "scenario.yaml"
     # It must not be taken for what belongs to this run, should this one be interrupted.
@@ -177,6 +188,8 @@ def _logged(setup: Scenario, out: Path, stage: Stage, fresh: bool) -> ScenarioRu
     earlier = its_scenario.exists()
     write_scenario(its_scenario, setup)
     try:
+        if drive is not None:
+            return _repeated(drive, stage, log)
         return run_scenario(setup, stage, log, fresh=fresh)
     except BaseException as error:
         if log.is_dir() and not any(log.iterdir()):
@@ -224,6 +237,14 @@ def run_scenario(
         station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
         result, factor = timed(station, scenario.simulation, stage("Run the scenario"), log)
     return ScenarioRun(scenario, result, identification, source, factor)
+
+
+def _repeated(drive: Drive, progress: Stage, log: Path) -> ScenarioRun:
+    begin = time.perf_counter()
+    result = repeat(drive, progress("Repeat the drive"), log)
+    factor = drive.scenario.simulation.duration / (time.perf_counter() - begin)
+    identification = None if drive.load is None else drive.load.identification
+    return ScenarioRun(drive.scenario, result, identification, "of the drive", factor)
 
 
 def in_contact(result: SimulationResult) -> NDArray[np.bool_]:

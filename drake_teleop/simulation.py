@@ -61,7 +61,7 @@ def simulate(
             return simulate(diagram, simulation, progress=stage("Simulate"), log=log)
     simulator = MakeSimulator(diagram, simulation)
     end = simulation.settle + simulation.duration
-    on_disk = None if log is None else _LogOnDisk(Path(log), simulator, simulation.settle)
+    on_disk = None if log is None else LogOnDisk(Path(log), simulator, simulation.settle)
     stops, rows = simulation.on_fault == "stop", 0
     simulator.Initialize()
     try:
@@ -102,7 +102,7 @@ def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
     """
     station = simulator.get_system()
     log = station.GetSubsystemByName(LOG).FindLog(simulator.get_context())
-    for name, column in _columns(station).items():
+    for name, column in columns(station).items():
         if name not in ("fault", "fault_at_hand"):
             continue
         for k in np.flatnonzero(log.data()[column][0, rows:])[:1] + rows:
@@ -115,14 +115,14 @@ def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
     return int(log.num_samples())
 
 
-def _columns(station: Diagram) -> dict[str, slice]:
+def columns(station: Diagram) -> dict[str, slice]:
     """Where the station's signals stand in its log, by name."""
     ports = [station.get_output_port(index) for index in range(station.num_output_ports())]
     ends = np.cumsum([port.size() for port in ports])
     return {p.get_name(): slice(e - p.size(), e) for p, e in zip(ports, ends, strict=True)}
 
 
-class _LogOnDisk:
+class LogOnDisk:
     """Moves the log of a running station into a folder of parts."""
 
     def __init__(self, folder: Path, simulator: Simulator, start: float) -> None:
@@ -145,6 +145,10 @@ class _LogOnDisk:
         part.write_part(self._folder, self._rows)
         self._sink.Clear()
         self._rows += len(part.t)
+
+    def keep(self) -> None:
+        """Writes them, and keeps them: the next `take` writes the same part with more rows."""
+        read_log(self._simulator, self._start).write_part(self._folder, self._rows)
 
 
 def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
@@ -180,7 +184,7 @@ def read_log(simulator: Simulator, start: float) -> SimulationResult:
     t = log.sample_times() - start
     kept = t > -1e-9
     data = log.data().T[kept]
-    signals = {name: data[:, column] for name, column in _columns(diagram).items()}
+    signals = {name: data[:, column] for name, column in columns(diagram).items()}
     if "sample_time" in signals:
         signals["sample_time"] -= start
     specs = [signal_of(name, values.shape[1]) for name, values in signals.items()]

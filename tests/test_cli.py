@@ -263,7 +263,10 @@ def test_options_reach_the_commands(capsys, install):
     run_main(capsys, "reproduce", "--out", "out/r")
     run_main(capsys, "identify", "a.yaml", "--delay", "0.006")
     assert calls == [
-        (("contact_transition", Path("out/run")), {"seed": 7, "fresh": True, "quiet": True}),
+        (
+            ("contact_transition", Path("out/run")),
+            {"inputs": None, "seed": 7, "fresh": True, "quiet": True},
+        ),
         ((Path("out/r"),), {"seed": None, "quiet": False}),
         (
             (Path("a.yaml"), Path("out/identify")),

@@ -63,6 +63,8 @@ WRITING = {
     ("_compiled.py", ".touch"), ("_compiled.py", ".write_bytes"), ("_compiled.py", "os.replace"),
     ("identified_load.py", 'open("wb'), ("identified_load.py", "np.savez"),
     ("slave/meshes.py", ".write_text"),
+    # A line for each change of a drive's inputs, which is to outlive the process.
+    ("live/session.py", 'open("w'),
     # A mark of one byte more.
     ("studies/store.py", 'open("ab'),
     # Functions of the package that write by `writing.py`.
@@ -126,7 +128,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "x.parquet": read_table,
     "x.yaml": load_description,
     "log.parquet": SimulationResult.read_parquet,
-    "load-1.npz": identified_load._read,
+    "load-1.npz": identified_load.read_load,
     "identification.json": Identification.load,
     "excitation.yaml": FourierTrajectory.load,
     "scenario.yaml": LoadScenario,

@@ -1,0 +1,153 @@
+"""Where a live hand wants the stylus: a smooth path from wherever it is to its newest target."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+
+from drake_teleop._compiled import njit
+from drake_teleop.lifetime import ONE_DICT, weak_callback
+from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
+from drake_teleop.scenario import Scenario
+from drake_teleop.sides.master import MakeMasterSide
+
+Array = NDArray[np.float64]
+
+#: Of the critically damped way to a target [rad/s]. At 5 Hz a step of the target shakes neither
+#: hand nor arm, and the tool is half way after some 85 ms.
+_SPEED = 2 * math.pi * 5.0
+# A path: whether the stylus is held, when it began [s], its target X_BE (7,), and then how far the
+# start was from there (3,), its velocity (3,), as a rotation vector in B (3,), its rate (3,).
+_HELD, _START, _TARGET, _AWAY, _TURNED, _PATH = 0, 1, 2, 9, 15, 21
+
+
+@njit(cache=True)
+def _wanted_into(path, time, pose, out):
+    """Writes the wanted X_BE (7,) and its twist [v; omega] (6,) into `out` (13,).
+
+    Each axis obeys x'' + 2 w x' + w^2 x = 0, whose solution is exact at any time: nothing depends
+    on how a simulation is cut into slices. Who lets go wants the stylus where it is, `pose` (7,).
+    """
+    if path[_HELD] < 0.5:
+        out[:7] = pose
+        out[7:] = 0.0
+        return
+    t = time - path[_START]
+    decay = math.exp(-_SPEED * t)
+    r, rate = np.empty(3), np.empty(3)
+    for k in range(3):
+        speed = path[_AWAY + 3 + k] + _SPEED * path[_AWAY + k]
+        out[4 + k] = path[_TARGET + 4 + k] + (path[_AWAY + k] + speed * t) * decay
+        out[7 + k] = (path[_AWAY + 3 + k] - _SPEED * speed * t) * decay
+        turning = path[_TURNED + 3 + k] + _SPEED * path[_TURNED + k]
+        r[k] = (path[_TURNED + k] + turning * t) * decay
+        rate[k] = (path[_TURNED + 3 + k] - _SPEED * turning * t) * decay
+    target = (path[_TARGET], path[_TARGET + 1], path[_TARGET + 2], path[_TARGET + 3])
+    orientation = multiply(exponential((r[0], r[1], r[2])), target)
+    for k in range(4):
+        out[k] = orientation[k]
+    # omega = rate + a r x rate + b r x (r x rate)
+    square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+    a, b = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    if square > 1e-4:
+        angle = math.sqrt(square)
+        a = (1.0 - math.cos(angle)) / square
+        b = (angle - math.sin(angle)) / (square * angle)
+    along = r[0] * rate[0] + r[1] * rate[1] + r[2] * rate[2]
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        across = r[i] * rate[j] - r[j] * rate[i]
+        out[10 + k] = rate[k] + a * across + b * (r[k] * along - square * rate[k])
+
+
+def _rate_of(r: Array, omega: Array) -> Array:
+    """(3,) the rate of a rotation vector r (3,) [rad] that turns with omega (3,) [rad/s]."""
+    angle = float(np.linalg.norm(r))
+    if angle < 1e-6:
+        return omega
+    across = np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
+    a = (1.0 - math.cos(angle)) / angle**2
+    b = (angle - math.sin(angle)) / angle**3
+    return np.linalg.solve(np.eye(3) + a * across + b * across @ across, omega)
+
+
+class LiveHand(LeafSystem):
+    """The wanted pose of a hand that is led from outside: critically damped to its target.
+
+    .. pydrake_system::
+
+        name: LiveHand
+        input_ports:
+        - pose_master: (7,) X_BE
+        output_ports:
+        - intended_pose: (7,) X_BE that the operator wants
+        - intended_twist: (6,) its twist [v; omega] in B [m/s, rad/s]
+
+    Args:
+        start: (7,) X_BE that it holds until it is led elsewhere.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, start: Array) -> None:
+        super().__init__()
+        path = np.zeros(_PATH)
+        path[_HELD], path[_TARGET:_AWAY] = 1.0, start
+        self._path = self.DeclareNumericParameter(BasicVector(path))
+        self._pose = self.DeclareVectorInputPort("pose_master", 7)
+        self._wanted = np.empty(13)
+        needed = {self.all_parameters_ticket(), self.time_ticket(), self._pose.ticket()}
+        for name, size, calc in (
+            ("intended_pose", 7, self._calc_pose),
+            ("intended_twist", 6, self._calc_twist),
+        ):
+            self.DeclareVectorOutputPort(name, size, weak_callback(calc), needed)
+
+    def Lead(self, context: Context, target: Array | None) -> None:
+        """From now on it wants the stylus at `target` (7,) X_BE, or with None lets go of it.
+
+        The way begins where it is, as fast as it is. A hand that lets go pulls nowhere; only its
+        damping is left.
+        """
+        now = self._now(context).copy()
+        path = np.zeros(_PATH)
+        if target is not None:
+            path[_HELD], path[_START], path[_TARGET:_AWAY] = 1.0, context.get_time(), target
+            path[_AWAY : _AWAY + 3] = now[4:7] - target[4:]
+            path[_AWAY + 3 : _TURNED] = now[7:10]
+            r = np.array(logarithm(multiply(tuple(now[:4]), conjugate(tuple(target[:4])))))
+            path[_TURNED : _TURNED + 3], path[_TURNED + 3 :] = r, _rate_of(r, now[10:])
+        context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
+
+    def _now(self, context: Context) -> Array:
+        path = context.get_numeric_parameter(self._path).value()
+        _wanted_into(path, context.get_time(), self._pose.Eval(context), self._wanted)
+        return self._wanted
+
+    def _calc_pose(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._now(context)[:7])
+
+    def _calc_twist(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._now(context)[7:])
+
+
+def MakeLiveMasterSide(scenario: Scenario) -> Diagram:
+    """`MakeMasterSide` with a hand that is led while the station runs: `LiveHand.Lead`.
+
+    The scenario's operator gives the grip; it should intend nothing, and have no task.
+    """
+    builder = DiagramBuilder()
+    side = builder.AddNamedSystem("led", MakeMasterSide(scenario))
+    start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
+    hand = builder.AddNamedSystem("live_hand", LiveHand(start))
+    builder.Connect(side.GetOutputPort("pose_master"), hand.get_input_port())
+    for name in ("intended_pose", "intended_twist"):
+        builder.Connect(hand.GetOutputPort(name), side.GetInputPort(name))
+    for name in ("wrench_command", "clutch"):
+        builder.ExportInput(side.GetInputPort(name), name)
+    for index in range(side.num_output_ports()):
+        builder.ExportOutput(side.get_output_port(index), side.get_output_port(index).get_name())
+    return builder.Build()

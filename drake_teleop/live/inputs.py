@@ -1,0 +1,166 @@
+"""What a driver does, as whole numbers: what is recorded is exactly what was simulated.
+
+A recorded drive is a table `inputs.csv`: one row for each change, with its time in ms since the
+start and every input; the last row is the end of the drive, so far as it was recorded.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.quaternions import exponential
+from drake_teleop.scenario import Scenario
+from drake_teleop.texts import read_text
+
+Array = NDArray[np.float64]
+
+#: The file of a drive's inputs.
+INPUTS = "inputs.csv"
+#: The inputs change between slices of this length [ms], and a slice is simulated at once.
+SLICE_MS = 5
+_LENGTH, _ANGLE, _SHARE, _SCALE = 1e-5, 1e-4, 1e-2, 1e-5
+_LONGEST = 36_000_000  # ms; ten hours, as of a scenario
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Everything that a driver may change, in whole numbers.
+
+    Attributes:
+        x, y, z: where the hand wants the stylus, from its start, along the axes of B [10 um].
+        rx, ry, rz: the wanted turn from the start as a rotation vector in B [0.1 mrad].
+        held: 1 while the hand holds the stylus, 0 when it has let go.
+        clutch: 1 while the motion goes to the slave.
+        sigma: share of the gripper's non-contact wrench, of all of it if it is not told apart [%].
+        sigma_object: share of a gripped object's [%].
+        gamma: scale of the contact wrench [%].
+        force_scale: of force and torque, slave to master [1e-5].
+    """
+
+    x: int = 0
+    y: int = 0
+    z: int = 0
+    rx: int = 0
+    ry: int = 0
+    rz: int = 0
+    held: int = 1
+    clutch: int = 1
+    sigma: int = 0
+    sigma_object: int = 0
+    gamma: int = 100
+    force_scale: int = 5714
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Inputs:
+        """Those with which a scenario starts."""
+        sigma, sigma_object, gamma = (round(s / _SHARE) for s in scenario.force_scaling.scales())
+        scale = round(scenario.force_scaling.force_scale / _SCALE)
+        started = cls(sigma=sigma, sigma_object=sigma_object, gamma=gamma, force_scale=scale)
+        return started.changed({})
+
+    def changed(self, values: Mapping[str, Any]) -> Inputs:
+        """With other values, each brought into its range; what is no finite number is left out."""
+        changes = {}
+        for name, (low, high) in RANGES.items():
+            value = values.get(name)
+            if isinstance(value, (int, float)) and abs(value) < 1e15:
+                changes[name] = round(min(max(value, low), high))
+        return dataclasses.replace(self, **changes)
+
+    @property
+    def target(self) -> tuple[int, ...]:
+        """What leads the hand."""
+        return self.x, self.y, self.z, self.rx, self.ry, self.rz, self.held
+
+    def pose(self, start: Array) -> Array | None:
+        """The wanted X_BE (7,), of (3,) the stylus' position at the start [m]; None: let go."""
+        if not self.held:
+            return None
+        turn = exponential(tuple(_ANGLE * r for r in (self.rx, self.ry, self.rz)))
+        return np.concatenate([turn, start + _LENGTH * np.array([self.x, self.y, self.z])])
+
+    @property
+    def scales(self) -> dict[str, float]:
+        """As `ForceScaling.SetScales` takes them."""
+        return {
+            "sigma_gripper": _SHARE * self.sigma,
+            "sigma_object": _SHARE * self.sigma_object,
+            "gamma": _SHARE * self.gamma,
+            "force_scale": _SCALE * self.force_scale,
+        }
+
+
+#: Of each input. The hand's box is 0.3 m wide: beyond it the device has its end stops.
+RANGES = {
+    **dict.fromkeys(("x", "y", "z"), (-15_000, 15_000)),
+    **dict.fromkeys(("rx", "ry", "rz"), (-10_000, 10_000)),
+    **dict.fromkeys(("held", "clutch"), (0, 1)),
+    **dict.fromkeys(("sigma", "sigma_object", "gamma"), (0, 300)),
+    "force_scale": (0, 100_000),
+}
+_COLUMNS = ("ms", *RANGES)
+
+
+def header() -> str:
+    """The first line of a file of inputs."""
+    return ",".join(_COLUMNS) + "\n"
+
+
+def row(ms: int, inputs: Inputs) -> str:
+    """A line of it: what holds from this time on [ms]."""
+    return ",".join(map(str, (ms, *(getattr(inputs, name) for name in RANGES)))) + "\n"
+
+
+def read_inputs(path: Path) -> list[tuple[int, Inputs]]:
+    """The changes in a file of inputs, with their times [ms]; the last one is the end.
+
+    A last line that was being written when its process was killed is left out.
+
+    Raises:
+        DrakeTeleopError: naming file and line, for whatever else is wrong.
+    """
+    complete = read_text(path).rpartition("\n")[0]
+    lines = [line.split(",") for line in complete.split("\n")]
+    if tuple(lines[0]) != _COLUMNS:
+        raise DrakeTeleopError(
+            "is no record of a drive",
+            where=str(path),
+            remedy=f"its columns are {', '.join(_COLUMNS)}",
+        )
+    changes = list(_checked(lines[1:], path))
+    if not changes or changes[-1][0] == 0:
+        raise DrakeTeleopError("ends when it begins", where=str(path))
+    return changes
+
+
+def _checked(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]:
+    earlier = -1
+    for number, line in enumerate(lines, start=2):
+        where = f"{path}:{number}"
+        try:
+            ms, *values = map(int, line)
+        except ValueError:
+            raise DrakeTeleopError("has something other than whole numbers", where=where) from None
+        if len(values) != len(RANGES):
+            raise DrakeTeleopError(f"has {len(line)} numbers, not {len(_COLUMNS)}", where=where)
+        if not max(earlier, 0) <= ms <= _LONGEST or ms % SLICE_MS or (earlier < 0 and ms):
+            raise DrakeTeleopError(
+                f"{ms} ms is no time here",
+                where=where,
+                remedy=f"times are multiples of {SLICE_MS} ms, from 0 on, in order",
+            )
+        earlier, inputs = ms, dict(zip(RANGES, values, strict=True))
+        for name, (low, high) in RANGES.items():
+            if not low <= inputs[name] <= high:
+                raise DrakeTeleopError(
+                    f"{name} = {inputs[name]} is outside {low} to {high}", where=where
+                )
+        yield ms, Inputs(**inputs)

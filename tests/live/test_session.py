@@ -1,0 +1,168 @@
+"""A drive: inputs between slices, and the same bytes when it is repeated."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from drake_teleop.cli import main
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identified_load import IdentifiedLoad
+from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs, row
+from drake_teleop.live.session import Drive, Session, live_scenario, read_drive, repeat
+from drake_teleop.load.identification import Identification
+from drake_teleop.pages.progress import silent
+from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.slave.plant import NominalSlave
+
+END = 300  # ms
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    """A leaf 6 mm below the tool."""
+    setup = live_scenario(LoadScenario("contact_transition"))
+    return replace(setup, sheet_spring__position=[0.55, 0.0, 0.233])
+
+
+@pytest.fixture(scope="module")
+def load(scenario) -> IdentifiedLoad:
+    phi = NominalSlave(scenario.slave.payload).arm.phi_load
+    truth = Identification(
+        phi=phi, offsets=np.zeros(6), covariance=np.eye(16), identifiable=np.ones(16, bool),
+        condition_number=1.0, delay_s=0.0, residual_rms=np.zeros(6),
+        method="known", samples=0,
+    )  # fmt: skip
+    return IdentifiedLoad(truth, None, from_cache=False)
+
+
+def script(scenario: Scenario) -> list[tuple[int, Inputs]]:
+    """Down into the leaf with sliders on ramps; clutch out and in; the hand lets go at the end."""
+    now, changes = Inputs.of(scenario), []
+    for ms in range(0, END, 20):
+        now = now.changed(
+            {"z": -20 * ms, "rx": 2 * ms, "sigma": ms // 3, "gamma": 100 + ms // 5}
+            | {"force_scale": 5714 + 10 * ms, "clutch": ms not in (160, 180)}
+            | {"held": ms < 240}
+        )
+        changes.append((ms, now))
+    return [*changes, (END, now)]
+
+
+def same(one: SimulationResult, other: SimulationResult) -> bool:
+    return list(one) == list(other) and all(
+        np.array_equal(one[name], other[name], equal_nan=True) for name in ("t", *one)
+    )
+
+
+@pytest.fixture(scope="module")
+def driven(scenario, load, tmp_path_factory):
+    """A drive as a page makes one, slice after slice; its folder and its log."""
+    folder = tmp_path_factory.mktemp("drive")
+    session = Session(scenario, load, log=folder / "log.parquet", record=folder)
+    changes = dict(script(scenario))
+    while session.ms < END:
+        session.apply(changes.get(session.ms, session.inputs))
+        session.advance()
+        if session.ms % 50 == 0:
+            session.news()
+            session.keep()
+    session.close()
+    return folder, SimulationResult.read_parquet(folder / "log.parquet")
+
+
+@pytest.mark.slow
+def test_a_drive_is_recorded_and_repeats_itself_however_it_is_sliced(driven, scenario, load):
+    folder, log = driven
+    drive = read_drive(folder)
+    assert drive.scenario == replace(scenario, simulation__duration=1e-3 * END)
+    assert dict(drive.changes).items() >= dict(script(scenario)).items()
+    for slice_ms in (1, 7, END):
+        assert same(repeat(drive, silent(""), slice_ms=slice_ms), log)
+    assert len(log.t) == END + 1 and np.abs(log["true_contact_wrench_W"][:, 2]).max() > 5.0
+    # One input one slice late is another drive.
+    late = [(ms + 5 * (ms == 100), inputs) for ms, inputs in script(scenario)]
+    assert not same(repeat(Drive(scenario, load, late), silent("")), log)
+
+
+@pytest.mark.slow
+def test_nothing_jumps_when_inputs_change(driven, scenario):
+    _, log = driven
+    step = np.abs(np.diff(log["pose_command"][:, 4:], axis=0)).max()
+    assert step < 1e-3  # at 1 kHz, less than 1 m/s
+    assert np.abs(np.diff(log["intent"][:239, 4:], axis=0)).max() < 6e-4
+    assert np.abs(np.diff(log["force_to_master"][:, :3], axis=0)).max() < 0.5
+    # Where the clutch is open the command stays; later it goes on from there.
+    held = log["pose_command"][170:180]
+    assert np.ptp(held, axis=0).max() == 0.0
+    assert np.ptp(log["pose_command"][210:230], axis=0).max() > 1e-4
+
+
+@pytest.mark.slow
+def test_a_hand_that_has_let_go_pulls_nowhere(driven):
+    """Nothing but its damping is left, which opposes every motion."""
+    _, log = driven
+    after = slice(241, None)
+    np.testing.assert_allclose(
+        log["hand_wrench_E"][after, :3], -20.0 * log["twist_master"][after, :3], atol=1e-12
+    )
+    np.testing.assert_allclose(log["intent"][after], log["pose_master"][after], atol=1e-15)
+    assert np.linalg.norm(log["hand_wrench_E"][239, :3]) > 0.5
+
+
+@pytest.mark.slow
+def test_run_repeats_a_drive_to_the_same_bytes(driven, tmp_path, capsys, monkeypatch):
+    folder, _ = driven
+    for painted in ("write_replay", "write_picture", "overview"):
+        monkeypatch.setattr(f"drake_teleop.run.{painted}", lambda *_: None)
+    with pytest.raises(SystemExit) as end:
+        main(["run", "--inputs", str(folder), "--out", str(tmp_path / "again"), "--quiet"])
+    assert end.value.code == 0, capsys.readouterr().err
+    parts = sorted((folder / "log.parquet").iterdir())
+    again = sorted((tmp_path / "again" / "log.parquet").iterdir())
+    assert [p.read_bytes() for p in parts] == [p.read_bytes() for p in again]
+    assert (
+        json.loads((tmp_path / "again" / "session.json").read_text())["load_source"]
+        == "of the drive"
+    )
+    for wrong in ([], ["press", "--inputs", str(folder)], ["--inputs", str(folder), "--seed", "1"]):
+        with pytest.raises(SystemExit) as end:
+            main(["run", *wrong, "--out", str(tmp_path / "wrong")])
+        assert end.value.code == 2
+        assert "error: " in capsys.readouterr().err
+
+
+def test_inputs_are_brought_into_their_ranges_and_nonsense_is_left_out():
+    wild = {"x": 1e300, "y": -(10**400), "z": np.nan, "rx": "1", "clutch": 7, "sigma": 12.6}
+    inputs = Inputs().changed(wild | {"unknown": 1, "gamma": None, "held": False, "rz": np.inf})
+    assert inputs == Inputs(sigma=13, clutch=1, held=0)
+    assert Inputs().changed({"x": 1e9, "force_scale": -3}) == Inputs(x=15_000, force_scale=0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no record of a drive"),
+        (header(), "ends when it begins"),
+        (header() + row(0, Inputs()), "ends when it begins"),
+        (header() + row(5, Inputs()), "5 ms is no time"),
+        (header() + row(0, Inputs()) + row(7, Inputs()), "7 ms is no time"),
+        (header() + row(0, Inputs()) + row(5, Inputs(x=1_000_000)), ":3.*x = 1000000 is outside"),
+        (header() + "0,1\n", "has 2 numbers, not 13"),
+        (header() + "0,a\n", "something other than whole numbers"),
+    ],
+)
+def test_a_file_of_inputs_that_is_none_is_one_line(tmp_path, text, message):
+    (tmp_path / INPUTS).write_text(text)
+    with pytest.raises(DrakeTeleopError, match=message):
+        read_inputs(tmp_path / INPUTS)
+
+
+def test_a_line_that_a_killed_process_did_not_finish_is_left_out(tmp_path):
+    path = tmp_path / INPUTS
+    path.write_text(header() + row(0, Inputs()) + row(5, Inputs(x=3)) + row(10, Inputs())[:9])
+    assert read_inputs(path) == [(0, Inputs()), (5, Inputs(x=3))]
+    assert len(RANGES) == 12
