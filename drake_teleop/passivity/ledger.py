@@ -60,7 +60,8 @@ At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
     0.8 s and ten round trips the tip stuck and slipped on for good over 100 ms.
 :M3: The wall is remembered, so that fast taps are felt: while nothing else is heard,
     u_n = -k_c (x_m - x_w)_n. It is dropped when the slave was so deep in it that it should
-    have met 1 N, 1 to 3 mm, and met nothing: a hard wall that has gone stops the hand before 3 mm.
+    have met 1 N, 1 to 3 mm, and met nothing: a hard wall that has gone stops the hand before 3 mm;
+    or when it missed 0.03 N s beyond 0.3 mm: a light hand leans on a wall by less than 1 N.
 :M4: A hand that moves fast along u, as one that has let go, is pushed less: module `retreat`,
     after M6. The next step counts what was held.
 :M5: u may spend a share of L_m; what was shortened comes back in 20 ms. With L_m at its end there
@@ -163,6 +164,8 @@ _SAME = 5e-3  # m, between touches of one wall
 # m, N, m: the slave so deep in a wall without meeting it that it has gone; what it should meet at
 # least; and so deep at least.
 _GONE, _EXPECTED, _SURE = 3e-3, 1.0, 1e-3
+# m, N s: deeper than this it should meet something, and so much of it until the wall has gone.
+_SLIGHT, _UNMET = 0.3e-3, 0.03
 _ALIGNED = 0.7  # cosine between the wrenches of one wall
 _DRAIN = 50.0  # 1/s, share of the ledger that the wrench may spend
 _RETURN = 0.02  # s, in which a shortened wrench comes back
@@ -172,12 +175,12 @@ _BRAKE, _BRAKED = 0.5, 0.1  # N and m/s: what was pushed is braked with so much,
 
 # Memory as at the head of `ledger_slave`: filtered velocity, whether something is touched, what it
 # pushes with and its direction. Way between hand and slave at the onset; the remembered wall's
-# direction (into it), its stiffness (0: none), how deep the hand is in it; friction that is shown,
-# the largest that was seen.
+# direction (into it), its stiffness (0: none), how deep the hand is in it, the impulse that the
+# slave missed in it; friction that is shown, the largest that was seen.
 _places = own_memory()
 _places.vector(NORMAL.stop - VELOCITY_HERE.start)
 _OFFSET, _INWARD = _places.vector(6), _places.vector(6)
-_WALL, _DEPTH = _places.number(), _places.number()
+_WALL, _DEPTH, _MISSED = _places.number(), _places.number(), _places.number()
 _RUBBING, _FRICTION = _places.vector(6), _places.vector(2)
 # What the force gave since it last came to rest; share of the wrench that is withheld.
 _GIVEN, _WITHHELD = _places.vector(2), _places.vector(2)
@@ -297,12 +300,17 @@ def _predict(received, dx, T, p, memory, ahead, wrench):
             memory[_MISSING][:] = 1.0
         memory[TOUCHED] = 0.0
         gone = min(_GONE, max(_EXPECTED / max(memory[_WALL], 1.0), _SURE))
-        if memory[_DEPTH] - over_way(inward, ahead) > gone:
+        slaves = memory[_DEPTH] - over_way(inward, ahead)
+        memory[_MISSED] += T * memory[_WALL] * (slaves - _SLIGHT)
+        if slaves <= _SLIGHT:
+            memory[_MISSED] = 0.0
+        if slaves > gone or memory[_MISSED] > _UNMET:
             memory[_WALL] = 0.0
         inside = min(memory[_WALL] * max(memory[_DEPTH], 0.0), _REMEMBERED)
         for i in range(6):
             wrench[i] = -inside * inward[i]
         return
+    memory[_MISSED] = 0.0
     offset, onset = memory[_OFFSET], memory[TOUCHED] == 0.0
     if onset or not along(shown, memory[PUSHED], p) > 0.0:
         memory[_MISSING][:] = 1.0

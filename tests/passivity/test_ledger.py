@@ -289,6 +289,19 @@ def test_a_wall_that_has_gone_is_not_felt_for_long(wall):
     assert 100 < np.count_nonzero(felt[t > 5.05]) < 200
 
 
+def test_a_light_hand_does_not_lean_on_a_wall_that_has_gone():
+    """It presses with less than the 1 N that tell at once; a round trip is 100 ms."""
+    t = times(7.0)
+    there = np.stack([np.zeros(len(t)), np.where(t < 5.0, 5.1e3, 0.0)], axis=1)
+    run = run_one_dof(
+        model(LIGHT), CHARGED_BEFORE, NetworkConfig(delay=0.05), timeout=PATIENT,
+        intent=charging(t, 3.0, 0.02), wall=there,
+    )  # fmt: skip
+    felt = np.abs(run.felt)
+    assert felt[(t > 4.5) & (t < 5.0)].min() > 0.7
+    assert felt[t > 5.25].max() < 0.05
+
+
 @pytest.mark.parametrize("rate", [0.7, 1.5])
 def test_taps_are_felt_from_the_second_on(rate):
     """News of each comes when the hand is out again: the remembered wall stands in for it."""
