@@ -20,6 +20,7 @@ from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
+from drake_teleop.logs.read.tables import read_table
 
 WRENCH, POSE = ("fx", "fy", "fz", "tx", "ty", "tz"), ("qw", "qx", "qy", "qz", "x", "y", "z")
 
@@ -73,8 +74,13 @@ def deviations(found: IdentifiedLog) -> np.ndarray:
     return (load.phi - PHI) / load.standard_deviations[6:]
 
 
-def test_identify_takes_the_noise_of_poses_into_account(folder):
-    found = identify_log(described(folder, "own"))
+@pytest.fixture(scope="module")
+def whole(folder) -> IdentifiedLog:
+    return identify_log(described(folder, "own"), cutoff_hz=10.0)
+
+
+def test_identify_takes_the_noise_of_poses_into_account(whole):
+    found = whole
     load = found.identification
     assert np.abs(deviations(found)).max() < 3.5
     assert load.identifiable.all() and not found.findings
@@ -97,6 +103,45 @@ def test_what_no_rigid_load_explains_identifies_none_unless_it_is_stated(folder)
     assert any("state wrench.gain_std" in note for note in found.log.notes)
     stated = identify_log(described(folder, "gains", wrench={"gain_std": 0.01}))
     assert stated.identification.identifiable[6:10].all()
+
+
+LIMITS = {
+    "read.tables._LARGE": 100,
+    "read.reading._CHUNK": 300,
+    "read.alignment._CHUNK": 170,
+    "pose_motion.splines._CHUNK": 260,
+    "posed_fit._SHOWN": 300,
+    "posed_fit._CHUNK": 70,
+    "posed_fit._BESIDE": 30,
+}
+"""What an hour at 1 kHz is too long for, so low that 10 s are."""
+
+
+def test_a_long_log_in_parts_says_what_it_says_as_a_whole(whole, folder, tmp_path, monkeypatch):
+    files = {}
+    for stream in ("wrench", "pose"):
+        files[stream] = f"own_{stream}.parquet"
+        pl.read_csv(folder / f"own_{stream}.csv").write_parquet(tmp_path / files[stream])
+    for name, value in LIMITS.items():
+        monkeypatch.setattr(f"drake_teleop.logs.{name}", value)
+    path = described(tmp_path, "own", wrench={"file": files["wrench"]}, file=files["pose"])
+    parts = identify_log(path, cutoff_hz=10.0)
+    assert not isinstance(read_table(tmp_path / files["pose"]).columns, dict)
+    moved = parts.identification.phi - whole.identification.phi
+    assert (np.abs(moved) < 0.02 * whole.identification.standard_deviations[6:]).all()
+    few, all_ = parts.log, whole.log
+    assert len(few) == pytest.approx(len(all_) / 5, abs=8)
+    np.testing.assert_allclose(few.dt, 5 * all_.dt)
+    same = np.searchsorted(all_.t, few.t - 1e-6)[5:-5]
+    np.testing.assert_allclose(all_.t[same], few.t[5:-5], atol=1e-9)
+    off = few.wrench[5:-5] - all_.wrench[same]
+    assert (np.abs(off).max(axis=0) < 0.5 * whole.identification.residual_rms).all()
+    for one, other in zip(few.motion, all_.motion, strict=True):
+        scale = np.abs(other).max(axis=0)
+        np.testing.assert_allclose(one[5:-5] / scale, other[same] / scale, atol=5e-3)
+    np.testing.assert_allclose(
+        parts.identification.residual_rms, whole.identification.residual_rms, rtol=0.1
+    )
 
 
 @pytest.mark.slow
