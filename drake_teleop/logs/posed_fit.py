@@ -73,11 +73,10 @@ def fit_posed(
     inside = (moved.t >= moved.t[0] + margin) & (moved.t <= moved.t[-1] - margin)
     shown = shown.only(measured(moved, cutoff_hz) & inside)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
-    fit = _fit(shown, found, found.rejected[at], method)
+    fit = _fit(shown, found, found.rejected[at], method, log.posed.gain_std)
     finding = frame_finding(found, log.posed)
-    # Gains that are wrong are no rigid load's; those that are stated are in the deviations.
-    doubtful = not found.fit.rigid and log.posed.gain_std == 0.0
-    if finding is not None or doubtful:  # then nothing of the load is what it seems
+    # Gains that are wrong are no rigid load's; what stated ones explain is in the deviations.
+    if finding is not None or not found.fit.explained:  # then nothing of the load is what it seems
         flags = fit.identification.identifiable & np.repeat([True, False], [6, 10])
         fit = replace(fit, identification=replace(fit.identification, identifiable=flags))
     if finding is not None:
@@ -125,7 +124,9 @@ def _moved(log: Log, found: PoseEstimate) -> Log:
     return replace(moved, specific_force=s, angular_velocity=omega, angular_acceleration=alpha)
 
 
-def _fit(log: Log, found: PoseEstimate, rejected: NDArray[np.bool_], method: str) -> BatchResult:
+def _fit(
+    log: Log, found: PoseEstimate, rejected: NDArray[np.bool_], method: str, gain_std: float
+) -> BatchResult:
     """As of `identify_batch`, with the estimate and covariance of the spectra."""
     kept = ~rejected
     theta = _consistent(found) if method == "consistent" else found.theta
@@ -148,7 +149,7 @@ def _fit(log: Log, found: PoseEstimate, rejected: NDArray[np.bool_], method: str
         residual_rms=noise,
         method=METHODS[method].name,
     )
-    return BatchResult(load, noise, rejected, _note(found), equations)
+    return BatchResult(load, noise, rejected, _note(found, gain_std), equations)
 
 
 def _consistent(found: PoseEstimate) -> NDArray[np.float64]:
@@ -162,11 +163,12 @@ def _consistent(found: PoseEstimate) -> NDArray[np.float64]:
     return consistent_least_squares(gram, gram @ theta, theta)
 
 
-def _note(found: PoseEstimate) -> str:
-    if found.fit.rigid:
+def _note(found: PoseEstimate, stated: float) -> str:
+    if found.fit.explained:
         return found.note
+    gains = "gains (state wrench.gain_std), " if stated == 0.0 else f"gains beyond {stated:g}, "
     text = (
-        "the wrench is not that of a rigid load alone: gains (state wrench.gain_std), bending, or a"
-        f" frame that is not S; deviations are {found.fit.inflation:.2g} times as large as by noise"
+        f"the wrench is not that of a rigid load alone: {gains}bending, or a frame that is not S;"
+        f" deviations are {found.fit.inflation:.2g} times as large as by noise"
     )
     return f"{found.note}; {text}" if found.note else text

@@ -103,6 +103,7 @@ def test_what_no_rigid_load_explains_identifies_none_unless_it_is_stated(folder)
     assert any("state wrench.gain_std" in note for note in found.log.notes)
     stated = identify_log(described(folder, "gains", wrench={"gain_std": 0.01}))
     assert stated.identification.identifiable[6:10].all()
+    assert not any("rigid load alone" in note for note in stated.log.notes)
 
 
 LIMITS = {

@@ -310,6 +310,14 @@ def test_gains_that_are_wrong_are_a_misfit_and_those_stated_are_in_the_deviation
     assert not found.fit.rigid and found.fit.one_weight and found.fit.inflation > 3.0
     assert np.abs(deviations(found)).max() < 4.0
     assert np.sqrt(found.covariance[6, 6]) == pytest.approx(0.02, rel=0.5)
+    assert found.fit.explained
+
+
+def test_gains_explain_no_more_than_is_stated():
+    kind = Kind(gain=0.01, seed=8)
+    assert not estimate_from_poses(*record(kind), GRAVITY_W, gain=0.001).fit.explained
+    turned = Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4)
+    assert not estimate_from_poses(*record(turned), GRAVITY_W, gain=0.01).fit.explained
 
 
 def test_gains_enter_as_they_move_the_estimate():

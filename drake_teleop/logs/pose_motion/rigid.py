@@ -51,7 +51,7 @@ LOAD, DELAY, LEVER, TURN = slice(0, 16), slice(16, 17), slice(17, 20), slice(20,
 ARM = 0.06
 """Length that compares an error of a force's gain with one of a torque's [m]."""
 _STEPS, _CONVERGED = 40, 1e-4
-_RIGID, _NOISE = 4.0, 1.5
+_RIGID, _BY_GAINS, _NOISE = 4.0, 1.5, 1.5
 _LIMITS = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
 _LEAST_SHARE = 0.1
 _SMALL = 1e-4  # rad, of a numerical derivative
@@ -78,6 +78,7 @@ class RigidFit:
             beside it, of what is undetermined; 0 of what was not free.
         misfit: twice the log likelihood ratio to the saturated model.
         degrees: what it would be for a rigid load.
+        misfit_of_gains: what errors of gains as large as stated would add to that.
         one_weight: whether all bands had the same.
     """
 
@@ -85,12 +86,18 @@ class RigidFit:
     covariance: Array
     misfit: float
     degrees: float
+    misfit_of_gains: float = 0.0
     one_weight: bool = False
 
     @property
     def rigid(self) -> bool:
         """Whether a rigid load explains the wrench: the misfit is below four times its degrees."""
         return self.misfit < _RIGID * self.degrees
+
+    @property
+    def explained(self) -> bool:
+        """Whether a rigid load and gains as wrong as stated do."""
+        return self.misfit < _RIGID * self.degrees + _BY_GAINS * self.misfit_of_gains
 
     @property
     def inflation(self) -> float:
@@ -164,11 +171,16 @@ def fit_rigid(
     record = _Record(Z, Q, levels, free, saturated.power)
     solution = _solve(record, start)
     # The saturated model is not compensated: nor must be what is compared with it.
-    plain = _solve(replace(record, Q=np.zeros_like(Q)), solution.state).state
+    plain = _solve(replace(record, Q=np.zeros_like(Q)), solution.state)
     least = least_power(record.Z, levels.sizes)
-    power = np.maximum(levels.power(_sums(record, plain)), least)
-    misfit = 2.0 * (float(levels.costs(power).sum()) - saturated.cost)
-    fit = RigidFit(solution.state, np.zeros((0, 0)), misfit, 6.0 * SIGNALS - float(free.sum()))
+    power = np.maximum(levels.power(_sums(record, plain.state)), least)
+    fit = RigidFit(
+        solution.state,
+        covariance=np.zeros((0, 0)),
+        misfit=2.0 * (float(levels.costs(power).sum()) - saturated.cost),
+        degrees=6.0 * SIGNALS - float(free.sum()),
+        misfit_of_gains=_misfit_of_gains(record, plain, gain),
+    )
     if not fit.rigid:
         solution = _solve(record, solution.state, one_weight=True)
         fit = replace(fit, state=solution.state, one_weight=True)
@@ -351,6 +363,23 @@ def gain_effects(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
     length = np.repeat([1.0, ARM], 3)
     effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
     return np.asarray(effect.reshape(PARAMETERS, 36))
+
+
+def _misfit_of_gains(record: _Record, solution: _Solution, gain: float) -> float:
+    """That errors of gains of this standard deviation add, about; 0 for an exact sensor."""
+    if gain == 0.0:
+        return 0.0
+    B, levels = solution.B, record.levels
+    effects = gain_effects(B, record.Z, solution.W, solution.inverse)
+    left = -np.einsum("cjk,ji->cik", B, effects)
+    length = np.repeat([1.0, ARM], 3)
+    left = left.reshape(6, 6, 6, WIDTH)  # of channel c by gain d, k
+    for c in range(6):
+        left[c, c, :, FORCES] += np.diag(length[c] / length)
+    left = left.reshape(6, 36, WIDTH)
+    sums = gain**2 * np.einsum("cik,bkm,cim->bc", left, record.Z, left, optimize=True)
+    more = levels.power(np.maximum(sums, 0.0)) / record.power
+    return 2.0 * float(levels.costs(1.0 + more).sum())
 
 
 def _moved(state: State, step: Array) -> State:
