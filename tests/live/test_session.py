@@ -30,7 +30,7 @@ def scenario() -> Scenario:
 
 @pytest.fixture(scope="module")
 def load(scenario) -> IdentifiedLoad:
-    phi = NominalSlave(scenario.slave.payload).arm.phi_load
+    phi = NominalSlave(scenario.slave).arm.phi_load
     truth = Identification(
         phi=phi, offsets=np.zeros(6), covariance=np.eye(16), identifiable=np.ones(16, bool),
         condition_number=1.0, delay_s=0.0, residual_rms=np.zeros(6),
