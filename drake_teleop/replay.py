@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import Box, Meshcat, MeshcatVisualizer, Rgba
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
@@ -34,7 +35,10 @@ from drake_teleop.resources import models_dir
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario
 from drake_teleop.scenario_reference import commented
-from drake_teleop.slave.plant import AddEnvironment, NominalSlave, ParseSlave, finalize
+from drake_teleop.signals import POSE_OF
+from drake_teleop.slave.moving_pose import positions_of
+from drake_teleop.slave.plant import NominalSlave, ParseSlave, finalize
+from drake_teleop.slave.surroundings import AddEnvironment, MovingBodies, Touched
 from drake_teleop.writing import output_folder, write_json, write_text
 
 Array = NDArray[np.float64]
@@ -121,7 +125,9 @@ def write_replay(
     times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
     rows = _nearest(result.t, times)
     # Of a log on the disk each signal is read once, and no more of it is kept than is shown.
-    signals = {name: result[name][rows] for name in (*_NEEDED, *_SHOWN) if name in result}
+    moving = [name for name in result.signals if name.startswith(POSE_OF)]
+    shown = [name for name in (*_NEEDED, *_SHOWN, *moving) if name in result]
+    signals = {name: result[name][rows] for name in shown}
     contact = np.zeros(len(result.t), dtype=bool)
     if "true_contact_wrench_W" in result:
         contact = np.any(result["true_contact_wrench_W"] != 0, axis=1)
@@ -211,15 +217,16 @@ class ReplayScene:
         self._slave, self._sensor = self._parsed.instance, self._parsed.sensor_frame
         nominal = NominalSlave(scenario.slave)
         self._joints, self._tip = nominal.arm.num_joints, nominal.tip
-        self._sheet = None
-        if scenario.environment is not None:
-            touched = AddEnvironment(self.plant, scenario.environment)
-            self._sheet = None if scenario.environment.moving_part is None else touched
+        touched = Touched([], None)
+        if scenario.surroundings is not None:
+            touched = AddEnvironment(self.plant, scenario.surroundings)
+        self._sheet = touched.sheet
         self._is_phantom = scenario.master.model == PHANTOM
         self._master = None
         if "master_state" in recorded:
             self._master = _add_master(self.plant, scenario)
         finalize(self.plant)
+        self._moving = {POSE_OF + k: body for k, body in MovingBodies(self.plant, touched).items()}
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
         self._diagram: Diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
@@ -249,11 +256,26 @@ class ReplayScene:
             plant.SetPositions(context, self._master, master)
         if self._sheet is not None:
             plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
+        for name, body in self._moving.items():
+            if name in signals:
+                self._move(body, signals[name][sample])
         self._diagram.ForcedPublish(self._root)
         forces, places = self._forces(signals, sample), self._places()
         for force, place, arrow in self._arrows:
             f_W = forces[force]
             arrow.show(film_time, places[place], self._R_BW @ f_W if place == "stylus" else f_W)
+
+    def _move(self, index: BodyIndex, pose: Array) -> None:
+        """Puts a body of the surroundings where it was, after those that it hangs on."""
+        joints = map(self.plant.get_joint, self.plant.GetJointIndices())
+        (joint,) = (joint for joint in joints if joint.child_body().index() == index)
+        X_WBody = RigidTransform(Quaternion(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
+        X_WF = joint.frame_on_parent().CalcPoseInWorld(self.context)
+        X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
+        q, first = self.plant.GetPositions(self.context), joint.position_start()
+        moved = positions_of(joint, X_WF.inverse() @ X_WBody @ X_BM)
+        q[first : first + joint.num_positions()] = moved
+        self.plant.SetPositions(self.context, q)
 
     def _forces(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
         """In W. Eq. (1) is what the sensor exerts on the load; these are what the load exerts."""
@@ -300,10 +322,12 @@ def _furnish(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
         height = _TABLE_TOP - 0.03
         for i, (dx, dy) in enumerate(((-0.31, -0.27), (-0.31, 0.27), (0.13, -0.27), (0.13, 0.27))):
             box(f"leg_{i}", (0.04, 0.04, height), (x + dx, y + dy, height / 2), _STEEL)
-    stand = None if scenario.environment is None else scenario.environment.stand
-    if stand is not None and stand.height > 0:
-        size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
-        box("plinth", size, (*centre, stand.height / 2), _STEEL)
+    surroundings = scenario.surroundings
+    for k, part in enumerate(() if surroundings is None else surroundings.parts):
+        stand = part.stand
+        if stand is not None and stand.height > 0:
+            size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
+            box(f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL)
     plain_room(meshcat)
     aside = np.zeros(3) if with_table else _WITHOUT_MASTER
     meshcat.SetCameraPose(_CAMERA + aside, _TARGET + aside)

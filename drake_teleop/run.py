@@ -28,6 +28,8 @@ peak_force_to_master_N      largest force that the device displayed
 joint_speed_use             largest share of a joint's speed limit; likewise joint_torque_use
 mass_error_percent          of the estimate at the end; likewise com_error_mm
 assumed                     what the models of arm and tool do not say, if anything
+contact_by                  if Drake's contact results are used, which takes longer: why
+moved_mm                    with bodies that move: how far each is at the end from where it was
 warnings                    what was not as it should be, and when, see `drake_teleop.run_warnings`
 =========================== =====================================================================
 
@@ -50,6 +52,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import (
@@ -69,7 +72,8 @@ from drake_teleop.replay import write_replay, write_scenario
 from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.run_warnings import run_warnings
 from drake_teleop.scenario import LoadScenario, Scenario, check_scenario, replace
-from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.signals import POSE_OF
+from drake_teleop.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station import MakeTeleopStation
 from drake_teleop.task_measures import task_failure, task_measures
 from drake_teleop.writing import (
@@ -301,6 +305,10 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         summary |= _peaks("peak", "_to_master", result["force_to_master"])
     if "contact" in result:
         summary |= _detection_figures(result, contact_spans(result.t, contact))
+    if beyond := _beyond(run.scenario):
+        summary["contact_by"] = f"Drake's contact results, which take longer: {beyond}"
+    if moved := _moved(result):
+        summary["moved_mm"] = moved
     if run.scenario.operator.task is not None:
         figures = task_measures(result, run.scenario)
         summary |= {name: None if np.isnan(x) else x for name, x in figures.items()}
@@ -340,6 +348,24 @@ def _detection_figures(
     onsets = t[1:][np.diff(result["contact"][:, 0]) > 0]
     false = [x for x in onsets if not any(a <= x <= b + FILTER_TAIL for a, b in spans)]
     return summary | {"false_contacts": len(false)}
+
+
+def _beyond(scenario: Scenario) -> str:
+    """What of the surroundings the compiled contact law does not know, see `Contact`."""
+    surroundings = scenario.surroundings
+    if surroundings is None or surroundings in (scenario.sheet_spring, scenario.slot):
+        return ""  # which it knows
+    builder = DiagramBuilder()
+    return AddSlavePlant(builder, scenario.slave, surroundings).contact.beyond
+
+
+def _moved(result: SimulationResult) -> dict[str, float]:
+    """How far each body of the surroundings is at the end from where it was at t = 0 [mm]."""
+    names = [name for name in result.signals if name.startswith(POSE_OF)]
+    ways = {name: result[name][-1, 4:] - result[name][0, 4:] for name in names}
+    return {
+        name.removeprefix(POSE_OF): 1e3 * float(np.linalg.norm(way)) for name, way in ways.items()
+    }
 
 
 def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
@@ -396,6 +422,10 @@ def _print(summary: dict[str, Any], out: Path) -> None:
             slave, hand = (summary[f"contact_{at}_ms"][k] for at in ("noticed", "at_hand"))
             noticed = f", noticed after {_ms(slave)}, at the hand after {_ms(hand)}"
         console.print(f"contact from {start:.4f} to {stop:.4f} s{noticed}", highlight=False)
+    if "contact_by" in summary:
+        console.print(f"contact by {summary['contact_by']}", highlight=False)
+    for name, way in summary.get("moved_mm", {}).items():
+        console.print(f"{name} was moved by {way:.1f} mm", highlight=False)
     if summary.get("failure"):
         console.print(f"[bold red]the task failed:[/] {summary['failure']}", highlight=False)
     for words in summary.get("assumed", ()):

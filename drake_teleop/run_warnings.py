@@ -203,8 +203,8 @@ def _limits(
         yield "the device displays the most that it can", spans_of(t, full, LASTING)
         ended = device.at_an_end(result["master_state"][:, :6])
         yield "the device is at the end of its workspace", spans_of(t, ended)
-    if scenario.sheet_spring is not None and "sheet_state" in result:
-        bent = scenario.sheet_spring.largest_small_deflection
+    if scenario.leaf is not None and "sheet_state" in result:
+        bent = scenario.leaf.largest_small_deflection
         yield (
             f"the leaf bends by more than {1e3 * bent:.0f} mm, where its model is no longer good,",
             spans_of(t, np.abs(result["sheet_state"][:, 0]) > bent),

@@ -9,15 +9,18 @@ import dataclasses
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
 from drake_teleop.channel.channel import LONGEST_TIMEOUT, Channel
 from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.environment.environment import Environment
+from drake_teleop.environment.block import Block
+from drake_teleop.environment.box import Box
+from drake_teleop.environment.environment import Environment, Several
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
+from drake_teleop.environment.wall import Wall
 from drake_teleop.errors import DrakeTeleopError, expect, meant
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.estimation.load_estimator import LoadEstimatorConfig
@@ -41,9 +44,19 @@ from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.sensor.presets import preset_of
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.slave.joint_control import JointControlConfig
+from drake_teleop.slave.scene import Scene
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.texts import read_yaml
 
+#: All kinds of things that `environment` may list.
+Thing: TypeAlias = (
+    Wall
+    | Box
+    | Block
+    | SheetSpring
+    | Slot
+    | Scene
+)  # fmt: skip
 #: What fixed steps need in contact [s]: ball on leaf vibrate at up to 700 Hz.
 _CONTACT_STEP = 1.25e-4
 
@@ -113,21 +126,31 @@ class Scenario:
     contact_detection: ContactDetectionConfig | None = None
     sheet_spring: SheetSpring | None = None
     slot: Slot | None = None
+    environment: list[Thing] = plain(
+        [], "all else there is to touch, such as [!Wall {stiffness: 2e4}, !Block {}]"
+    )
 
     @property
-    def environment(self) -> Environment | None:
-        """What there is to touch."""
-        return next((getattr(self, name) for name in self._environments), None)
+    def surroundings(self) -> Environment | None:
+        """What there is to touch; `Several`, if it is that."""
+        things = self._things
+        if not things:
+            return None
+        return things[0] if len(things) == 1 else Several(things)
 
     @property
-    def _environments(self) -> list[str]:
-        """The fields that say what there is to touch: a field of a kind of `Environment` is one."""
-        names = [entry.name for entry in dataclasses.fields(self)]
-        return [name for name in names if isinstance(getattr(self, name), Environment)]
+    def leaf(self) -> SheetSpring | None:
+        """The sheet spring, wherever it stands."""
+        return next((thing for thing in self._things if isinstance(thing, SheetSpring)), None)
+
+    @property
+    def _things(self) -> list[Environment]:
+        own = (thing for thing in (self.sheet_spring, self.slot) if thing is not None)
+        return [*own, *self.environment]
 
     def without_environment(self) -> "Scenario":
         """The same with nothing to touch."""
-        return dataclasses.replace(self, **dict.fromkeys(self._environments))  # type: ignore[arg-type]
+        return dataclasses.replace(self, sheet_spring=None, slot=None, environment=[])
 
     @property
     def is_direct(self) -> bool:
@@ -146,12 +169,15 @@ class Scenario:
         self.master.check(f"{where}:master")
         self.slave.check(f"{where}:slave")
         self.wrist_sensor.check(f"{where}:wrist_sensor", self.rates.sensor_hz)
-        if len(self._environments) > 1:
-            raise DrakeTeleopError(
-                f"there are a {' and a '.join(self._environments)} to touch",
-                where=f"{where}:{self._environments[-1]}",
-                remedy="leave one of them out",
-            )
+        for index, thing in enumerate(self.environment):
+            thing.check(f"{where}:environment[{index}]")
+        for kind, name in ((SheetSpring, "sheet spring"), (Slot, "slot")):
+            if sum(isinstance(thing, kind) for thing in self._things) > 1:
+                raise DrakeTeleopError(
+                    f"there is more than one {name}",
+                    where=f"{where}:environment",
+                    remedy="leave the others out",
+                )
         _check_task(self, where)
         _check_steps(self, where)
         _check_channel(self, where)
@@ -185,7 +211,12 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     """
     data, where = ReadScenario(name_or_path)
     scenario = ScenarioFromData(data, where)
-    scenario.slave = scenario.slave.found_from(Path(where).parent)
+    folder = Path(where).parent
+    scenario.slave = scenario.slave.found_from(folder)
+    scenario.environment = [
+        thing.found_from(folder) if isinstance(thing, Scene) else thing
+        for thing in scenario.environment
+    ]
     return scenario
 
 
@@ -262,7 +293,7 @@ def _check_task(scenario: Scenario, where: str) -> None:
 def _check_steps(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
     controlled = simulation.integrator == "runge_kutta3"
-    if scenario.environment is not None and not controlled and simulation.max_step > _CONTACT_STEP:
+    if scenario.surroundings is not None and not controlled and simulation.max_step > _CONTACT_STEP:
         raise DrakeTeleopError(
             f"steps of {simulation.max_step:g} s are too long for contact",
             where=f"{where}:simulation.max_step",

@@ -13,6 +13,9 @@ def _signal(name: str, components: str, units: str, description: str) -> Signal:
     return Signal(name, tuple(components.split()), unit[0] if len(unit) == 1 else unit, description)
 
 
+#: Before the name of a body of the surroundings that moves: its pose is a signal of its own.
+POSE_OF = "pose_of_"
+
 _WRENCH = ("f_x f_y f_z tau_x tau_y tau_z", "N,N,N,N m,N m,N m")
 _POSE = ("q_w q_x q_y q_z p_x p_y p_z", "1,1,1,1,m,m,m")
 _TWIST = ("v_x v_y v_z omega_x omega_y omega_z", "m/s,m/s,m/s,rad/s,rad/s,rad/s")
@@ -113,6 +116,8 @@ def signal_of(name: str, size: int) -> Signal:
 
     Where a joint slides, rad stands for m and N m for N.
     """
+    if name.startswith(POSE_OF):
+        return _signal(name, *_POSE, f"where the body {name.removeprefix(POSE_OF)} is, in W, at t")
     signal = SIGNALS[name]
     if size == len(signal.components):
         return signal

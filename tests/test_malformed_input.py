@@ -39,7 +39,7 @@ SCENARIOS = {
         "{sheet_spring: {}, simulation: {integrator: runge_kutta2}}",
         "simulation.max_step",
     ),
-    "two things to touch": ("{sheet_spring: {}, slot: {}}", "scenario.yaml:slot"),
+    "two leaves": ("{sheet_spring: {}, environment: [!SheetSpring {}]}", "yaml:environment"),
     "a slot too deep": ("slot: {depth: 0.5}", "slot.depth"),
     "fraction for the seed": ("simulation: {seed: 0.5}", "simulation.seed"),
 }

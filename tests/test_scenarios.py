@@ -30,7 +30,9 @@ def margin(values, lower, upper):
 
 
 def test_these_are_shipped_and_say_what_they_are():
-    assert ScenarioNames() == sorted([*MOVEMENTS, *TASKS, "ideal_sensor", "identification"])
+    assert ScenarioNames() == sorted(
+        [*MOVEMENTS, *TASKS, "ideal_sensor", "identification", "push_block"]
+    )
     for name in ScenarioNames():
         scenario = LoadScenario(name)
         scenario.check()

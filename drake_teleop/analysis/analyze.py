@@ -5,7 +5,7 @@ Diagram itself, linearised; the closed form of one axis stands beside it. `summa
 
 ============ ==================================================================================
 scenario     its name, direction, grip, passivity method, delay_s (one way), wall_N_per_m (its
-             leaf, or else the paper's 5.1 kN/m)
+             leaf or wall, or else the paper's 5.1 kN/m), wall_is (which of them)
 axis         the numbers of `analysis.one_axis.OneAxis`, and tool_coupling
 diagram      list: operating point, states, stable, decay_1_per_s (of what dies last),
              frequency_Hz (of its oscillation); one_axis: the same of the sampled one-axis model
@@ -133,7 +133,7 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
     along = task_direction(linear, DIRECTIONS[direction])
     sampling = sampling_of(linear)
     wall = (5100.0, 0.0)
-    if scenario.sheet_spring is not None:
+    if along.axis.wall_stiffness > 0.0:
         wall = (along.axis.wall_stiffness, along.axis.wall_damping)
     axis = dataclasses.replace(along.axis, wall_stiffness=0.0, wall_damping=0.0)
     contact = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
@@ -142,7 +142,7 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
     free = linearize(linear.without_environment(), load_estimate=estimate)
     progress(0.5)
     points = [("free motion", free, axis)]
-    if scenario.sheet_spring is not None:
+    if scenario.leaf is not None:
         pressed = linearize(linear, load_estimate=estimate, displacement=pressing(linear))
         points.append(("on the leaf", pressed, contact))
     progress(1.0)
@@ -158,6 +158,7 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
         "method": method,
         "delay_s": axis.delay,
         "wall_N_per_m": wall[0],
+        "wall_is": wall_is(scenario, along.axis.wall_stiffness > 0.0),
         "axis": dataclasses.asdict(axis) | {"tool_coupling": along.tool_coupling},
         "diagram": [
             diagram_figures(name, closed(system, linear), on_paper, sampling)
@@ -196,6 +197,23 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
     return figures, Curves(axis, OMEGA, H, closed_form, wall, nyquist, maps)
 
 
+def wall_is(scenario: Scenario, is_known: bool) -> str:
+    """What the wall of the closed forms is: only leaf and wall have a stiffness along one line.
+
+    Args:
+        scenario: with or without something to touch.
+        is_known: whether that has a stiffness.
+    """
+    if scenario.leaf is not None:
+        return "the leaf"
+    surroundings = scenario.surroundings
+    if is_known:
+        return "the wall, in series with the tool"
+    kinds = () if surroundings is None else surroundings.parts
+    names = " and ".join(type(part).__name__.lower() for part in kinds)
+    return "the paper's" + (f": {names} not analysed" if names else "")
+
+
 def sampling_of(scenario: Scenario) -> Sampling:
     """The rates of a scenario."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
@@ -213,7 +231,7 @@ def pressing(scenario: Scenario) -> list[float]:
     Raises:
         DrakeTeleopError: if the motion is not scaled to anything.
     """
-    assert scenario.sheet_spring is not None
+    assert scenario.leaf is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
         raise DrakeTeleopError(
@@ -222,7 +240,7 @@ def pressing(scenario: Scenario) -> list[float]:
             remedy="choose a scale above 0, or leave the sheet_spring out",
         )
     tip = NominalSlave(scenario.slave).start_tip
-    way = np.array(scenario.sheet_spring.position) - [0.0, 0.0, _PRESSED] - tip
+    way = np.array(scenario.leaf.position) - [0.0, 0.0, _PRESSED] - tip
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
     return list(R_WB.T @ way / scaling.translation_scale)
 

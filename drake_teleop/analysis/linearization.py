@@ -383,7 +383,8 @@ class _Period:
         self.dt = 1 / scenario.rates.hand_hz
         smooth = _smooth(scenario)
         self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
-        if smooth.environment is not None:
+        if smooth.surroundings is not None:
+            _check_contact(self._diagram)
             _remove_friction(self._diagram)
         self._simulator = MakeSimulator(self._diagram, smooth.simulation)
         # Steps that followed the error would follow the displacements too.
@@ -396,7 +397,7 @@ class _Period:
         self._sensor = self._system("wrist_sensor")
         servo = smooth.joint_control
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
-        largest = _ANGLE if smooth.environment is None else _IN_CONTACT
+        largest = _ANGLE if smooth.surroundings is None else _IN_CONTACT
         self._joint_step = min(largest, _ACCELERATION / gain)
         self._groups = self._state_groups()
         self._steps = np.concatenate([group.steps for group in self._groups])
@@ -636,6 +637,15 @@ def _smooth(scenario: Scenario) -> Scenario:
         # For an arm that has a closed form, which leads to the same angles and remembers nothing.
         slave__inverse_kinematics=AUTOMATIC,
     )
+
+
+def _check_contact(diagram: Diagram) -> None:
+    if beyond := GetBlock(diagram, "wrist_sensor").beyond:
+        raise DrakeTeleopError(
+            f"these surroundings cannot be linearised: {beyond}",
+            where="environment",
+            remedy="leave them out, or leave a leaf, a slot, walls and boxes",
+        )
 
 
 def _remove_friction(diagram: Diagram) -> None:

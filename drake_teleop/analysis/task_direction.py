@@ -17,15 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
+from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.analysis.one_axis import OneAxis
+from drake_teleop.environment.point_contact import STIFFNESS
+from drake_teleop.environment.wall import Wall
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import checked
 from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.slave.arm import ArmModel, forward_kinematics, inverse_dynamics, jacobian
 from drake_teleop.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
 from drake_teleop.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.slave.plant import NominalSlave, SlavePlant
+from drake_teleop.slave.plant import AddSlavePlant, NominalSlave, SlavePlant
 
 Array = NDArray[np.float64]
 
@@ -115,7 +118,7 @@ def task_direction(
     mass, first_moment_S = arm.phi_load[0], arm.phi_load[1:4]
     mobility = tool_W @ np.concatenate([a, alpha])
     mass_acceleration = n_W @ (a + np.cross(alpha, R_WS @ first_moment_S / mass))
-    servo, sheet = scenario.joint_control, scenario.sheet_spring
+    servo, sheet = scenario.joint_control, scenario.leaf
     forward, backward = scenario.channel.lines()
     axis = OneAxis(
         hand_mass=hand.mass,
@@ -133,10 +136,21 @@ def task_direction(
         sigma=sigma,
         gamma=gamma,
         delay=0.5 * (forward.delay + backward.delay),
-        wall_stiffness=0.0 if sheet is None else float(sheet.stiffness),
+        wall_stiffness=_wall_stiffness(scenario),
         wall_damping=0.0 if sheet is None else float(sheet.damping),
     )
     return TaskDirection(axis, hand_B, tool_W, float(mass_acceleration / mobility))
+
+
+def _wall_stiffness(scenario: Scenario) -> float:
+    """Of the leaf, or of a wall and the tool's ball in series [N/m]; 0 for anything else."""
+    if scenario.leaf is not None:
+        return float(scenario.leaf.stiffness)
+    wall = scenario.surroundings
+    if not isinstance(wall, Wall):
+        return 0.0
+    pairs = AddSlavePlant(DiagramBuilder(), scenario.slave, wall).contact_pairs
+    return float(pairs[:, STIFFNESS].sum())
 
 
 def _device(scenario: Scenario, moved_B: Array, n: Array) -> tuple[float, float]:

@@ -79,7 +79,7 @@ def delayed_contact(
     sheet = SheetSpring(position=[x, y, z - _GAP], length=0.12, width=0.05, thickness=LEAVES[leaf])
     return (
         replace(
-            base,
+            base.without_environment(),
             simulation=dataclasses.replace(base.simulation, settle=settle, duration=task.end),
             operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, back]),
             channel=channel,

@@ -9,6 +9,8 @@ along the normal, regularised Coulomb friction across it); a test ties it to the
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Box, GeometryId, ProximityProperties, SceneGraphInspector, Sphere
@@ -22,8 +24,8 @@ from drake_teleop.vectors import apply, dot, nine, three, transposed
 
 Array = NDArray[np.float64]
 
-#: Columns of the table of pairs: static and dynamic friction.
-FRICTION = slice(24, 26)
+#: Columns of the table of pairs: stiffness; static and dynamic friction.
+STIFFNESS, FRICTION = 22, slice(24, 26)
 #: Their number.
 WIDTH = 27
 _STIFFNESS, _DISSIPATION = "point_contact_stiffness", "hunt_crossley_dissipation"
@@ -34,7 +36,7 @@ def ContactPairs(
     plant: MultibodyPlant,
     inspector: SceneGraphInspector,
     tool: BodyIndex,
-    environment: ModelInstanceIndex,
+    environment: Iterable[ModelInstanceIndex],
     slip: float,
 ) -> Array:
     """The pairs of a sphere of the tool and a box of the environment, as a table for the kernel.
@@ -54,11 +56,12 @@ def ContactPairs(
         and dynamic friction, 26 slip at which it is complete [m/s].
 
     Raises:
-        DrakeTeleopError: for other shapes.
+        DrakeTeleopError: for other shapes, or where Drake chooses the stiffness.
     """
     context = plant.CreateDefaultContext()
     rows = []
-    for body in map(plant.get_body, plant.GetBodyIndices(environment)):
+    touched = (body for instance in environment for body in plant.GetBodyIndices(instance))
+    for body in map(plant.get_body, touched):
         X_WBody = plant.EvalBodyPoseInWorld(context, body)
         for box in plant.GetCollisionGeometriesForBody(body):
             for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
@@ -104,20 +107,24 @@ def _direction(plant: MultibodyPlant, context: Context, body: RigidBody) -> Arra
 
 
 def _law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
-    """k, d and friction of a pair: springs in series, harmonic mean of friction, as in Drake."""
+    """k, d and friction of a pair, as in Drake.
+
+    Springs in series, dissipation by what each deforms, the harmonic mean of friction.
+    """
+    for shape in (ball, box):
+        if not all(shape.HasProperty("material", name) for name in (_STIFFNESS, _DISSIPATION)):
+            raise DrakeTeleopError(
+                "leaves stiffness or dissipation to Drake",
+                where="drake:proximity_properties",
+                remedy="give drake:point_contact_stiffness and drake:hunt_crossley_dissipation",
+            )
     k_1, k_2 = (float(shape.GetProperty("material", _STIFFNESS)) for shape in (ball, box))
     d_1, d_2 = (float(shape.GetProperty("material", _DISSIPATION)) for shape in (ball, box))
-    if k_1 != k_2:
-        # The point of contact would not be halfway between the surfaces.
-        raise DrakeTeleopError(
-            "tool and environment differ in their contact's stiffness",
-            where=_STIFFNESS,
-            remedy="give both the same",
-        )
     both = CalcContactFrictionFromSurfaceProperties(
         *(shape.GetProperty("material", "coulomb_friction") for shape in (ball, box))
     )
-    return [k_1 / 2, (d_1 + d_2) / 2, both.static_friction(), both.dynamic_friction()]
+    d = (k_2 * d_1 + k_1 * d_2) / (k_1 + k_2)
+    return [k_1 * k_2 / (k_1 + k_2), d, both.static_friction(), both.dynamic_friction()]
 
 
 @njit(cache=True)

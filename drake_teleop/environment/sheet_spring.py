@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from xml.etree import ElementTree
 
 import numpy as np
+from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, PrismaticSpring
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, PrismaticSpring
 
-from drake_teleop.environment.environment import Environment, Stand
+from drake_teleop.environment.environment import Environment, ExcludeContact, Stand
 from drake_teleop.fields import settings
 from drake_teleop.quantities import quantity
 from drake_teleop.resources import models_dir
@@ -74,9 +75,18 @@ class SheetSpring(Environment):
         x, y, z = self.position
         return Stand(0.34, 0.24, x + 0.065, y, z - _BENCH)
 
-    def AddTo(self, plant: MultibodyPlant) -> ModelInstanceIndex:
+    def AddTo(self, plant: MultibodyPlant) -> None:
         """See `AddSheetSpring`."""
-        return AddSheetSpring(plant, self)
+        AddSheetSpring(plant, self)
+
+    def PrepareContact(
+        self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
+    ) -> None:
+        """The tool alone touches the leaf, whose shape reaches down to where others may stand."""
+        leaf = plant.GetBodyByName("leaf")
+        others = [BodyIndex(k) for k in range(plant.num_bodies()) if BodyIndex(k) != tool]
+        shapes = plant.GetCollisionGeometriesForBody(leaf)
+        ExcludeContact(plant, scene_graph, shapes, others)
 
 
 def AddSheetSpring(plant: MultibodyPlant, sheet: SheetSpring) -> ModelInstanceIndex:

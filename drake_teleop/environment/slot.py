@@ -28,7 +28,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
-from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, SpatialInertia
 
 from drake_teleop.environment.environment import Environment, Stand
 from drake_teleop.fields import settings
@@ -95,13 +95,15 @@ class Slot(Environment):
         """From the floor to the slot's foot."""
         return Stand(0.16, 0.16, self.position[0], self.position[1], self.foot)
 
-    def AddTo(self, plant: MultibodyPlant) -> ModelInstanceIndex:
+    def AddTo(self, plant: MultibodyPlant) -> None:
         """See `AddSlot`."""
-        return AddSlot(plant, self)
+        AddSlot(plant, self)
 
-    def PrepareTool(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    def PrepareContact(
+        self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
+    ) -> None:
         """See `TouchAsSlot`."""
-        TouchAsSlot(plant, scene_graph, self)
+        TouchAsSlot(plant, scene_graph, self, tool)
 
 
 def AddSlot(plant: MultibodyPlant, slot: Slot) -> ModelInstanceIndex:
@@ -125,10 +127,12 @@ def AddSlot(plant: MultibodyPlant, slot: Slot) -> ModelInstanceIndex:
     return instance
 
 
-def TouchAsSlot(plant: MultibodyPlant, scene_graph: SceneGraph, slot: Slot) -> None:
+def TouchAsSlot(
+    plant: MultibodyPlant, scene_graph: SceneGraph, slot: Slot, tool: BodyIndex
+) -> None:
     """Gives the tool's balls the slot's contact, so that of both it is what the slot says."""
     source = plant.get_source_id()
-    for ball in plant.GetCollisionGeometriesForBody(plant.GetBodyByName("tool")):
+    for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
         scene_graph.AssignRole(source, ball, _material(slot), RoleAssign.kReplace)
 
 

@@ -31,7 +31,8 @@ from drake_teleop.slave.arm import ArmModel
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.assumed_limits import with_all_limits
 from drake_teleop.slave.models import ParseModel, drakes_errors_said
-from drake_teleop.slave.plant import AddEnvironment, NominalSlave, ParseSlave, finalize
+from drake_teleop.slave.plant import NominalSlave, ParseSlave, finalize
+from drake_teleop.slave.surroundings import AddEnvironment
 
 _POSTURES = 1000  # random ones, in which distances of shapes are looked at
 # Of the joints' ranges, speeds and torques; the rest is for tracking errors and feedback.
@@ -94,8 +95,8 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         parsed = ParseSlave(plant, scenario.slave)
-        if scenario.environment is not None:
-            AddEnvironment(plant, scenario.environment)
+        if scenario.surroundings is not None:
+            AddEnvironment(plant, scenario.surroundings)
         folders.extend(parsed.folders)
         return parsed.instance, parsed.sensor_frame
 

@@ -8,7 +8,9 @@ tool minus what the environment exerts on it (Eqs. 1, 2), and the motion is that
 The plant takes steps of its own, cut only where something drives it. When a step is over the sensor
 looks back: at each instant in it at which it samples, position and velocity are interpolated
 (Hermite), and the accelerations follow from the dynamics under the torque that the motors held. So
-8 kHz need no events, and what is sampled is exact for the state it belongs to.
+8 kHz need no events, and what is sampled is exact for the state it belongs to. Contact that the
+compiled law does not know (`Contact.beyond`) Drake tells, for the end of a step alone: then each
+sample is an event, and ends one.
 """
 
 from __future__ import annotations
@@ -63,9 +65,16 @@ from drake_teleop.sensor.sensor_chain import (
     read_into,
     sensor_chain,
 )
-from drake_teleop.slave.arm import MOTION_SIZE, ArmModel, forward_dynamics, sensor_motion
+from drake_teleop.slave.arm import (
+    MOTION_SIZE,
+    ArmModel,
+    forward_dynamics,
+    forward_kinematics,
+    sensor_motion,
+)
+from drake_teleop.slave.drake_contact import contact_wrench_W
 from drake_teleop.slave.plant import SlavePlant
-from drake_teleop.slave.tool_contact import add_force, environment_wrench
+from drake_teleop.slave.tool_contact import environment_wrench
 from drake_teleop.vectors import apply, cross, minus, nine, put, three, transposed
 
 Array = NDArray[np.float64]
@@ -323,12 +332,13 @@ class WristSensor(LeafSystem):
         self._offset = constants[OFFSET]
         # A copy, because something may be grasped; the joint control knows nothing of that.
         carried = arm.with_load(arm.phi_load)
-        self._physics = (carried.table, carried.load, slave.contact_pairs, slave.leaf)
+        self._physics = (carried.table, carried.load, slave.contact_pairs, slave.contact.leaf)
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
             first[WRENCH] += config.offset
         # Contact takes many steps for one torque, and to work off the queue takes longer than them.
-        self._longest = _LONGEST if slave.can_touch else 1
+        self._beyond = slave.contact.beyond
+        self._longest = _LONGEST if slave.can_touch and not slave.contact.beyond else 1
         tail = np.zeros(2 + self._longest * (2 * n + 3))
         memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
@@ -342,12 +352,12 @@ class WristSensor(LeafSystem):
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
         self._applied = self.DeclareVectorInputPort("applied_wrench_W", 6)
         self._sheet = self._contacts = self._noise = None
-        if slave.sheet is not None:
+        if slave.sensed_sheet is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         if slave.can_touch:
             contacts = Value[ContactResults]()
             self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
-            self._tool = slave.tool
+            self._tool = slave.contact.bodies, slave.contact.shapes
         if not config.ideal:
             self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
         self.DeclareDiscreteState(memory)
@@ -360,7 +370,10 @@ class WristSensor(LeafSystem):
         self._step = self.DeclareVectorOutputPort(
             "step", len(self._result), weak_callback(self._calc_step), tickets
         )
-        self.DeclarePerStepDiscreteUpdateEvent(self._update)
+        if self._beyond:
+            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        else:
+            self.DeclarePerStepDiscreteUpdateEvent(self._update)
         self.DeclarePeriodicPublishEvent(_CHECK_PERIOD, 0.0, self._check)
 
     @property
@@ -377,6 +390,11 @@ class WristSensor(LeafSystem):
     def contact_pairs(self) -> Array:
         """(k, 27) what may touch, see `ContactPairs`, a view."""
         return self._physics[2]
+
+    @property
+    def beyond(self) -> str:
+        """What its own contact law does not know, see `Contact`."""
+        return self._beyond
 
     @property
     def remembered(self) -> NDArray[np.intp]:
@@ -414,17 +432,14 @@ class WristSensor(LeafSystem):
     def _touching_W(self, context: Context) -> Array:
         if self._contacts is None:
             return self._nothing
-        results = self._contacts.Eval(context)
-        contacts = results.num_point_pair_contacts()
-        if contacts == 0:
-            return self._nothing
-        wrench_W = np.zeros(6)
-        for k in range(contacts):
-            contact = results.point_pair_contact_info(k)
-            force = contact.contact_force()  # on body B
-            if contact.bodyB_index() != self._tool:
-                force = -force
-            add_force(wrench_W, contact.contact_point(), force)
+        return contact_wrench_W(self._contacts.Eval(context), *self._tool)
+
+    def _touching_So_W(self, context: Context) -> Array:
+        """What contacts exert on the tool, about So, as what is applied to it."""
+        wrench_W = self._touching_W(context).copy()
+        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+        forward_kinematics(self._physics[0], self._state.Eval(context)[: self._n], R_WS, p_WS)
+        wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
         return wrench_W
 
     def _inputs(self, context: Context) -> tuple[object, ...]:
@@ -468,6 +483,8 @@ class WristSensor(LeafSystem):
         if not np.isfinite(x).all():  # nothing is known; the samples say so
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)
+        if self._beyond:
+            applied = applied + self._touching_So_W(context)
         _accelerations(self._physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
         if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ALIKE * (1.0 + np.abs(vdot).max()):
@@ -521,9 +538,10 @@ def AddWristSensor(
             RandomSource(RandomDistribution.kGaussian, NOISE_SIZE, NOISE_BLOCK * period),
         )
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    if slave.sheet is not None:
+    if slave.sensed_sheet is not None:
         builder.Connect(
-            slave.plant.get_state_output_port(slave.sheet), sensor.GetInputPort("sheet_state")
+            slave.plant.get_state_output_port(slave.sensed_sheet),
+            sensor.GetInputPort("sheet_state"),
         )
     if slave.can_touch:
         builder.Connect(

@@ -10,7 +10,7 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.sample import sample_parts
-from drake_teleop.signals import LOG, SIGNALS
+from drake_teleop.signals import LOG, POSE_OF, SIGNALS
 
 #: Ports that hold several signals side by side, in the order of `SIGNALS`: to read one port takes
 #: less time than to read its parts.
@@ -47,8 +47,8 @@ def wire(builder: DiagramBuilder, source: System, name: str, target: System, ent
     builder.Connect(output, port)
 
 
-def record(builder: DiagramBuilder, name: str, sides: Iterable[System], log_hz: float) -> Diagram:
-    """Exports and records every port that is a signal, in the order of `SIGNALS`.
+def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float) -> Diagram:
+    """Exports and records every port that is a signal, in the order of `SIGNALS`, then poses.
 
     What lies side by side in one port of a side (`TOGETHER`) is recorded from there.
     """
@@ -57,10 +57,11 @@ def record(builder: DiagramBuilder, name: str, sides: Iterable[System], log_hz: 
         for side in sides
         for port in (side.get_output_port(i) for i in range(side.num_output_ports()))
     }
-    signals = [signal for signal in SIGNALS if signal in outputs]
-    for signal in signals:
-        builder.ExportOutput(outputs[signal], signal)
-    wide = {part: name for name, parts in TOGETHER.items() if name in outputs for part in parts}
+    signals = [name for name in SIGNALS if name in outputs]
+    signals += [name for name in outputs if name.startswith(POSE_OF)]
+    for name in signals:
+        builder.ExportOutput(outputs[name], name)
+    wide = {part: port for port, parts in TOGETHER.items() if port in outputs for part in parts}
     ports = [outputs[name] for name in dict.fromkeys(wide.get(name, name) for name in signals)]
     # One wide log: at 8 kHz each further system with events of its own costs time at every step.
     row = builder.AddNamedSystem("log_input", Multiplexer([port.size() for port in ports]))
@@ -69,7 +70,7 @@ def record(builder: DiagramBuilder, name: str, sides: Iterable[System], log_hz: 
     log = LogVectorOutput(row.get_output_port(), builder, 1 / log_hz)
     log.set_name(LOG)
     diagram = builder.Build()
-    diagram.set_name(name)
+    diagram.set_name(title)
     return diagram
 
 

@@ -20,11 +20,14 @@ from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.sensor.wrist_sensor import AddWristSensor
 from drake_teleop.sides.ports import export
+from drake_teleop.signals import POSE_OF
+from drake_teleop.slave.drake_contact import DrakeContact
 from drake_teleop.slave.forward_kinematics import ForwardKinematics
 from drake_teleop.slave.ik_methods import METHODS, method_of
 from drake_teleop.slave.joint_control import JointControl
 from drake_teleop.slave.joint_trajectory import JointTrajectory
 from drake_teleop.slave.monitor import SlaveMonitor
+from drake_teleop.slave.moving_pose import MovingPose
 from drake_teleop.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.slave.tool_contact import ToolContact
 
@@ -59,7 +62,8 @@ def MakeSlaveSide(
           ik_status, scaled_wrench_S, fault: signals
         - load_estimate, contact_wrench_S (if the load is known or learnt): signals
         - load_state (if the load is watched), true_contact_wrench_W (with something to touch),
-          sheet_state (with a sheet spring): signals
+          sheet_state (with a sheet spring), pose_of_NAME (of each other body of the surroundings
+          that moves): signals
         - sample, scaled_contact_and_fault: several of these side by side, for the log
 
     Args:
@@ -174,7 +178,7 @@ def _add_body(
 ) -> _Body:
     """Adds what every slave has; the joint command is left open."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
-    slave = AddSlavePlant(builder, scenario.slave, scenario.environment, q_start)
+    slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
     arm, plant, start = slave.arm, slave.plant, slave.start
     state = plant.get_state_output_port(slave.instance)
     builder.ExportOutput(state, "slave_state")
@@ -237,16 +241,29 @@ def _add_body(
 
 
 def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputPort) -> None:
-    contact = builder.AddNamedSystem(
-        "tool_contact",
-        ToolContact(slave.arm, slave.contact_pairs, moves=slave.sheet is not None),
-    )
-    builder.Connect(state, contact.GetInputPort("slave_state"))
+    plant = slave.plant
+    if slave.contact.beyond:
+        contact = builder.AddNamedSystem(
+            "tool_contact", DrakeContact(slave.contact.bodies, slave.contact.shapes)
+        )
+        results = plant.get_contact_results_output_port()
+        builder.Connect(results, contact.GetInputPort("contact_results"))
+    else:
+        moves = slave.sheet is not None
+        contact = builder.AddNamedSystem(
+            "tool_contact", ToolContact(slave.arm, slave.contact_pairs, moves=moves)
+        )
+        builder.Connect(state, contact.GetInputPort("slave_state"))
     export(builder, contact, "true_contact_wrench_W")
     if slave.sheet is not None:
-        sheet = slave.plant.get_state_output_port(slave.sheet)
-        builder.Connect(sheet, contact.GetInputPort("sheet_state"))
+        sheet = plant.get_state_output_port(slave.sheet)
         builder.ExportOutput(sheet, "sheet_state")
+        if slave.sensed_sheet is not None:
+            builder.Connect(sheet, contact.GetInputPort("sheet_state"))
+    for name, body in slave.contact.moving.items():
+        pose = builder.AddNamedSystem(POSE_OF + name, MovingPose(body))
+        builder.Connect(plant.get_body_poses_output_port(), pose.GetInputPort("body_poses"))
+        export(builder, pose, **{POSE_OF + name: "pose"})
 
 
 def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:

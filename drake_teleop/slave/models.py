@@ -38,6 +38,8 @@ from drake_teleop.texts import read_text, read_yaml
 
 # What ties links to each other besides joints: Drake's tags in URDF and SDF, MJCF's.
 _LOOP = re.compile(rb"<(drake:ball_constraint|drake:linear_bushing_rpy|connect|weld|distance)\b")
+# How what is said of lost meshes begins.
+_MISSING = "shapes are missing of"
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,30 @@ def ParseTool(
     return ParsedTool(roots[0], assumptions, read.folder)
 
 
+def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
+    """Parses what stands around an arm: nothing of it is held, and nothing assumed.
+
+    Args:
+        plant: not finalized.
+        path: as for `ParseModel`.
+
+    Returns:
+        The folder of converted meshes, to be kept as long as shapes are looked at.
+
+    Raises:
+        DrakeTeleopError: if the file cannot be read, or has what Drake would leave out.
+    """
+    read = _read(plant, path, ())
+    missing = [text for text in read.assumptions if text.startswith(_MISSING)]
+    if read.root is not None:
+        missing += [f"{name} {what}" for name, what in _peculiar_joints(read.root).items()]
+    if missing:
+        raise DrakeTeleopError(
+            missing[0], where=str(path), remedy="nothing may be left out that the tool could touch"
+        )
+    return read.folder
+
+
 class _Read(NamedTuple):
     """What stands in a file; the XML's root, if it is a URDF or SDF."""
 
@@ -194,9 +220,7 @@ def _read(plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...]) ->
         else:
             inertias = check_model(root, str(path))
             lost = without_lost_meshes(root, packages, Path(converted.name))
-            assumptions = [
-                f"shapes are missing of {', '.join(links)}: {what}" for what, links in lost.items()
-            ]
+            assumptions = [f"{_MISSING} {', '.join(links)}: {what}" for what, links in lost.items()]
             assumptions += inertias
             text = ElementTree.tostring(root, encoding="unicode")
             with _drakes_errors_raised():

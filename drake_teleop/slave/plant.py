@@ -17,7 +17,6 @@ from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBo
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.environment.environment import Environment
-from drake_teleop.environment.point_contact import WIDTH, ContactPairs
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.slave.arm import SLIDES, ArmModel, inverse_dynamics
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
@@ -28,6 +27,7 @@ from drake_teleop.slave.models import ParseModel, drakes_errors_said
 from drake_teleop.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.slave.payload import AddPayload
 from drake_teleop.slave.slave_config import Slave
+from drake_teleop.slave.surroundings import AddEnvironment, Contact, ContactWith, no_contact
 from drake_teleop.slave.tool import AddTool, shapes_reach
 
 #: What the arm's model instance is called in a plant, whatever its file says.
@@ -50,10 +50,7 @@ class SlavePlant:
         start: (n,) joint positions at the start [rad].
         X_WS_start: (7,) see `start_pose`.
         tip: (3,) p_STip, where the tool makes contact [m].
-        sheet: model instance of what moves when it is touched, such as the leaf, if anything does.
-        contact_pairs: (k, 27) what may touch, see `ContactPairs`; none without an environment.
-        leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] of the leaf, and its acceleration by
-            gravity [m/s^2]; without one, a mass that nothing moves.
+        contact: with what there is to touch.
         assumptions: what the models do not say.
     """
 
@@ -64,15 +61,28 @@ class SlavePlant:
     start: NDArray[np.float64]
     X_WS_start: NDArray[np.float64]
     tip: NDArray[np.float64]
-    sheet: ModelInstanceIndex | None
-    contact_pairs: NDArray[np.float64]
-    leaf: NDArray[np.float64]
+    contact: Contact
     assumptions: tuple[str, ...]
+
+    @property
+    def contact_pairs(self) -> NDArray[np.float64]:
+        """(k, 27) what may touch by the compiled contact law, see `ContactPairs`."""
+        return self.contact.pairs
+
+    @property
+    def sheet(self) -> ModelInstanceIndex | None:
+        """Model instance of the leaf, or another `moving_part`, if there is one."""
+        return self.contact.sheet
 
     @property
     def can_touch(self) -> bool:
         """Whether there is something to touch."""
-        return len(self.contact_pairs) > 0
+        return len(self.contact_pairs) > 0 or bool(self.contact.beyond)
+
+    @property
+    def sensed_sheet(self) -> ModelInstanceIndex | None:
+        """The sheet, if the compiled contact law moves it."""
+        return None if self.contact.beyond else self.sheet
 
     @property
     def start_tip(self) -> NDArray[np.float64]:
@@ -147,24 +157,20 @@ def AddSlavePlant(
     else:
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
         plant.set_name("slave_plant")
-        plant.set_contact_model(ContactModel.kPoint)
+        areas = ContactModel.kHydroelasticWithFallback
+        plant.set_contact_model(areas if environment.hydroelastic else ContactModel.kPoint)
         plant.set_stiction_tolerance(environment.slip)
     parsed = ParseSlave(plant, slave)
     instance, tool = parsed.instance, parsed.tool
     touched = None if environment is None else AddEnvironment(plant, environment)
     with drakes_errors_said(slave.path):
         finalize(plant)
-    pairs, leaf = np.zeros((0, WIDTH)), np.array([1.0, 0.0, 0.0, 0.0])
+    contact = no_contact()
     if environment is not None and touched is not None:
         _remove_visuals(plant, scene_graph)
         _remove_shapes(plant, scene_graph, instance, tool)
-        environment.PrepareTool(plant, scene_graph)
-        inspector = scene_graph.model_inspector()
-        pairs = ContactPairs(plant, inspector, tool, touched, environment.slip)
-    sheet = None
-    if environment is not None and environment.moving_part is not None:
-        sheet = touched
-        leaf = np.array([*environment.moving_part, plant.gravity_field().gravity_vector()[2]])
+        frame = parsed.sensor_frame
+        contact = ContactWith(plant, scene_graph, frame, tool, environment, touched)
     arm, assumptions = parsed.arm()
     start = start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
@@ -181,16 +187,9 @@ def AddSlavePlant(
         start,
         X_WS_start,
         _tip(plant, slave, parsed, arm),
-        sheet,
-        pairs,
-        leaf,
+        contact,
         (*parsed.assumptions, *assumptions),
     )
-
-
-def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> ModelInstanceIndex:
-    """Adds what there is to touch to a plant that has the tool and is not finalized."""
-    return environment.AddTo(plant)
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,9 @@ from drake_teleop.scenario import LoadScenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import forward_kinematics, jacobian
 from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
-from drake_teleop.slave.plant import R_WS_HOME, AddEnvironment, AddSlavePlant, ParseSlave
+from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, ParseSlave
 from drake_teleop.slave.slave_config import Slave
+from drake_teleop.slave.surroundings import AddEnvironment
 from drake_teleop.slave.tool_contact import environment_wrench
 from drake_teleop.station import MakeTeleopStation
 
@@ -45,9 +46,9 @@ def pairs_of_a_ball(slot: Slot) -> np.ndarray:
     friction = CoulombFriction(1.0, 1.0)
     ball = Sphere(PEG_RADIUS)
     plant.RegisterCollisionGeometry(tool, RigidTransform(), ball, "ball", friction)
-    environment = AddEnvironment(plant, slot)
+    environment = AddEnvironment(plant, slot).instances
     plant.Finalize()
-    TouchAsSlot(plant, scene_graph, slot)
+    TouchAsSlot(plant, scene_graph, slot, tool.index())
     pairs = ContactPairs(plant, scene_graph.model_inspector(), tool.index(), environment, slot.slip)
     return pairs[np.all(pairs[:, :3] == 0.0, axis=1)]
 

@@ -102,4 +102,4 @@ def test_other_shapes_are_refused():
     plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(0.1), "ball", friction)
     plant.Finalize()
     with pytest.raises(DrakeTeleopError, match="spheres on boxes only, not a Box on a Sphere"):
-        ContactPairs(plant, scene_graph.model_inspector(), tool.index(), table, 1e-4)
+        ContactPairs(plant, scene_graph.model_inspector(), tool.index(), [table], 1e-4)

@@ -1,0 +1,160 @@
+"""What there is to touch in the slave's plant: what of it moves, which law tells its contact."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex
+
+from drake_teleop.environment.environment import Environment
+from drake_teleop.environment.point_contact import WIDTH, ContactPairs
+from drake_teleop.errors import DrakeTeleopError
+
+_SAME = 1e-12  # of frames: rounding
+
+
+class Touched(NamedTuple):
+    """What there is to touch in a plant: model instances, and that of the leaf, if there is one."""
+
+    instances: Collection[ModelInstanceIndex]
+    sheet: ModelInstanceIndex | None
+
+
+class Contact(NamedTuple):
+    """What may touch the tool, and how it is told.
+
+    Attributes:
+        pairs: (k, 27) of `ContactPairs`; none if `beyond` says something.
+        beyond: what the compiled contact law does not know, so that Drake's contact results are
+            used; empty if it knows all.
+        bodies: the tool's, and what is welded to it, as numbers.
+        shapes: identifiers of their shapes, as numbers.
+        leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] of the leaf, and its acceleration by
+            gravity [m/s^2]; without one, a mass that nothing moves.
+        sheet: model instance of the leaf, or another `moving_part`, if there is one.
+        moving: everything else that moves, by name.
+    """
+
+    pairs: NDArray[np.float64]
+    beyond: str
+    bodies: frozenset[int]
+    shapes: frozenset[int]
+    leaf: NDArray[np.float64]
+    sheet: ModelInstanceIndex | None
+    moving: dict[str, BodyIndex]
+
+
+def no_contact() -> Contact:
+    """With nothing to touch."""
+    leaf = np.array([1.0, 0.0, 0.0, 0.0])
+    return Contact(np.zeros((0, WIDTH)), "", frozenset(), frozenset(), leaf, None, {})
+
+
+def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> Touched:
+    """Adds what there is to touch to a plant that has the tool and is not finalized.
+
+    Raises:
+        DrakeTeleopError: if a file of it cannot be read.
+    """
+    before, sheet = plant.num_model_instances(), None
+    for part in environment.parts:
+        if part.moving_part is not None:
+            sheet = ModelInstanceIndex(plant.num_model_instances())
+        part.AddTo(plant)
+    added = range(before, plant.num_model_instances())
+    return Touched([ModelInstanceIndex(index) for index in added], sheet)
+
+
+def ContactWith(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    sensor_frame: Frame,
+    tool: BodyIndex,
+    environment: Environment,
+    touched: Touched,
+) -> Contact:
+    """Prepares the contact of the tool with what was added, once the plant is finalized.
+
+    Args:
+        plant: finalized.
+        scene_graph: with the shapes of tool and environment, and of nothing else.
+        sensor_frame: S.
+        tool: the body on it.
+        environment: what there is to touch.
+        touched: the same, as `AddEnvironment` returned it.
+
+    Raises:
+        DrakeTeleopError: if a scene's contact is not what was asked for.
+    """
+    environment.PrepareContact(plant, scene_graph, tool)
+    bodies = plant.GetBodiesWeldedTo(plant.get_body(tool))
+    shapes = {body.index(): plant.GetCollisionGeometriesForBody(body) for body in bodies}
+    contact = no_contact()._replace(
+        # Numbers: the identifiers themselves would hold the plant.
+        bodies=frozenset(int(index) for index in shapes),
+        shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
+        sheet=touched.sheet,
+        moving=MovingBodies(plant, touched),
+    )
+    for part in environment.parts:
+        if part.moving_part is not None:
+            gravity = plant.gravity_field().gravity_vector()[2]
+            contact = contact._replace(leaf=np.array([*part.moving_part, gravity]))
+    context = plant.CreateDefaultContext()
+    X_STool = plant.CalcRelativeTransform(context, sensor_frame, plant.get_body(tool).body_frame())
+    if any(own for index, own in shapes.items() if index != tool):
+        return contact._replace(beyond="several bodies of the tool have shapes")
+    if not X_STool.IsNearlyIdentity(_SAME):
+        return contact._replace(beyond="the tool's shapes are not placed from S")
+    if beyond := _beyond(environment, contact):
+        return contact._replace(beyond=beyond)
+    inspector = scene_graph.model_inspector()
+    try:
+        pairs = ContactPairs(plant, inspector, tool, touched.instances, environment.slip)
+    except DrakeTeleopError as unknown:
+        return contact._replace(beyond=str(unknown))
+    if not len(pairs):
+        return contact._replace(beyond="nothing has a shape")
+    return contact._replace(pairs=pairs)
+
+
+def _beyond(environment: Environment, contact: Contact) -> str:
+    if environment.hydroelastic:
+        return "contacts have areas"
+    if contact.moving:
+        return f"there is what moves ({', '.join(contact.moving)})"
+    if contact.sheet is not None and len(environment.parts) > 1:
+        return "the leaf is not alone"
+    return ""
+
+
+def MovingBodies(plant: MultibodyPlant, touched: Touched) -> dict[str, BodyIndex]:
+    """What moves of it, besides the leaf, in a finalized plant, by the names of the bodies.
+
+    Of several of one name each has that of its model instance before its own.
+    """
+    bodies = [
+        plant.get_body(index)
+        for instance in touched.instances
+        if instance != touched.sheet
+        for index in plant.GetBodyIndices(instance)
+    ]
+    moving = [body for body in bodies if not plant.IsAnchored(body)]
+    names = [body.name() for body in moving]
+    return {
+        _plain(body.name() if names.count(body.name()) == 1 else body.scoped_name().get_full()): (
+            body.index()
+        )
+        for body in moving
+    }
+
+
+def _plain(name: str) -> str:
+    """For the name of a signal: a full stop would end it."""
+    return re.sub(r"\W+", "_", name)

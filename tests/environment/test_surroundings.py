@@ -1,0 +1,230 @@
+"""Several things to touch, still and moving: against Drake's contact, reactions and statics."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.common.yaml import yaml_load
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.math import RollPitchYaw
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.analysis.linearization import linearize
+from drake_teleop.environment.block import Block
+from drake_teleop.environment.box import Box
+from drake_teleop.environment.environment import Several
+from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.environment.wall import Wall
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identification import true_load
+from drake_teleop.operator.operator import MinimumJerk
+from drake_teleop.replay import ReplayScene
+from drake_teleop.run import ScenarioRun, summarise
+from drake_teleop.scenario import LoadScenario, Scenario, ScenarioFromData, replace
+from drake_teleop.simulation import MakeSimulator, simulate
+from drake_teleop.slave.drake_contact import contact_wrench_W
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.scene import Scene
+from drake_teleop.slave.slave_config import Slave
+from drake_teleop.slave.tool_contact import environment_wrench
+from drake_teleop.station import GetBlock, MakeTeleopStation
+
+SOFT_PAD = """
+<sdf version="1.9" xmlns:drake="drake.mit.edu"><model name="pad"><link name="pad">
+<collision name="pad"><geometry><cylinder><radius>0.05</radius><length>0.02</length></cylinder>
+</geometry><drake:proximity_properties><drake:compliant_hydroelastic/>
+<drake:hydroelastic_modulus>1e6</drake:hydroelastic_modulus>
+<drake:mesh_resolution_hint>0.02</drake:mesh_resolution_hint>
+<drake:hunt_crossley_dissipation>1.0</drake:hunt_crossley_dissipation>
+<drake:mu_dynamic>0.3</drake:mu_dynamic></drake:proximity_properties></collision>
+</link></model></sdf>
+"""
+
+
+def test_walls_and_boxes_are_drakes_law_of_two_surfaces():
+    """In a corner of a soft rough floor, a stiff smooth wall and a tilted box: no two alike."""
+    corner = Several(
+        [
+            Wall(position=[0.55, 0.0, 0.2], stiffness=3e3, dissipation=4.0, friction=0.7),
+            Wall(position=[0.567, 0.0, 0.2], normal=[-1.0, 0.0, 0.2], stiffness=7e5, friction=0.1),
+            Box(position=[0.55, 0.07, 0.2], rotation=[0.3, 0.1, 0.0], size=[0.1, 0.1, 0.1]),
+        ]
+    )
+    builder = DiagramBuilder()
+    slave = AddSlavePlant(builder, Slave(position=[0.55, 0.0, 0.398]), corner)
+    root = builder.Build().CreateDefaultContext()
+    plant, context = slave.plant, slave.plant.GetMyMutableContextFromRoot(root)
+    random, home = np.random.default_rng(0), plant.GetPositions(context, slave.instance)
+    found, most = np.zeros(6), 0
+    for _ in range(300):
+        q = home + 0.02 * random.uniform(-1, 1, 6)
+        v = random.normal(size=6) * 10.0 ** random.uniform(-5, 0)
+        plant.SetPositions(context, slave.instance, q)
+        plant.SetVelocities(context, slave.instance, v)
+        results = plant.get_contact_results_output_port().Eval(context)
+        most = max(most, results.num_point_pair_contacts())
+        environment_wrench(
+            slave.arm.table, slave.contact_pairs, np.zeros(6), q, v, np.zeros(2), found
+        )
+        expected = contact_wrench_W(results, slave.contact.bodies, slave.contact.shapes)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    assert slave.contact.beyond == ""
+    assert most == 3
+
+
+@pytest.fixture(scope="module")
+def pad(tmp_path_factory) -> str:
+    path = tmp_path_factory.mktemp("scene") / "pad.sdf"
+    path.write_text(SOFT_PAD)
+    return str(path)
+
+
+@pytest.mark.parametrize("case", ["block", "pad", "leaf"])
+def test_the_wrist_wrench_is_the_reaction_whatever_is_touched(case, pad):
+    """A block that is pushed, an area of pressure, a leaf beside a wall; 8 kHz, at every sample."""
+    things = {
+        "block": [Block(position=[0.561, 0.0, 0.2])],  # which the ball begins 1 mm deep in
+        "pad": [Scene(file=pad, position=[0.5, 0.0, 0.241], contact="hydroelastic")],
+        "leaf": [SheetSpring(position=[0.5, 0.0, 0.251]), Wall(position=[0.4, 0.0, 0.252])],
+    }
+    scenario = replace(
+        Scenario(),
+        environment=things[case],
+        slave__position=[0.5, 0.0, 0.45],
+        wrist_sensor__ideal=True,
+        simulation__settle=0.0,
+        force_scaling__force_scale=0.0,
+        operator__intent=[MinimumJerk(duration=0.1, translation=[0.03, 0.0, -0.005])],
+    )
+    simulator = MakeSimulator(MakeTeleopStation(scenario), scenario.simulation)
+    simulator.Initialize()
+    station, root = simulator.get_system(), simulator.get_mutable_context()
+    plant, sensor = (GetBlock(station, name) for name in ("slave_plant", "wrist_sensor"))
+    context, sensed = plant.GetMyContextFromRoot(root), sensor.GetMyContextFromRoot(root)
+    place = list(plant.GetJointIndices()).index(plant.GetJointByName("sensor_weld").index())
+    truth, peak, error = station.GetOutputPort("true_contact_wrench_W"), 0.0, 0.0
+    for k in range(1, 161):
+        simulator.AdvanceTo(k * 0.000125)
+        reaction = plant.get_reaction_forces_output_port().Eval(context)[place]
+        expected = np.concatenate([reaction.translational(), reaction.rotational()])
+        peak = max(peak, np.linalg.norm(truth.Eval(root)[:3]))
+        simulator.AdvancePendingEvents()
+        sample = sensed.get_discrete_state_vector().value()[:6]
+        error = max(error, np.abs(sample - expected).max())
+    assert peak > 1.0
+    assert error < 1e-12
+    if case != "leaf":
+        return
+    # Its log has the leaf, and no other body moves.
+    assert station.HasOutputPort("sheet_state")
+    assert "leaf is not alone" in sensor.beyond
+
+
+@pytest.mark.slow
+def test_a_block_that_is_pushed_over_its_table_resists_by_friction():
+    """mu m g, in steady sliding, and the summary says how far."""
+    scenario = replace(LoadScenario("push_block"), wrist_sensor__ideal=True)
+    estimate = true_load(scenario)
+    result = simulate(MakeTeleopStation(scenario, load_estimate=estimate), scenario.simulation)
+    (block,) = scenario.environment
+    (sliding,) = np.nonzero((result.t > 0.6) & (result.t < 1.1))
+    f = result["true_contact_wrench_W"][sliding, :3].mean(axis=0)
+    # The ball rubs on the block, too, and presses it down by what pushes the ball up.
+    weight = block.mass * 9.81 + f[2]
+    speed = np.gradient(result["pose_of_block"][:, 4], result.t)[sliding]
+    push = -f[0] - block.mass * (speed[-1] - speed[0]) / np.ptp(result.t[sliding])
+    assert speed.min() > 0.01
+    assert push == pytest.approx(block.friction * weight, rel=0.005)
+    contact = result["contact_wrench_S"][sliding, 0].mean()  # x_S is x_W
+    assert contact == pytest.approx(-f[0], rel=0.02)
+    summary = summarise(ScenarioRun(scenario, result, None, "", 1.0))
+    assert 40.0 < summary["moved_mm"]["block"] < 60.0
+    assert "what moves (block)" in summary["contact_by"]
+
+
+def test_the_film_shows_what_moved_where_it_was():
+    """A block that is turned, and a door that is open, from their poses alone."""
+    door = Scene(position=[0.4, 0.3, 0.1], rotation=[0.0, 0.0, 0.7])
+    scenario = replace(Scenario(), environment=[Block(), door])
+    turned = RollPitchYaw(0.1, -0.2, 0.5).ToQuaternion().wxyz()
+    opened = RollPitchYaw(0.0, 0.0, 0.7 + 0.6).ToQuaternion().wxyz()
+    poses = {
+        "pose_of_block": np.array([[*turned, 0.7, 0.1, 0.3]]),
+        "pose_of_door": np.array([[*opened, 0.4, 0.3, 0.1]]),
+    }
+    still = {
+        "slave_state": np.zeros((1, 12)),
+        "measured_wrench_S": np.zeros((1, 6)),
+        "load_estimate": np.zeros((1, 16)),
+    }
+    scene = ReplayScene(Meshcat(MeshcatParams(host="localhost")), scenario, still | poses)
+    scene.show(0.0, still | poses, 0)
+    for name, pose in poses.items():
+        body = scene.plant.GetBodyByName(name.removeprefix("pose_of_"))
+        X_WBody = body.EvalPoseInWorld(scene.context)
+        np.testing.assert_allclose(X_WBody.rotation().ToQuaternion().wxyz(), pose[0, :4], atol=1e-9)
+        np.testing.assert_allclose(X_WBody.translation(), pose[0, 4:], atol=1e-12)
+    hinge = scene.plant.GetJointByName("hinge")
+    assert hinge.get_angle(scene.context) == pytest.approx(0.6, abs=1e-9)
+
+
+def test_the_docs_example_is_what_it_says():
+    text = (Path(__file__).parents[2] / "docs" / "station.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"^```yaml\n(environment:.*?)^```$", text, re.M | re.S)
+    scenario = ScenarioFromData(yaml_load(data=example), "station.md")
+    slave = AddSlavePlant(DiagramBuilder(), Slave(), scenario.surroundings)
+    assert set(slave.contact.moving) == {"block", "door"}
+    assert slave.contact.beyond == "there is what moves (block, door)"
+
+
+def test_what_the_law_does_not_know_is_not_linearised():
+    scenario = replace(Scenario(), environment=[Block()])
+    with pytest.raises(DrakeTeleopError, match="cannot be linearised: there is what moves"):
+        linearize(scenario)
+
+
+@pytest.mark.parametrize(
+    ("thing", "what"),
+    [
+        (
+            {"_tag": "!Wall", "normal": [0.0, 0.0, 0.0]},
+            r"environment\[0\].normal: has no direction",
+        ),
+        ({"_tag": "!Wall", "stiffness": 0.0}, r"environment\[0\].stiffness: 0 N/m is outside"),
+        ({"_tag": "!Wal"}, r"environment\[0\]: '!Wal' is not known; use one of !Wall"),
+        ({"_tag": "!Block", "table": [0.05, 0.05]}, "smaller than the block"),
+    ],
+)
+def test_a_thing_that_cannot_be_is_one_error(thing, what):
+    with pytest.raises(DrakeTeleopError, match=what):
+        ScenarioFromData({"environment": [thing]}, "scenario.yaml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        ("<drake:compliant_hydroelastic/>", "", "no shape in it is hydroelastic"),
+        ('link name="pad"', 'link name="tool"', "a body is called tool"),
+        ("<cylinder><radius>0.05</radius><length>0.02</length></cylinder>",
+         "<mesh><uri>lost.obj</uri></mesh>", "shapes are missing of pad"),
+    ],
+)  # fmt: skip
+def test_a_scene_that_would_be_left_out_is_one_error(old, new, what, tmp_path):
+    (tmp_path / "pad.sdf").write_text(SOFT_PAD.replace(old, new))
+    scene = Scene(file=str(tmp_path / "pad.sdf"), contact="hydroelastic")
+    with pytest.raises(DrakeTeleopError, match=what):
+        AddSlavePlant(DiagramBuilder(), Slave(), scene)
+
+
+def test_a_scene_is_found_from_the_scenarios_folder(tmp_path):
+    (tmp_path / "mine.yaml").write_text("environment: [!Scene {file: pad.sdf}, !Scene {}]")
+    absent = LoadScenario(tmp_path / "mine.yaml").surroundings
+    with pytest.raises(DrakeTeleopError, match=r"pad\.sdf: there is no such file"):
+        AddSlavePlant(DiagramBuilder(), Slave(), absent)
+    (tmp_path / "pad.sdf").write_text(SOFT_PAD)
+    (found, shipped) = LoadScenario(tmp_path / "mine.yaml").environment
+    assert found.path == tmp_path / "pad.sdf"
+    assert shipped.path.parent.name == "models"
