@@ -342,6 +342,12 @@ def analyze(scenario: str, direction: str, out: Path, quiet: bool) -> None:
 @cli.command("compare-passivity")
 @click.option("--networks", type=option.Names(), help="Presets.  [default: lan to lunar]")
 @click.option("--methods", type=option.Names(), help="Methods.  [default: all]")
+@click.option(
+    "--scenario",
+    default="contact_transition",
+    show_default=True,
+    help="Whose station it is: a shipped one's, or a YAML file's.",
+)
 @option.jobs
 @option.out("compare-passivity")
 @option.seed_0
@@ -349,6 +355,7 @@ def analyze(scenario: str, direction: str, out: Path, quiet: bool) -> None:
 def compare_passivity(
     networks: tuple[str, ...] | None,
     methods: tuple[str, ...] | None,
+    scenario: str,
     jobs: int | None,
     out: Path,
     seed: int,
@@ -365,6 +372,7 @@ def compare_passivity(
         out,
         networks=networks or study.NETWORKS,
         methods=methods or study.METHODS,
+        scenario=scenario,
         seed=seed,
         jobs=jobs or -1,
         quiet=quiet,

@@ -20,7 +20,7 @@ one_dof   list: method, wall_N_per_m, jitter, loss, longest_s: the longest round
           to which every one was stable (0: none was), and grid_s, the round trips tried
 covering  list: sigma, round_trip_s, wall_N_per_m, injected_J: energy that a loop without a method
           has created in one run; damping_Ns_per_m: what the device needs so that it creates none
-networks, methods, seed  as asked for
+networks, methods, scenario, seed  as asked for
 ========= ======================================================================================
 """
 
@@ -75,6 +75,7 @@ def compare_command(
     *,
     networks: Sequence[str] = NETWORKS,
     methods: Sequence[str] = METHODS,
+    scenario: str | Path = "contact_transition",
     seed: int = 0,
     jobs: int = -1,
     quiet: bool = False,
@@ -86,6 +87,8 @@ def compare_command(
         out: the folder.
         networks: names of presets.
         methods: names of methods.
+        scenario: whose station it is, a shipped one or a YAML file: slave, master, sensor, scales,
+            grip; not its rates, nor what it touches.
         seed: of sensor and networks.
         jobs: processes at once; -1: one for each core.
         quiet: no progress bars and no tables.
@@ -103,11 +106,12 @@ def compare_command(
     with show_progress(progress and not quiet) as stage:
         limits = _one_dof_study(methods, seed, jobs, stage)
         let_go = _hands_study(networks, methods, seed, jobs, stage)
-        runs, traces = _station_study(networks, methods, seed, jobs, stage)
+        runs, traces = _station_study(scenario, networks, methods, seed, jobs, stage)
         covering = _covering_study(stage)
     summary = {
         "networks": list(networks),
         "methods": list(methods),
+        "scenario": str(scenario),
         "seed": seed,
         "station": runs,
         "hands": let_go,
@@ -230,9 +234,19 @@ def _hands_study(
 
 
 def _station_study(
-    networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: Stage
+    scenario: str | Path,
+    networks: Sequence[str],
+    methods: Sequence[str],
+    seed: int,
+    jobs: int,
+    stage: Stage,
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, NDArray[np.float64]]]]:
-    base = replace(LoadScenario("contact_transition"), simulation__seed=seed, rates=_RATES)
+    base = replace(
+        LoadScenario(scenario).without_environment(),
+        simulation__seed=seed,
+        rates=_RATES,
+        contact_detection=None,
+    )
     estimate = identified_load(base, stage).estimate
     # The longest runs first, so that no process is left with one at the end.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
+from types import SimpleNamespace
 
 import polars as pl
 import pytest
@@ -83,6 +84,21 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
 def test_unknown_names_are_one_clear_error(tmp_path, arguments, message):
     with pytest.raises(DrakeTeleopError, match=message):
         study.compare_command(tmp_path, **arguments)
+
+
+def test_the_station_may_be_ones_own(monkeypatch, tmp_path):
+    """With its tool and its grip; at the study's rates, and with nothing but the study's leaves."""
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("{slave: {payload: {mass: 0.3}}, sheet_spring: {}, contact_detection: {}}")
+    bases = []
+    monkeypatch.setattr(study, "identified_load", lambda base, stage: SimpleNamespace(estimate=0))
+    monkeypatch.setattr(
+        study, "_each", lambda run, cases, *_: bases.extend(c[0] for c in cases) or []
+    )
+    study._station_study(mine, ["lan"], ["none"], 3, 1, lambda name: None)
+    base = bases[0]
+    assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (0.3, 3, study._RATES)
+    assert base.surroundings is None and base.contact_detection is None
 
 
 def test_presets_reach_around_the_earth_and_to_the_moon():
