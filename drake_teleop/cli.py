@@ -302,6 +302,55 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
     inspect_command(log, out, quiet=quiet)
 
 
+@cli.command()
+@click.argument("identification", type=option.PATH)
+@click.option(
+    "--to",
+    required=True,
+    type=click.Choice(
+        [
+            "ur",
+            "franka",
+            "xarm",
+            "kth",
+            "ft_tools",
+            "ros2-admittance",
+            "bota",
+            "urdf",
+            "sdf",
+            "mjcf",
+        ]
+    ),
+    help="Whose format.",
+)
+@click.option(
+    "--sensor-pose",
+    nargs=6,
+    type=option.Number(-1e3, 1e3),
+    metavar="X Y Z ROLL PITCH YAW",
+    help="Of the sensor in the flange [m, deg].  [default: the values are in the sensor's frame]",
+)
+@click.option(
+    "--sign",
+    type=click.Choice(["-1", "1"]),
+    default="-1",
+    show_default=True,
+    help="As in the log's description: -1 if the sensor reports what the load exerts on it.",
+)
+def export(identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: str) -> None:
+    """Say a load in a robot's own words.
+
+    Prints the load of an identification.json in the format, the units and the frame of a robot, of
+    a compensation or of a model, and on stderr what it drops and what is not identified.
+    """
+    from drake_teleop.robots.export import export_command
+
+    text, warnings = export_command(identification, to, sensor_pose, int(sign))
+    for warning in warnings:
+        click.echo(f"warning: {warning}", err=True)
+    click.echo(text, nl=False)
+
+
 @cli.command("sample-log")
 @option.seed_0
 @option.out("sample-log")

@@ -1,0 +1,1 @@
+"""Robots that stand in a lab: what was identified, in their own words."""

@@ -1,0 +1,334 @@
+"""An identified load in the format of a robot, of a compensation, or of a model.
+
+**Frames.** Robots and models want the load about a frame of theirs, the flange say; X_FS places the
+sensor in it. Compensations work in the sensor's frame.
+
+**Signs.** `Identification.offsets` are those of the wrench that the sensor exerts on the load. What
+a compensation subtracts is in the sensor's own sign, which for most is the opposite: what the load
+exerts on the sensor, `sign: -1` in a log description.
+
+**Sources.** Of the formats, as read in November 2026; none was tried on the real thing here:
+
+=============== ================================================================================
+ur              URScript manual, `set_target_payload(m, cog, inertia)`; the order of the six as in
+                ur_msgs/SetPayload: xx, yy, zz, xy, xz, yz, about the centre, axes of the flange
+franka          endeffector-config.json of Desk (frankarobotics/external_gripper_example): inertia
+                about the centre, 3 x 3 by columns; transformation of the flange, 4 x 4 by columns
+xarm            xArm-Python-SDK, `set_tcp_load(kg, [mm])`
+kth             kth-ros-pkg/force_torque_tools, gravity_compensation/config
+ft_tools        tpoignonec/ft_tools_ros2, FtParameters: reading = R^T m g + offset
+ros2-admittance ros2_controllers, admittance_controller: gravity_compensation
+bota            bota-payload-utils 1.0.3, payload_compensator_config; whether its inertia is about
+                the centre or about the sensor it does not say: the centre's is written
+urdf, sdf, mjcf a link, a model, a body with this inertia, on the frame F
+=============== ================================================================================
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array
+from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
+
+STANDARD_GRAVITY = 9.80665  #: m/s^2, for a weight in N
+
+
+@dataclass(frozen=True)
+class Load:
+    """What a format is written from, in SI.
+
+    Args:
+        mass: [kg].
+        com: (3,) centre of mass in the frame of the values [m].
+        inertia: (3, 3) about that centre, axes of that frame [kg m^2].
+        offsets: (6,) of the sensor, in its frame and sign [N, N m].
+    """
+
+    mass: float
+    com: Array
+    inertia: Array
+    offsets: Array
+
+    @property
+    def six(self) -> tuple[float, ...]:
+        """xx, yy, zz, xy, xz, yz [kg m^2]."""
+        i = self.inertia
+        return i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]
+
+
+@dataclass(frozen=True)
+class Format:
+    """One target.
+
+    Args:
+        write: the text of a load.
+        of_sensor: its values are in the sensor's frame, whatever it is mounted on.
+        inertia, offsets: whether it takes them.
+        body: it is read as a body, so that there has to be one with these values.
+        comment: what a comment's line begins with; empty if there are none.
+        note: what to know of it besides.
+    """
+
+    write: Callable[[Load], str]
+    of_sensor: bool = False
+    inertia: bool = True
+    offsets: bool = False
+    body: bool = False
+    comment: str = ""
+    note: str = ""
+
+
+def export(
+    found: Identification,
+    to: str,
+    *,
+    R_FS: Array | None = None,
+    p_FoSo_F: Array | None = None,
+    sign: int = -1,
+) -> tuple[str, list[str]]:
+    """The text for a target, and what to know before it is entered.
+
+    Args:
+        found: the load.
+        to: one of `FORMATS`.
+        R_FS, p_FoSo_F: (3, 3) and (3,) orientation and place [m] of the sensor in the frame F that
+            the target's values are in; None: F is S.
+        sign: -1 if the sensor reports what the load exerts on it, as most do, else 1.
+
+    Returns:
+        text: with the warnings as comments, if the format has any.
+        warnings: what the target drops, and which of its values are not identified.
+
+    Raises:
+        DrakeTeleopError: for an unknown target, a pose that the target has no use for, or a load
+            that no body has for a target that is read as one.
+    """
+    if to not in FORMATS:
+        raise DrakeTeleopError(
+            f"{to!r} is no target", where="export", remedy=f"one of {', '.join(FORMATS)}"
+        )
+    format = FORMATS[to]
+    moved = R_FS is not None or p_FoSo_F is not None
+    if moved and format.of_sensor:
+        raise DrakeTeleopError(
+            f"{to} takes its values in the sensor's frame",
+            where="export",
+            remedy="leave out the sensor's pose",
+        )
+    phi = transform_phi(
+        found.phi,
+        np.eye(3) if R_FS is None else R_FS,
+        np.zeros(3) if p_FoSo_F is None else p_FoSo_F,
+    )
+    if found.mass <= 0.0 or (format.body and not is_physically_consistent(phi)):
+        raise DrakeTeleopError(
+            f"no body has these values (mass {found.mass:.4g} kg), and {to} describes one",
+            where="export",
+            remedy="`identify --method consistent` finds the nearest body; a negative mass means"
+            " that the sign of the wrench is wrong",
+        )
+    load = Load(*mass_com_inertia(phi), sign * found.offsets)
+    warnings = _warnings(found, to, format)
+    notes = "".join(f"{format.comment} {text}\n" for text in warnings if format.comment)
+    return notes + format.write(load), warnings
+
+
+def export_command(
+    identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: int
+) -> tuple[str, list[str]]:
+    """The command `export`: the text and the warnings, see `export`.
+
+    Args:
+        identification: an identification.json.
+        to: one of `FORMATS`.
+        sensor_pose: x, y, z [m] of the sensor in the frame of the values, and its roll, pitch, yaw
+            [deg] about that frame's fixed axes, as in a URDF; None: the sensor's own frame.
+        sign: as for `export`.
+
+    Raises:
+        DrakeTeleopError: as `Identification.load` and `export`.
+    """
+    found = Identification.load(identification)
+    if sensor_pose is None:
+        return export(found, to, sign=sign)
+    roll, pitch, yaw = np.radians(sensor_pose[3:])
+    R_FS = turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)
+    return export(found, to, R_FS=R_FS, p_FoSo_F=np.array(sensor_pose[:3]), sign=sign)
+
+
+def turn(axis: int, angle: float) -> Array:
+    """(3, 3) rotation about the axis 0, 1 or 2 [rad]."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R = np.eye(3)
+    R[i, i] = R[j, j] = np.cos(angle)
+    R[j, i] = np.sin(angle)
+    R[i, j] = -R[j, i]
+    return R
+
+
+def _warnings(found: Identification, to: str, format: Format) -> list[str]:
+    taken = {name: name.startswith(("m", "I")) for name in PARAMETERS}
+    taken |= {name: format.inertia for name in PARAMETERS if name.startswith("I")}
+    taken |= {name: format.offsets for name in PARAMETERS if name.endswith(("_ox", "_oy", "_oz"))}
+    warnings = [
+        f"{name} is not identified ({verdict}): do not enter what depends on it"
+        for name, verdict in zip(PARAMETERS, found.verdicts, strict=True)
+        if taken[name] and verdict != "identified"
+    ]
+    if not format.inertia:
+        warnings.append(f"{to} has no place for the inertia: what it causes in motion stays")
+    if not found.physically_consistent:
+        warnings.append(
+            "no body has these values: `identify --method consistent` finds the nearest"
+        )
+    return [*warnings, format.note] if format.note else warnings
+
+
+def _number(value: float) -> str:
+    """All digits that matter; no exponent's capital, no -0."""
+    return repr(float(value) + 0.0)
+
+
+def _row(values: Any) -> str:
+    return ", ".join(map(_number, values))
+
+
+def _ur(load: Load) -> str:
+    return f"set_target_payload({_number(load.mass)}, [{_row(load.com)}], [{_row(load.six)}])\n"
+
+
+def _franka(load: Load) -> str:
+    return _json(
+        {
+            "mass": load.mass,
+            "centerOfMass": load.com.tolist(),
+            "inertia": load.inertia.T.ravel().tolist(),
+            "transformation": np.eye(4).T.ravel().tolist(),
+        }
+    )
+
+
+def _xarm(load: Load) -> str:
+    return f"arm.set_tcp_load({_number(load.mass)}, [{_row(1e3 * load.com)}])\n"
+
+
+def _kth(load: Load) -> str:
+    return (
+        f"bias: [{_row(load.offsets)}]\n"
+        "gripper_com_frame_id: ft_sensor\n"
+        f"gripper_com_pose: [{_row(load.com)}, 0.0, 0.0, 0.0]\n"
+        f"gripper_mass: {_number(load.mass)}\n"
+    )
+
+
+def _ft_tools(load: Load) -> str:
+    return (
+        f"mass: {_number(load.mass)}\n"
+        f"sensor_frame_to_com: [{_row(load.com)}]\n"
+        f"force_offset: [{_row(load.offsets[:3])}]\n"
+        f"torque_offset: [{_row(load.offsets[3:])}]\n"
+    )
+
+
+def _admittance(load: Load) -> str:
+    return (
+        "admittance_controller:\n  ros__parameters:\n    gravity_compensation:\n"
+        "      frame: {id: ft_sensor, external: false}\n"
+        f"      CoG: {{pos: [{_row(load.com)}], force: {_number(load.mass * STANDARD_GRAVITY)}}}\n"
+    )
+
+
+def _bota(load: Load) -> str:
+    six = dict(zip(("Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz"), load.six, strict=True))
+    bias = dict(zip(("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"), load.offsets.tolist(), strict=True))
+    properties = {
+        "mass": load.mass,
+        "com": dict(zip("xyz", load.com.tolist(), strict=True)),
+        "inertia": {name: float(value) for name, value in six.items()},
+        "bias": bias,
+    }
+    config = {"enable_dynamic_compensation": True, "payload_properties": properties}
+    return _json({"payload_compensator_config": config})
+
+
+def _urdf(load: Load) -> str:
+    xx, yy, zz, xy, xz, yz = map(_number, load.six)
+    return (
+        '<robot name="load">\n  <link name="load">\n    <inertial>\n'
+        f'      <origin xyz="{_words(load.com)}" rpy="0 0 0"/>\n'
+        f'      <mass value="{_number(load.mass)}"/>\n'
+        f'      <inertia ixx="{xx}" ixy="{xy}" ixz="{xz}" iyy="{yy}" iyz="{yz}" izz="{zz}"/>\n'
+        "    </inertial>\n  </link>\n</robot>\n"
+    )
+
+
+def _sdf(load: Load) -> str:
+    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    inertia = "".join(
+        f"<{name}>{_number(value)}</{name}>" for name, value in zip(names, load.six, strict=True)
+    )
+    return (
+        '<sdf version="1.9">\n  <model name="load">\n    <link name="load">\n      <inertial>\n'
+        f"        <pose>{_words(load.com)} 0 0 0</pose>\n"
+        f"        <mass>{_number(load.mass)}</mass>\n"
+        f"        <inertia>{inertia}</inertia>\n"
+        "      </inertial>\n    </link>\n  </model>\n</sdf>\n"
+    )
+
+
+def _mjcf(load: Load) -> str:
+    return (
+        '<mujoco model="load">\n  <worldbody>\n    <body name="load">\n      <freejoint/>\n'
+        f'      <inertial pos="{_words(load.com)}" mass="{_number(load.mass)}"'
+        f' fullinertia="{_words(load.six)}"/>\n'
+        "    </body>\n  </worldbody>\n</mujoco>\n"
+    )
+
+
+def _words(values: Any) -> str:
+    return " ".join(map(_number, values))
+
+
+def _json(document: dict[str, Any]) -> str:
+    return json.dumps(document, indent=2) + "\n"
+
+
+_FRAME = "ft_sensor stands for the name of your sensor's frame"
+
+FORMATS = {
+    "ur": Format(_ur, comment="#"),
+    "franka": Format(
+        _franka, note="transformation is the flange itself: put in that of your end effector"
+    ),
+    "xarm": Format(_xarm, inertia=False, comment="#"),
+    "kth": Format(
+        _kth,
+        of_sensor=True,
+        inertia=False,
+        offsets=True,
+        comment="#",
+        note=f"{_FRAME}; the weight is the mass times what an IMU reads: if the compensated force"
+        " is twice the weight, turn the sign of the mass round",
+    ),
+    "ft_tools": Format(_ft_tools, of_sensor=True, inertia=False, offsets=True, comment="#"),
+    "ros2-admittance": Format(_admittance, of_sensor=True, inertia=False, comment="#", note=_FRAME),
+    "bota": Format(
+        _bota,
+        of_sensor=True,
+        offsets=True,
+        note="the inertia is about the centre of mass; Bota does not say about which point it is",
+    ),
+    "urdf": Format(_urdf, body=True),
+    "sdf": Format(_sdf, body=True),
+    "mjcf": Format(_mjcf, body=True),
+}
+"""What `export` writes, by the name of the target."""
