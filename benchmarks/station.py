@@ -164,14 +164,25 @@ def against_the_port(scenario: Scenario) -> float:
     simulator = MakeMovingStation(scenario)
     station, context = simulator.get_system(), simulator.get_context()
     plant, sensor = (GetBlock(station, name) for name in ("slave_plant", "wrist_sensor"))
-    joints = list(plant.GetJointIndices())
-    weld = joints.index(plant.GetJointByName("sensor_weld").index())
+    # What hangs on the body that carries S, each by a weld of its own.
+    indices = list(plant.GetJointIndices())
+    S = plant.GetFrameByName(scenario.slave.sensor_frame)
+    welds = [
+        (place, joint.frame_on_child())
+        for place, joint in enumerate(map(plant.get_joint, indices))
+        if joint.parent_body().index() == S.body().index()
+    ]
     largest, period = 0.0, 1 / scenario.rates.hand_hz
     start = round(context.get_time() / period)
     for k in range(1, int(scenario.simulation.duration / period)):
         advance(simulator, (start + k) * period)
-        forces = plant.get_reaction_forces_output_port().Eval(plant.GetMyContextFromRoot(context))
-        port = forces[weld].translational().copy()
+        of_plant = plant.GetMyContextFromRoot(context)
+        forces = plant.get_reaction_forces_output_port().Eval(of_plant)
+        R_SW = S.CalcPoseInWorld(of_plant).rotation().inverse()
+        port = sum(
+            (R_SW @ frame.CalcPoseInWorld(of_plant).rotation()) @ forces[place].translational()
+            for place, frame in welds
+        )
         simulator.AdvancePendingEvents()  # the sensor's sample of this instant
         sample = sensor.GetMyContextFromRoot(context).get_discrete_state_vector().value()
         largest = max(largest, float(np.abs(sample[:3] - port).max()))

@@ -1,11 +1,14 @@
-"""Does every station keep the promises of the paper's: each device, free and before a wall?
+"""Does every station keep the promises of the paper's: each arm, each device, free and at a wall?
 
 For each cell: the ideal sensor's force against the plant's reaction port; the mass that `identify`
 finds, and what elimination leaves of the peak inertial force; what the hand feels of the device and
 of sigma times the load, against (device + sigma k m_t), from forces and accelerations at 1.3 Hz;
-CPU time over the bare plant.
+CPU time over the station's own bare plant, and simulated over CPU time.
 
-    python benchmarks/stations.py [--devices NAME,NAME] [--json FILE]
+    python benchmarks/stations.py [--arms A,...] [--devices D,...] [--models DIR] [--json FILE]
+
+An arm that is not the RX90 moves half as far. Those of Franka and Universal Robots are looked for
+in the package example-robot-data (the extra `bench`), or in --models, its folder of robots.
 """
 
 from __future__ import annotations
@@ -14,56 +17,109 @@ import argparse
 import dataclasses
 import json
 import sys
+import tempfile
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
+from inverse_kinematics import described
 from station import against_the_port, fastest
 
 from drake_teleop.identification import slave_arm
 from drake_teleop.master.data_sheets import FIGURES, PHANTOM, Master
 from drake_teleop.operator.operator import Sine
 from drake_teleop.reproduction.speed import MakeBarePlant, MakeMovingStation
+from drake_teleop.resources import models_dir
 from drake_teleop.run import run_scenario, summarise
 from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.slave.slave_config import Slave
+from drake_teleop.slave.tool import Ball, Tool
 
 _SIGMA, _PUSHED = 0.5, 1.3  # Hz
+_GAP = 0.072  # m, from the tip at the start to the leaf
 _REACH = 0.1  # m, how far the scenarios' intents lead from their start
+
+#: Besides the RX90 and its copy on a rail: file, and what else it takes.
+_PEG = Tool(mass=1.5, com=[0.01, 0.0, 0.06], shapes=[Ball(0.012, [0.0, 0.0, 0.188])])
+ARMS = {
+    "rx90": ("", Slave()),
+    "rail": ("", Slave()),
+    "panda": (
+        "panda_description/urdf/panda.urdf",
+        Slave(sensor_frame="panda_link8", position=[0.5, 0.0, 0.45], tool=_PEG),
+    ),
+    "ur5": (
+        "ur_description/urdf/ur5_robot.urdf",
+        Slave(sensor_frame="tool0", position=[0.5, 0.1, 0.4]),
+    ),
+}
+_RAIL = """<link name="foot"><inertial><mass>30</mass>
+<inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz></inertia></inertial></link>
+<joint name="rail" type="prismatic"><parent>foot</parent><child>base</child>
+<axis><xyz>0 1 0</xyz><limit><lower>-0.4</lower><upper>0.4</upper><velocity>1</velocity>
+<effort>4000</effort><drake:acceleration>8</drake:acceleration></limit></axis></joint>
+"""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--arms", default=",".join(ARMS))
     parser.add_argument("--devices", default=",".join((PHANTOM, *FIGURES)))
     parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument(
+        "--models", type=Path, default=described(), help="example-robot-data/robots"
+    )
     arguments = parser.parse_args()
     rows = []
-    columns = "port N", "mass %", "left %", "felt %", "cost"
-    print(f"{'device':20s} {'surroundings':12s}", *(f"{name:>10s}" for name in columns))
-    for device in arguments.devices.split(","):
-        for surroundings, scenario in _scenarios(device).items():
+    columns = "port N", "mass %", "left %", "felt %", "cost", "rtf"
+    print(f"{'arm':6s} {'device':20s} {'surroundings':12s}", *(f"{name:>10s}" for name in columns))
+    for arm, device in product(arguments.arms.split(","), arguments.devices.split(",")):
+        for surroundings, scenario in _scenarios(arm, device, arguments.models).items():
             row = figures(scenario, free=surroundings == "free motion")
-            rows.append({"device": device, "surroundings": surroundings} | row)
+            rows.append({"arm": arm, "device": device, "surroundings": surroundings} | row)
             shown = (f"{value:10.3g}" if value is not None else 10 * " " for value in row.values())
-            print(f"{device:20s} {surroundings:12s}", *shown, flush=True)
+            print(f"{arm:6s} {device:20s} {surroundings:12s}", *shown, flush=True)
     if arguments.json:
         arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
 
 
-def _scenarios(device: str) -> dict[str, Scenario]:
+def _slave(arm: str, models: Path | None) -> Slave:
+    if arm == "rx90":
+        return Slave()
+    if arm == "rail":
+        text = (models_dir() / "rx90.sdf").read_text()
+        before, base, rest = text.partition('    <link name="base">')
+        path = Path(tempfile.mkdtemp(prefix="drake_teleop_")) / "rail.sdf"
+        path.write_text(before + _RAIL + base + rest)
+        return Slave(model=str(path))
+    if models is None:
+        raise SystemExit("no example-robot-data: give --models or --arms rx90,rail")
+    file, slave = ARMS[arm]
+    return dataclasses.replace(slave, model=str(models / file))
+
+
+def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario]:
     """The tool moves as in the paper; a small device less, by a larger kinematic scale."""
-    scenarios = {}
+    scenarios, slave = {}, _slave(arm, models)
+    own = 1.0 if arm == "rx90" else 0.5
     for what, name in (("free motion", "free_motion_force"), ("wall", "contact_transition")):
         scenario, share = LoadScenario(name), 1.0
         if device != PHANTOM:
             share = min(1.0, 0.5 * min(FIGURES[device].size) / _REACH)
         intent = [
-            dataclasses.replace(move, translation=[share * x for x in move.translation])
+            dataclasses.replace(move, translation=[own * share * x for x in move.translation])
             for move in scenario.operator.intent
         ]
+        if scenario.sheet_spring is not None and arm != "rx90":
+            below = (NominalSlave(slave).start_tip - [0.0, 0.0, own * _GAP]).tolist()
+            scenario = replace(scenario, sheet_spring__position=below)
         scenarios[what] = replace(
             scenario,
+            slave=slave,
             master=Master(model=device),
             operator__intent=intent,
             kinematic_scaling__translation_scale=1 / share,
@@ -87,6 +143,7 @@ def figures(scenario: Scenario, free: bool) -> dict[str, float | None]:
         "left_percent": None if left is None else 100 * left / inertial,
         "felt_error_percent": _felt_error(scenario) if free else None,
         "cost_over_bare": seconds["whole"] / seconds["bare"],
+        "real_time_factor": 1 / seconds["whole"],
     }
 
 

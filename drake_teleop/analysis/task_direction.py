@@ -25,10 +25,11 @@ from drake_teleop.environment.wall import Wall
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import checked
 from drake_teleop.scenario import Scenario, check_scenario
-from drake_teleop.slave.arm import ArmModel, forward_kinematics, inverse_dynamics, jacobian
+from drake_teleop.slave.arm import forward_kinematics, jacobian
 from drake_teleop.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
 from drake_teleop.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.slave.plant import AddSlavePlant, NominalSlave, SlavePlant
+from drake_teleop.slave.servo import mass_matrix
 
 Array = NDArray[np.float64]
 
@@ -114,7 +115,7 @@ def task_direction(
     forward_kinematics(arm.table, q, R_WS, p_WS)
     tool_W = np.concatenate([n_W, np.cross(R_WS @ slave.tip, n_W)])
     # Acceleration of S for a unit push at the tip, while no motor reacts.
-    a, alpha = np.split(J @ np.linalg.solve(_mass_matrix(arm, q), J.T @ tool_W), 2)
+    a, alpha = np.split(J @ np.linalg.solve(mass_matrix(arm, q), J.T @ tool_W), 2)
     mass, first_moment_S = arm.phi_load[0], arm.phi_load[1:4]
     mobility = tool_W @ np.concatenate([a, alpha])
     mass_acceleration = n_W @ (a + np.cross(alpha, R_WS @ first_moment_S / mass))
@@ -180,14 +181,3 @@ def _slave_posture(slave: SlavePlant, moved: Array) -> Array:
             f"the arm cannot follow by {moved} m ({IkStatus(status).name})", where="displacement"
         )
     return q
-
-
-def _mass_matrix(arm: ArmModel, q: Array) -> Array:
-    """(n, n) with rotors and tool: inverse dynamics of unit accelerations."""
-    still, weight = np.zeros(len(q)), np.empty(len(q))
-    inverse_dynamics(arm.table, q, still, still, weight)
-    columns = np.empty((len(q), len(q)))
-    for unit, column in zip(np.eye(len(q)), columns, strict=True):
-        inverse_dynamics(arm.table, q, still, unit, column)
-        column -= weight
-    return columns.T

@@ -11,6 +11,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
 from drake_teleop.channel.channel import TeleopChannel
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sides.ports import export
@@ -99,11 +100,21 @@ def _told_of_the_device(scenario: Scenario, passivity: PassivityConfig) -> Passi
 
 
 def told_of_the_arm(scenario: Scenario) -> PassivityConfig:
-    """A scenario's method; `ledger`, whose promise rests on the mass, is told the arm's."""
+    """A scenario's method; `ledger`, whose promise rests on the mass, is told the arm's.
+
+    Raises:
+        DrakeTeleopError: for an arm of less than six joints, which has none in some direction.
+    """
     passivity = scenario.passivity
     if passivity.method != "ledger" or passivity.slave_mass is not None:
         return passivity
     slave = NominalSlave(scenario.slave)
+    if slave.arm.num_joints < 6:
+        raise DrakeTeleopError(
+            f"an arm of {slave.arm.num_joints} joints gives way in no direction but those",
+            where="passivity.method",
+            remedy="take another method, or give passivity.slave_mass with its servo yourself",
+        )
     servo = servo_at_tool(slave.arm, slave.start, scenario.joint_control)
     return dataclasses.replace(
         passivity,

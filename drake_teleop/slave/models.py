@@ -91,8 +91,14 @@ def ParseModel(
         DrakeTeleopError: if the file cannot be read, has no such frame, says what cannot be true of
             an arm, see `check_model`, or fastens the base elsewhere than at `X_WBase`.
     """
-    before = set(plant.GetJointIndices())
+    before, forces = set(plant.GetJointIndices()), plant.num_force_elements()
     read = _read(plant, path, package_paths)
+    if plant.num_force_elements() > forces:
+        raise DrakeTeleopError(
+            "has springs, or other forces of its own",
+            where=str(path),
+            remedy="take them out: what moves the arm are its motors, gravity and what it touches",
+        )
     having = [i for i in read.instances if plant.HasFrameNamed(sensor_frame, i)]
     if len(having) != 1:
         frames = [
@@ -395,7 +401,7 @@ def _weld_base(
             raise DrakeTeleopError(
                 f"{name} {peculiar[name]}",
                 where=where,
-                remedy="the arm up to the sensor has to be a chain of independent revolute joints",
+                remedy="the arm up to the sensor has to be a chain of independent joints",
             )
     if body.index() != plant.world_body().index():
         X_WB = RigidTransform() if X_WBase is None else X_WBase

@@ -26,10 +26,13 @@ from drake_teleop.slave.inverse_kinematics import IkStatus, has_closed_form, nea
 from drake_teleop.slave.models import ParseModel, drakes_errors_said
 from drake_teleop.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.slave.payload import AddPayload
+from drake_teleop.slave.servo import mass_matrix
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.surroundings import AddEnvironment, Contact, ContactWith, no_contact
 from drake_teleop.slave.tool import AddTool, shapes_reach
 
+# Of any motion of the joints [kg m^2]: 1e-9 is that of a grain of sand at an arm's length.
+_LEAST_INERTIA = 1e-9
 #: What the arm's model instance is called in a plant, whatever its file says.
 ARM = "arm"
 #: S at home: the tool points down, x_S along x_W.
@@ -356,11 +359,17 @@ def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
 
 
 def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
-    """Refuses a posture that the motors cannot hold.
+    """Refuses a posture that the motors cannot hold, and an arm without inertia.
 
     Raises:
-        DrakeTeleopError: naming the joint that cannot.
+        DrakeTeleopError: naming the joint that cannot; or if a torque could move joints at once.
     """
+    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _LEAST_INERTIA:
+        raise DrakeTeleopError(
+            "nothing resists a torque: its links have too little inertia for its joints",
+            where="slave.model",
+            remedy="give the links their masses and inertias, or the joints rotor inertias",
+        )
     still, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
     inverse_dynamics(arm.table, q, still, still, torque)
     share = np.abs(torque) / arm.effort_limit

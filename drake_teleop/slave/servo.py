@@ -7,10 +7,26 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.slave.arm import ArmModel, forward_dynamics, jacobian
+from drake_teleop.slave.arm import ArmModel, forward_dynamics, inverse_dynamics, jacobian
 from drake_teleop.slave.joint_control import JointControlConfig
 
 Array = NDArray[np.float64]
+
+
+def mass_matrix(arm: ArmModel, q: Array) -> Array:
+    """(n, n) M(q), with rotors and tool: inverse dynamics of unit accelerations.
+
+    Args:
+        arm: the arm with its tool.
+        q: (n,) where it is [rad].
+    """
+    still, weight = np.zeros(len(q)), np.empty(len(q))
+    inverse_dynamics(arm.table, q, still, still, weight)
+    columns = np.empty((len(q), len(q)))
+    for unit, column in zip(np.eye(len(q)), columns, strict=True):
+        inverse_dynamics(arm.table, q, still, unit, column)
+        column -= weight
+    return columns.T
 
 
 def operational_inertia(arm: ArmModel, q: Array) -> Array:

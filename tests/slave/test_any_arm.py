@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from odd_arms import other_arm_urdf
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import true_load
@@ -169,7 +172,33 @@ def test_what_cannot_be_is_one_error(scenario, change, expected):
         MakeTeleopStation(changed, load_estimate=np.ones(16))
 
 
-def test_a_loop_is_refused(folder, tmp_path, scenario):
+def test_links_without_inertia_are_refused(folder, tmp_path):
+    path, text = tmp_path / "arm.urdf", (folder / "arm.urdf").read_text()
+    path.write_text(re.sub("<inertial>.*?</inertial>|<transmission.*?</transmission>", "", text))
+    massless = Slave(model=str(path), sensor_frame="ft", home=HOME, tool=Tool(mass=1.0))
+    with pytest.raises(DrakeTeleopError, match="nothing resists a torque"):
+        NominalSlave(massless)
+
+
+def test_of_five_joints_the_ledger_knows_no_mass(folder, scenario):
+    five = replace(scenario, slave__sensor_frame="l5", slave__home=HOME[:5])
+    assert NominalSlave(five.slave).arm.num_joints == 5
+    assert "held: j6, j7, to_finger" in NominalSlave(five.slave).assumptions
+    MakeTeleopStation(five, load_estimate=true_load(five))
+    over = replace(five, channel=Channel(network="lan"), passivity__method="ledger")
+    with pytest.raises(DrakeTeleopError, match="an arm of 5 joints"):
+        MakeTeleopStation(over, load_estimate=true_load(five))
+
+
+def test_a_spring_is_refused(tmp_path):
+    path, text = tmp_path / "arm.sdf", (models_dir() / "rx90.sdf").read_text()
+    sprung = "<dynamics><spring_stiffness>5</spring_stiffness></dynamics></axis>"
+    path.write_text(text.replace("</axis>", sprung, 1))
+    with pytest.raises(DrakeTeleopError, match="has springs"):
+        NominalSlave(Slave(model=str(path)))
+
+
+def test_a_loop_is_refused(folder, tmp_path):
     text = (folder / "arm.urdf").read_text()
     loop = (
         '<drake:ball_constraint><drake:ball_constraint_body_A name="l3"/></drake:ball_constraint>'
