@@ -171,8 +171,8 @@ def AddSlavePlant(
     contact = no_contact()
     if environment is not None and touched is not None:
         _remove_visuals(plant, scene_graph)
-        _remove_shapes(plant, scene_graph, instance, tool)
         frame = parsed.sensor_frame
+        _remove_shapes(plant, scene_graph, instance, _beyond(plant, frame.body()))
         contact = ContactWith(plant, scene_graph, frame, tool, environment, touched)
     arm, assumptions = parsed.arm()
     start = start_posture(slave, arm) if q_start is None else q_start
@@ -300,12 +300,13 @@ def _remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
 
 
 def _remove_shapes(
-    plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, tool: BodyIndex
+    plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, load: list[RigidBody]
 ) -> None:
     """Of the arm itself nothing touches: a model's hulls overlap, and would push it about."""
+    carried = {body.index() for body in load}
     for index in plant.GetBodyIndices(arm):
         for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
-            if index != tool:
+            if index not in carried:
                 scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
 

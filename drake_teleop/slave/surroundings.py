@@ -94,7 +94,16 @@ def ContactWith(
     """
     environment.PrepareContact(plant, scene_graph, tool)
     bodies = plant.GetBodiesWeldedTo(plant.get_body(tool))
-    shapes = {body.index(): plant.GetCollisionGeometriesForBody(body) for body in bodies}
+    inspector = scene_graph.model_inspector()
+    # Those of the arm are no longer for contact.
+    shapes = {
+        body.index(): [
+            shape
+            for shape in plant.GetCollisionGeometriesForBody(body)
+            if inspector.GetProximityProperties(shape) is not None
+        ]
+        for body in bodies
+    }
     contact = no_contact()._replace(
         # Numbers: the identifiers themselves would hold the plant.
         bodies=frozenset(int(index) for index in shapes),
@@ -114,7 +123,6 @@ def ContactWith(
         return contact._replace(beyond="the tool's shapes are not placed from S")
     if beyond := _beyond(environment, contact):
         return contact._replace(beyond=beyond)
-    inspector = scene_graph.model_inspector()
     try:
         pairs = ContactPairs(plant, inspector, tool, touched.instances, environment.slip)
     except DrakeTeleopError as unknown:

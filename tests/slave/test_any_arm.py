@@ -148,6 +148,17 @@ def test_a_tool_of_numbers():
     np.testing.assert_allclose(touching.contact_pairs[0, :4], [0, 0, 0.1, 0.02], atol=1e-15)
 
 
+def test_the_arm_touches_nothing_but_what_hangs_on_its_sensor_does(folder, tmp_path):
+    ball = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
+    path, tool = tmp_path / "arm.urdf", Tool(mass=1.0, shapes=[Ball()])
+    text = (folder / "arm.urdf").read_text()
+    slave = Slave(model=str(path), sensor_frame="ft", home=HOME, tool=tool)
+    for link, beyond in (("l7", ""), ("hand", "several bodies of the tool have shapes")):
+        path.write_text(text.replace(f'<link name="{link}">', f'<link name="{link}">{ball}'))
+        contact = AddSlavePlant(DiagramBuilder(), slave, SheetSpring()).contact
+        assert (contact.beyond, len(contact.shapes)) == (beyond, 2 if beyond else 1)
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
