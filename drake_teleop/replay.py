@@ -38,6 +38,7 @@ from drake_teleop.scenario_reference import commented
 from drake_teleop.signals import POSE_OF
 from drake_teleop.slave.moving_pose import positions_of
 from drake_teleop.slave.plant import NominalSlave, ParseSlave, finalize
+from drake_teleop.slave.skeleton import AddSkeleton
 from drake_teleop.slave.surroundings import AddEnvironment, MovingBodies, Touched
 from drake_teleop.writing import output_folder, write_json, write_text
 
@@ -217,6 +218,7 @@ class ReplayScene:
         self._slave, self._sensor = self._parsed.instance, self._parsed.sensor_frame
         nominal = NominalSlave(scenario.slave)
         self._joints, self._tip = nominal.arm.num_joints, nominal.tip
+        AddSkeleton(self.plant, nominal)
         touched = Touched([], None)
         if scenario.surroundings is not None:
             touched = AddEnvironment(self.plant, scenario.surroundings)

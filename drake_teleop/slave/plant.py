@@ -48,6 +48,7 @@ class SlavePlant:
     Args:
         plant: continuous MultibodyPlant, finalized.
         instance: the arm's joints.
+        sensor_frame: S.
         tool: the body on the sensor.
         arm: kinematics and dynamics up to S, with all that hangs there as its load.
         start: (n,) joint positions at the start [rad].
@@ -59,6 +60,7 @@ class SlavePlant:
 
     plant: MultibodyPlant
     instance: ModelInstanceIndex
+    sensor_frame: Frame
     tool: BodyIndex
     arm: ArmModel
     start: NDArray[np.float64]
@@ -185,6 +187,7 @@ def AddSlavePlant(
     return SlavePlant(
         plant,
         instance,
+        parsed.sensor_frame,
         tool,
         arm,
         start,

@@ -151,6 +151,9 @@ def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
     surface = ProximityProperties()
     friction = CoulombFriction(_FRICTION, _FRICTION)
     AddContactMaterial(surface, _DISSIPATION, _STIFFNESS, friction)
+    if not tool.shapes:  # or nothing would be seen of it
+        seen = RigidTransform(tool.com), Sphere(_radius(tool))
+        plant.RegisterVisualGeometry(body, *seen, "tool", _COLOUR)
     for k, each in enumerate(tool.shapes):
         name = f"tool_{k}"
         plant.RegisterCollisionGeometry(body, each.pose, each.shape, name, surface)
@@ -161,9 +164,13 @@ def _inertia(tool: Tool) -> SpatialInertia:
     if tool.mass == 0.0:
         return SpatialInertia.Zero()
     if not any(tool.inertia):
-        radius = (tool.mass / _STEEL * 3 / (4 * np.pi)) ** (1 / 3)
-        about_com = SpatialInertia.SolidSphereWithMass(tool.mass, radius)
+        about_com = SpatialInertia.SolidSphereWithMass(tool.mass, _radius(tool))
         return about_com.Shift(np.negative(tool.com))
     xx, xy, xz, yy, yz, zz = np.array(tool.inertia) / tool.mass
     about_S = UnitInertia(xx, yy, zz, xy, xz, yz).ShiftFromCenterOfMass(np.negative(tool.com))
     return SpatialInertia(tool.mass, tool.com, about_S, skip_validity_check=True)
+
+
+def _radius(tool: Tool) -> float:
+    """Of a ball of steel of its mass [m]."""
+    return float((tool.mass / _STEEL * 3 / (4 * np.pi)) ** (1 / 3))

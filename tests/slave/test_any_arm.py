@@ -7,6 +7,8 @@ import re
 import numpy as np
 import pytest
 from odd_arms import other_arm_urdf
+from pydrake.geometry import Role
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.channel.channel import Channel
@@ -18,7 +20,8 @@ from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.signals import SIGNALS
 from drake_teleop.simulation import MakeSimulator, simulate
 from drake_teleop.slave.ik_methods import method_of
-from drake_teleop.slave.plant import AddSlavePlant, NominalSlave, start_pose
+from drake_teleop.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
+from drake_teleop.slave.skeleton import AddSkeleton
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.tool import Ball, Block, Tool
 from drake_teleop.station import GetBlock, MakeTeleopStation
@@ -157,6 +160,21 @@ def test_the_arm_touches_nothing_but_what_hangs_on_its_sensor_does(folder, tmp_p
         path.write_text(text.replace(f'<link name="{link}">', f'<link name="{link}">{ball}'))
         contact = AddSlavePlant(DiagramBuilder(), slave, SheetSpring()).contact
         assert (contact.beyond, len(contact.shapes)) == (beyond, 2 if beyond else 1)
+
+
+def test_of_an_arm_without_shapes_sticks_are_seen(scenario):
+    slave, builder = NominalSlave(scenario.slave), DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+    ParseSlave(plant, scenario.slave)
+    AddSkeleton(plant, slave)
+    inspector = scene_graph.model_inspector()
+    for k, joint in enumerate(slave.arm.joint_names[1:], start=1):
+        (stick,) = plant.GetVisualGeometriesForBody(plant.GetBodyByName(f"l{k}"))
+        half = inspector.GetShape(stick).length() / 2
+        frame = plant.GetJointByName(joint).frame_on_parent()
+        end = inspector.GetPoseInFrame(stick) @ np.array([0, 0, half])
+        np.testing.assert_allclose(end, frame.GetFixedPoseInBodyFrame().translation(), atol=1e-12)
+    assert len(inspector.GetAllGeometryIds(Role.kIllustration)) == 8  # base and seven links
 
 
 @pytest.mark.parametrize(
