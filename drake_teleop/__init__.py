@@ -15,6 +15,7 @@ from drake_teleop.errors import DrakeTeleopError
 
 if TYPE_CHECKING:
     from drake_teleop.identification import identify_load
+    from drake_teleop.live.server import drive
     from drake_teleop.load.compensation import contact_wrench, scaled_wrench
     from drake_teleop.load.identification import Identification
     from drake_teleop.load.normal_equations import identify
@@ -38,6 +39,7 @@ __all__ = [
     "SimulationResult",
     "__version__",
     "contact_wrench",
+    "drive",
     "eliminate_log",
     "identify",
     "identify_load",
@@ -53,6 +55,7 @@ __all__ = [
 _HOMES = {
     "identification": ("identify_load",),
     "run": ("run_scenario",),
+    "live.server": ("drive",),
     "load.compensation": ("contact_wrench", "scaled_wrench"),
     "load.identification": ("Identification",),
     "load.normal_equations": ("identify",),

@@ -78,6 +78,29 @@ def run(
     run_command(scenario, out, inputs=inputs, seed=seed, fresh=fresh, quiet=quiet)
 
 
+@cli.command()
+@click.argument("scenario", type=option.SCENARIO, default="contact_transition")
+@click.option("--record", type=option.PATH, metavar="DIR", help="Record the drive in this folder.")
+@click.option(
+    "--port",
+    type=option.Whole(0, 65535),
+    default=0,
+    show_default="any that is free",
+    help="Of 127.0.0.1, for the page.",
+)
+@click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser.")
+def drive(scenario: str, record: Path | None, port: int, no_browser: bool) -> None:
+    """Drive a station live in the browser.
+
+    SCENARIO is the name of a shipped one or a YAML file; its operator gives the grip alone. One
+    page, on this machine: the hand by mouse, keys, touch or gamepad, which vibrates in contact;
+    forces, sigma, gamma and eta while you press. `run --inputs DIR` repeats what was recorded.
+    """
+    from drake_teleop.live.server import drive_command
+
+    drive_command(scenario, record=record, port=port, browser=not no_browser)
+
+
 @cli.command("scenario")
 @click.argument("name", type=option.SCENARIO, required=False)
 def print_scenario(name: str | None) -> None:

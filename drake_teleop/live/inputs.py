@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.quaternions import exponential
+from drake_teleop.quaternions import exponential, logarithm
 from drake_teleop.scenario import Scenario
 from drake_teleop.texts import read_text
 
@@ -86,6 +86,13 @@ class Inputs:
             return None
         turn = exponential(tuple(_ANGLE * r for r in (self.rx, self.ry, self.rz)))
         return np.concatenate([turn, start + _LENGTH * np.array([self.x, self.y, self.z])])
+
+    def held_at(self, pose: Array, start: Array) -> Inputs:
+        """With the hand that wants the stylus at `pose` (7,) X_BE, as nearly as numbers allow."""
+        turn = logarithm(tuple(pose[:4]))
+        places = zip(("x", "y", "z"), (pose[4:] - start) / _LENGTH, strict=True)
+        turns = zip(("rx", "ry", "rz"), (r / _ANGLE for r in turn), strict=True)
+        return self.changed({name: float(x) for name, x in (*places, *turns)} | {"held": 1})
 
     @property
     def scales(self) -> dict[str, float]:

@@ -30,6 +30,9 @@ from drake_teleop.writing import make_folder, naming, write_text
 
 #: Of a log on disk: a second. A longer part takes longer to write, which a driver would notice.
 _PART_ROWS = 1000
+# Of a change of scales [s]. A slider that is moved changes them 60 times a second, and each ramp
+# begins slowly: with longer ones nothing would happen until it rests.
+_RAMP = 0.05
 _LOAD, _SCENARIO = "load.npz", "scenario.yaml"
 
 
@@ -106,7 +109,7 @@ class Session:
             self._clutch.FixValue(self._context, [float(inputs.clutch)])
         if inputs.scales != before.scales:
             context = self._scaling.GetMyMutableContextFromRoot(self._context)
-            self._scaling.SetScales(context, **inputs.scales)
+            self._scaling.SetScales(context, **inputs.scales, duration=_RAMP)
         if self._record is not None:
             self._record.write(self.ms, inputs)
 
@@ -132,6 +135,11 @@ class Session:
             self._sink.Clear()
             self._seen = 0
         return found
+
+    def stylus(self) -> Inputs:
+        """The inputs of a hand that takes hold of the stylus where it is, without pulling."""
+        pose = self._station.GetOutputPort("pose_master").Eval(self._context)
+        return self.inputs.held_at(pose, self._start)
 
     def keep(self) -> None:
         """Brings everything until now to the disk; the session may go on."""

@@ -9,34 +9,13 @@ import pytest
 
 from drake_teleop.cli import main
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identified_load import IdentifiedLoad
 from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs, row
-from drake_teleop.live.session import Drive, Session, live_scenario, read_drive, repeat
-from drake_teleop.load.identification import Identification
+from drake_teleop.live.session import Drive, Session, read_drive, repeat
 from drake_teleop.pages.progress import silent
 from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.scenario import Scenario, replace
 
 END = 300  # ms
-
-
-@pytest.fixture(scope="module")
-def scenario() -> Scenario:
-    """A leaf 6 mm below the tool."""
-    setup = live_scenario(LoadScenario("contact_transition"))
-    return replace(setup, sheet_spring__position=[0.55, 0.0, 0.233])
-
-
-@pytest.fixture(scope="module")
-def load(scenario) -> IdentifiedLoad:
-    phi = NominalSlave(scenario.slave).arm.phi_load
-    truth = Identification(
-        phi=phi, offsets=np.zeros(6), covariance=np.eye(16), identifiable=np.ones(16, bool),
-        condition_number=1.0, delay_s=0.0, residual_rms=np.zeros(6),
-        method="known", samples=0,
-    )  # fmt: skip
-    return IdentifiedLoad(truth, None, from_cache=False)
 
 
 def script(scenario: Scenario) -> list[tuple[int, Inputs]]:
@@ -94,7 +73,8 @@ def test_nothing_jumps_when_inputs_change(driven, scenario):
     step = np.abs(np.diff(log["pose_command"][:, 4:], axis=0)).max()
     assert step < 1e-3  # at 1 kHz, less than 1 m/s
     assert np.abs(np.diff(log["intent"][:239, 4:], axis=0)).max() < 6e-4
-    assert np.abs(np.diff(log["force_to_master"][:, :3], axis=0)).max() < 0.5
+    free = log["force_to_master"][:80, :3]  # before the leaf
+    assert np.abs(free).max() > 0.1 and np.abs(np.diff(free, axis=0)).max() < 0.02
     # Where the clutch is open the command stays; later it goes on from there.
     held = log["pose_command"][170:180]
     assert np.ptp(held, axis=0).max() == 0.0
@@ -110,7 +90,7 @@ def test_a_hand_that_has_let_go_pulls_nowhere(driven):
         log["hand_wrench_E"][after, :3], -20.0 * log["twist_master"][after, :3], atol=1e-12
     )
     np.testing.assert_allclose(log["intent"][after], log["pose_master"][after], atol=1e-15)
-    assert np.linalg.norm(log["hand_wrench_E"][239, :3]) > 0.5
+    assert np.linalg.norm(log["hand_wrench_E"][:239, :3], axis=1).max() > 0.5
 
 
 @pytest.mark.slow

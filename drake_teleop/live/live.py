@@ -1,0 +1,201 @@
+"""A drive with its driver and watchers, in the time of any clock; without any page.
+
+One client drives, the others watch; when the driver goes the next client that asks drives. A hand
+that nobody leads lets go at once, with the clutch open; a quarter of a second later simulated time
+stands still and the record is complete on the disk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.math import RollPitchYaw
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identified_load import IdentifiedLoad
+from drake_teleop.live.cockpit import Cockpit
+from drake_teleop.live.inputs import RANGES, SLICE_MS
+from drake_teleop.live.messages import parse
+from drake_teleop.live.pace import Pace
+from drake_teleop.live.session import Session
+from drake_teleop.scenario import Scenario
+
+Show = Callable[[dict[str, np.ndarray]], None]
+"""Shows the newest of some rows of a log."""
+
+#: Frames for the page [s].
+FRAME = 1 / 60
+# How long it goes on when nobody drives [s]; slices in a row before messages are listened to.
+_ALONE, _IN_A_ROW = 0.25, 4
+_LONGEST_MS = 36_000_000
+_LIMP = {"held": 0, "clutch": 0}
+
+
+class Live:
+    """What happens when messages and the clock's ticks come in.
+
+    Attributes:
+        refused: how many messages were none.
+
+    Args:
+        scenario: as `live_scenario` makes it.
+        load: what the station knows of its load.
+        record: the folder of the record; None for none. After a reset another one beside it.
+        show: what shows the scene.
+        now: the clock [s].
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        load: IdentifiedLoad | None,
+        record: Path | None,
+        show: Show,
+        now: float,
+    ) -> None:
+        self.refused = 0
+        self._scenario, self._load, self._record, self._show = scenario, load, record, show
+        self._clients: list[int] = []
+        self._driver: int | None = None
+        self._drives, self._paused, self._stopped = 0, False, ""
+        self._alone_since = now
+        self._pace = Pace(1e-3 * SLICE_MS, now)
+        self._frame_due = now
+        self._begin(now)
+
+    def _begin(self, now: float) -> None:
+        """A drive from the scenario's start."""
+        folder = self._record
+        if folder is not None and self._drives:
+            folder = folder.with_name(f"{folder.name}-{self._drives + 1}")
+        self._drives += 1
+        log = None if folder is None else folder / "log.parquet"
+        self._session = Session(self._scenario, self._load, log=log, record=folder)
+        self._cockpit, self._stopped, self._asleep = Cockpit(self._scenario), "", False
+        self._wanted = self._session.inputs
+        self._frame: dict[str, Any] = {}
+        self._pace.start(now)
+
+    def hello(self) -> dict[str, Any]:
+        """What a page has to know of the scenario."""
+        scaling = self._scenario.kinematic_scaling
+        return {
+            "scenario": self._scenario.description or "a station",
+            "ranges": RANGES,
+            "object": self._scenario.force_scaling.gripper_phi is not None,
+            "scale": scaling.translation_scale,
+            "alignment": RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix().tolist(),
+            "record": None if self._record is None else str(self._record),
+        }
+
+    def join(self, client: int, now: float) -> None:
+        """A page has connected; the first one drives."""
+        self._clients.append(client)
+        if self._driver is None:
+            self._hand_over(client, now)
+
+    def leave(self, client: int, now: float) -> None:
+        """A page has gone. If it was the driver, the hand lets go."""
+        self._clients.remove(client)
+        if client == self._driver:
+            self._driver, self._alone_since = None, now
+            self._wanted = self._wanted.changed(_LIMP)
+
+    def hear(self, client: int, text: Any, now: float) -> None:
+        """A message of a page; what is not one changes nothing but a counter."""
+        said = parse(text)
+        if said is None:
+            self.refused += 1
+            return
+        if "drive" in said and client != self._driver:
+            self._hand_over(client, now)
+        if client != self._driver:
+            return
+        if "set" in said:
+            self._wanted = self._wanted.changed(said["set"])
+        if "slow" in said:
+            self._pace.slow = said["slow"]
+        if "pause" in said and said["pause"] != self._paused:
+            self._paused = said["pause"]
+            self._pace.start(now)
+        if "reset" in said:
+            self._try(self._session.close)
+            self._begin(now)
+
+    def _hand_over(self, client: int, now: float) -> None:
+        """The client takes hold of the stylus where it is."""
+        self._driver = client
+        self._wanted = self._session.stylus().changed({"clutch": 1})
+        if self._asleep:
+            self._pace.start(now)
+        self._asleep = False
+
+    @property
+    def still(self) -> bool:
+        """Whether simulated time stands still."""
+        return self._paused or self._asleep or bool(self._stopped)
+
+    def wait(self, now: float) -> float:
+        """How long there is nothing to do [s]."""
+        frame = self._frame_due - now
+        return max(0.0, frame if self.still else min(frame, self._pace.wait(now)))
+
+    def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
+        """Simulates what is due, at most four slices; gives a frame when one is due."""
+        for _ in range(_IN_A_ROW):
+            now = clock()
+            if self.still or self._pace.wait(now) > 0:
+                break
+            self._pace.begin(now)
+            self._slice()
+        now = clock()
+        if self._driver is None and not self._asleep and now - self._alone_since >= _ALONE:
+            self._asleep = True
+            self._try(self._session.keep)
+        if now < self._frame_due:
+            return None
+        self._frame_due = max(self._frame_due + FRAME, now - FRAME)
+        return self._picture()
+
+    def _try(self, action: Callable[[], None]) -> None:
+        """Where the station or the disk cannot go on, the drive stops and says why."""
+        try:
+            action()
+        except DrakeTeleopError as error:
+            self._stopped = str(error)
+
+    def _slice(self) -> None:
+        self._try(lambda: self._session.apply(self._wanted))
+        if not self._stopped:
+            self._try(self._session.advance)
+        if self._session.ms >= _LONGEST_MS:
+            self._stopped = "ten hours are over"
+
+    def _picture(self) -> dict[str, Any]:
+        rows = self._session.news()
+        if len(rows["t"]):
+            self._frame = self._cockpit.frame(rows, self._session.inputs)
+            self._show(rows)
+        inputs = self._wanted
+        return self._frame | {
+            "factor": round(self._pace.factor * self._pace.slow, 3),
+            "late": round(1e3 * self._pace.lateness(), 1),
+            "lost": round(self._pace.given_up, 2),
+            "state": self._state(),
+            "driver": self._driver,
+            "drive": self._drives,
+            "stopped": self._stopped,
+            "inputs": {name: getattr(inputs, name) for name in RANGES},
+        }
+
+    def _state(self) -> str:
+        if self._stopped:
+            return "stopped"
+        return "paused" if self._paused else "waiting" if self._asleep else "running"
+
+    def close(self) -> None:
+        """Ends the drive; its record is complete."""
+        self._session.close()

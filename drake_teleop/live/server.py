@@ -1,0 +1,262 @@
+"""`drake-teleop drive`: one page on this machine, and the socket that drives.
+
+The page, Drake's 3D viewer and the socket are served on 127.0.0.1 alone, to who knows the token in
+the address; the socket, to this very page. Meshcat listens there too, and tells the scene to
+whoever asks; nothing is ever taken from it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import itertools
+import json
+import secrets
+import threading
+import time
+import webbrowser
+from http import HTTPStatus
+from importlib import resources
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+from pydrake.common import FindResourceOrThrow
+from pydrake.geometry import Meshcat, MeshcatParams
+from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identified_load import IdentifiedLoad, identified_load
+from drake_teleop.live.live import Live, Show
+from drake_teleop.live.messages import LONGEST
+from drake_teleop.live.session import live_scenario
+from drake_teleop.replay import ReplayScene
+from drake_teleop.scenario import LoadScenario, Scenario, check_scenario
+
+_HOST = "127.0.0.1"
+_MOST_CLIENTS = 8
+_BEHIND = 2**18  # bytes that wait for a slow page, before it misses frames
+
+
+class LiveDrive:
+    """A station that is being driven, in a thread of its own.
+
+    Attributes:
+        url: of the page; whoever has it may drive.
+    """
+
+    def __init__(self, scenario: Scenario, record: Path | None, port: int) -> None:
+        setup = live_scenario(scenario)
+        setup.check()
+        load = None if setup.load_estimator.enabled else identified_load(setup)
+        self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
+        self._failed: Exception | None = None
+        self._ready, self._over = threading.Event(), threading.Event()
+        self._numbers = itertools.count(1)  # of pages
+        self._thread = threading.Thread(target=self._run, args=(setup, load, record), daemon=True)
+        self._thread.start()
+        self._ready.wait()
+        if self._failed is not None:
+            raise self._failed
+
+    def wait(self) -> None:
+        """Waits until it is over: after `stop`, or Ctrl-C."""
+        try:
+            while not self._over.wait(0.2):
+                pass
+        finally:
+            self.stop()
+        if self._failed is not None:
+            raise self._failed
+
+    def stop(self) -> None:
+        """Ends the drive; its record is then complete on the disk."""
+        with contextlib.suppress(RuntimeError):  # the loop is closed already
+            self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join()
+
+    def _repr_html_(self) -> str:
+        return f'<iframe src="{self.url}" style="width:100%;height:44rem;border:0"></iframe>'
+
+    def _run(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> None:
+        """The drive's thread. Meshcat is made and unmade here: no other thread may touch it."""
+        try:
+            self._live = self._make(scenario, load, record)
+            asyncio.run(self._serve())
+        except Exception as error:
+            self._failed = error.with_traceback(None)
+        finally:
+            del self._live
+            gc.collect()
+            self._over.set()
+            self._ready.set()
+
+    def _make(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> Live:
+        meshcat = Meshcat(MeshcatParams(host="localhost"))
+        self._scene_url = meshcat.ws_url()
+        return Live(scenario, load, record, _scene(meshcat, scenario), time.perf_counter())
+
+    async def _serve(self) -> None:
+        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        try:
+            server = await serve(
+                self._meet,
+                _HOST,
+                self._port,
+                process_request=self._request,
+                max_size=LONGEST,
+                max_queue=8,
+                compression=None,
+                ping_interval=5,
+                ping_timeout=5,
+            )
+        except OSError as error:
+            what = f"cannot be listened to ({error.strerror})"
+            remedy = "give another --port"
+            raise DrakeTeleopError(what, where=f"port {self._port}", remedy=remedy) from error
+        self._port = server.sockets[0].getsockname()[1]
+        self.url = f"http://{_HOST}:{self._port}/?token={self._token}"
+        self._ready.set()
+        try:
+            async with server:
+                await self._drive(server)
+        finally:
+            self._live.close()
+
+    async def _drive(self, server: Server) -> None:
+        """The one loop: slices and frames, and messages whenever there is time between them."""
+        gc.collect()
+        gc.freeze()
+        gc.disable()  # a full collection takes as long as ten slices
+        try:
+            while not self._stop.is_set():
+                frame = self._live.tick(time.perf_counter)
+                if frame is not None:
+                    ready = [
+                        c
+                        for c in server.connections
+                        if c.transport.get_write_buffer_size() < _BEHIND
+                    ]
+                    broadcast(ready, json.dumps({"frame": frame}))
+                # As asyncio waits in whole milliseconds, the last one is not slept through.
+                rest = self._live.wait(time.perf_counter())
+                await asyncio.sleep(max(rest - 1e-3, 0.0))
+        finally:
+            gc.enable()
+            gc.unfreeze()
+
+    def _request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Serves a file, or lets a socket be opened; refuses whatever is not from our own page."""
+        host = f"{_HOST}:{self._port}"
+        address = urlsplit(request.path)
+        token = parse_qs(address.query).get("token", [""])[0]
+        if request.headers.get("Host") != host or not secrets.compare_digest(
+            token.encode(), self._token.encode()
+        ):
+            return _response(HTTPStatus.FORBIDDEN, "text/plain", b"The address needs its token.\n")
+        if address.path == "/socket":
+            origin = request.headers.get_all("Origin")
+            if origin != [f"http://{host}"]:
+                return _response(HTTPStatus.FORBIDDEN, "text/plain", b"Another page's.\n")
+            return None
+        if address.path == "/":
+            page = resources.files("drake_teleop.live").joinpath("page.html").read_bytes()
+            return _response(HTTPStatus.OK, "text/html; charset=utf-8", page)
+        if address.path == "/meshcat.js":
+            script = Path(FindResourceOrThrow("drake/geometry/meshcat.js")).read_bytes()
+            return _response(HTTPStatus.OK, "text/javascript; charset=utf-8", script)
+        return _response(HTTPStatus.NOT_FOUND, "text/plain", b"Nothing is here.\n")
+
+    async def _meet(self, connection: ServerConnection) -> None:
+        """A page, from its first message to its last."""
+        live = self._live
+        if len(connection.server.connections) > _MOST_CLIENTS:
+            await connection.close(1013, "too many pages")
+            return
+        you = next(self._numbers)
+        live.join(you, time.perf_counter())
+        try:
+            hello = live.hello() | {"you": you, "meshcat": self._scene_url}
+            await connection.send(json.dumps({"hello": hello}))
+            async for text in connection:
+                live.hear(you, text, time.perf_counter())
+        except ConnectionClosed:
+            pass
+        finally:
+            live.leave(you, time.perf_counter())
+
+
+def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
+    headers = Headers(
+        {
+            "Content-Type": kind,
+            "Content-Length": str(len(body)),
+            "Cache-Control": "no-store",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+            "Connection": "close",
+        }
+    )
+    return Response(status.value, status.phrase, headers, body)
+
+
+def _scene(meshcat: Meshcat, scenario: Scenario) -> Show:
+    recorded = ("slave_state", "master_state", "measured_wrench_S", "load_estimate")
+    scene = ReplayScene(meshcat, scenario, (*recorded, "contact_wrench_S"))
+
+    def show(rows: dict[str, np.ndarray]) -> None:
+        scene.show(float(rows["t"][-1]), rows, -1)
+
+    return show
+
+
+def drive(
+    scenario: Scenario | str | Path,
+    *,
+    record: str | Path | None = None,
+    port: int = 0,
+    browser: bool = False,
+) -> LiveDrive:
+    """Drives a station in the browser: its hand by mouse, keys, gamepad or touch.
+
+    The drive goes on in a thread of its own. In a notebook the page is shown where the value of
+    this call is; elsewhere open its `url`. `wait()` returns when it is over, `stop()` ends it.
+
+    Args:
+        scenario: or the name of a shipped one, or a YAML file. Its operator gives the grip alone.
+        record: a folder for the drive, which `run --inputs` repeats; None for none.
+        port: of 127.0.0.1; 0 for any that is free.
+        browser: whether to open the page in the user's browser.
+
+    Raises:
+        DrakeTeleopError: if the scenario cannot be used, or the port is taken.
+    """
+    if not isinstance(scenario, Scenario):
+        scenario = LoadScenario(scenario)
+    check_scenario(scenario)
+    live = LiveDrive(scenario, None if record is None else Path(record), port)
+    if browser:
+        webbrowser.open(live.url)
+    return live
+
+
+def drive_command(
+    scenario: str, *, record: Path | None, port: int, browser: bool, quiet: bool = False
+) -> None:
+    """`drake-teleop drive`: until Ctrl-C.
+
+    Raises:
+        DrakeTeleopError: as `drive`.
+        KeyboardInterrupt: saying how the drive is repeated, if it is recorded.
+    """
+    live = drive(scenario, record=record, port=port, browser=browser)
+    print(f"drive it at {live.url}\nCtrl-C ends it", flush=True)
+    try:
+        live.wait()
+    except KeyboardInterrupt:
+        if record is not None:
+            print(f"\nrecorded; repeat it: drake-teleop run --inputs {record}")

@@ -1,0 +1,32 @@
+"""What all drives here are of: a leaf 6 mm below the tool, and a load that is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.identified_load import IdentifiedLoad
+from drake_teleop.live.session import live_scenario
+from drake_teleop.load.identification import Identification
+from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.slave.plant import NominalSlave
+
+
+@pytest.fixture(scope="session")
+def scenario() -> Scenario:
+    """A leaf 6 mm below the tool, and a sensor without errors."""
+    setup = live_scenario(LoadScenario("contact_transition"))
+    place = [0.55, 0.0, 0.233]
+    return replace(setup, sheet_spring__position=place, wrist_sensor__ideal=True)
+
+
+@pytest.fixture(scope="session")
+def load(scenario: Scenario) -> IdentifiedLoad:
+    """The truth."""
+    phi = NominalSlave(scenario.slave).arm.phi_load
+    truth = Identification(
+        phi=phi, offsets=np.zeros(6), covariance=np.eye(16), identifiable=np.ones(16, bool),
+        condition_number=1.0, delay_s=0.0, residual_rms=np.zeros(6),
+        method="known", samples=0,
+    )  # fmt: skip
+    return IdentifiedLoad(truth, None, from_cache=False)

@@ -1,0 +1,191 @@
+"""Driver, watchers and clock, in virtual time; and what a page is shown."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.live.live import FRAME, Live
+from drake_teleop.live.messages import LONGEST, parse
+from drake_teleop.live.pace import Pace
+from drake_teleop.live.session import Session, read_drive, repeat
+from drake_teleop.pages.progress import silent
+from drake_teleop.result import SimulationResult
+
+
+class Clock:
+    """Time that passes only when it is told to."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def make(scenario, load, clock, record=None) -> Live:
+    return Live(scenario, load, record, lambda rows: None, clock())
+
+
+def pass_time(live: Live, clock: Clock, seconds: float) -> list[dict]:
+    """All frames of a while in which nothing is ever late."""
+    end, frames = clock.now + seconds, []
+    while clock.now < end:
+        frame = live.tick(clock)
+        if frame is not None:
+            frames.append(json.loads(json.dumps(frame, allow_nan=False)))
+        clock.now += max(live.wait(clock.now), 1e-4)
+    return frames
+
+
+@pytest.mark.slow
+def test_a_page_that_closes_in_contact_lets_the_hand_go_and_all_is_on_the_disk(
+    scenario, load, clock, tmp_path
+):
+    folder = tmp_path / "drive"
+    live = make(scenario, load, clock, folder)
+    live.join(1, clock())
+    live.hear(1, json.dumps({"set": {"z": -5000}}), clock())
+    frames = pass_time(live, clock, 0.25)
+    assert frames[-1]["contact"] and frames[-1]["f"][1][1] > 0.2
+    assert not frames[1]["contact"] and frames[-1]["state"] == "running"
+    assert frames[-1]["factor"] == pytest.approx(1.0, abs=0.01) and frames[-1]["lost"] == 0.0
+    assert len(frames) == pytest.approx(0.25 / FRAME, abs=2)
+    assert frames[-1]["energy"][0] > 0.0 and frames[-1]["energy"][1] > 0.0
+
+    left = clock.now
+    live.leave(1, clock())
+    frames = pass_time(live, clock, 0.4)
+    assert frames[-1]["state"] == "waiting" and frames[-1]["t"] == pytest.approx(0.5, abs=0.02)
+    log = SimulationResult.read_parquet(folder / "log.parquet")
+    gone = int(1e3 * (left - 100.0)) + 10  # much less than half a second later
+    pull = log["hand_wrench_E"][gone:, :3] + 20.0 * log["twist_master"][gone:, :3]
+    np.testing.assert_allclose(pull, 0.0, atol=1e-12)
+    assert np.ptp(log["pose_command"][gone + 10 :, 4:], axis=0).max() == 0.0
+    again = repeat(read_drive(folder), silent(""))
+    assert len(again.t) == len(log.t)
+    np.testing.assert_array_equal(again["slave_state"], log["slave_state"])
+
+    # The next page takes the stylus where it is.
+    live.join(2, clock())
+    frame = pass_time(live, clock, 0.03)[-1]
+    assert (frame["driver"], frame["state"], frame["inputs"]["held"]) == (2, "running", 1)
+    live.close()
+    pull = SimulationResult.read_parquet(folder / "log.parquet")["hand_wrench_E"][:, :3]
+    assert len(pull) > len(log.t)
+    assert np.abs(np.diff(pull[len(log.t) - 5 :], axis=0)).max() < 0.2
+
+
+def test_one_drives_and_others_watch_until_they_ask(scenario, load, clock):
+    live = make(scenario, load, clock)
+    live.join(1, clock())
+    live.join(2, clock())
+    live.hear(2, '{"set": {"x": 100}, "pause": true, "reset": true}', clock())
+    (frame, *_) = pass_time(live, clock, FRAME)
+    assert (frame["driver"], frame["inputs"]["x"], frame["drive"]) == (1, 0, 1)
+    live.hear(2, '{"drive": true, "set": {"x": 100}}', clock())
+    live.hear(1, '{"set": {"x": 500}}', clock())
+    frame = pass_time(live, clock, FRAME)[-1]
+    assert (frame["driver"], frame["inputs"]["x"]) == (2, 100)
+    live.hear(2, '{"pause": true}', clock())
+    frames = pass_time(live, clock, 0.1)
+    assert frames[-1]["state"] == "paused" and frames[-1]["t"] == frames[0]["t"]
+    live.hear(2, '{"pause": false, "slow": 10}', clock())
+    assert pass_time(live, clock, 0.2)[-1]["t"] - frames[-1]["t"] == pytest.approx(0.02, abs=6e-3)
+    live.hear(2, '{"reset": true}', clock())
+    frame = pass_time(live, clock, FRAME)[-1]
+    assert (frame["drive"], frame["inputs"]["x"]) == (2, 0) and frame["t"] < 0.02
+
+
+def test_what_stops_a_drive_is_said_and_a_reset_begins_again(scenario, load, clock, monkeypatch):
+    live = make(scenario, load, clock)
+    live.join(1, clock())
+
+    def fail(self, ms=5):
+        raise DrakeTeleopError("joint 2 leaves its range")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, "advance", fail)
+        frame = pass_time(live, clock, 0.05)[-1]
+        assert (frame["state"], frame["stopped"]) == ("stopped", "joint 2 leaves its range")
+    live.hear(1, '{"reset": true}', clock())
+    assert pass_time(live, clock, 0.02)[-1]["state"] == "running"
+
+
+def test_lost_time_is_caught_up_with_or_given_up():
+    pace = Pace(5e-3, 0.0)
+    for k in range(10):
+        pace.begin(5e-3 * k)
+    assert pace.factor == pytest.approx(1.0) and pace.lateness() == pytest.approx(0.0, abs=1e-12)
+    pace.begin(0.09)  # 40 ms late: the next ones are due at once
+    assert pace.wait(0.09) == pytest.approx(-0.035) and pace.given_up == 0.0
+    pace.begin(0.3)
+    assert pace.given_up == pytest.approx(0.245) and pace.wait(0.3) == pytest.approx(5e-3)
+    assert pace.factor < 0.2 and pace.lateness(100) == pytest.approx(0.245)
+    pace.slow = 4.0
+    pace.begin(0.305)
+    assert pace.wait(0.305) == pytest.approx(0.02)
+
+
+def nonsense(rng: np.random.Generator) -> object:
+    """What somebody might say: damaged messages, other types, numbers that are none."""
+    good = json.dumps({"set": {"x": 10, "sigma": 50, "clutch": 1}, "slow": 2.0, "pause": False})
+    kind = rng.integers(8)
+    if kind == 0:
+        return bytes(rng.integers(0, 256, 40, dtype=np.uint8))
+    if kind == 1:
+        return good[: rng.integers(len(good))]
+    if kind == 2:
+        place = rng.integers(len(good))
+        return good[:place] + chr(rng.integers(1, 0x2000)) + good[place + 1 :]
+    if kind == 3:
+        return "[" * int(rng.integers(1, LONGEST + 9))
+    wild = ["NaN", "Infinity", "-1e308", "1e999", "9" * 400, "null", "true", '"7"', "[1]", "{}"]
+    names = ["x", "rz", "sigma", "force_scale", "held", "clutch", "__class__", "ms", ""]
+    values = ", ".join(f'"{rng.choice(names)}": {rng.choice(wild)}' for _ in range(3))
+    other = rng.choice(["slow", "pause", "reset", "drive", "set"])
+    return f'{{"set": {{{values}}}, "{other}": {rng.choice(wild)}}}'
+
+
+@pytest.mark.slow
+def test_ten_thousand_messages_of_nonsense_leave_every_number_finite(scenario, load, clock):
+    live, rng = make(scenario, load, clock), np.random.default_rng(0)
+    live.join(1, clock())
+    live._begin = lambda now: None  # a reset builds a station, and is asked for a thousand times
+    for k in range(10_000):
+        live.hear(1, nonsense(rng), clock())
+        if k % 1000 == 0:
+            live.hear(1, '{"pause": false, "slow": 1}', clock())
+            live._session.apply(live._wanted)
+            live._session.advance()
+    frame = live._picture()
+    assert live.refused > 3000
+    assert frame["state"] == "running" and math.isfinite(sum(frame["inputs"].values()))
+    rows = live._session.log()
+    json.dumps(frame, allow_nan=False)
+    assert all(np.isfinite(rows[name]).all() for name in rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ('{"set": {"x": 1, "y": NaN, "z": true, "rx": "1"}}', {"set": {"x": 1}}),
+        ('{"slow": 1e9, "pause": 1}', {"slow": 20.0}),
+        ('{"drive": true, "reset": 1}', {"drive": True}),
+        ("[]", None),
+        ("{}", None),
+        (b'{"reset": true}', None),
+        ('{"reset": true}' + " " * LONGEST, None),
+    ],
+)
+def test_nothing_is_taken_from_a_message_that_is_not_expected(text, found):
+    assert parse(text) == found
