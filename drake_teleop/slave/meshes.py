@@ -21,6 +21,11 @@ class Packages:
     def __init__(self, model: Path, package_paths: tuple[Path, ...]) -> None:
         self._folder = model.resolve().parent
         self.found: dict[str, Path] = {}
+        if model.suffix.lower() not in (".urdf", ".sdf"):  # which may lead to other files
+            for folder in package_paths:
+                for candidate in (folder, *sorted(folder.glob("*"))):
+                    if candidate.is_dir():
+                        self.found.setdefault(candidate.name, candidate.resolve())
         text = model.read_bytes().decode("utf-8", errors="replace")
         for name in set(re.findall(r"package://([^/\s\"'<]+)", text)):
             for folder in (*package_paths, self._folder, *self._folder.parents):

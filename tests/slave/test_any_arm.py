@@ -162,6 +162,23 @@ def test_the_arm_touches_nothing_but_what_hangs_on_its_sensor_does(folder, tmp_p
         assert (contact.beyond, len(contact.shapes)) == (beyond, 2 if beyond else 1)
 
 
+def test_model_directives_lead_to_other_files_and_their_packages(folder, tmp_path):
+    (tmp_path / "packages" / "parts").mkdir(parents=True)
+    (tmp_path / "packages" / "parts" / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    shape = '<visual><geometry><mesh filename="package://parts/a.obj"/></geometry></visual>'
+    text = (folder / "arm.urdf").read_text()
+    (tmp_path / "arm.urdf").write_text(text.replace('<link name="l2">', f'<link name="l2">{shape}'))
+    path = tmp_path / "arm.dmd.yaml"
+    path.write_text(f"directives: [add_model: {{name: mine, file: {tmp_path.as_uri()}/arm.urdf}}]")
+    slave = Slave(model=str(path), sensor_frame="ft", home=HOME, tool=None)
+    with pytest.raises(DrakeTeleopError, match="cannot be read as a robot .*package 'parts'"):
+        AddSlavePlant(DiagramBuilder(), slave, SheetSpring())
+    slave.package_paths = [str(tmp_path / "packages")]
+    found = AddSlavePlant(DiagramBuilder(), slave, SheetSpring())
+    assert found.arm.phi_load[0] == pytest.approx(0.9)
+    assert found.plant.HasModelInstanceNamed("arm")
+
+
 def test_of_an_arm_without_shapes_sticks_are_seen(scenario):
     slave, builder = NominalSlave(scenario.slave), DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
