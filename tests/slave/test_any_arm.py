@@ -171,7 +171,7 @@ def test_model_directives_lead_to_other_files_and_their_packages(folder, tmp_pat
     path = tmp_path / "arm.dmd.yaml"
     path.write_text(f"directives: [add_model: {{name: mine, file: {tmp_path.as_uri()}/arm.urdf}}]")
     slave = Slave(model=str(path), sensor_frame="ft", home=HOME, tool=None)
-    with pytest.raises(DrakeTeleopError, match="cannot be read as a robot .*package 'parts'"):
+    with pytest.raises(DrakeTeleopError, match=r"cannot be read as a robot .*package 'parts'"):
         AddSlavePlant(DiagramBuilder(), slave, SheetSpring())
     slave.package_paths = [str(tmp_path / "packages")]
     found = AddSlavePlant(DiagramBuilder(), slave, SheetSpring())
