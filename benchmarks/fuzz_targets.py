@@ -24,6 +24,7 @@ import polars as pl
 from fuzz_mutations import Mutation
 from pydrake.math import RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop import cli
 from drake_teleop.channel import network
@@ -44,6 +45,9 @@ from drake_teleop.scenario import LoadScenario, ScenarioFromData
 from drake_teleop.scenario_reference import commented
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.slave.models import ParseModel, drakes_errors_said
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.scene import Scene
+from drake_teleop.slave.slave_config import Slave
 from drake_teleop.studies import study
 from drake_teleop.texts import read_json, yaml_data
 
@@ -396,6 +400,14 @@ def _model(path: Path) -> None:
         plant.Finalize()
 
 
+def _doors(_: Path) -> list[bytes]:
+    return _contents(models_dir(), "door.sdf")
+
+
+def _scene(path: Path) -> None:
+    AddSlavePlant(DiagramBuilder(), Slave(), Scene(file=str(path)))
+
+
 def _robot(path: Path) -> None:
     RobotFromModel(path, "sensor", WristSensorConfig())
 
@@ -530,6 +542,7 @@ TARGETS = (
     Target("result", ".parquet", 2, _results, _result_mutation, _result),
     Target("urdf", ".urdf", 1.5, _urdfs, mutations.xml, _model),
     Target("sdf", ".sdf", 1, _sdfs, mutations.xml, _model),
+    Target("scene", ".sdf", 1, _doors, mutations.xml, _scene),
     Target("mjcf", ".xml", 1, lambda _: [_MJCF], mutations.xml, _model),
     Target("dmd", ".dmd.yaml", 0.5, _directives, _yaml, _model),
     Target("robot", ".urdf", 2, _urdfs, mutations.xml, _robot),

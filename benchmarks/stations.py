@@ -1,9 +1,9 @@
-"""Does every station keep the promises of the paper's: each arm, each device, free and at a wall?
+"""Does every station keep the promises of the paper's: each arm and device, free and at things?
 
 For each cell: the ideal sensor's force against the plant's reaction port; the mass that `identify`
 finds, and what elimination leaves of the peak inertial force; what the hand feels of the device and
 of sigma times the load, against (device + sigma k m_t), from forces and accelerations at 1.3 Hz;
-CPU time over the station's own bare plant, and simulated over CPU time.
+CPU time over the station's own bare plant, alone and with what it touches; simulated over CPU time.
 
     python benchmarks/stations.py [--arms A,...] [--devices D,...] [--models DIR] [--json FILE]
 
@@ -41,6 +41,12 @@ from drake_teleop.slave.tool import Ball, Tool
 
 _SIGMA, _PUSHED = 0.5, 1.3  # Hz
 _GAP = 0.072  # m, from the tip at the start to the leaf
+_BEFORE = np.array([0.068, 0.0, -0.05])  # m, from the tip at the start to the block's foot
+_SCENARIOS = {
+    "free motion": "free_motion_force",
+    "wall": "contact_transition",
+    "moving block": "push_block",
+}
 _REACH = 0.1  # m, how far the scenarios' intents lead from their start
 
 #: Besides the RX90 and its copy on a rail: file, and what else it takes.
@@ -75,7 +81,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     rows = []
-    columns = "port N", "mass %", "left %", "felt %", "cost", "rtf"
+    columns = "port N", "mass %", "left %", "felt %", "cost", "with all", "rtf"
     print(f"{'arm':6s} {'device':20s} {'surroundings':12s}", *(f"{name:>10s}" for name in columns))
     for arm, device in product(arguments.arms.split(","), arguments.devices.split(",")):
         for surroundings, scenario in _scenarios(arm, device, arguments.models).items():
@@ -106,7 +112,7 @@ def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario
     """The tool moves as in the paper; a small device less, by a larger kinematic scale."""
     scenarios, slave = {}, _slave(arm, models)
     own = 1.0 if arm == "rx90" else 0.5
-    for what, name in (("free motion", "free_motion_force"), ("wall", "contact_transition")):
+    for what, name in _SCENARIOS.items():
         scenario, share = LoadScenario(name), 1.0
         if device != PHANTOM:
             share = min(1.0, 0.5 * min(FIGURES[device].size) / _REACH)
@@ -114,12 +120,18 @@ def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario
             dataclasses.replace(move, translation=[own * share * x for x in move.translation])
             for move in scenario.operator.intent
         ]
+        tip = NominalSlave(slave).start_tip
         if scenario.sheet_spring is not None and arm != "rx90":
-            below = (NominalSlave(slave).start_tip - [0.0, 0.0, own * _GAP]).tolist()
+            below = (tip - [0.0, 0.0, own * _GAP]).tolist()
             scenario = replace(scenario, sheet_spring__position=below)
+        blocks = [
+            dataclasses.replace(block, position=(tip + _BEFORE).tolist())
+            for block in scenario.environment
+        ]
         scenarios[what] = replace(
             scenario,
             slave=slave,
+            environment=blocks,
             master=Master(model=device),
             operator__intent=intent,
             kinematic_scaling__translation_scale=1 / share,
@@ -135,6 +147,7 @@ def figures(scenario: Scenario, free: bool) -> dict[str, float | None]:
     makes = {
         "whole": partial(MakeMovingStation, scenario),
         "bare": partial(MakeBarePlant, scenario),
+        "plant": partial(MakeBarePlant, scenario, touching=not free),
     }
     seconds = fastest(makes, scenario.simulation.duration)
     return {
@@ -143,6 +156,7 @@ def figures(scenario: Scenario, free: bool) -> dict[str, float | None]:
         "left_percent": None if left is None else 100 * left / inertial,
         "felt_error_percent": _felt_error(scenario) if free else None,
         "cost_over_bare": seconds["whole"] / seconds["bare"],
+        "cost_over_plant": seconds["whole"] / seconds["plant"],
         "real_time_factor": 1 / seconds["whole"],
     }
 

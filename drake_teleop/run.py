@@ -29,7 +29,8 @@ joint_speed_use             largest share of a joint's speed limit; likewise joi
 mass_error_percent          of the estimate at the end; likewise com_error_mm
 assumed                     what the models of arm and tool do not say, if anything
 contact_by                  if Drake's contact results are used, which takes longer: why
-moved_mm                    with bodies that move: how far each is at the end from where it was
+moved_mm                    with bodies that move: how far each is at the end from where it was;
+                            likewise turned_deg
 warnings                    what was not as it should be, and when, see `drake_teleop.run_warnings`
 =========================== =====================================================================
 
@@ -68,6 +69,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.pages.progress import Stage, show_progress
 from drake_teleop.pages.style import contact_spans
+from drake_teleop.quaternions import conjugate, logarithm, multiply
 from drake_teleop.replay import write_replay, write_scenario
 from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.run_warnings import run_warnings
@@ -306,9 +308,8 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     if "contact" in result:
         summary |= _detection_figures(result, contact_spans(result.t, contact))
     if beyond := _beyond(run.scenario):
-        summary["contact_by"] = f"Drake's contact results, which take longer: {beyond}"
-    if moved := _moved(result):
-        summary["moved_mm"] = moved
+        summary["contact_by"] = f"Drake's contact results (slower): {beyond}"
+    summary |= _moved(result)
     if run.scenario.operator.task is not None:
         figures = task_measures(result, run.scenario)
         summary |= {name: None if np.isnan(x) else x for name, x in figures.items()}
@@ -359,13 +360,15 @@ def _beyond(scenario: Scenario) -> str:
     return AddSlavePlant(builder, scenario.slave, surroundings).contact.beyond
 
 
-def _moved(result: SimulationResult) -> dict[str, float]:
-    """How far each body of the surroundings is at the end from where it was at t = 0 [mm]."""
-    names = [name for name in result.signals if name.startswith(POSE_OF)]
-    ways = {name: result[name][-1, 4:] - result[name][0, 4:] for name in names}
-    return {
-        name.removeprefix(POSE_OF): 1e3 * float(np.linalg.norm(way)) for name, way in ways.items()
-    }
+def _moved(result: SimulationResult) -> dict[str, dict[str, float]]:
+    """How far each body of the surroundings has moved and turned since t = 0."""
+    moved, turned = {}, {}
+    for signal in (name for name in result.signals if name.startswith(POSE_OF)):
+        name, first, last = signal.removeprefix(POSE_OF), *result[signal][[0, -1]]
+        moved[name] = 1e3 * float(np.linalg.norm(last[4:] - first[4:]))
+        turn = logarithm(multiply(tuple(last[:4]), conjugate(tuple(first[:4]))))
+        turned[name] = float(np.degrees(np.linalg.norm(turn)))
+    return {"moved_mm": moved, "turned_deg": turned} if moved else {}
 
 
 def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
@@ -425,7 +428,8 @@ def _print(summary: dict[str, Any], out: Path) -> None:
     if "contact_by" in summary:
         console.print(f"contact by {summary['contact_by']}", highlight=False)
     for name, way in summary.get("moved_mm", {}).items():
-        console.print(f"{name} was moved by {way:.1f} mm", highlight=False)
+        turn = f"{way:.1f} mm and turned by {summary['turned_deg'][name]:.1f} degrees"
+        console.print(f"{name} was moved by {turn}", highlight=False)
     if summary.get("failure"):
         console.print(f"[bold red]the task failed:[/] {summary['failure']}", highlight=False)
     for words in summary.get("assumed", ()):

@@ -211,7 +211,7 @@ def wall_is(scenario: Scenario, is_known: bool) -> str:
         return "the wall, in series with the tool"
     kinds = () if surroundings is None else surroundings.parts
     names = " and ".join(type(part).__name__.lower() for part in kinds)
-    return "the paper's" + (f": {names} not analysed" if names else "")
+    return "the paper's" + (f", because a {names} is not analysed" if names else "")
 
 
 def sampling_of(scenario: Scenario) -> Sampling:

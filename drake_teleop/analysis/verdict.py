@@ -15,6 +15,8 @@ def verdict(figures: dict[str, Any]) -> list[str]:
             f"The method {figures['method']} is not linear.",
             "All that follows is about the station without it.",
         ]
+    if "is not analysed" in figures["wall_is"]:
+        said.append(f"The wall is {figures['wall_is']}.")
     said += [_rest(point, figures["grip"]) for point in figures["diagram"]]
     for row in figures["margins"]:
         if row["grip"] == figures["grip"] and row["wall_N_per_m"] == figures["wall_N_per_m"]:

@@ -16,7 +16,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, SpatialInertia
 
 from drake_teleop.environment.box import AddFixedBox
-from drake_teleop.environment.environment import ExcludeContact, LetFloat, NewInstance, Stand
+from drake_teleop.environment.environment import (
+    ExcludeContact,
+    LetFloat,
+    NewInstance,
+    OnSensor,
+    Stand,
+)
 from drake_teleop.environment.surface import Surface
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fields import settings
@@ -55,7 +61,8 @@ class Block(Surface):
     def stand(self) -> Stand | None:
         """From the floor to the table."""
         x, y, top = self.position
-        return Stand(0.1, 0.1, x, y, top - _TABLE) if min(self.table) > 0.0 else None
+        across = 0.6 * min(self.table)
+        return Stand(across, across, x, y, top - _TABLE) if across > 0.0 else None
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         """The block, at rest on its table; without a scene graph they have no shapes."""
@@ -88,6 +95,7 @@ class Block(Surface):
         name = scene_graph.model_inspector().GetName
         feet = [shape for shape in shapes if _FEET in name(shape)]
         boxes = [shape for shape in shapes if shape not in feet]
-        ExcludeContact(plant, scene_graph, feet, [tool])
-        others = {tool} | {body.index() for body in blocks}
+        on_sensor = OnSensor(plant, tool)
+        ExcludeContact(plant, scene_graph, feet, on_sensor)
+        others = {*on_sensor, *(body.index() for body in blocks)}
         ExcludeContact(plant, scene_graph, boxes, [k for k in bodies if k not in others])

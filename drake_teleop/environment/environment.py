@@ -137,6 +137,26 @@ def LetFloat(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform) ->
     joint.set_default_positions(np.concatenate([turn, X_WBody.translation()]))
 
 
+def OnSensor(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
+    """The tool and what is welded to it, in a finalized plant."""
+    return [body.index() for body in plant.GetBodiesWeldedTo(plant.get_body(tool))]
+
+
+def ToolShapes(
+    plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
+) -> dict[BodyIndex, list[GeometryId]]:
+    """What of it may touch, by body; shapes of the arm are no longer for contact."""
+    properties = scene_graph.model_inspector().GetProximityProperties
+    return {
+        index: [
+            shape
+            for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index))
+            if properties(shape) is not None
+        ]
+        for index in OnSensor(plant, tool)
+    }
+
+
 def ExcludeContact(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,

@@ -15,7 +15,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, PrismaticSpring
 
-from drake_teleop.environment.environment import Environment, ExcludeContact, Stand
+from drake_teleop.environment.environment import Environment, ExcludeContact, OnSensor, Stand
 from drake_teleop.fields import settings
 from drake_teleop.quantities import quantity
 from drake_teleop.resources import models_dir
@@ -84,7 +84,8 @@ class SheetSpring(Environment):
     ) -> None:
         """The tool alone touches the leaf, whose shape reaches down to where others may stand."""
         leaf = plant.GetBodyByName("leaf")
-        others = [BodyIndex(k) for k in range(plant.num_bodies()) if BodyIndex(k) != tool]
+        on_sensor = OnSensor(plant, tool)
+        others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in on_sensor]
         shapes = plant.GetCollisionGeometriesForBody(leaf)
         ExcludeContact(plant, scene_graph, shapes, others)
 

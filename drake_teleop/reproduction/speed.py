@@ -23,17 +23,24 @@ from drake_teleop.station import MakeTeleopStation
 _SPAN = 0.1  # simulated seconds a turn
 
 
-def MakeBarePlant(scenario: Scenario) -> Simulator:
-    """Arm and tool under the torque that holds them, see the module."""
+def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
+    """Arm and tool under the torque that holds them, see the module.
+
+    Args:
+        scenario: of the station.
+        touching: whether its surroundings are there too.
+    """
     builder = DiagramBuilder()
-    slave = AddSlavePlant(builder, scenario.slave, None)
+    surroundings = scenario.surroundings if touching else None
+    slave = AddSlavePlant(builder, scenario.slave, surroundings)
     diagram = builder.Build()
     step = 1 / scenario.rates.sensor_hz
     simulation = Simulation(integrator="runge_kutta2", max_step=step)
     simulator = MakeSimulator(diagram, simulation)
     context = slave.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    torque = -slave.plant.CalcGravityGeneralizedForces(context)
-    slave.plant.get_actuation_input_port().FixValue(context, list(torque))
+    gravity = slave.plant.CalcGravityGeneralizedForces(context)
+    torque = -slave.plant.GetVelocitiesFromArray(slave.instance, gravity)
+    slave.plant.get_actuation_input_port(slave.instance).FixValue(context, list(torque))
     simulator.Initialize()
     return simulator
 

@@ -21,7 +21,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
-from drake_teleop.environment.environment import Environment, LetFloat
+from drake_teleop.environment.environment import Environment, LetFloat, ToolShapes
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fields import settings
 from drake_teleop.quantities import choice, plain, quantity
@@ -122,7 +122,7 @@ class Scene(Environment):
         if not self.hydroelastic:
             return
         inspector = scene_graph.model_inspector()
-        own = plant.GetCollisionGeometriesForBody(plant.get_body(tool))
+        own = [shape for each in ToolShapes(plant, scene_graph, tool).values() for shape in each]
         others = set(inspector.GetAllGeometryIds(Role.kProximity)) - set(own)
         if not any(is_hydroelastic(inspector.GetProximityProperties(shape)) for shape in others):
             raise DrakeTeleopError(

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex
+from pydrake.systems.framework import Context
 
-from drake_teleop.environment.environment import Environment
+from drake_teleop.environment.environment import Environment, ToolShapes
 from drake_teleop.environment.point_contact import WIDTH, ContactPairs
 from drake_teleop.errors import DrakeTeleopError
 
 _SAME = 1e-12  # of frames: rounding
+_NO_INERTIA = 1e-12  # kg or kg m^2: nothing that is moved has less
 
 
 class Touched(NamedTuple):
@@ -90,20 +92,10 @@ def ContactWith(
         touched: the same, as `AddEnvironment` returned it.
 
     Raises:
-        DrakeTeleopError: if a scene's contact is not what was asked for.
+        DrakeTeleopError: if a scene's contact is not what was asked for, or what moves has no mass.
     """
     environment.PrepareContact(plant, scene_graph, tool)
-    bodies = plant.GetBodiesWeldedTo(plant.get_body(tool))
-    inspector = scene_graph.model_inspector()
-    # Those of the arm are no longer for contact.
-    shapes = {
-        body.index(): [
-            shape
-            for shape in plant.GetCollisionGeometriesForBody(body)
-            if inspector.GetProximityProperties(shape) is not None
-        ]
-        for body in bodies
-    }
+    shapes = ToolShapes(plant, scene_graph, tool)
     contact = no_contact()._replace(
         # Numbers: the identifiers themselves would hold the plant.
         bodies=frozenset(int(index) for index in shapes),
@@ -116,6 +108,7 @@ def ContactWith(
             gravity = plant.gravity_field().gravity_vector()[2]
             contact = contact._replace(leaf=np.array([*part.moving_part, gravity]))
     context = plant.CreateDefaultContext()
+    _check_masses(plant, context, contact)
     X_STool = plant.CalcRelativeTransform(context, sensor_frame, plant.get_body(tool).body_frame())
     if any(own for index, own in shapes.items() if index != tool):
         return contact._replace(beyond="several bodies of the tool have shapes")
@@ -123,6 +116,7 @@ def ContactWith(
         return contact._replace(beyond="the tool's shapes are not placed from S")
     if beyond := _beyond(environment, contact):
         return contact._replace(beyond=beyond)
+    inspector = scene_graph.model_inspector()
     try:
         pairs = ContactPairs(plant, inspector, tool, touched.instances, environment.slip)
     except DrakeTeleopError as unknown:
@@ -132,11 +126,25 @@ def ContactWith(
     return contact._replace(pairs=pairs)
 
 
+def _check_masses(plant: MultibodyPlant, context: Context, contact: Contact) -> None:
+    if not contact.moving:
+        return
+    inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
+    if not inertia.min() > _NO_INERTIA:
+        bodies = {name: plant.get_body(index) for name, index in contact.moving.items()}
+        names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
+        raise DrakeTeleopError(
+            f"{' and '.join(names or bodies)} can move, and has no mass or no inertia",
+            where="environment",
+            remedy="give it both, or fix it",
+        )
+
+
 def _beyond(environment: Environment, contact: Contact) -> str:
     if environment.hydroelastic:
         return "contacts have areas"
     if contact.moving:
-        return f"there is what moves ({', '.join(contact.moving)})"
+        return f"{', '.join(contact.moving)} can move"
     if contact.sheet is not None and len(environment.parts) > 1:
         return "the leaf is not alone"
     return ""

@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 
+from drake_teleop.analysis.analyze import wall_is
 from drake_teleop.analysis.task_direction import OneAxisFromScenario, task_direction
 from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.environment.block import Block
 from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.environment.wall import Wall
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import slave_arm
 from drake_teleop.master import phantom
@@ -41,6 +44,21 @@ def test_what_the_scenario_says():
     assert axis.mass_error == pytest.approx(0.1)
     assert axis.wall_stiffness == scenario.sheet_spring.stiffness
     assert OneAxisFromScenario(replace(scenario, sheet_spring=None), (1, 0, 0)).wall_stiffness == 0
+
+
+@pytest.mark.parametrize(
+    ("things", "stiffness", "what"),
+    [
+        ([Wall(stiffness=2e4)], 1 / (1 / 2e4 + 1 / 4e5), "the wall, in series with the tool"),
+        ([SheetSpring(), Wall()], SheetSpring().stiffness, "the leaf"),
+        ([Wall(), Block()], 0.0, "the paper's, because a wall and block is not analysed"),
+    ],
+)
+def test_the_wall_is_a_leaf_or_a_wall_by_itself_or_said_to_be_none(things, stiffness, what):
+    scenario = replace(Scenario(), environment=things)
+    found = OneAxisFromScenario(scenario, (0, 0, 1)).wall_stiffness
+    assert found == pytest.approx(stiffness)
+    assert wall_is(scenario, found > 0.0) == what
 
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 0.5)])
