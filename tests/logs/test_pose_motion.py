@@ -110,7 +110,7 @@ def test_noise_of_poses_adds_to_the_moments_what_is_said():
     place, turn = 2e-4, 5e-4
     Q = noise_moments(splines, grid, taper, zeta, of, (place, turn))
     sums = np.zeros_like(Q)
-    none = np.zeros((len(of.frequency), 6))
+    none, rates = np.zeros((len(of.frequency), 6)), 2j * np.pi * of.frequency[:, None]
     for seed in range(12):
         noise = np.random.default_rng(seed).normal(size=(len(clean.t), 6))
         R = rotation_matrices(clean.quaternion, "quaternion_wxyz")
@@ -118,7 +118,7 @@ def test_noise_of_poses_adds_to_the_moments_what_is_said():
         noisy = Poses(clean.t, clean.position + place * noise[:, :3], quaternions(R)).continued()
         error = PoseSplines(noisy, 0.07).signals(grid.t, GRAVITY_W) - zeta
         spectrum = signal_spectrum(grid, taper, error, len(of.frequency))
-        sums += moments(spectrum, none, of) / 12
+        sums += moments(spectrum, none, of, rates * spectrum) / 12
     # Below 2 Hz what is faster and turned into it by the motion is more than what is said.
     whole = Levels.flat(of).grouped
     well = whole(of.sums(of.frequency)) / whole(of.sizes) > 2.0
@@ -250,6 +250,33 @@ def test_a_contact_and_a_knock_are_left_out():
     assert found.rejected[(found.t > 15.0) & (found.t < 15.02)].all()
     assert found.rejected.mean() < 0.2
     assert np.abs(deviations(found)).max() < 3.5
+
+
+def test_two_fifths_of_the_record_are_lost():
+    """In ten pieces of 0.8 s, so that the taper has twenty edges: they must not hold the delay."""
+    t, wrench, poses = record(Kind(seed=13))
+    found = estimate_from_poses(t, wrench, poses, GRAVITY_W, lost=(t % 2.0) < 0.8)
+    assert found.delay_s == pytest.approx(LATE, abs=5 * found.delay_deviation)
+    assert found.delay_deviation < 3e-4
+    assert found.fit.rigid and np.abs(deviations(found)).max() < 3.5
+    assert np.sqrt(found.covariance[6, 6]) < 2e-3
+
+
+def test_signals_move_behind_a_chopped_taper_and_their_rates_are_theirs():
+    t, wrench, poses = record(Kind(seed=1))
+    grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
+    taper = taper_without(end_taper(grid.t, 0.3, SECONDS - 0.3), (grid.t % 2.0) < 0.8, grid.dt)
+    spectra, there = (
+        spectra_of(splines, grid, taper, GRAVITY_W, delay, 20.0) for delay in (LATE, LATE + 0.03)
+    )
+    moved, slight = spectra.at(LATE + 0.03), spectra.at(LATE + 1e-5)
+    size = np.abs(spectra.signals).max(axis=0)
+    np.testing.assert_allclose(moved.signals / size, there.signals / size, atol=1e-3)
+    rates = (slight.signals - spectra.signals) / 1e-5
+    expected = moments(spectra.signals, spectra.wrench, spectra.of, rates)
+    scale = np.sqrt(np.einsum("bii,bjj->bij", expected, expected))
+    scale[:, 22], scale[:, :, 22] = np.inf, np.inf  # the constant has no rate
+    np.testing.assert_allclose(spectra.moments() / scale, expected / scale, atol=2e-3)
 
 
 def test_weights_of_a_poor_start_do_not_stay():

@@ -174,12 +174,11 @@ def estimate_from_poses(
             remedy="record longer, without interruptions",
         )
     top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
-    splines, spectra, taper, rejected, note = _searched(
+    splines, spectra, rejected, note = _searched(
         grid, poses, lost, gravity, guess, top, known=delay is not None
     )
-    zeta = splines.signals(grid.t + spectra.delay, gravity)
     Z = spectra.moments()
-    Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
+    Q = noise_moments(splines, grid, spectra.taper, spectra.zeta, spectra.of, splines.noise())
     levels = wandering(Z, spectra.of)
     best = saturated(Z, levels)
 
@@ -219,7 +218,7 @@ def _searched(
     top: float,
     *,
     known: bool,
-) -> tuple[PoseSplines, Spectra, Array, NDArray[np.bool_], str]:
+) -> tuple[PoseSplines, Spectra, NDArray[np.bool_], str]:
     """Splines with the knots, and spectra with the delay and taper, that are used."""
     part = _liveliest(grid)
     some = replace(grid, t=grid.t[part], wrench=_rows(grid, part))
@@ -234,7 +233,7 @@ def _searched(
     rejected, note = disturbed(spectra, grid, base, spacing)
     taper = without(base, rejected, grid.dt)
     spectra = spectra_of(splines, grid, taper, gravity, late, top)
-    return splines, spectra, taper, rejected, note
+    return splines, spectra, rejected, note
 
 
 def _rows(grid: Grid, part: slice) -> Array:

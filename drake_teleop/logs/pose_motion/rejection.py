@@ -23,7 +23,7 @@ NOTHING_REJECTED = (
 )
 _HUBER, _REJECT, _FITS = 3.0, 4.5, 30
 _NORMAL_MAD = 1.4826
-_MOST_LOSS = 2.0
+_MOST_LOSS = 2.5
 _PASSED = 0.3
 _MARGIN = 0.1
 """On either side of what is rejected, or the knots' distance [s]."""
@@ -34,7 +34,8 @@ def disturbed(
 ) -> tuple[NDArray[np.bool_], str]:
     """(M,) where something else acts, and what a user has to know of it.
 
-    Nothing is rejected if that would double some standard deviation of the coefficients.
+    Nothing is rejected if that raises some standard deviation of the coefficients 2.5 times as much
+    as the loss of as many samples at random would: then it is the motion that is rejected.
 
     Args:
         spectra: of the record with this taper, which knows nothing of disturbances.
@@ -87,11 +88,11 @@ def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) ->
 
 
 def _loss(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
-    """By how much the deviation of some coefficient grows."""
+    """By how much more the deviation of some coefficient grows than by fewer samples alone."""
     if kept.sum() < 2 * x.shape[1]:
         return np.inf
     every, some = (
         np.diag(np.linalg.pinv(x[rows].T @ x[rows], rcond=1e-12, hermitian=True))
         for rows in (inside, kept)
     )
-    return float(np.sqrt(np.max(some / every)))
+    return float(np.sqrt(np.max(some / every) * kept.sum() / inside.sum()))

@@ -15,6 +15,7 @@ then the accelerations are noise.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -27,9 +28,11 @@ from drake_teleop.logs.pose_motion.spectra import (
     Complex,
     Grid,
     bands,
+    later,
     moments,
     shifted,
     signal_spectrum,
+    slope,
     wrench_spectrum,
 )
 from drake_teleop.logs.pose_motion.splines import (
@@ -133,25 +136,47 @@ class Spectra:
         wrench: (K, 6).
         signals: (K, 16), of P at t + `delay`.
         delay: [s].
+        grid, taper, zeta: of the record, the latter (M, 16) in time.
     """
 
     of: Bands
     wrench: Complex
     signals: Complex
     delay: float
+    grid: Grid
+    taper: Array
+    zeta: Array
+
+    @cached_property
+    def chopped(self) -> bool:
+        """Whether the taper is low between its ends too."""
+        inside = np.flatnonzero(self.taper > 0.5)
+        return bool(len(inside) > 0 and len(inside) <= inside[-1] - inside[0])
 
     def at(self, delay: float) -> Spectra:
-        """The same with the signals moved to another delay, taper and all: for small moves."""
-        late = shifted(self.signals, self.of.frequency, delay - self.delay)
-        return Spectra(self.of, self.wrench, late, delay)
+        """The same with the signals, but not `zeta`, moved to another delay.
+
+        The taper's slow ends may move with them, but not the many edges of a chopped one: they
+        would hold the delay where it is.
+        """
+        shift, signals = delay - self.delay, self.signals
+        if self.chopped:
+            before = later(self.grid, self.taper, shift)
+            signals = signal_spectrum(self.grid, before, self.zeta, len(signals))
+        late = shifted(signals, self.of.frequency, shift)
+        late[:, 0] = self.signals[:, 0]
+        return replace(self, signals=late)
 
     def moments(self) -> Array:
-        """(bands, 38, 38)"""
-        return moments(self.signals, self.wrench, self.of)
+        """(bands, 38, 38); the derivative is that of the signals, without that of the taper."""
+        rates = 2j * np.pi * self.of.frequency[:, None] * self.signals
+        edges = slope(self.grid, self.taper)
+        rates -= signal_spectrum(self.grid, edges, self.zeta, len(rates))
+        rates[:, 0] = 0.0
+        return moments(self.signals, self.wrench, self.of, rates)
 
     def fit(self) -> Saturated:
-        Z = moments(self.signals, self.wrench, self.of, rates=False)
-        return saturated(Z, Levels.flat(self.of))
+        return saturated(moments(self.signals, self.wrench, self.of), Levels.flat(self.of))
 
 
 def spectra_of(
@@ -166,19 +191,13 @@ def spectra_of(
     of = bands(grid, taper, top)
     count = len(of.frequency)
     zeta = splines.signals(grid.t + delay, gravity_W)
-    return Spectra(
-        of,
-        wrench_spectrum(grid, taper, count),
-        signal_spectrum(grid, taper, zeta, count),
-        delay,
-    )
+    wrench = wrench_spectrum(grid, taper, count)
+    signals = signal_spectrum(grid, taper, zeta, count)
+    return Spectra(of, wrench, signals, delay, grid, taper, zeta)
 
 
 def best_delay(spectra: Spectra, reach: float) -> tuple[float, float]:
-    """The delay of the least L, within `reach` of the spectra's, and that L.
-
-    Make the spectra anew at the delay that was found, see `Spectra.at`.
-    """
+    """The delay of the least L, within `reach` of the spectra's, and that L."""
     step = min(_COARSE, reach / 2)
     at = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1)
     costs = np.array([spectra.at(x).fit().cost for x in at])
@@ -245,7 +264,7 @@ def best_spacing(
         costs[h] = spectra(h, delay).fit().cost
     best = min(costs, key=lambda h: costs[h])
     if not known:
-        delay, _ = best_delay(spectra(best, delay), _COARSE)
+        delay, _ = best_delay(spectra(best, delay), 3 * _COARSE)
     return best, delay
 
 

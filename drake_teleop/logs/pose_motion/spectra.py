@@ -179,15 +179,26 @@ def shifted(spectrum: Complex, frequency: Array, shift: float) -> Complex:
     return out
 
 
-def moments(zeta: Complex, wrench: Complex, of: Bands, *, rates: bool = True) -> Array:
+def later(grid: Grid, taper: Array, shift: float) -> Array:
+    """(M,) the taper moved by `shift` [s]."""
+    return _passed_through(grid, taper, np.exp(-2j * np.pi * grid.frequency * shift))
+
+
+def slope(grid: Grid, taper: Array) -> Array:
+    """(M,) its derivative [1/s]."""
+    return _passed_through(grid, taper, 2j * np.pi * grid.frequency)
+
+
+def _passed_through(grid: Grid, x: Array, response: NDArray[np.complexfloating]) -> Array:
+    return np.asarray(np.fft.irfft(np.fft.rfft(x, grid.length) * response, grid.length)[: len(x)])
+
+
+def moments(zeta: Complex, wrench: Complex, of: Bands, rates: Complex | None = None) -> Array:
     """(bands, 38, 38) sums of Re y* y^T over each band, y = [zeta (16), F (6), d zeta/dt (16)].
 
     Without rates (bands, 22, 22).
     """
-    parts = [zeta, wrench]
-    if rates:
-        parts.append(2j * np.pi * of.frequency[:, None] * zeta)
-        parts[-1][:, 0] = 0.0
+    parts = [zeta, wrench] if rates is None else [zeta, wrench, rates]
     y = np.hstack(parts) * np.sqrt(of.weight)[:, None]
     starts = np.searchsorted(of.band, np.arange(of.count + 1))
     out = np.empty((of.count, y.shape[1], y.shape[1]))
