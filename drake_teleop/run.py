@@ -337,7 +337,7 @@ def _detection_figures(
     t, summary = result.t, {}
     for name, key in (("contact", "contact_noticed_ms"), ("contact_at_hand", "contact_at_hand_ms")):
         flagged = t[result[name][:, 0] > 0]
-        ends = [start for start, _ in spans[1:]] + [np.inf]
+        ends = [*(start for start, _ in spans[1:]), np.inf][: len(spans)]
         found = [
             flagged[(flagged >= start) & (flagged < end)]
             for (start, _), end in zip(spans, ends, strict=True)

@@ -36,7 +36,7 @@ from drake_teleop.passivity.ledger import fastest
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario
 from drake_teleop.sides.channel import power_scale, told_of_the_arm
-from drake_teleop.slave.arm import ArmModel
+from drake_teleop.slave.arm import SLIDES, ArmModel
 from drake_teleop.slave.inverse_kinematics import IkStatus
 
 Array = NDArray[np.float64]
@@ -77,7 +77,7 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
     return [
         f"{what} {_when(spans)}"
         for found in (_faults(result), _limits(result, scenario, arm), _channel(result, scenario),
-                      _joints(result, scenario), _hand(result))
+                      _joints(result, scenario, arm), _hand(result))
         for what, spans in found
         if spans
     ]  # fmt: skip
@@ -292,7 +292,9 @@ def _listed(values: Array) -> str:
     return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
-def _joints(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
+def _joints(
+    result: SimulationResult, scenario: Scenario, arm: ArmModel
+) -> Iterator[tuple[str, Spans]]:
     if "joint_command" not in result:
         return
     t, command = result.t, result["joint_command"]
@@ -302,9 +304,11 @@ def _joints(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str,
     window = _TIME_CONSTANTS / (2 * np.pi * slowest) + 1 / scenario.rates.joint_control_hz
     for k in range(command.shape[1]):
         far = behind(t, command[:, [k]], actual[:, [k]], window)
-        spans = spans_of(t, far > _JOINT_FAR, LASTING)
-        degrees = np.rad2deg(_largest_in(t, far, spans))
-        yield f"joint {k + 1} is up to {degrees:.1f} degrees behind its command", spans
+        slides = arm.table[k, SLIDES] != 0.0
+        spans = spans_of(t, far > (_FAR if slides else _JOINT_FAR), LASTING)
+        largest = _largest_in(t, far, spans)
+        way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
+        yield f"joint {k + 1} is up to {way} behind its command", spans
     hunting = hunts(t, command, actual, _JOINT_SWING)
     yield "the slave hunts: it goes to and fro uncommanded", spans_of(t, hunting, LASTING)
 

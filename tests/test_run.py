@@ -17,8 +17,9 @@ from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.resources import scenarios_dir
 from drake_teleop.result import Signal, SimulationResult
-from drake_teleop.run import in_contact, run_command
+from drake_teleop.run import _detection_figures, in_contact, run_command
 from drake_teleop.scenario import LoadScenario
+from drake_teleop.signals import SIGNALS
 
 # Learns while it moves, so that no identification comes first.
 QUICK = """
@@ -201,3 +202,12 @@ def test_a_touch_is_noticed_by_the_detector_and_then_by_the_operator(tmp_path, c
     printed = " ".join(capsys.readouterr().out.split())
     assert f"noticed after {noticed[0]:.1f} ms, at the hand after {at_hand[0]:.1f} ms" in printed
     assert "task_time_s" in printed
+
+
+def test_where_nothing_was_touched_there_is_no_time_of_notice():
+    noticed = np.array([0.0, 1.0, 1.0, 0.0])
+    signals = {"contact": noticed, "contact_at_hand": noticed}
+    specs = [SIGNALS[name] for name in signals]
+    result = SimulationResult(np.arange(4.0), signals, specs)
+    expected = {"contact_noticed_ms": [], "contact_at_hand_ms": [], "false_contacts": 1}
+    assert _detection_figures(result, []) == expected

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,7 @@ from drake_teleop.scenario import Scenario, Simulation, replace
 from drake_teleop.sensor.presets import PRESETS
 from drake_teleop.signals import SIGNALS
 from drake_teleop.simulation import simulate
+from drake_teleop.slave.arm import SLIDES
 from drake_teleop.station import MakeTeleopStation
 
 T = np.arange(3001) / 1000
@@ -171,6 +174,17 @@ def test_many_times_are_counted():
     (warning,) = run_warnings(recorded(saturated=(0, happened)), OVER_NETWORK, ARM)
     assert warning.count("from") == 3
     assert warning.endswith(" and 3 more times")
+
+
+def test_a_joint_that_slides_is_behind_by_millimetres():
+    sliding = dataclasses.replace(ARM, table=ARM.table.copy())
+    sliding.table[5, SLIDES] = 1.0
+    late = recorded(slave_state=(5, 0.01 * during(1, 1.5)))
+    (warning,) = run_warnings(late, OVER_NETWORK, sliding)
+    assert "joint 6 is up to 10.0 mm behind" in warning
+    assert (
+        run_warnings(recorded(slave_state=(5, 0.001 * during(1, 1.5))), OVER_NETWORK, sliding) == []
+    )
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.3])

@@ -6,7 +6,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT
-from drake_teleop.slave.arm import ArmModel
+from drake_teleop.slave.arm import SLIDES, ArmModel
 
 
 class SlaveMonitor(LeafSystem):
@@ -48,11 +48,12 @@ class SlaveMonitor(LeafSystem):
         if inside.all():
             return
         joint = int(inside.argmin())
+        unit = "m" if self._arm.table[joint, SLIDES] else "rad"
         # Raised, not returned as EventStatus.Failed: that crashes for systems written in Python.
         raise DrakeTeleopError(
             f"joint {joint + 1} of the slave left its range at {context.get_time():.3f} s: "
-            f"{q[joint]:.3f} rad is outside {self._arm.lower[joint]:.3f} to "
-            f"{self._arm.upper[joint]:.3f} rad",
+            f"{q[joint]:.3f} {unit} is outside {self._arm.lower[joint]:.3f} to "
+            f"{self._arm.upper[joint]:.3f} {unit}",
             where="simulation",
-            remedy="ask for a smaller motion, or start elsewhere (slave.position)",
+            remedy="ask for a smaller motion, or start elsewhere (slave.position, slave.home)",
         )
