@@ -592,6 +592,59 @@ def excite(
     )
 
 
+@cli.command()
+@click.argument("folder", type=option.PATH)
+@click.option("--arm", required=True, type=option.PATH, help="Its URDF, SDF, MJCF or .dmd.yaml.")
+@click.option(
+    "--sensor-frame",
+    required=True,
+    metavar="NAME",
+    help="Frame or link of the model at which the wrist sensor measures.",
+)
+@click.option(
+    "--package-path",
+    "package_paths",
+    type=option.PATH,
+    multiple=True,
+    help="Where its package:// addresses are looked up; may be repeated.",
+)
+@click.option(
+    "--tool",
+    type=option.PATH,
+    help="Its model.  [default: what the arm's model has beyond the sensor, or a stand-in]",
+)
+@click.option("--device", default="phantom_premium_15", show_default=True, metavar="NAME")
+@click.option("--sensor", metavar="PRESET", help="Of the wrist sensor.")
+@option.quiet
+def new(
+    folder: Path,
+    arm: Path,
+    sensor_frame: str,
+    package_paths: tuple[Path, ...],
+    tool: Path | None,
+    device: str,
+    sensor: str | None,
+    quiet: bool,
+) -> None:
+    """Begin a station with an arm of your own.
+
+    Writes FOLDER/station.yaml, a short commented scenario: where the arm starts, scales that fit
+    the device, a wall below the tool. Then runs it once, into FOLDER/first_run.
+    """
+    from drake_teleop.new_station import new_command
+
+    new_command(
+        folder,
+        arm,
+        sensor_frame,
+        package_paths=package_paths,
+        tool=tool,
+        device=device,
+        sensor=sensor,
+        quiet=quiet,
+    )
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command line and exits: 0, 2 for unusable input, 130 for Ctrl-C or `kill`.
 

@@ -79,7 +79,7 @@ def test_no_command_shows_the_help(capsys):
     assert status == 0
     for command in (
         "reproduce", "run", "identify", "eliminate", "inspect", "detect", "compare-passivity",
-        "study", "scaling-study", "excite", "replay", "sample-log", "scenario", "export",
+        "study", "scaling-study", "excite", "replay", "sample-log", "scenario", "export", "new",
     ):  # fmt: skip
         assert f"  {command} " in out
     assert "..." not in out.split("Commands:")[1]  # every summary fits its line

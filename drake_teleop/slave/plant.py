@@ -174,7 +174,7 @@ def AddSlavePlant(
     if environment is not None and touched is not None:
         _remove_visuals(plant, scene_graph)
         frame = parsed.sensor_frame
-        _remove_shapes(plant, scene_graph, instance, _beyond(plant, frame.body()))
+        _remove_shapes(plant, scene_graph, instance, bodies_beyond(plant, frame.body()))
         contact = ContactWith(plant, scene_graph, frame, tool, environment, touched)
     arm, assumptions = parsed.arm()
     start = start_posture(slave, arm) if q_start is None else q_start
@@ -254,7 +254,7 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     if plant.HasModelInstanceNamed(ARM):
         plant.RenameModelInstance(plant.GetModelInstanceByName(ARM), f"{ARM}_of_model")
     plant.RenameModelInstance(model.instance, ARM)
-    frame, own = model.sensor_frame, _beyond(plant, model.sensor_frame.body())
+    frame, own = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
     assumptions, folders = [*model.assumptions], [model.folder]
     if slave.tool is not None:
         tool = AddTool(plant, slave.tool, frame, slave.packages)
@@ -272,11 +272,11 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     )
 
 
-def _beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
+def bodies_beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
     """What hangs on a body, from the nearest outwards."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
-    return near + [far for each in near for far in _beyond(plant, each)]
+    return near + [far for each in near for far in bodies_beyond(plant, each)]
 
 
 def finalize(plant: MultibodyPlant) -> None:

@@ -1,0 +1,382 @@
+"""`drake-teleop new DIR --arm FILE --sensor-frame NAME`: a station of one's own, to start from.
+
+Reads the arm, looks for a place in front of it where the tool points down and the arm can go to all
+sides, chooses scales that fit the haptic device, writes a short commented scenario, and runs it
+once: in free motion, and down onto a wall.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.master.data_sheets import FIGURES, PHANTOM
+from drake_teleop.master.phantom import FORCE_LIMIT
+from drake_teleop.run import run_command
+from drake_teleop.scenario import LoadScenario
+from drake_teleop.sensor.presets import PRESETS
+from drake_teleop.slave.arm import ArmModel
+from drake_teleop.slave.forward_kinematics import pose_into
+from drake_teleop.slave.inverse_kinematics import IkStatus
+from drake_teleop.slave.numeric_inverse_kinematics import find_posture
+from drake_teleop.slave.plant import (
+    R_WS_HOME,
+    NominalSlave,
+    ParseSlave,
+    bodies_beyond,
+    finalize,
+    home_position,
+)
+from drake_teleop.slave.slave_config import Slave
+from drake_teleop.slave.tool import Ball, Tool
+from drake_teleop.writing import make_folder, write_text
+
+#: The cube in which the Phantom's grip can go from where scenarios start, half its edge [m] (E).
+_PHANTOMS = 0.08
+#: A tool to be replaced [kg, m].
+_STAND_IN = Tool(mass=1.0, com=[0.0, 0.0, 0.05], shapes=[Ball(radius=0.012, position=[0, 0, 0.1])])
+_HALVES = (0.3, 0.2, 0.15, 0.1, 0.075, 0.05, 0.03)  # of cubes that are tried [m]
+_POSTURES, _PLACES = 3000, 12  # at random; of them looked at
+_STEEP = np.cos(np.radians(40.0))  # z_S so far from straight down at most
+_LIKED = np.array([0.6, 0.0, 0.4])  # in reaches: where most arms can go to all sides
+_SWING, _PRESS = 0.04, 0.01  # of the slave: free motion, depth in the wall, at most [m]
+_CONTACT = (
+    30.0  # N, of a hard press, that the device shall still display beside 1.5 times the weight
+)
+# N, of a hard press: the device displays that and 1.5 times the weight.
+_CONTACT = 30.0
+# N/m: the wall, and how stiff the hand may feel it. The paper's station is stable up to 680 N/m
+# with a hand of medium grip; `analyze` says what this one is.
+_WALL, _FELT = 2000.0, 400.0
+_FREQUENCY, _HURRY = 1.0, 0.5  # of the swing [Hz]; share of the joints' speeds that it may take
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What was found for an arm and a device.
+
+    Args:
+        joints: names of the arm's joints up to the sensor.
+        tool_mass: what hangs on the sensor [kg].
+        own_tool: whether the model has it.
+        position: p_WS to start at, the tool down [m].
+        half: half the edge of the cube around it that the arm can reach [m].
+        translation_scale, force_scale: slave over master; master over slave.
+        swing: of the slave in free motion [m]; the wall is 1.5 times as far below the tool.
+        lowest: p_W of the tool's lowest point at the start [m].
+        assumptions: what the models do not say.
+    """
+
+    joints: tuple[str, ...]
+    tool_mass: float
+    own_tool: bool
+    position: NDArray[np.float64]
+    half: float
+    translation_scale: float
+    force_scale: float
+    swing: float
+    lowest: NDArray[np.float64]
+    assumptions: tuple[str, ...]
+
+
+def new_command(
+    folder: Path,
+    arm: Path,
+    sensor_frame: str,
+    *,
+    package_paths: tuple[Path, ...] = (),
+    tool: Path | None = None,
+    device: str = PHANTOM,
+    sensor: str | None = None,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Writes `station.yaml` into a folder, and runs it into `first_run` there.
+
+    Args:
+        folder: new, or with no station.yaml.
+        arm: its model, see `Slave.model`.
+        sensor_frame: frame or link of the model at which the wrist sensor measures.
+        package_paths: for package:// addresses.
+        tool: model of the tool; None: what the arm's model has beyond the sensor, or a stand-in.
+        device: the haptic device.
+        sensor: preset of the wrist sensor; None: as scenarios have it.
+        quiet: no progress bars and no tables.
+
+    Returns:
+        The summary of the run, as of `run_command`.
+
+    Raises:
+        DrakeTeleopError: for a model that cannot be used, an arm that cannot point its tool down
+            anywhere, a device or a sensor that is not known, or a folder with a station.
+    """
+    scenario = folder / "station.yaml"
+    if scenario.exists():
+        raise DrakeTeleopError(
+            "is there already", where=str(scenario), remedy="edit it, or name another folder"
+        )
+    for kind, name, known in (
+        ("device", device, (PHANTOM, *FIGURES)),
+        ("sensor", sensor, (None, *PRESETS)),
+    ):
+        if name not in known:
+            raise DrakeTeleopError(
+                f"{name!r} is none that is known",
+                where=f"--{kind}",
+                remedy=f"one of {', '.join(filter(None, known))}",
+            )
+    plan = plan_station(arm, sensor_frame, package_paths, tool, device)
+    make_folder(folder)
+    paths = [_from(folder, path) for path in package_paths]
+    tools = None if tool is None else _from(folder, tool)
+    write_text(
+        scenario, _text(plan, _from(folder, arm), sensor_frame, paths, tools, device, sensor)
+    )
+    LoadScenario(scenario)
+    if not quiet:
+        _print(plan, scenario)
+    return run_command(scenario, folder / "first_run", quiet=quiet)
+
+
+def plan_station(
+    arm: Path,
+    sensor_frame: str,
+    package_paths: tuple[Path, ...] = (),
+    tool: Path | None = None,
+    device: str = PHANTOM,
+) -> Plan:
+    """Place and scales for an arm and a device; arguments and errors as of `new_command`."""
+    slave = Slave(
+        model=str(arm),
+        sensor_frame=sensor_frame,
+        package_paths=[str(path) for path in package_paths],
+        tool=_STAND_IN if tool is None else Tool(model=str(tool)),
+    )
+    model, assumptions = _read(slave)
+    own_tool = tool is None and float(model.phi_load[0]) > _STAND_IN.mass + 1e-6
+    if own_tool:
+        slave.tool = None
+        model, assumptions = _read(slave)
+    position, half = find_place(model)
+    slave.position = position.tolist()
+    figures = FIGURES.get(device)
+    room = _PHANTOMS if figures is None else min(figures.size) / 2.0
+    peak = FORCE_LIMIT if figures is None else figures.peak_force
+    mass = float(model.phi_load[0])
+    translation_scale = _rounded(min(half / room, 1.0))
+    most = min(peak / (1.5 * 9.81 * mass + _CONTACT), _FELT / (_WALL * translation_scale), 1.0)
+    swing = min(_SWING, half / 2.0, room * translation_scale / 2.0)
+    return Plan(
+        joints=tuple(model.joint_names),
+        tool_mass=mass,
+        own_tool=own_tool,
+        position=position,
+        half=half,
+        translation_scale=translation_scale,
+        force_scale=_rounded(most),
+        swing=_rounded(swing * min(1.0, _HURRY / _speed_use(model, position, swing))),
+        lowest=_lowest(slave),
+        assumptions=tuple(assumptions),
+    )
+
+
+def find_place(arm: ArmModel, seed: int = 0) -> tuple[NDArray[np.float64], float]:
+    """Where the arm can hold the tool down and go to all sides.
+
+    Args:
+        arm: with limits.
+        seed: of the postures that are tried.
+
+    Returns:
+        position: (3,) p_WS [m], rounded to a centimetre.
+        half: half the edge of the cube around it that can be reached, the tool down [m].
+
+    Raises:
+        DrakeTeleopError: if there is no such place.
+    """
+    random = np.random.default_rng(seed)
+    postures = random.uniform(arm.lower, arm.upper, (_POSTURES, arm.num_joints))
+    poses = np.empty((_POSTURES, 7))
+    for q, pose in zip(postures, poses, strict=True):
+        pose_into(arm.table, q, pose)
+    x, y = poses[:, 1], poses[:, 2]
+    down = 1.0 - 2.0 * (x * x + y * y) < -_STEEP  # z_W of z_S
+    reach = np.quantile(np.hypot(poses[:, 4], poses[:, 5]), 0.98)
+    places = np.round(poses[down & _before(poses[:, 4:], reach), 4:], 2)
+    order = np.argsort(np.linalg.norm(places - reach * _LIKED, axis=1))
+    best = np.zeros(3), 0.0
+    for place in places[order[:: max(len(order) // _PLACES, 1)]]:
+        half = _free_half(arm, place)
+        if half > best[1]:
+            best = place, half
+    if best[1] == 0.0:
+        raise DrakeTeleopError(
+            "nowhere can the arm hold its sensor with z downwards and move to all sides",
+            where="new",
+            remedy="check sensor_frame (its z axis points to the tool) and the joints' limits",
+        )
+    return best
+
+
+def _before(places: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+    """Which places (k, 3) are in front of the base, neither on its post nor behind it, nor low."""
+    x, y, z = places.T / reach
+    r = np.hypot(x, y)
+    result: NDArray[np.bool_] = (r > 0.35) & (r < 0.85) & (x > 0.9 * r) & (z > 0.15) & (z < 0.8)
+    return result
+
+
+def _free_half(arm: ArmModel, place: NDArray[np.float64]) -> float:
+    """Half the edge of the largest cube of `_HALVES` whose corners can be reached; 0: none.
+
+    It stays away from the base by as much.
+    """
+    try:
+        q = home_position(arm, place.tolist())
+    except DrakeTeleopError:
+        return 0.0
+    w = R_WS_HOME.ToQuaternion().wxyz()
+    for half in (half for half in _HALVES if 2.0 * half <= np.hypot(*place[:2])):
+        corners = (place + half * np.array(signs) for signs in product((-1.0, 1.0), repeat=3))
+        if all(
+            find_posture(arm, np.array([*w, *corner]), q)[1] == IkStatus.OK for corner in corners
+        ):
+            return half
+    return 0.0
+
+
+def _speed_use(arm: ArmModel, place: NDArray[np.float64], swing: float) -> float:
+    """The largest share of its speed that a joint takes for the swing up and down."""
+    q = home_position(arm, place.tolist())
+    above = np.array([*R_WS_HOME.ToQuaternion().wxyz(), *place])
+    above[6] += swing
+    way = np.abs(find_posture(arm, above, q)[0] - q)
+    return float((2.0 * np.pi * _FREQUENCY * way / arm.velocity_limit).max())
+
+
+def _lowest(slave: Slave) -> NDArray[np.float64]:
+    """p_W (3,) of the lowest point of what hangs on the sensor, at the start [m].
+
+    By the boxes around its shapes; without shapes, of its tip.
+    """
+    nominal = NominalSlave(slave)
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
+    parsed = ParseSlave(plant, slave)
+    finalize(plant)
+    context, inspector = plant.CreateDefaultContext(), scene_graph.model_inspector()
+    plant.SetPositions(context, parsed.instance, nominal.start)
+    lowest = nominal.start_tip
+    for body in bodies_beyond(plant, parsed.sensor_frame.body()):
+        for shape in plant.GetCollisionGeometriesForBody(body):
+            box = inspector.GetObbInGeometryFrame(shape)
+            if box is None:  # a half space
+                continue
+            X_WBox = plant.EvalBodyPoseInWorld(context, body) @ (
+                inspector.GetPoseInFrame(shape) @ box.pose()
+            )
+            corners = (np.array(signs) * box.half_width() for signs in product((-1, 1), repeat=3))
+            lowest = min([lowest, *(X_WBox @ corner for corner in corners)], key=lambda p: p[2])
+    return np.array(lowest)
+
+
+def _read(slave: Slave) -> tuple[ArmModel, list[str]]:
+    plant = MultibodyPlant(0.0)
+    parsed = ParseSlave(plant, slave)
+    finalize(plant)
+    arm, assumed = parsed.arm()
+    return arm, [*parsed.assumptions, *assumed]
+
+
+def _rounded(value: float) -> float:
+    """To two digits, downwards."""
+    unit = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(f"{np.floor(value / unit + 1e-9) * unit:.12g}")
+
+
+def _from(folder: Path, path: Path) -> str:
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+
+
+def _text(
+    plan: Plan,
+    arm: str,
+    sensor_frame: str,
+    package_paths: list[str],
+    tool: str | None,
+    device: str,
+    sensor: str | None,
+) -> str:
+    """The scenario, each line with what it says."""
+    s, swing = plan.translation_scale, plan.swing
+    x, y, z = plan.lowest
+    wall = z - 1.5 * swing
+    down = 1.5 * swing + min(_PRESS, swing / 4.0)
+    stand_in = (
+        "tool:  # a stand-in: put your tool's file (model: ...) or its numbers here\n"
+        f"    mass: {_STAND_IN.mass}\n    com: {_STAND_IN.com}\n"
+        "    shapes: [!Ball {radius: 0.012, position: [0.0, 0.0, 0.1]}]"
+    )
+    what = "tool: null  # what the model has beyond the sensor" if plan.own_tool else stand_in
+    lines = [
+        "# Made by drake-teleop new. Fields that are not here have their defaults; all, with their",
+        "# unit, range and meaning: drake-teleop scenario station.yaml",
+        f"description: {Path(arm).stem} led by a {device}",
+        "simulation: {duration: 5.0, settle: 0.8}",
+        "slave:",
+        f"  model: {arm}",
+        *([f"  package_paths: [{', '.join(package_paths)}]"] if package_paths else []),
+        f"  sensor_frame: {sensor_frame}",
+        f"  position: {_row(plan.position)}  # of the sensor at the start, tool down [m]",
+        f"  {what if tool is None else f'tool: {{model: {tool}}}'}",
+        "master:",
+        f"  model: {device}",
+        *(["wrist_sensor:", f"  preset: {sensor}"] if sensor else []),
+        "kinematic_scaling:",
+        f"  translation_scale: {s:g}  # the arm can go {1e3 * plan.half:g} mm to all sides",
+        "force_scaling:",
+        "  sigma: 0.0  # 1: the hand feels the whole tool",
+        f"  force_scale: {plan.force_scale:g}  # for which hands and walls: drake-teleop analyze",
+        "environment:",
+        f"  - !Wall {{position: {_row([x, y, wall])}, stiffness: {_WALL:g}}}",
+        "operator:",
+        "  grip: medium",
+        "  intent:  # of the hand: a swing up and down, and then down onto the wall",
+        "    - !Sine {t_start: 0.2, duration: 2.6, ramp: 0.5, "
+        f"frequency: {_FREQUENCY:g},"
+        f" translation: [0.0, 0.0, {swing / s:.4g}]}}",
+        "    - !MinimumJerk {t_start: 3.2, duration: 1.2,"
+        f" translation: [0.0, 0.0, {-down / s:.4g}]}}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _row(values: Any) -> str:
+    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+
+
+def _print(plan: Plan, scenario: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"A station: {scenario}", title_justify="left", show_header=False)
+    tool = "of the model" if plan.own_tool else "on the sensor"
+    for name, value in (
+        ("Joints", f"{len(plan.joints)}: {', '.join(plan.joints)}"),
+        ("Tool", f"{plan.tool_mass:.4g} kg, {tool}"),
+        ("Start", f"sensor at {_row(plan.position)} m, tool down"),
+        ("Room around it", f"{1e3 * plan.half:g} mm to all sides"),
+        ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
+    ):
+        table.add_row(name, value)
+    console = Console()
+    console.print(table)
+    for assumed in plan.assumptions:
+        console.print(f"assumed: {assumed}", highlight=False, markup=False)

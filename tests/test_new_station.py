@@ -1,0 +1,86 @@
+"""`drake-teleop new`: what it writes is a station that works, for an arm of one's own."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import product
+
+import numpy as np
+import pytest
+
+from drake_teleop import new_station
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.new_station import find_place, new_command, plan_station
+from drake_teleop.resources import models_dir
+from drake_teleop.scenario import LoadScenario
+from drake_teleop.slave.inverse_kinematics import IkStatus
+from drake_teleop.slave.numeric_inverse_kinematics import find_posture
+from drake_teleop.slave.plant import R_WS_HOME, NominalSlave
+
+ARM = models_dir() / "rx90.sdf"
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """What would have been run."""
+    calls = []
+
+    def run(scenario, out, **options):
+        calls.append((scenario, out, options))
+        return {}
+
+    monkeypatch.setattr(new_station, "run_command", run)
+    return calls
+
+
+def test_a_station_is_written_and_run(tmp_path, runs, capsys):
+    new_command(tmp_path / "mine", ARM, "sensor", device="omega_6", sensor="ati_gamma_imu")
+    path = tmp_path / "mine" / "station.yaml"
+    assert runs == [(path, tmp_path / "mine" / "first_run", {"quiet": False})]
+    scenario = LoadScenario(path)
+    assert scenario.slave.path.resolve() == ARM.resolve()
+    assert (scenario.master.model, scenario.wrist_sensor.preset) == ("omega_6", "ati_gamma_imu")
+    assert "6: joint_1" in capsys.readouterr().out
+    plan = plan_station(ARM, "sensor", device="omega_6")
+    scale = scenario.kinematic_scaling.translation_scale
+    # The device's workspace is within what the arm reaches, and the hand's way within the device's.
+    assert 0.055 * scale <= plan.half
+    way = 1.5 * plan.swing + 0.01
+    assert way / scale <= 0.113 / 2
+    # From the tool's lowest point down onto the wall, and no further than a centimetre into it.
+    tip = NominalSlave(scenario.slave).start_tip
+    wall = scenario.environment[0].position[2]
+    assert wall == pytest.approx(tip[2] - 1.5 * plan.swing, abs=1e-3)
+    into = -scenario.operator.intent[1].translation[2] * scale - (tip[2] - wall)
+    assert 0.0 < into <= 0.0101
+    with pytest.raises(DrakeTeleopError, match="is there already"):
+        new_command(tmp_path / "mine", ARM, "sensor")
+
+
+def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():
+    arm = NominalSlave(LoadScenario("free_motion_force").slave).arm
+    place, half = find_place(arm)
+    assert place[0] > abs(place[1]) and place[2] > 0.1
+    w = R_WS_HOME.ToQuaternion().wxyz()
+    q = NominalSlave(LoadScenario("free_motion_force").slave).start
+    for signs in product((-1.0, 1.0), repeat=3):
+        pose = np.array([*w, *(place + half * np.array(signs))])
+        assert find_posture(arm, pose, q)[1] == IkStatus.OK
+    stiff = dataclasses.replace(arm, lower=arm.lower * 0.0 - 0.01, upper=arm.upper * 0.0 + 0.01)
+    with pytest.raises(DrakeTeleopError, match="nowhere can the arm hold its sensor"):
+        find_place(stiff)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"device": "omega_5"}, r"--device: 'omega_5' is none.*omega_6"),
+        ({"sensor": "ati"}, r"--sensor: 'ati' is none.*ati_gamma"),
+        ({"frame": "wrist"}, "wrist"),
+    ],
+)
+def test_what_is_not_known_is_one_line_and_nothing_is_written(options, says, tmp_path, runs):
+    frame = options.pop("frame", "sensor")
+    with pytest.raises(DrakeTeleopError, match=says):
+        new_command(tmp_path / "mine", ARM, frame, **options)
+    assert not (tmp_path / "mine").exists() and runs == []
