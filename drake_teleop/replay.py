@@ -218,7 +218,7 @@ class ReplayScene:
         self._slave, self._sensor = self._parsed.instance, self._parsed.sensor_frame
         nominal = NominalSlave(scenario.slave)
         self._joints, self._tip = nominal.arm.num_joints, nominal.tip
-        AddSkeleton(self.plant, nominal)
+        AddSkeleton(self.plant, self._sensor)
         touched = Touched([], None)
         if scenario.surroundings is not None:
             touched = AddEnvironment(self.plant, scenario.surroundings)

@@ -182,8 +182,8 @@ def test_model_directives_lead_to_other_files_and_their_packages(folder, tmp_pat
 def test_of_an_arm_without_shapes_sticks_are_seen(scenario):
     slave, builder = NominalSlave(scenario.slave), DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
-    ParseSlave(plant, scenario.slave)
-    AddSkeleton(plant, slave)
+    parsed = ParseSlave(plant, scenario.slave)
+    AddSkeleton(plant, parsed.sensor_frame)
     inspector = scene_graph.model_inspector()
     for k, joint in enumerate(slave.arm.joint_names[1:], start=1):
         (stick,) = plant.GetVisualGeometriesForBody(plant.GetBodyByName(f"l{k}"))
