@@ -30,6 +30,9 @@ from drake_teleop import cli
 from drake_teleop.channel import network
 from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
 from drake_teleop.excitation.robot import RobotFromModel
+from drake_teleop.live.inputs import RANGES, Inputs, header, read_inputs
+from drake_teleop.live.inputs import row as inputs_row
+from drake_teleop.live.messages import SLOWEST, parse
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
@@ -470,6 +473,35 @@ def _exchange(path: Path) -> None:
                 raise AssertionError(f"packet {newest} came changed, or before it was sent")
 
 
+def _drives(_: Path) -> list[bytes]:
+    lines = [
+        inputs_row(ms, Inputs(x=ms, sigma=ms % 100, clutch=ms % 2)) for ms in range(0, 200, 20)
+    ]
+    return ["".join([header(), *lines]).encode()]
+
+
+_MESSAGES = (
+    {"set": {"x": 10, "y": -20.5, "rz": 3, "sigma": 50, "force_scale": 5714, "held": 1}},
+    {"pause": True, "slow": 5, "set": {"clutch": 0}},
+    {"drive": True, "reset": True},
+)
+
+
+def _message(path: Path) -> None:
+    """What a page says: nothing that is not bounded comes of it, whatever it is."""
+    content = path.read_bytes()
+    said = [parse(text) for text in (content, content.decode(errors="replace"))]
+    for found in filter(None, said):
+        inputs = Inputs().changed(found.get("set", {}))
+        for name, (low, high) in RANGES.items():
+            value = getattr(inputs, name)
+            if not (isinstance(value, int) and low <= value <= high):
+                raise AssertionError(f"{name} = {value!r}")
+        pose = inputs.changed({"held": 1}).pose(np.zeros(3))
+        if not 1.0 <= found.get("slow", 1.0) <= SLOWEST or not np.isfinite(pose).all():
+            raise AssertionError(f"{found!r}")
+
+
 def _floats(value: Any) -> np.ndarray:
     numbers = value if isinstance(value, list) and value else [0.0]
     return np.array([x if isinstance(x, (int, float)) else math.nan for x in numbers], float)
@@ -480,6 +512,8 @@ def _floats(value: Any) -> np.ndarray:
 _COMMANDS = (
     "reproduce --out out/r --seed 3 --quiet",
     "run contact_transition --out out/c --seed 7 --fresh",
+    "run --inputs out/d --out out/c",
+    "drive press --record out/d --port 8000 --no-browser",
     "scenario press",
     "replay out/c --scenario press",
     "identify log.csv --gripper g.json --method robust --cutoff 20 --delay 0.01",
@@ -552,6 +586,15 @@ TARGETS = (
         for change in [mutations.table(f".{suffix}")]
     ),
     Target("packets", ".json", 2, _exchanges, _json, _exchange),
+    Target("inputs", ".csv", 1, _drives, mutations.text, read_inputs),
+    Target(
+        "message",
+        ".json",
+        1,
+        lambda _: [json.dumps(each).encode() for each in _MESSAGES],
+        _json,
+        _message,
+    ),
     Target("options", ".json", 2, _commands, mutations.arguments, _command_line),
 )
 

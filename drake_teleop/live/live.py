@@ -39,6 +39,7 @@ class Live:
 
     Attributes:
         refused: how many messages were none.
+        pace: when slices are due.
 
     Args:
         scenario: as `live_scenario` makes it.
@@ -62,7 +63,7 @@ class Live:
         self._driver: int | None = None
         self._drives, self._paused, self._stopped = 0, False, ""
         self._alone_since = now
-        self._pace = Pace(1e-3 * SLICE_MS, now)
+        self.pace = Pace(1e-3 * SLICE_MS, now)
         self._frame_due = now
         self._begin(now)
 
@@ -77,7 +78,7 @@ class Live:
         self._cockpit, self._stopped, self._asleep = Cockpit(self._scenario), "", False
         self._wanted = self._session.inputs
         self._frame: dict[str, Any] = {}
-        self._pace.start(now)
+        self.pace.start(now)
 
     def hello(self) -> dict[str, Any]:
         """What a page has to know of the scenario."""
@@ -117,10 +118,10 @@ class Live:
         if "set" in said:
             self._wanted = self._wanted.changed(said["set"])
         if "slow" in said:
-            self._pace.slow = said["slow"]
+            self.pace.slow = said["slow"]
         if "pause" in said and said["pause"] != self._paused:
             self._paused = said["pause"]
-            self._pace.start(now)
+            self.pace.start(now)
         if "reset" in said:
             self._try(self._session.close)
             self._begin(now)
@@ -130,7 +131,7 @@ class Live:
         self._driver = client
         self._wanted = self._session.stylus().changed({"clutch": 1})
         if self._asleep:
-            self._pace.start(now)
+            self.pace.start(now)
         self._asleep = False
 
     @property
@@ -141,15 +142,15 @@ class Live:
     def wait(self, now: float) -> float:
         """How long there is nothing to do [s]."""
         frame = self._frame_due - now
-        return max(0.0, frame if self.still else min(frame, self._pace.wait(now)))
+        return max(0.0, frame if self.still else min(frame, self.pace.wait(now)))
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
         """Simulates what is due, at most four slices; gives a frame when one is due."""
         for _ in range(_IN_A_ROW):
             now = clock()
-            if self.still or self._pace.wait(now) > 0:
+            if self.still or self.pace.wait(now) > 0:
                 break
-            self._pace.begin(now)
+            self.pace.begin(now)
             self._slice()
         now = clock()
         if self._driver is None and not self._asleep and now - self._alone_since >= _ALONE:
@@ -181,9 +182,9 @@ class Live:
             self._show(rows)
         inputs = self._wanted
         return self._frame | {
-            "factor": round(self._pace.factor * self._pace.slow, 3),
-            "late": round(1e3 * self._pace.lateness(), 1),
-            "lost": round(self._pace.given_up, 2),
+            "factor": round(self.pace.factor * self.pace.slow, 3),
+            "late": round(1e3 * self.pace.lateness(), 1),
+            "lost": round(self.pace.given_up, 2),
             "state": self._state(),
             "driver": self._driver,
             "drive": self._drives,

@@ -98,7 +98,7 @@ class LiveDrive:
     def _make(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> Live:
         meshcat = Meshcat(MeshcatParams(host="localhost"))
         self._scene_url = meshcat.ws_url()
-        return Live(scenario, load, record, _scene(meshcat, scenario), time.perf_counter())
+        return Live(scenario, load, record, show_in(meshcat, scenario), time.perf_counter())
 
     async def _serve(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
@@ -204,7 +204,8 @@ def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
     return Response(status.value, status.phrase, headers, body)
 
 
-def _scene(meshcat: Meshcat, scenario: Scenario) -> Show:
+def show_in(meshcat: Meshcat, scenario: Scenario) -> Show:
+    """What shows the newest rows of a log in Meshcat, as a film does."""
     recorded = ("slave_state", "master_state", "measured_wrench_S", "load_estimate")
     scene = ReplayScene(meshcat, scenario, (*recorded, "contact_wrench_S"))
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
 from drake_teleop.identified_load import IdentifiedLoad
+from drake_teleop.live import server
 from drake_teleop.live.session import live_scenario
 from drake_teleop.load.identification import Identification
 from drake_teleop.scenario import LoadScenario, Scenario, replace
@@ -30,3 +33,13 @@ def load(scenario: Scenario) -> IdentifiedLoad:
         method="known", samples=0,
     )  # fmt: skip
     return IdentifiedLoad(truth, None, from_cache=False)
+
+
+@pytest.fixture(scope="session")
+def live(scenario: Scenario, load: IdentifiedLoad) -> Iterator[server.LiveDrive]:
+    """A drive that listens."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(server, "identified_load", lambda scenario: load)
+        drive = server.drive(scenario)
+    yield drive
+    drive.stop()

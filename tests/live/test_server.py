@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -17,15 +16,6 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.live import server
 from drake_teleop.live.messages import LONGEST
 from drake_teleop.scenario import Scenario
-
-
-@pytest.fixture(scope="module")
-def live(scenario, load) -> Iterator[server.LiveDrive]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(server, "identified_load", lambda scenario: load)
-        drive = server.drive(scenario)
-    yield drive
-    drive.stop()
 
 
 def status(url: str, **headers: str) -> int:

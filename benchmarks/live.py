@@ -1,0 +1,108 @@
+"""Does a station that is driven keep up with the clock, and how much of a core does that take?
+
+    python benchmarks/live.py [--seconds 60] [--json FILE]
+
+A script taps on the leaf of `contact_transition` at 1 Hz, fast in between, as a driver would: 60
+messages a second, in through the page's handler; 60 frames a second out, made into JSON, with the
+3D scene. Sensor at 8 kHz, slices of 5 ms, no browser. Real time: the factor of simulated over
+elapsed time, lateness of slices, lost time that was given up, CPU of the process over elapsed time.
+Baseline: the CPU time of the same drive by `repeat`, without clock, page and scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatParams
+
+from drake_teleop.identified_load import identified_load
+from drake_teleop.live.live import FRAME, Live
+from drake_teleop.live.server import show_in
+from drake_teleop.live.session import live_scenario, read_drive, repeat
+from drake_teleop.pages.progress import silent
+from drake_teleop.scenario import LoadScenario
+
+
+def wanted(t: float) -> dict[str, int]:
+    """What the script wants at a time [s], in the units of `Inputs`; the leaf is 65 mm below."""
+    down, sway = 0.5 - 0.5 * np.cos(2 * np.pi * t), np.sin(2 * np.pi * 0.3 * t)
+    return {"z": round(-7300 * down), "x": round(300 * sway), "sigma": round(50 + 50 * sway)}
+
+
+def driven(seconds: float, folder: Path) -> dict[str, float]:
+    """Figures of a drive in real time, which is recorded."""
+    scenario = live_scenario(LoadScenario("contact_transition"))
+    load = identified_load(scenario)
+    clock = time.perf_counter
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    live = Live(scenario, load, folder, show_in(meshcat, scenario), clock())
+    live.join(1, clock())
+    for _ in range(200):  # what is compiled and loaded at the first call
+        live.tick(clock)
+        time.sleep(live.wait(clock()))
+    late, bytes_sent, touched, frames = [], 0, 0, 0
+    start, cpu, lost = clock(), time.process_time(), live.pace.given_up
+    next_message = start
+    while clock() - start < seconds:
+        now = clock()
+        if now >= next_message:
+            next_message += FRAME
+            live.hear(1, json.dumps({"set": wanted(now - start)}), now)
+        if not live.still and live.pace.wait(now) <= 0:
+            late.append(-live.pace.wait(now))
+        frame = live.tick(clock)
+        if frame is not None:
+            bytes_sent += len(json.dumps({"frame": frame}))
+            touched, frames = touched + frame["contact"], frames + 1
+        time.sleep(live.wait(clock()))
+    elapsed, cpu = clock() - start, time.process_time() - cpu
+    p50, p95, p99, most = 1e3 * np.percentile(late, [50, 95, 99, 100])
+    lost = live.pace.given_up - lost
+    live.close()
+    return {
+        "factor": 1.0 - lost / elapsed,
+        "late_p50_ms": float(p50),
+        "late_p95_ms": float(p95),
+        "late_p99_ms": float(p99),
+        "late_max_ms": float(most),
+        "given_up_s": lost,
+        "core_share": cpu / elapsed,
+        "frames_per_s": frames / elapsed,
+        "kB_per_s": 1e-3 * bytes_sent / elapsed,
+        "contact_share": touched / frames,
+    }
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        figures = driven(options.seconds, Path(folder) / "drive")
+        drive = read_drive(Path(folder) / "drive")
+        cpu = time.process_time()
+        repeat(drive, silent(""), Path(folder) / "again")
+        seconds = drive.scenario.simulation.duration
+        figures["core_share_of_repeat"] = (time.process_time() - cpu) / seconds
+        parts = sorted((Path(folder) / "drive" / "log.parquet").iterdir())
+        again = [Path(folder) / "again" / part.name for part in parts]
+        figures["repeat_has_the_same_bytes"] = all(
+            a.read_bytes() == b.read_bytes() for a, b in zip(parts, again, strict=True)
+        )
+    for name, value in figures.items():
+        print(f"{name:28} {value:.4g}")
+    if options.json is not None:
+        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+    sys.exit(not figures["repeat_has_the_same_bytes"])
+
+
+if __name__ == "__main__":
+    main()
