@@ -31,6 +31,7 @@ from drake_teleop.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.fault import MEANINGS, Fault
 from drake_teleop.load.sample import LOST
 from drake_teleop.master.dynamics import HapticDevice
+from drake_teleop.master.leader import LeaderDevice
 from drake_teleop.pages.style import contact_spans
 from drake_teleop.passivity.ledger import fastest
 from drake_teleop.result import SimulationResult
@@ -187,9 +188,12 @@ def _limits(
         for status in list(IkStatus)[1:]:
             happened = result["ik_status"][:, 0] == status
             yield f"inverse kinematics: {status.name}", spans_of(t, happened)
-    asked = 2 * np.pi * scenario.joint_control.position_bandwidth_hz * _joint_error(result)
+    control = scenario.joint_control
+    asked, fastest = control.speed_gain * _joint_error(result), arm.velocity_limit
+    if control.position_interface is not None:
+        fastest = np.minimum(fastest, control.position_interface.max_speed)
     for what, values, limit in (
-        ("speed", asked, arm.velocity_limit),
+        ("speed", asked, fastest),
         ("torque", result["joint_torque"], arm.effort_limit),
     ):
         clipped = np.abs(values) >= _AT_LIMIT * limit
@@ -198,10 +202,12 @@ def _limits(
     if "force_to_master" in result:
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
         full = np.linalg.norm(shown[:, :3], axis=1) >= _AT_LIMIT * device.peak_force
-        if device.peak_torque.all():
+        if isinstance(device, LeaderDevice):
+            full |= np.linalg.norm(shown[:, 3:], axis=1) >= _AT_LIMIT * device.peak_torque[0]
+        elif device.peak_torque.all():
             full |= _full_torque(shown[:, 3:], result["master_state"], device)
         yield "the device displays the most that it can", spans_of(t, full, LASTING)
-        ended = device.at_an_end(result["master_state"][:, :6])
+        ended = device.at_an_end(result["master_state"][:, : device.num_joints])
         yield "the device is at the end of its workspace", spans_of(t, ended)
     if scenario.leaf is not None and "sheet_state" in result:
         bent = scenario.leaf.largest_small_deflection
@@ -299,9 +305,7 @@ def _joints(
         return
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
-    control = scenario.joint_control
-    slowest = min(control.position_bandwidth_hz, control.velocity_bandwidth_hz)
-    window = _TIME_CONSTANTS / (2 * np.pi * slowest) + 1 / scenario.rates.joint_control_hz
+    window = _TIME_CONSTANTS * scenario.joint_control.lag + 1 / scenario.rates.joint_control_hz
     for k in range(command.shape[1]):
         far = behind(t, command[:, [k]], actual[:, [k]], window)
         slides = arm.table[k, SLIDES] != 0.0

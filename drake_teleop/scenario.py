@@ -43,7 +43,7 @@ from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.sensor.presets import preset_of
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.slave.joint_control import JointControlConfig
+from drake_teleop.slave.joint_control import JointControlConfig, interface_of
 from drake_teleop.slave.scene import Scene
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.texts import read_yaml
@@ -168,6 +168,7 @@ class Scenario:
         self.load_estimator.check(f"{where}:load_estimator")
         self.master.check(f"{where}:master")
         self.slave.check(f"{where}:slave")
+        self.joint_control.check(f"{where}:joint_control", self.rates.joint_control_hz)
         self.wrist_sensor.check(f"{where}:wrist_sensor", self.rates.sensor_hz)
         for index, thing in enumerate(self.environment):
             thing.check(f"{where}:environment[{index}]")
@@ -213,6 +214,7 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     scenario = ScenarioFromData(data, where)
     folder = Path(where).parent
     scenario.slave = scenario.slave.found_from(folder)
+    scenario.master = scenario.master.found_from(folder)
     scenario.environment = [
         thing.found_from(folder) if isinstance(thing, Scene) else thing
         for thing in scenario.environment
@@ -248,6 +250,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     defaults = Scenario(
         wrist_sensor=preset_of(data.get("wrist_sensor")),
         master=Master(figures=figures_of(data.get("master"))),
+        joint_control=JointControlConfig(interface=interface_of(data.get("joint_control"))),
     )
     scenario = yaml_load_typed(schema=Scenario, data=yaml_dump(data), defaults=defaults)
     scenario.check(where)

@@ -32,7 +32,7 @@ def _joints(joints: int) -> str:
 
 _STATE, _STATE_UNITS = _state(6)
 _JOINTS = _joints(6)
-# Those of the slave have as many components as its arm has joints.
+# Those of the slave have as many components as its arm has joints; so has a leader's state.
 _OF_JOINTS = ("joint_position", "joint_torque", "joint_command")
 
 
@@ -123,6 +123,6 @@ def signal_of(name: str, size: int) -> Signal:
         return signal
     if name in _OF_JOINTS:
         return _signal(name, _joints(size), signal.units[0], signal.description)
-    if name == "slave_state":
+    if name in ("slave_state", "master_state"):
         return _signal(name, *_state(size // 2), signal.description)
     return signal

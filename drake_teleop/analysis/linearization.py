@@ -396,9 +396,12 @@ class _Period:
         self._push.body_index = slave.tool
         self._sensor = self._system("wrist_sensor")
         servo = smooth.joint_control
+        servo.check_is_torque("the linearisation")
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
         largest = _ANGLE if smooth.surroundings is None else _IN_CONTACT
         self._joint_step = min(largest, _ACCELERATION / gain)
+        hand = smooth.operator.hand
+        self._device = smooth.master.device(hand.mass, hand.inertia)
         self._groups = self._state_groups()
         self._steps = np.concatenate([group.steps for group in self._groups])
         # What the sensor remembers follows from the rest; it is of order 1.
@@ -410,8 +413,6 @@ class _Period:
             for g in self._groups
             for k in range(len(g.steps))
         )
-        hand = smooth.operator.hand
-        self._device = smooth.master.device(hand.mass, hand.inertia)
         self._start_B = np.array([1.0, 0.0, 0.0, 0.0, *smooth.master.position])
         self._pose = self._eval("kinematic_scaling", "pose_command")
         self._hand, self._wrench = np.zeros(6), np.zeros(6)
@@ -438,10 +439,11 @@ class _Period:
             return _States(system, group, slice(None), np.concatenate(steps))
 
         joints = self._context("slave_plant").num_continuous_states() // 2
+        axes = self._device.num_joints
         # Angles, as the sensor remembers some of them, must stay small.
         remembered = np.full(len(self._sensor.remembered), _ANGLE)
         return [
-            whole("master_device", 0, np.full(6, _ANGLE), np.full(6, _RATE)),
+            whole("master_device", 0, np.full(axes, _ANGLE), np.full(axes, _RATE)),
             whole("master_device", 1, np.full(7, _ANGLE)),
             whole("master_device", 2, np.full(6, _RATE)),
             # The angles again, for the display; what else it remembers acts after faults alone.
@@ -532,10 +534,10 @@ class _Period:
         q = self._device.inverse_kinematics(pose_B)
         context = self._context("master_device")
         rest = (
-            np.append(q, np.zeros(6)),
+            np.append(q, np.zeros(len(q))),
             pose_B,
             np.zeros(6),
-            initial_display(q, self._device.numbers),
+            initial_display(self._device.display_axes(q), self._device.numbers),
         )
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)

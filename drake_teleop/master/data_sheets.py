@@ -22,6 +22,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ import numpy as np
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fields import settings
 from drake_teleop.master.dynamics import HapticDevice
+from drake_teleop.master.leader import LeaderDevice
+from drake_teleop.master.leader_model import Leader
 from drake_teleop.master.numbers import (
     CENTRE,
     COULOMB,
@@ -47,7 +50,7 @@ from drake_teleop.master.numbers import (
 from drake_teleop.master.phantom import FORCE_LIMIT, WRIST_TORQUE_LIMIT
 from drake_teleop.quantities import choice, quantity
 
-PHANTOM = "phantom_premium_15"
+PHANTOM, LEADER = "phantom_premium_15", "leader"
 
 
 @settings
@@ -123,21 +126,29 @@ class Master:
     """Which haptic device, and where it starts."""
 
     model: str = choice(
-        PHANTOM, (PHANTOM, *FIGURES, "custom"), "the device; custom: by `figures` alone"
+        PHANTOM,
+        (PHANTOM, *FIGURES, "custom", LEADER),
+        "the device; custom: by `figures` alone; leader: an arm of a file",
     )
     position: list[float] = quantity(
         [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
     )
     friction: JointFriction = field(default_factory=JointFriction)
     figures: DeviceFigures | None = None
+    leader: Leader | None = None
 
-    def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice:
+    def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
         """The device with a hand on it.
 
         Args:
             hand_mass: [kg], moves with the stylus.
             hand_inertia: [kg m^2], about every axis through E.
+
+        Raises:
+            DrakeTeleopError: as `Leader.device`.
         """
+        if self.leader is not None:
+            return self.leader.device(self.position, hand_mass, hand_inertia)
         numbers = np.zeros(NUMBERS)
         numbers[HAND_MASS], numbers[HAND_INERTIA] = hand_mass, hand_inertia
         if self.model == PHANTOM:
@@ -159,8 +170,16 @@ class Master:
         if self.model == PHANTOM:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
+        if self.leader is not None:
+            return dataclasses.replace(self, leader=dataclasses.replace(self.leader, friction=[]))
         figures = dataclasses.replace(self._figures(), friction=0.0, friction_torque=0.0)
         return dataclasses.replace(self, figures=figures)
+
+    def found_from(self, folder: Path) -> "Master":
+        """The same with its file found from a folder."""
+        if self.leader is None:
+            return self
+        return dataclasses.replace(self, leader=self.leader.found_from(folder))
 
     def _figures(self) -> DeviceFigures:
         return self.figures or FIGURES.get(self.model, DeviceFigures())
@@ -183,6 +202,20 @@ class Master:
                 where=f"{where}.friction",
                 remedy="leave it out, and set figures.friction and figures.damping",
             )
+        if (self.leader is None) == (self.model == LEADER):
+            raise DrakeTeleopError(
+                "a leader arm and `model: leader` belong together",
+                where=f"{where}.leader",
+                remedy="give both, with leader.file and leader.hand_frame, or none",
+            )
+        if self.leader is not None:
+            self.leader.check(f"{where}.leader")
+            if self.figures is not None:
+                raise DrakeTeleopError(
+                    "a leader arm has its own dynamics",
+                    where=f"{where}.figures",
+                    remedy="leave them out",
+                )
         if self.figures is not None and self.figures.turn[1] > _STEEPEST:
             raise DrakeTeleopError(
                 f"a pitch of {self.figures.turn[1]:g} rad: there yaw and roll are the same",

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fault import sound
 from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.master.dynamics import HapticDevice, pose_into, step, twist_into
-from drake_teleop.master.force_display import initial_display
+from drake_teleop.master.force_display import ForceDisplay, initial_display
+from drake_teleop.master.leader import LeaderArm, LeaderDevice, LeaderDisplay
 from drake_teleop.vectors import put
 
 _LARGEST_PERIOD = 1e-3  # s, slower than any haptic device
@@ -34,14 +35,28 @@ def _advance(state, pose, twist, display, hand_wrench, drive, device, period, wo
     put(display, 0, state, 0, 6)
 
 
-def _check_friction(device: HapticDevice, q: NDArray[np.float64], period: float) -> None:
+def check_period(
+    device: HapticDevice | LeaderDevice, q: NDArray[np.float64], period: float
+) -> None:
+    """Checks that a step a period is short enough for the device at the joints q.
+
+    Raises:
+        DrakeTeleopError: if it is not, for any device or for the friction of this one.
+    """
+    if not 0 < period <= _LARGEST_PERIOD:
+        raise DrakeTeleopError(
+            f"a period of {period:g} s is too long for the haptic device",
+            where="master.period",
+            remedy=f"choose at most {_LARGEST_PERIOD:g} s (1 kHz); the paper uses above 2 kHz",
+        )
+    device.check_limits(q)
     slope = device.damping_matrix(q, creeping=True)
     rate = float(np.max(np.linalg.eigvals(np.linalg.solve(device.mass_matrix(q), slope)).real))
     if rate * period > _LARGEST_FRICTION_STEP:
         raise DrakeTeleopError(
             f"the friction stops the device within {1e3 / rate:.2g} ms, too fast for a "
             f"period of {1e3 * period:g} ms",
-            where="master.friction" if device.is_phantom else "master.figures",
+            where=device.friction_field,
             remedy="choose less friction, or a higher hand rate",
         )
 
@@ -80,14 +95,7 @@ class MasterDevice(LeafSystem):
 
     def __init__(self, period: float, device: HapticDevice, q_initial: NDArray[np.float64]) -> None:
         super().__init__()
-        if not 0 < period <= _LARGEST_PERIOD:
-            raise DrakeTeleopError(
-                f"a period of {period:g} s is too long for the haptic device",
-                where="master.period",
-                remedy=f"choose at most {_LARGEST_PERIOD:g} s (1 kHz); the paper uses above 2 kHz",
-            )
-        device.check_limits(q_initial)
-        _check_friction(device, q_initial, period)
+        check_period(device, q_initial, period)
         self._period = period
         self._numbers = device.numbers
         self._work = np.zeros((2, 6, 6))
@@ -120,3 +128,33 @@ class MasterDevice(LeafSystem):
             self._work,
             self._stages,
         )
+
+
+def AddDevice(
+    builder: DiagramBuilder,
+    period: float,
+    device: HapticDevice | LeaderDevice,
+    q_initial: NDArray[np.float64],
+) -> tuple[LeafSystem, LeafSystem]:
+    """Adds "master_device" and "force_display", wired to each other, of a device or a leader arm.
+
+    Args:
+        builder: the diagram.
+        period, device, q_initial: as for `MasterDevice`.
+
+    Returns:
+        Both; what remains to be connected is the hand's wrench and the command.
+    """
+    check_period(device, q_initial, period)
+    if isinstance(device, LeaderDevice):
+        block: LeafSystem = LeaderArm(period, device, q_initial)
+        display: LeafSystem = LeaderDisplay(period, device)
+    else:
+        block, display = MasterDevice(period, device, q_initial), ForceDisplay(period, device)
+    builder.AddNamedSystem("master_device", block)
+    builder.AddNamedSystem("force_display", display)
+    builder.Connect(block.GetOutputPort("for_display"), display.GetInputPort("for_display"))
+    builder.Connect(display.GetOutputPort("drive"), block.GetInputPort("drive"))
+    if isinstance(device, LeaderDevice):
+        builder.Connect(block.GetOutputPort("state"), display.GetInputPort("state"))
+    return block, display

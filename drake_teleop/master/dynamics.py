@@ -120,6 +120,20 @@ class HapticDevice:
         return self.numbers[PEAK_TORQUE]
 
     @property
+    def num_joints(self) -> int:
+        """The number of its axes."""
+        return 6
+
+    @property
+    def friction_field(self) -> str:
+        """Where a scenario has its friction."""
+        return "master.friction" if self.is_phantom else "master.figures"
+
+    def display_axes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(6,) what the force display takes for its axes at the joints q (6,): these."""
+        return q
+
+    @property
     def is_phantom(self) -> bool:
         """Whether its kinematics are the Phantom's; otherwise those of `task_space`."""
         return not self.numbers[IN_TASK_SPACE]

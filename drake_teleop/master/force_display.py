@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_teleop._compiled import njit
 from drake_teleop.fault import Fault, sound
 from drake_teleop.lifetime import ONE_DICT, weak_callback
-from drake_teleop.master.dynamics import HapticDevice, gravity_torque_into, jacobian_into
+from drake_teleop.master.dynamics import gravity_torque_into, jacobian_into
 from drake_teleop.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.passivity.memory import Slots
 from drake_teleop.passivity.packet import limit
@@ -139,6 +140,14 @@ def _change(device, numbers, period, drive):
         drive[_FAULT] = _RESUMING
 
 
+class Numbered(Protocol):
+    """A device of any kind, as the display knows it."""
+
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """(NUMBERS,), see `numbers`."""
+
+
 class ForceDisplay(LeafSystem):
     """Turns the wrench that the hand shall feel into motor torques of the master.
 
@@ -167,7 +176,7 @@ class ForceDisplay(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, period: float, device: HapticDevice) -> None:
+    def __init__(self, period: float, device: Numbered) -> None:
         super().__init__()
         self._period = period
         self._numbers = device.numbers

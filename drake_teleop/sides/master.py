@@ -8,8 +8,7 @@ from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_teleop.channel.network import mean_delay
-from drake_teleop.master.device import MasterDevice
-from drake_teleop.master.force_display import ForceDisplay
+from drake_teleop.master.device import AddDevice
 from drake_teleop.operator.decision import Training
 from drake_teleop.operator.operator import Operator
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
@@ -52,9 +51,7 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
 
     operator = builder.AddNamedSystem("operator", _operator(scenario, start_B))
     period, model = 1 / scenario.rates.hand_hz, scenario.master.device(hand.mass, hand.inertia)
-    device = builder.AddNamedSystem(
-        "master_device", MasterDevice(period, model, model.inverse_kinematics(start_B))
-    )
+    device, display = AddDevice(builder, period, model, model.inverse_kinematics(start_B))
     builder.Connect(operator.GetOutputPort("hand_wrench_E"), device.GetInputPort("hand_wrench_E"))
     builder.Connect(device.GetOutputPort("pose_master"), operator.GetInputPort("pose_master"))
     builder.Connect(device.GetOutputPort("twist_master"), operator.GetInputPort("twist_master"))
@@ -75,9 +72,6 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
     builder.ExportInput(kinematic_scaling.GetInputPort("clutch"), "clutch")
     export(builder, kinematic_scaling, "pose_command")
 
-    display = builder.AddNamedSystem("force_display", ForceDisplay(period, model))
-    builder.Connect(device.GetOutputPort("for_display"), display.GetInputPort("for_display"))
-    builder.Connect(display.GetOutputPort("drive"), device.GetInputPort("drive"))
     builder.ExportInput(display.GetInputPort("wrench_command"), "wrench_command")
     export(builder, display, "force_to_master", "fault_at_hand", "displayed_and_fault")
     return builder.Build()

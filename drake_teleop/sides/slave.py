@@ -24,7 +24,7 @@ from drake_teleop.signals import POSE_OF
 from drake_teleop.slave.drake_contact import DrakeContact
 from drake_teleop.slave.forward_kinematics import ForwardKinematics
 from drake_teleop.slave.ik_methods import METHODS, method_of
-from drake_teleop.slave.joint_control import JointControl
+from drake_teleop.slave.joint_control import MakeJointControl
 from drake_teleop.slave.joint_trajectory import JointTrajectory
 from drake_teleop.slave.monitor import SlaveMonitor
 from drake_teleop.slave.moving_pose import MovingPose
@@ -185,7 +185,7 @@ def _add_body(
 
     control = builder.AddNamedSystem(
         "joint_control",
-        JointControl(arm, scenario.joint_control, 1 / rates.joint_control_hz, start),
+        MakeJointControl(arm, scenario.joint_control, 1 / rates.joint_control_hz, start),
     )
     torque = control.GetOutputPort("joint_torque")
     builder.Connect(state, control.GetInputPort("slave_state"))

@@ -5,28 +5,93 @@ Here the velocity loop acts through the arm's computed torque, so that the joint
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from drake_teleop._compiled import njit
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fault import sound
 from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT
-from drake_teleop.quantities import quantity
+from drake_teleop.quantities import choice, quantity
 from drake_teleop.slave.arm import ArmModel, inverse_dynamics
+from drake_teleop.slave.position_servo import INTERFACES, PositionInterface, PositionServo
 from drake_teleop.vectors import put
+
+COMPUTED_TORQUE = "computed_torque"
 
 
 @settings
 @dataclass
 class JointControlConfig:
-    """Bandwidths of the two loops; the closed loop is about as fast as the position loop."""
+    """How the joints follow; of computed torque the loop is about as fast as the position loop."""
 
     position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "of the position loop (E)")
     velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "of the velocity loop (E)")
+    servo: str = choice(
+        COMPUTED_TORQUE,
+        (COMPUTED_TORQUE, *INTERFACES, "position"),
+        "computed_torque has the bandwidths above; the others are arms that take positions, by"
+        " name or, position, by `interface` alone",
+    )
+    interface: PositionInterface | None = None
+
+    @property
+    def position_interface(self) -> PositionInterface | None:
+        """That of the servo; None of computed torque."""
+        if self.servo == COMPUTED_TORQUE:
+            return None
+        return self.interface or INTERFACES.get(self.servo, PositionInterface())
+
+    @property
+    def lag(self) -> float:
+        """By how much it is behind a steady motion, about [s]."""
+        interface = self.position_interface
+        if interface is not None:
+            return interface.lookahead + interface.dead_time + 1 / interface.command_hz
+        return 1 / (2 * np.pi * min(self.position_bandwidth_hz, self.velocity_bandwidth_hz))
+
+    @property
+    def speed_gain(self) -> float:
+        """The speed that is asked of a joint, over its error [1/s]."""
+        interface = self.position_interface
+        return 2 * np.pi * self.position_bandwidth_hz if interface is None else 1 / self.lag
+
+    def check(self, where: str, rate: float) -> None:
+        """Checks what ranges cannot, against the rate of the joint control [Hz].
+
+        Raises:
+            DrakeTeleopError: naming `where` and the field.
+        """
+        if self.servo == COMPUTED_TORQUE and self.interface is not None:
+            raise DrakeTeleopError(
+                "computed torque takes the bandwidths, not an interface",
+                where=f"{where}.interface",
+                remedy="leave it out, or choose another servo, such as position",
+            )
+        interface = self.position_interface
+        if interface is not None:
+            interface.check(f"{where}.interface", rate)
+
+    def check_is_torque(self, what: str) -> None:
+        """For what knows computed torque alone.
+
+        Raises:
+            DrakeTeleopError: for another servo, saying what does not know it.
+        """
+        if self.servo != COMPUTED_TORQUE:
+            raise DrakeTeleopError(
+                f"{what} does not know the servo {self.servo}",
+                where="joint_control.servo",
+                remedy=f"choose {COMPUTED_TORQUE}, with a position_bandwidth_hz of"
+                f" {1 / (2 * np.pi * self.lag):.2g} for the same lag; `run` has them all",
+            )
 
 
 @njit(cache=True)
@@ -112,3 +177,18 @@ class JointControl(LeafSystem):
             *self._constants,
             discrete_state.get_mutable_value(0),
         )
+
+
+def MakeJointControl(
+    arm: ArmModel, config: JointControlConfig, period: float, q_start: NDArray[np.float64]
+) -> LeafSystem:
+    """The block that a scenario asks for; arguments as of `JointControl`."""
+    interface = config.position_interface
+    if interface is None:
+        return JointControl(arm, config, period, q_start)
+    return PositionServo(arm, interface, period, q_start)
+
+
+def interface_of(block: Mapping[str, Any] | None) -> PositionInterface | None:
+    """The defaults for a scenario's `joint_control.interface`: those of the servo that it names."""
+    return copy.deepcopy(INTERFACES.get(str((block or {}).get("servo"))))

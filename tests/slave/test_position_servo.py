@@ -1,0 +1,143 @@
+"""Arms that take joint positions: lag, dead time, limits, and torques that follow."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.scenario import Scenario, ScenarioFromData, replace
+from drake_teleop.slave.arm import forward_dynamics, inverse_dynamics
+from drake_teleop.slave.joint_control import MakeJointControl
+from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.slave.position_servo import INTERFACES, PositionInterface
+from drake_teleop.slave.servo import servo_at_tool
+
+HOME = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
+PERIOD = 5e-4
+UR = INTERFACES["ur_servoj"]
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return NominalSlave(Scenario().slave).arm
+
+
+def follow(arm, interface, command, steps):
+    """(steps, 12) [q; v] of the arm under the block's torque, and the torque (steps, 6).
+
+    The arm takes semi-implicit steps: the drives' loop, not the integrator, is what is looked at.
+    """
+    config = dataclasses.replace(Scenario().joint_control, servo="position", interface=interface)
+    block = MakeJointControl(arm, config, PERIOD, HOME)
+    context, q, v = block.CreateDefaultContext(), HOME.copy(), np.zeros(6)
+    states, torques, vdot = [], [], np.empty(6)
+    for k in range(steps):
+        block.GetInputPort("joint_command").FixValue(context, command(k * PERIOD))
+        block.GetInputPort("slave_state").FixValue(context, np.concatenate([q, v]))
+        update = block.EvalUniquePeriodicDiscreteUpdate(context)
+        context.get_mutable_discrete_state().SetFrom(update)
+        tau = block.GetOutputPort("joint_torque").Eval(context)
+        forward_dynamics(arm.table, q, v, tau, np.zeros(6), vdot)
+        v = v + PERIOD * vdot
+        q = q + PERIOD * v
+        states.append(np.concatenate([q, v]))
+        torques.append(tau)
+    return np.array(states), np.array(torques)
+
+
+def test_a_steady_motion_is_followed_by_lookahead_dead_time_and_half_a_hold_later(arm):
+    speed = np.array([0.2, -0.1, 0.15, 0.1, -0.2, 0.3])
+    states, _ = follow(arm, UR, lambda t: HOME + speed * t, 2400)
+    late = (HOME + speed * 2400 * PERIOD - states[-1, :6]) / speed
+    expected = UR.lookahead + UR.dead_time + 0.5 / UR.command_hz
+    np.testing.assert_allclose(late, expected, atol=1.5 * PERIOD)
+
+
+def test_a_step_begins_after_the_dead_time_and_is_the_closed_form(arm):
+    """Of d2r/dt2 = gain (1 - r - lookahead dr/dt), damped by 0.87."""
+    states, _ = follow(arm, UR, lambda t: HOME + 0.02, 800)
+    response = (states[:, 0] - HOME[0]) / 0.02
+    assert np.abs(response[: round(UR.dead_time / PERIOD)]).max() < 1e-9
+    w = np.sqrt(UR.gain)
+    damping = 0.5 * w * UR.lookahead
+    turning = w * np.sqrt(1 - damping**2)
+    t = (np.arange(800) + 1) * PERIOD - UR.dead_time
+    decay = np.exp(-damping * w * t)
+    wanted = 1 - decay * (np.cos(turning * t) + damping * w / turning * np.sin(turning * t))
+    np.testing.assert_allclose(response[20:], wanted[20:], atol=0.01)
+
+
+def test_speed_and_acceleration_stay_within_the_limits(arm):
+    slow = dataclasses.replace(UR, max_speed=0.5, max_acceleration=4.0, dead_time=0.0)
+    states, _ = follow(arm, slow, lambda t: HOME + 0.4, 800)
+    speed = states[:, 6:]
+    assert 0.49 < speed.max() < 0.5 * (1 + 1e-6)
+    assert np.abs(np.diff(speed, axis=0)).max() / PERIOD < 4.0 * (1 + 1e-6)
+
+
+def test_it_brakes_in_time_however_far_the_target_is(arm):
+    """A fast interface of weak motors, such as Franka's: a linear law would shoot far beyond."""
+    franka = INTERFACES["franka_position"]
+    states, _ = follow(arm, franka, lambda t: HOME + 0.3, 1600)
+    moved = states[:, :6] - HOME
+    assert np.abs(moved[-1] - 0.3).max() < 1e-4
+    assert moved.max() < 0.3 + 2e-3
+
+
+def test_what_it_generates_is_torque_that_the_arm_follows(arm):
+    """Along what is generated, the torque is the inverse dynamics of that motion."""
+    states, torques = follow(arm, UR, lambda t: HOME + 0.1, 60)
+    q, v = np.split(states[40], 2)
+    vdot, expected = (states[41, 6:] - v) / PERIOD, np.empty(6)
+    inverse_dynamics(arm.table, q, v, vdot, expected)
+    np.testing.assert_allclose(torques[41], expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1e9])
+def test_a_command_that_is_none_leaves_the_last_and_lost_encoders_the_weight(arm, bad):
+    held, _ = follow(arm, UR, lambda t: HOME if t < 0.01 else np.full(6, bad), 60)
+    np.testing.assert_allclose(held[-1, :6], HOME, atol=1e-6)
+    config = dataclasses.replace(Scenario().joint_control, servo="ur_servoj")
+    block = MakeJointControl(arm, config, PERIOD, HOME)
+    context, weight = block.CreateDefaultContext(), np.empty(6)
+    block.GetInputPort("joint_command").FixValue(context, HOME)
+    block.GetInputPort("slave_state").FixValue(context, np.full(12, bad))
+    update = block.EvalUniquePeriodicDiscreteUpdate(context)
+    inverse_dynamics(arm.table, HOME, np.zeros(6), np.zeros(6), weight)
+    np.testing.assert_array_equal(update.get_value(0), weight)
+
+
+@pytest.mark.parametrize(
+    ("changes", "where"),
+    [
+        ({"command_hz": 300.0}, "command_hz"),
+        ({"gain": 1e7, "lookahead": 0.1}, "gain"),
+        ({"drive_bandwidth_hz": 500.0}, "drive_bandwidth_hz"),
+    ],
+)
+def test_what_cannot_be_is_one_error(changes, where):
+    interface = dataclasses.replace(PositionInterface(), **changes)
+    scenario = replace(
+        Scenario(), joint_control__servo="position", joint_control__interface=interface
+    )
+    with pytest.raises(DrakeTeleopError, match=re.escape(f"joint_control.interface.{where}")):
+        scenario.check()
+
+
+def test_a_file_changes_single_figures_of_a_named_arm():
+    data = {"joint_control": {"servo": "franka_position", "interface": {"dead_time": 0.01}}}
+    found = ScenarioFromData(data, "x").joint_control.position_interface
+    assert found == dataclasses.replace(INTERFACES["franka_position"], dead_time=0.01)
+    scenario = replace(Scenario(), joint_control__interface=UR)
+    with pytest.raises(DrakeTeleopError, match="leave it out"):
+        scenario.check()
+
+
+def test_what_is_told_a_stiffness_refuses_it(arm):
+    config = dataclasses.replace(Scenario().joint_control, servo="ur_servoj")
+    with pytest.raises(DrakeTeleopError, match="choose computed_torque"):
+        servo_at_tool(arm, HOME, config)
