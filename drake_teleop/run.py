@@ -354,8 +354,8 @@ def _detection_figures(
 def _beyond(scenario: Scenario) -> str:
     """What of the surroundings the compiled contact law does not know, see `Contact`."""
     surroundings = scenario.surroundings
-    if surroundings is None or surroundings in (scenario.sheet_spring, scenario.slot):
-        return ""  # which it knows
+    if surroundings is None:
+        return ""
     builder = DiagramBuilder()
     return AddSlavePlant(builder, scenario.slave, surroundings).contact.beyond
 

@@ -143,7 +143,8 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
     progress(0.5)
     points = [("free motion", free, axis)]
     if scenario.leaf is not None:
-        pressed = linearize(linear, load_estimate=estimate, displacement=pressing(linear))
+        alone = replace(linear.without_environment(), sheet_spring=scenario.leaf)
+        pressed = linearize(alone, load_estimate=estimate, displacement=pressing(alone))
         points.append(("on the leaf", pressed, contact))
     progress(1.0)
 

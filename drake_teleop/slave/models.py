@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn, TypeAlias
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -40,6 +40,10 @@ from drake_teleop.texts import read_text, read_yaml
 _LOOP = re.compile(rb"<(drake:ball_constraint|drake:linear_bushing_rpy|connect|weld|distance)\b")
 # How what is said of lost meshes begins.
 _MISSING = "shapes are missing of"
+# What a file should be, and where its packages are looked for.
+_Said: TypeAlias = tuple[str, str]
+_ROBOT = ("robot", "with --package-path for package://")
+_SCENE = ("scene", "its package:// addresses in folders around it")
 
 
 @dataclass(frozen=True)
@@ -180,7 +184,7 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
     Raises:
         DrakeTeleopError: if the file cannot be read, or has what Drake would leave out.
     """
-    read = _read(plant, path, ())
+    read = _read(plant, path, (), _SCENE)
     missing = [text for text in read.assumptions if text.startswith(_MISSING)]
     if read.root is not None:
         missing += [f"{name} {what}" for name, what in _peculiar_joints(read.root).items()]
@@ -200,7 +204,9 @@ class _Read(NamedTuple):
     folder: TemporaryDirectory[str]
 
 
-def _read(plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...]) -> _Read:
+def _read(
+    plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], said: _Said = _ROBOT
+) -> _Read:
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path))
     packages = Packages(path, package_paths)
@@ -219,7 +225,7 @@ def _read(plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...]) ->
     elif kind == "xml":
         read_text(path)  # or names cannot be said
     _check_no_loop(path, kind)
-    with drakes_errors_said(path):
+    with drakes_errors_said(path, said):
         if root is None:
             with _drakes_errors_raised():
                 instances = parser.AddModels(str(path))
@@ -311,7 +317,7 @@ def _actuate(plant: MultibodyPlant, chain: list[JointIndex], efforts: dict[str, 
 
 
 @contextmanager
-def drakes_errors_said(path: Path) -> Iterator[None]:
+def drakes_errors_said(path: Path, said: _Said = _ROBOT) -> Iterator[None]:
     """Makes one error, with the file, of what Drake raises over a model: at parsing or later."""
     try:
         yield
@@ -321,9 +327,9 @@ def drakes_errors_said(path: Path) -> Iterator[None]:
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
         reason = str(error).replace("<literal-string>", "")
         raise DrakeTeleopError(
-            f"cannot be read as a robot ({reason.strip()})",
+            f"cannot be read as a {said[0]} ({reason.strip()})",
             where=str(path),
-            remedy="give a URDF, SDF, MJCF or .dmd.yaml model, with --package-path for package://",
+            remedy=f"give a URDF, SDF, MJCF or .dmd.yaml model, {said[1]}",
         ) from None
 
 
