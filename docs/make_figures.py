@@ -1,7 +1,7 @@
 """Draws the pictures of README and docs into docs/figures.
 
-The station, Fig. 8 as `reproduce` makes it and its scene in 3D, the sample log, and the noise of
-the wrist sensor.
+The station, Fig. 8 as `reproduce` makes it and its scene in 3D, the sample log, the frames of a log
+and the noise of the wrist sensor.
 
 Run it as `python docs/make_figures.py`. The scene is a picture of `replay.html` as Chromium shows
 it; without Chromium it stays as it is.
@@ -196,6 +196,55 @@ def _line(
     axes.annotate("", xy=stop, xytext=start, arrowprops=arrow, zorder=2)
 
 
+def frames_figure() -> Picture:
+    """World, sensor and posed frame of a log, and what a description says of them."""
+    with house_style():
+        figure = Picture(figsize=(6.4, 3.3), facecolor="white", layout="none")
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set(xlim=(0, 6.4), ylim=(0, 3.3), aspect="equal")
+        axes.axis("off")
+        world, sensor, posed, centre = ((0.6, 0.5), (3.0, 2.1), (5.2, 1.0), (3.9, 1.55))
+        for at, along, size, colour in (
+            ((2.45, 2.42), -20.0, (0.62, 0.46), GREY),  # wrist, sensor and load
+            ((2.8, 2.29), -20.0, (0.28, 0.46), ORANGE),
+            ((3.06, 2.19), -20.0, (1.75, 0.46), BLUE),
+        ):
+            turned = mpl.transforms.Affine2D().rotate_deg_around(*at, along)
+            place = (at[0], at[1] - size[1])
+            box = FancyBboxPatch(
+                place, *size, boxstyle="round,pad=0,rounding_size=0.05", fc=colour, ec=BLACK
+            )
+            box.set(alpha=0.25, transform=turned + axes.transData)
+            axes.add_patch(box)
+        for origin, name, z, x in (
+            (world, "W", 90.0, 0.0),
+            (sensor, "S", -20.0, 70.0),
+            (posed, "P", 25.0, 115.0),
+        ):
+            for degrees, label in ((z, "z"), (x, "x")):
+                way = np.radians(degrees)
+                tip = np.array(origin) + 0.55 * np.array([np.cos(way), np.sin(way)])
+                _pointer(axes, origin, tip, BLACK)
+                axes.text(*(tip + 0.16 * (tip - origin)), label, ha="center", va="center")
+            axes.text(origin[0] - 0.2, origin[1] - 0.2, name, weight="bold", ha="center")
+        _pointer(axes, sensor, posed, VERMILION)
+        axes.text(4.1, 2.1, "position_in_sensor", color=VERMILION)
+        _pointer(axes, world, posed, GREEN)
+        axes.text(2.2, 0.45, "position, orientation: as recorded", color=GREEN)
+        axes.plot(*centre, "o", color=BLUE)
+        axes.text(centre[0] - 0.1, centre[1] - 0.4, "centre of mass", color=BLUE, ha="right")
+        _pointer(axes, (0.6, 2.9), (0.6, 2.2), GREY)
+        axes.text(0.72, 2.5, "gravity", color=GREY)
+        axes.text(5.2, 0.7, "TCP, flange,\ntracked body", va="top")
+        axes.text(2.55, 2.85, "sensor", color=ORANGE)
+    return figure
+
+
+def _pointer(axes: Axes, start: object, end: object, colour: str) -> None:
+    arrow = {"arrowstyle": "-|>", "color": colour, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", end, start, arrowprops=arrow)
+
+
 def noise_figure() -> Picture:
     """Spectrum and Allan deviation of fx at rest: predicted (lines), simulated for 5 min (dots)."""
     period, count = 125e-6, 300 * 8000
@@ -285,6 +334,7 @@ def main() -> None:
     # Without date and random ids, so that the same script draws the same file.
     with mpl.rc_context({"svg.hashsalt": "drake_teleop"}):
         station_figure().savefig(FIGURES / "station.svg", metadata={"Date": None})
+        frames_figure().savefig(FIGURES / "frames.svg", metadata={"Date": None})
         noise_figure().savefig(FIGURES / "sensor_noise.svg", metadata={"Date": None})
     with tempfile.TemporaryDirectory() as folder:
         log_figure(Path(folder) / "sample").savefig(FIGURES / "log.png")
