@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydrake.common.yaml import yaml_load
 from pydrake.geometry import Meshcat, MeshcatParams
-from pydrake.math import RollPitchYaw
+from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.analysis.linearization import linearize
@@ -22,6 +22,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import true_load
 from drake_teleop.operator.operator import MinimumJerk
 from drake_teleop.replay import ReplayScene
+from drake_teleop.resources import models_dir
 from drake_teleop.run import ScenarioRun, summarise
 from drake_teleop.scenario import LoadScenario, Scenario, ScenarioFromData, replace
 from drake_teleop.simulation import MakeSimulator, simulate
@@ -146,15 +147,24 @@ def test_a_block_that_is_pushed_over_its_table_resists_by_friction():
     assert "block can move" in summary["contact_by"]
 
 
-def test_the_film_shows_what_moved_where_it_was():
+def test_the_film_shows_what_moved_where_it_was(tmp_path):
     """A block that is turned, and a door that is open, from their poses alone."""
-    door = Scene(position=[0.4, 0.3, 0.1], rotation=[0.0, 0.0, 0.7])
+    hinge = '<joint name="hinge" type="revolute">'
+    text = (models_dir() / "door.sdf").read_text()
+    aside = f"{hinge}<pose>0.01 0.02 0.03 0 0 0.4</pose>"  # its frames are not those of its bodies
+    (tmp_path / "door.sdf").write_text(text.replace(hinge, aside))
+    file = str(tmp_path / "door.sdf")
+    door = Scene(file=file, position=[0.4, 0.3, 0.1], rotation=[0.0, 0.0, 0.7])
     scenario = replace(Scenario(), environment=[Block(), door])
     turned = RollPitchYaw(0.1, -0.2, 0.5).ToQuaternion().wxyz()
     opened = RollPitchYaw(0.0, 0.0, 0.7 + 0.6).ToQuaternion().wxyz()
+    # The hinge stays where it is.
+    p_DoorHinge = np.array([0.01, 0.02, 0.03])
+    closed, open_ = (RotationMatrix(RollPitchYaw(0.0, 0.0, yaw)) for yaw in (0.7, 1.3))
+    place = np.array([0.4, 0.3, 0.1]) + closed @ p_DoorHinge - open_ @ p_DoorHinge
     poses = {
         "pose_of_block": np.array([[*turned, 0.7, 0.1, 0.3]]),
-        "pose_of_door": np.array([[*opened, 0.4, 0.3, 0.1]]),
+        "pose_of_door": np.array([[*opened, *place]]),
     }
     still = {
         "slave_state": np.zeros((1, 12)),
