@@ -113,7 +113,7 @@ class Film:
         write_text(path, self._with_player(page))
 
     def _recorded(self, make_scene: Callable[[Meshcat], Show]) -> str:
-        with _quiet_drake():  # nobody is to connect to its server
+        with quiet_drake():  # nobody is to connect to its server
             meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
         show = make_scene(meshcat)
         interval = self._span / (len(self.times) - 1)
@@ -209,7 +209,8 @@ class Arrow:
 
 
 @contextmanager
-def _quiet_drake() -> Iterator[None]:
+def quiet_drake() -> Iterator[None]:
+    """Drake's notes, such as where Meshcat listens, are not printed meanwhile."""
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)

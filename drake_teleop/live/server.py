@@ -30,6 +30,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.film import quiet_drake
 from drake_teleop.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.live import Live, Show
 from drake_teleop.live.messages import LONGEST
@@ -96,7 +97,8 @@ class LiveDrive:
             self._ready.set()
 
     def _make(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> Live:
-        meshcat = Meshcat(MeshcatParams(host="localhost"))
+        with quiet_drake():
+            meshcat = Meshcat(MeshcatParams(host="localhost"))
         self._scene_url = meshcat.ws_url()
         return Live(scenario, load, record, show_in(meshcat, scenario), time.perf_counter())
 
@@ -113,6 +115,7 @@ class LiveDrive:
                 compression=None,
                 ping_interval=5,
                 ping_timeout=5,
+                close_timeout=1,
             )
         except OSError as error:
             what = f"cannot be listened to ({error.strerror})"
