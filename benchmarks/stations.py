@@ -29,7 +29,8 @@ from inverse_kinematics import described
 from station import against_the_port, fastest
 
 from drake_teleop.identification import slave_arm
-from drake_teleop.master.data_sheets import FIGURES, PHANTOM, Master
+from drake_teleop.master.data_sheets import FIGURES, LEADER, PHANTOM, Master
+from drake_teleop.master.leader_model import Leader
 from drake_teleop.operator.operator import Sine
 from drake_teleop.reproduction.speed import MakeBarePlant, MakeMovingStation
 from drake_teleop.resources import models_dir
@@ -48,6 +49,13 @@ _SCENARIOS = {
     "moving block": "push_block",
 }
 _REACH = 0.1  # m, how far the scenarios' intents lead from their start
+_LEADERS = 0.15  # m, the size of what the leader reaches around its home
+_LEADER = Leader(
+    file=str(models_dir() / "leader_arm.urdf"),
+    hand_frame="hand",
+    home=[0.0, -0.6, 1.9, 0.0, 0.5, 0.0],
+    friction=[0.01],
+)
 
 #: Besides the RX90 and its copy on a rail: file, and what else it takes.
 _PEG = Tool(mass=1.5, com=[0.01, 0.0, 0.06], shapes=[Ball(0.012, [0.0, 0.0, 0.188])])
@@ -74,7 +82,7 @@ _RAIL = """<link name="foot"><inertial><mass>30</mass>
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--arms", default=",".join(ARMS))
-    parser.add_argument("--devices", default=",".join((PHANTOM, *FIGURES)))
+    parser.add_argument("--devices", default=",".join((PHANTOM, *FIGURES, LEADER)))
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument(
         "--models", type=Path, default=described(), help="example-robot-data/robots"
@@ -115,7 +123,8 @@ def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario
     for what, name in _SCENARIOS.items():
         scenario, share = LoadScenario(name), 1.0
         if device != PHANTOM:
-            share = min(1.0, 0.5 * min(FIGURES[device].size) / _REACH)
+            size = _LEADERS if device == LEADER else min(FIGURES[device].size)
+            share = min(1.0, 0.5 * size / _REACH)
         intent = [
             dataclasses.replace(move, translation=[own * share * x for x in move.translation])
             for move in scenario.operator.intent
@@ -132,7 +141,7 @@ def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario
             scenario,
             slave=slave,
             environment=blocks,
-            master=Master(model=device),
+            master=Master(model=device, leader=_LEADER if device == LEADER else None),
             operator__intent=intent,
             kinematic_scaling__translation_scale=1 / share,
         )

@@ -12,9 +12,9 @@ writes, or the YAML file of the log's own name, as in the folder `logs` of `repr
 from __future__ import annotations
 
 import os
-from collections.abc import Container, Mapping
+from collections.abc import Callable, Container, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +23,13 @@ from pydrake.geometry import Box, Meshcat, MeshcatVisualizer, Rgba
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
+from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.film import Arrow, Film, Reading, Show, frame_times, plain_room
 from drake_teleop.master.data_sheets import PHANTOM
+from drake_teleop.master.leader_model import Leader
 from drake_teleop.master.phantom import serial_joint_angles
 from drake_teleop.pages.style import BLUE, VERMILION, contact_spans
 from drake_teleop.resources import models_dir
@@ -223,7 +224,6 @@ class ReplayScene:
         if scenario.surroundings is not None:
             touched = AddEnvironment(self.plant, scenario.surroundings)
         self._sheet = touched.sheet
-        self._is_phantom = scenario.master.model == PHANTOM
         self._master = None
         if "master_state" in recorded:
             self._master = _add_master(self.plant, scenario)
@@ -252,10 +252,9 @@ class ReplayScene:
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
         if self._master is not None:
-            master = signals["master_state"][sample, :6]
-            if self._is_phantom:
-                master = serial_joint_angles(master)
-            plant.SetPositions(context, self._master, master)
+            state = signals["master_state"][sample]
+            q = self._master.positions(state[: len(state) // 2])
+            plant.SetPositions(context, self._master.instance, q)
         if self._sheet is not None:
             plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
         for name, body in self._moving.items():
@@ -297,17 +296,51 @@ class ReplayScene:
             "tip": X_WS @ self._tip + _BESIDE_TIP_W,
         }
         if self._master is not None:
-            stylus = self.plant.GetFrameByName("stylus", self._master)
-            places["stylus"] = stylus.CalcPoseInWorld(self.context) @ _GRIP_E
+            places["stylus"] = self._master.hand.CalcPoseInWorld(self.context) @ self._master.grip
         return places
 
 
-def _add_master(plant: MultibodyPlant, scenario: Scenario) -> ModelInstanceIndex:
-    name = "phantom" if scenario.master.model == PHANTOM else "grip"
+class _Device(NamedTuple):
+    """The haptic device in the plant.
+
+    Attributes:
+        instance: of its joints.
+        hand: its frame in the hand.
+        grip: (3,) where in that the hand is [m].
+        positions: of its joints in the plant, from those of its state.
+        folder: of converted meshes, to be kept as long as shapes are looked at.
+    """
+
+    instance: ModelInstanceIndex
+    hand: Frame
+    grip: Array
+    positions: Callable[[Array], Array]
+    folder: object = None
+
+
+def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _Device:
+    if scenario.master.leader is not None:
+        return _add_leader(plant, scenario.master.leader)
+    is_phantom = scenario.master.model == PHANTOM
+    name = "phantom" if is_phantom else "grip"
     (master,) = Parser(plant, "master").AddModels(str(models_dir() / f"{name}.sdf"))
     base = plant.GetFrameByName("base", master)
     plant.WeldFrames(plant.world_frame(), base, RigidTransform(_P_WB))
-    return master
+    positions = serial_joint_angles if is_phantom else np.copy
+    return _Device(master, plant.GetFrameByName("stylus", master), _GRIP_E, positions)
+
+
+def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
+    """The leader, whose base stands on the table here, wherever B is."""
+    order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
+    parsed = leader.parse(plant, RigidTransform([*_P_WB[:2], _TABLE_TOP]))
+
+    def positions(q: Array) -> Array:
+        ordered = np.empty(len(q))
+        ordered[order] = q
+        return ordered
+
+    return _Device(parsed.instance, parsed.sensor_frame, np.zeros(3), positions, parsed.folder)
 
 
 def _furnish(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
