@@ -326,6 +326,91 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
 
 
 @cli.command()
+@click.argument("source")
+@click.option(
+    "--load", type=option.PATH, required=True, help="The identification.json of the load."
+)
+@click.option("--out", "sink", default="-", metavar="SINK", help="Where to.  [default: stdout]")
+@click.option(
+    "--sigma",
+    type=option.Number(0, 100),
+    default=0.0,
+    show_default=True,
+    help="Scale of the non-contact wrench.",
+)
+@click.option(
+    "--gamma",
+    type=option.Number(0, 100),
+    default=1.0,
+    show_default=True,
+    help="Scale of the contact wrench.",
+)
+@click.option(
+    "--rate",
+    type=option.Number(0, 1e5, min_open=True),
+    metavar="HZ",
+    help="Of the readings; a log tells its own.",
+)
+@click.option(
+    "--range",
+    "largest",
+    type=option.Number(0, 1e5, min_open=True),
+    nargs=2,
+    metavar="N NM",
+    help="Of the sensor: at its ends there is no wrench, and none that goes out is above it.",
+)
+@click.option("--predicted", is_flag=True, help="Extrapolate over the low-pass's lag.")
+@click.option("--tare", is_flag=True, help="Set the offsets at the start, untouched and at rest.")
+@click.option(
+    "--control",
+    type=option.Whole(1, 65535),
+    metavar="PORT",
+    help="Of 127.0.0.1, for the word `tare` by UDP.",
+)
+@click.option("--real-time", is_flag=True, help="Replay a log in its own time.")
+@option.cutoff
+@option.delay
+def compensate(
+    source: str,
+    load: Path,
+    sink: str,
+    sigma: float,
+    gamma: float,
+    rate: float | None,
+    largest: tuple[float, float] | None,
+    predicted: bool,
+    tare: bool,
+    control: int | None,
+    real_time: bool,
+    cutoff_hz: float,
+    delay: float | str,
+) -> None:
+    """Take the load out of a live wrench.
+
+    SOURCE is udp://[HOST]:PORT, - for lines of JSON on stdin, or replay:LOG; SINK is udp://HOST:PORT,
+    - for stdout, or a .csv or .parquet file. What cannot be trusted is zero, with a flag. The low-
+    pass is causal here; --delay is for logs. Until the source ends, or Ctrl-C.
+    """
+    from drake_teleop.robots.compensate import compensate_command
+
+    compensate_command(
+        source,
+        load,
+        sink,
+        sigma=sigma,
+        gamma=gamma,
+        rate_hz=rate,
+        largest=largest,
+        predicted=predicted,
+        tare=tare,
+        control=control,
+        real_time=real_time,
+        cutoff_hz=cutoff_hz,
+        delay=delay,
+    )
+
+
+@cli.command()
 @click.argument("identification", type=option.PATH)
 @click.option(
     "--to",

@@ -56,6 +56,8 @@ LISTENING = {
     ("live/server.py", "asyncio"),
     ("live/server.py", "socket"),
     ("live/server.py", "serve("),
+    # On this machine, unless the user names another address: tests/robots/test_udp.py.
+    ("robots/udp.py", "socket"),
 }
 """All that can listen; tests look at the sockets of both."""
 WRITES = re.compile(

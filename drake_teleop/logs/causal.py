@@ -67,13 +67,27 @@ def causal_low_pass(
                 remedy="give a cut-off below half the rate of the log, or causal mode `delayed`",
             )
         return x
+    from scipy.signal import lfilter
+
+    b, a, settled = low_pass_coefficients(dt, cutoff_hz, ahead_s)
+    at_first = settled.reshape(2, *[1] * (x.ndim - 1)) * x[:1]
+    return lfilter(b, a, x, axis=0, zi=at_first)[0]
+
+
+def low_pass_coefficients(
+    dt: float, cutoff_hz: float, ahead_s: float = 0.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Of `causal_low_pass`: b (3,), a (3,) and the memory (2,) that is settled at 1.
+
+    Args:
+        dt, cutoff_hz, ahead_s: see there; the cut-off is below the Nyquist rate.
+    """
     # SciPy's filters take longer to import than all the rest of the command.
-    from scipy.signal import bilinear, lfilter, lfilter_zi
+    from scipy.signal import bilinear, lfilter_zi
 
     w = _prewarped(cutoff_hz, dt)
     b, a = bilinear([ahead_s * w * w, w * w], [1.0, math.sqrt(2.0) * w, w * w], 1.0 / dt)
-    settled = lfilter_zi(b, a).reshape(2, *[1] * (x.ndim - 1)) * x[:1]
-    return lfilter(b, a, x, axis=0, zi=settled)[0]
+    return b, a, lfilter_zi(b, a)
 
 
 def filter_lag(dt: float, cutoff_hz: float | None) -> float:

@@ -1,0 +1,197 @@
+"""`drake-teleop compensate`: from a source through the compensator to a sink, in one loop."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array
+from drake_teleop.load.identification import Identification
+from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
+from drake_teleop.robots.lines import LineSink, LineSource, names_of
+from drake_teleop.robots.replay_log import LogSource
+from drake_teleop.robots.streams import Compensated, Sink, Source
+from drake_teleop.robots.table import TableSink
+from drake_teleop.robots.udp import THIS_MACHINE, UdpSink, UdpSource, listening
+
+_REPLAY = "replay:"
+_IDLE_S = 0.01  # between wrenches of zero while nothing comes
+
+
+class Control:
+    """A UDP port of this machine that takes the word `tare`, and answers."""
+
+    def __init__(self, port: int) -> None:
+        self._socket = listening(THIS_MACHINE, port)
+        self._socket.setblocking(False)
+        self.port = self._socket.getsockname()[1]
+
+    def answer(self, tare: Callable[[], str]) -> None:
+        """Answers what has been asked."""
+        try:
+            words, asker = self._socket.recvfrom(64)
+            known = words.strip() == b"tare"
+            self._socket.sendto((tare() if known else "unknown: say tare").encode(), asker)
+        except OSError:  # nothing was asked, or nobody waits for the answer
+            pass
+
+    def close(self) -> None:
+        """Ends it."""
+        self._socket.close()
+
+
+def source_of(
+    address: str,
+    load: Identification,
+    *,
+    rate_hz: float | None = None,
+    cutoff_hz: float | None = 30.0,
+    delay: str | float = "auto",
+    real_time: bool = False,
+) -> Source:
+    """The source at an address: udp://[HOST]:PORT, - for stdin, or replay:LOG.
+
+    Raises:
+        DrakeTeleopError: for another address, a live source without a rate, or as the source does.
+    """
+    if address.startswith(_REPLAY):
+        path = address.removeprefix(_REPLAY)
+        options = {"cutoff_hz": cutoff_hz, "delay": delay, "real_time": real_time}
+        return LogSource(path, load, **options)  # type: ignore[arg-type]
+    if address != "-" and not address.startswith("udp://"):
+        raise DrakeTeleopError(
+            "is no source", where=address, remedy="udp://:PORT, - for stdin, or replay:LOG"
+        )
+    if rate_hz is None:
+        raise DrakeTeleopError(
+            "the low-pass needs the rate of the readings", where=address, remedy="give --rate HZ"
+        )
+    if address == "-":
+        return LineSource(sys.stdin.fileno(), 1.0 / rate_hz)
+    return UdpSource(address, 1.0 / rate_hz)
+
+
+def sink_of(address: str) -> Sink:
+    """The sink at an address: udp://HOST:PORT, - for stdout, or a .csv or .parquet file.
+
+    Raises:
+        DrakeTeleopError: for another address.
+    """
+    if address == "-":
+        return LineSink(sys.stdout)
+    if address.startswith("udp://"):
+        return UdpSink(address)
+    if Path(address).suffix not in (".csv", ".parquet"):
+        raise DrakeTeleopError(
+            "is no sink", where=address, remedy="udp://HOST:PORT, -, or a .csv or .parquet file"
+        )
+    return TableSink(Path(address))
+
+
+def run(
+    source: Source,
+    compensator: Compensator,
+    sink: Sink,
+    *,
+    control: Control | None = None,
+    tare: bool = False,
+    say: Callable[[str], None] = lambda _: None,
+) -> Counter[str]:
+    """Compensates until the source ends.
+
+    Args:
+        control: answers requests to tare.
+        tare: also once, as soon as there is `TARE_S` of good readings, whatever comes of it.
+        say: takes what is to be known: a tare, and each kind of fault when it first comes.
+
+    Returns:
+        how many wrenches there were, under "wrenches", and how many with each flag.
+    """
+    counts: Counter[str] = Counter(wrenches=0)
+    tare_at = np.inf if not tare else round(TARE_S / source.dt)
+
+    def put(out: Compensated) -> None:
+        sink.write(out)
+        counts["wrenches"] += 1
+        for name in names_of(out.flags) if out.flags else ():
+            if counts[name] == 0:
+                say(f"t = {out.t:.3f} s: {name}")
+            counts[name] += 1
+
+    while (readings := source.read(_IDLE_S)) is not None:
+        if source.live and (stale := compensator.idle(time.monotonic())) and not readings:
+            put(stale)
+        for reading in readings:
+            put(compensator.step(reading, time.monotonic() if source.live else reading.t))
+            if compensator.rested >= tare_at:
+                tare_at = np.inf
+                say(f"tare {compensator.tare()}")
+        if control is not None:
+            control.answer(compensator.tare)
+    return counts
+
+
+def compensate_command(
+    source: str,
+    load: Path,
+    sink: str,
+    *,
+    sigma: float = 0.0,
+    gamma: float = 1.0,
+    rate_hz: float | None = None,
+    largest: tuple[float, float] | None = None,
+    predicted: bool = False,
+    tare: bool = False,
+    control: int | None = None,
+    real_time: bool = False,
+    cutoff_hz: float | None = 30.0,
+    delay: str | float = "auto",
+) -> None:
+    """The command `compensate`; what there is to know goes to stderr.
+
+    Args:
+        source, sink, rate_hz, real_time, delay: see `source_of` and `sink_of`.
+        load: identification.json.
+        sigma, gamma, cutoff_hz, predicted: see `Compensator`.
+        largest: the sensor's range [N], [N m].
+        tare: at the start.
+        control: port of `Control`.
+
+    Raises:
+        DrakeTeleopError: if one of them cannot be used.
+    """
+    found = Identification.load(load)
+    options = {"rate_hz": rate_hz, "cutoff_hz": cutoff_hz, "delay": delay, "real_time": real_time}
+    readings = source_of(source, found, **options)  # type: ignore[arg-type]
+    limits: Array | None = None if largest is None else np.repeat(largest, 3)
+    compensator = Compensator(
+        found,
+        readings.dt,
+        sigma=sigma,
+        gamma=gamma,
+        cutoff_hz=cutoff_hz,
+        wait=getattr(readings, "wait", 0),
+        predicted=predicted,
+        largest=limits,
+    )
+    wrenches = sink_of(sink)
+    asked = None if control is None else Control(control)
+
+    def say(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    say(f"late by {1e3 * (0.0 if predicted else compensator.lag_s):.1f} ms")
+    say(f"stale after {1e3 * STALE_S:.0f} ms; what cannot be trusted is zero")
+    try:
+        counts = run(readings, compensator, wrenches, control=asked, tare=tare, say=say)
+        say(", ".join(f"{name} {count}" for name, count in counts.items()))
+    finally:
+        for each in (readings, wrenches, asked):
+            if each is not None:
+                each.close()

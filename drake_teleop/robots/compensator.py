@@ -1,0 +1,231 @@
+"""The wrench without the tool, sample by sample, and nothing where it cannot be trusted.
+
+A good reading goes through the kernels of `eliminate --causal`, in their order: elimination, low-
+pass, the wait for a motion that comes later; the result is the same to the last bit. Whatever is
+wrong with a reading makes the wrench zero, with a flag that says what; never the last value. The
+next good one is compensated again. After a fault that lasted `STALE_S`, a restart or a clock that
+was set, the low-pass starts anew, settled, as at the very first.
+
+**Clocks.** The source's time t and ours are related by the least now - t so far, which fades by
+`DRIFT`, so that it follows clocks that drift apart. What a reading is later than that is its age;
+what is late for `JUMP_S` is a clock that was set.
+
+**Tare.** The offsets are set to what the last `TARE_S` seconds say, if S rests, the wrench does not
+waver and the offsets are not further off than sensors drift (`tare_limit`): a push is no offset.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.load.compensation import scaled_wrench_into
+from drake_teleop.load.identification import Identification
+from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
+from drake_teleop.logs.processing import usable_phi
+from drake_teleop.robots.streams import ONLY_SAID, VALUES, Compensated, Flag, Reading
+
+STALE_S = 0.05
+"""Age above which there is no wrench [s]."""
+JUMP_S = 1.0
+"""Steps of a clock, against the other, that are no lateness [s]."""
+DRIFT = 1e-3
+"""How fast clocks may drift apart [s/s]."""
+RATE_OFF = 0.05
+"""Share by which the rate may be another, over `_RATE_OF` readings."""
+TARE_S = 0.5
+"""How long it has to rest before a tare [s]."""
+_RATE_OF = 200
+_LARGEST = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
+# At rest, rms: specific force [m/s^2], angular velocity [rad/s]; noise of the wrench, as a multiple
+# of what the identification left, and at least [N, N m].
+_MOVED, _TURNING = 0.1, 0.02
+_WAVERS, _WAVERS_LEAST = 4.0, np.repeat([0.1, 0.005], 3)
+
+
+class Compensator:
+    """From readings to wrenches (module docstring).
+
+    Args:
+        load: what is eliminated.
+        dt: between readings [s].
+        sigma, gamma: scales of the load's wrench and of the contact in what is called scaled.
+        cutoff_hz: of the low-pass; None for none.
+        wait: readings that a motion comes behind the wrench, already brought together by the
+            source; what comes out is late by as many.
+        predicted: extrapolate over wait and low-pass.
+        largest: (6,) the sensor's range [N, N m].
+        tare_limit: how far offsets may drift [N], [N m].
+
+    Attributes:
+        offsets: (6,) of the sensor [N, N m].
+        lag_s: by how much a slow contact comes late, or would without the prediction [s].
+        rested: good readings in a row.
+    """
+
+    def __init__(
+        self,
+        load: Identification,
+        dt: float,
+        *,
+        sigma: float = 0.0,
+        gamma: float = 1.0,
+        cutoff_hz: float | None = 30.0,
+        wait: int = 0,
+        predicted: bool = False,
+        largest: Array | None = None,
+        tare_limit: tuple[float, float] = (5.0, 0.25),
+    ) -> None:
+        self._phi, self._nothing = usable_phi(load)[0], np.zeros(10)
+        self._scales, self._dt = (float(sigma), float(sigma), float(gamma)), dt
+        self.offsets = load.offsets.copy()
+        self.lag_s = wait * dt + filter_lag(dt, cutoff_hz)
+        self._filter = None
+        if cutoff_hz is not None and cutoff_hz < 0.5 / dt:
+            self._filter = low_pass_coefficients(dt, cutoff_hz, self.lag_s if predicted else 0.0)
+        self._range = np.full(6, np.inf) if largest is None else np.asarray(largest, float)
+        self._largest = np.concatenate([np.minimum(_LARGEST[:6], 2.0 * self._range), _LARGEST[6:]])
+        self._wavers = np.maximum(_WAVERS * load.residual_rms, _WAVERS_LEAST)
+        self._tare_limit = np.repeat(tare_limit, 3)
+        self._memory: tuple[Array, Array] | None = None
+        self._late: deque[Array] = deque(maxlen=wait + 1)
+        self._number, self._t, self._now = -1, 0.0, -math.inf
+        self._offset = math.inf  # the least now - t
+        self._in_time = -math.inf  # when the last one came that was not late
+        self._since, self._first, self._readings, self._rate_off = 0.0, 0, 0, 0
+        self._rest = np.zeros((max(2, round(TARE_S / dt)), VALUES + 6))
+        self.rested = 0
+
+    def step(self, reading: Reading, now: float) -> Compensated:
+        """Takes a reading that came at `now` [s], of a clock that never goes back."""
+        flags = self._judge(reading, now)
+        wrong = flags & ~ONLY_SAID
+        if wrong & ~(Flag.GAP):
+            return self._zero(flags)
+        if now - self._now > STALE_S:
+            self._settle_anew()
+        self._now, self._number, self._t = now, reading.number, reading.t
+        wrench = self._filtered(self._eliminated(reading.values))
+        if wrong:
+            return self._zero(flags)
+        return self._limited(reading, wrench, flags)
+
+    def idle(self, now: float) -> Compensated | None:
+        """What to say when nothing comes: nothing at first, then that it is stale."""
+        if now - self._now <= STALE_S:
+            return None
+        return self._zero(Flag.STALE)
+
+    def tare(self) -> str:
+        """Sets the offsets; what it did, or why it did not: "refused: ..."."""
+        if self.rested < len(self._rest):
+            return f"refused: there are not {TARE_S:g} s of good readings yet"
+        spread = self._rest.std(axis=0)
+        turning = float(np.abs(self._rest[:, 9:12]).mean(axis=0).max())
+        if spread[6:9].max() > _MOVED or turning > _TURNING:
+            return "refused: it moves"
+        if (spread[VALUES:] > self._wavers).any():
+            return "refused: the wrench wavers, as in contact"
+        step = self._rest[:, VALUES:].mean(axis=0)
+        if (np.abs(step) > self._tare_limit).any():
+            force, torque = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
+            return (
+                f"refused: {force:.3g} N and {torque:.3g} N m are more than offsets drift:"
+                " something is touched, or it is another load"
+            )
+        self.offsets = self.offsets + step
+        self.rested = 0
+        return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
+
+    def _judge(self, reading: Reading, now: float) -> int:
+        """The reading's flags; keeps the clocks."""
+        if reading.flags & Flag.DAMAGED:
+            return int(Flag.DAMAGED)
+        values, flags = reading.values, reading.flags
+        if not (math.isfinite(reading.t) and np.isfinite(values).all()):
+            return flags | Flag.NOT_FINITE
+        size = np.abs(values)
+        if (size > self._largest).any() or abs(reading.t) > 1e12:
+            return flags | Flag.OUT_OF_RANGE
+        if (size[:6] >= self._range).any():
+            flags |= Flag.SATURATED
+        ahead = now - reading.t
+        known = not math.isinf(self._offset)
+        step = reading.t - self._t
+        if known and reading.number <= self._number and abs(step) > JUMP_S:
+            return self._anew(reading, ahead, flags | Flag.RESTART)
+        if known and abs(ahead - self._offset) > JUMP_S:
+            return self._anew(reading, ahead, flags | Flag.CLOCK_JUMP)
+        if known and step <= 0.0:
+            return flags | Flag.REORDERED
+        if known and reading.number <= self._number:
+            return self._anew(reading, ahead, flags | Flag.RESTART)
+        self._offset = min(ahead, self._offset + (DRIFT * self._dt if known else 0.0))
+        if ahead - self._offset <= STALE_S:
+            self._in_time = now
+        elif now - self._in_time > JUMP_S:
+            return self._anew(reading, ahead, flags | Flag.CLOCK_JUMP)
+        else:
+            flags |= Flag.STALE
+        return flags | self._rate(reading)
+
+    def _anew(self, reading: Reading, ahead: float, flags: int) -> int:
+        """Believes the clock from here on."""
+        self._offset, self._number, self._t = ahead, reading.number, reading.t
+        self._readings, self.rested, self._in_time = 0, 0, reading.t + ahead
+        self._settle_anew()
+        return flags
+
+    def _settle_anew(self) -> None:
+        self._memory = None
+        self._late.clear()
+
+    def _rate(self, reading: Reading) -> int:
+        """Whether the rate is the stated one, over a while."""
+        if self._readings == 0:
+            self._since, self._first = reading.t, reading.number
+        self._readings += 1
+        if self._readings > _RATE_OF:
+            spacing = (reading.t - self._since) / max(1, reading.number - self._first)
+            off = abs(spacing / self._dt - 1.0) > RATE_OFF
+            self._rate_off, self._readings = int(Flag.WRONG_RATE) if off else 0, 0
+        return self._rate_off
+
+    def _eliminated(self, values: Array) -> Array:
+        """(12,) contact and scaled."""
+        out = np.empty((2, 6))
+        wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:15]
+        motion = wrench, self.offsets, s, omega, alpha
+        scaled_wrench_into(*motion, self._phi, self._nothing, 0.0, 0.0, 1.0, out[0])
+        scaled_wrench_into(*motion, self._nothing, self._phi, *self._scales, out[1])
+        row = self._rest[self.rested % len(self._rest)]
+        row[:VALUES], row[VALUES:] = values, out[0]
+        self.rested += 1
+        return out.ravel()
+
+    def _filtered(self, x: Array) -> Array:
+        """The low-pass, in the order of operations of `scipy.signal.lfilter`; then the wait."""
+        if self._filter is not None:
+            b, a, settled = self._filter
+            if self._memory is None:
+                self._memory = settled[0] * x, settled[1] * x
+            z0, z1 = self._memory
+            y = z0 + b[0] * x
+            self._memory = z1 + x * b[1] - y * a[1], x * b[2] - y * a[2]
+            x = y
+        self._late.append(x)
+        return self._late[0]
+
+    def _limited(self, reading: Reading, wrench: Array, flags: int) -> Compensated:
+        contact, scaled = wrench[:6], wrench[6:]
+        if (np.abs(wrench).reshape(2, 6) > self._range).any():
+            flags |= Flag.CLIPPED
+            contact, scaled = (np.clip(x, -self._range, self._range) for x in (contact, scaled))
+        return Compensated(reading.number, reading.t, contact, scaled, int(flags))
+
+    def _zero(self, flags: int) -> Compensated:
+        self.rested = 0
+        return Compensated(max(0, self._number), self._t, np.zeros(6), np.zeros(6), int(flags))

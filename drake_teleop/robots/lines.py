@@ -1,0 +1,102 @@
+"""Readings and wrenches as lines of JSON, one object each.
+
+In: t [s], wrench (6), s, omega, alpha (3 each); number and saturated may be left out. Out: number,
+t, contact and scaled (6 each), and flags as a list of names.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+from typing import Any, TextIO
+
+import numpy as np
+
+from drake_teleop.robots.streams import DAMAGED, VALUES, Compensated, Flag, Reading
+
+_LONGEST = 4096  # bytes of a line
+_BLOCK = 65536
+
+
+def read_line(line: bytes, number: int) -> Reading:
+    """The reading in a line, `DAMAGED` if it is none. It never raises.
+
+    Args:
+        line: without its end.
+        number: of the reading, if the line has none.
+    """
+    if len(line) > _LONGEST:
+        return DAMAGED
+    try:
+        data = json.loads(line)
+        parts = [np.array(data[name], float) for name in ("wrench", "s", "omega", "alpha")]
+        values = np.concatenate(parts)
+        t, number = float(data["t"]), int(data.get("number", number))
+        flags = int(Flag.SATURATED) if data.get("saturated") else 0
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+        return DAMAGED
+    good = values.shape == (VALUES,) and [len(part) for part in parts] == [6, 3, 3, 3]
+    return Reading(number, t, values, flags) if good and number >= 0 else DAMAGED
+
+
+def written_line(out: Compensated) -> str:
+    """The line of a wrench, without its end."""
+    data: dict[str, Any] = {
+        "number": out.number,
+        "t": out.t,
+        "contact": out.contact.tolist(),
+        "scaled": out.scaled.tolist(),
+        "flags": names_of(out.flags),
+    }
+    return json.dumps(data)
+
+
+def names_of(flags: int) -> list[str]:
+    """What the bits say, as in "out of range"."""
+    return [str(flag.name).lower().replace("_", " ") for flag in Flag if flag & flags]
+
+
+class LineSource:
+    """Readings from a file that is being written, such as standard input."""
+
+    live = True
+
+    def __init__(self, file: int, dt: float) -> None:
+        self.dt, self._file, self._rest, self._number, self._over = dt, file, b"", 0, False
+
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        """See `Source`."""
+        if self._over:
+            return None
+        if not select.select([self._file], [], [], timeout_s)[0]:
+            return []
+        block = os.read(self._file, _BLOCK)
+        self._over = not block
+        *lines, self._rest = (self._rest + block).split(b"\n")
+        if len(self._rest) > _LONGEST:
+            lines, self._rest = [*lines, self._rest], b""
+        found = []
+        for line in lines:
+            if line.strip():
+                found.append(read_line(line, self._number))
+                self._number += 1
+        return found
+
+    def close(self) -> None:
+        """See `Source`."""
+
+
+class LineSink:
+    """Wrenches into a text file, such as standard output, at once."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, out: Compensated) -> None:
+        """See `Sink`."""
+        self._file.write(written_line(out) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """See `Sink`."""

@@ -1,0 +1,85 @@
+"""A log as a source: what a loop would have been given of it.
+
+Wrench and motion are brought together as `eliminate` does, with the delay that it estimates; the
+loop waits for the motion, and is late by that. Motion that a log tells by poses alone was
+differentiated with a look ahead, see `drake_teleop.logs.causal`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.identification import Identification
+from drake_teleop.logs.processing import usable_phi
+from drake_teleop.logs.read.alignment import measured, undelayed
+from drake_teleop.logs.read.delay import delay_of
+from drake_teleop.logs.read.reading import read_log
+from drake_teleop.robots.streams import Flag, Reading
+
+
+class LogSource:
+    """Readings of a log.
+
+    Args:
+        path: canonical table or log description.
+        load: whose wrench tells the delay.
+        cutoff_hz, delay: as of `eliminate_log`.
+        real_time: in the log's own time; else as fast as they are taken.
+        chunk: readings at once.
+
+    Attributes:
+        wait: readings that the motion comes late.
+
+    Raises:
+        DrakeTeleopError: if the log cannot be used, or is of static poses.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        load: Identification,
+        *,
+        cutoff_hz: float | None = 30.0,
+        delay: str | float = "auto",
+        real_time: bool = False,
+        chunk: int = 256,
+    ) -> None:
+        log = read_log(path, bandwidth_hz=cutoff_hz)
+        if log.static:
+            raise DrakeTeleopError("poses at rest have no order in time", where=str(path))
+        delay_s, source = delay_of(log, cutoff_hz, delay, usable_phi(load)[0])
+        if source == "undetermined":
+            delay_s = load.delay_s
+        log = undelayed(log, delay_s)
+        self.dt, self.live = log.dt, real_time
+        self.wait = max(0, math.ceil(delay_s / log.dt - 1e-6))
+        self._t, self._values = log.t, np.hstack([log.wrench, *log.motion])
+        self._flags = np.where(measured(log, cutoff_hz), 0, int(Flag.GAP))
+        self._at, self._chunk, self._start = 0, chunk, math.nan
+
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        """See `Source`."""
+        first, last = self._at, len(self._t)
+        if first == last:
+            return None
+        stop = min(first + self._chunk, last)
+        if self.live:
+            now = time.monotonic()
+            if math.isnan(self._start):
+                self._start = now - self._t[0]
+            time.sleep(max(0.0, min(timeout_s, self._t[first] + self._start - now)))
+            here = time.monotonic() - self._start
+            stop = min(stop, int(np.searchsorted(self._t, here, side="right")))
+        self._at = max(first, stop)
+        return [
+            Reading(k, float(self._t[k]), self._values[k], int(self._flags[k]))
+            for k in range(first, self._at)
+        ]
+
+    def close(self) -> None:
+        """See `Source`."""

@@ -1,0 +1,136 @@
+"""Readings and wrenches in UDP packets of a fixed layout, as `drake_teleop_udp.h` has it in C.
+
+Little-endian, without padding. In: "DTW1", flags (of `Flag`, SATURATED alone is read), number,
+time [s], 15 numbers. Out: "DTC1", flags, number, time [s], contact (6), scaled (6).
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.robots.streams import DAMAGED, Compensated, Flag, Reading
+
+THIS_MACHINE = "127.0.0.1"
+READING = struct.Struct("<4sIQd15d")
+WRENCH = struct.Struct("<4sIQd12d")
+_IN, _OUT = b"DTW1", b"DTC1"
+_HEAD = struct.Struct("<4sIQd")
+_MOST = 256  # packets at once
+
+
+def packed(reading: Reading) -> bytes:
+    """The packet of a reading."""
+    return READING.pack(_IN, reading.flags, reading.number, reading.t, *reading.values)
+
+
+def unpacked(packet: bytes) -> Reading:
+    """The reading in a packet, `DAMAGED` if it is none. It never raises."""
+    if len(packet) != READING.size or packet[:4] != _IN:
+        return DAMAGED
+    _, flags, number, t = _HEAD.unpack_from(packet)
+    values = np.frombuffer(packet, "<f8", 15, _HEAD.size).astype(np.float64)
+    return Reading(number, t, values, flags & Flag.SATURATED)
+
+
+def packed_wrench(out: Compensated) -> bytes:
+    """The packet of a wrench."""
+    return WRENCH.pack(_OUT, out.flags, out.number, out.t, *out.contact, *out.scaled)
+
+
+def unpacked_wrench(packet: bytes) -> Compensated:
+    """The wrench in a packet.
+
+    Raises:
+        DrakeTeleopError: if there is none.
+    """
+    if len(packet) != WRENCH.size or packet[:4] != _OUT:
+        raise DrakeTeleopError("is no wrench", where="packet")
+    _, flags, number, t, *values = WRENCH.unpack(packet)
+    return Compensated(number, t, np.array(values[:6]), np.array(values[6:]), flags)
+
+
+def endpoint(address: str) -> tuple[str, int]:
+    """Host and port of udp://HOST:PORT; without a host, this machine.
+
+    Raises:
+        DrakeTeleopError: if there is no port.
+    """
+    try:
+        parts = urlsplit(address)
+        host, port = parts.hostname or THIS_MACHINE, parts.port
+    except ValueError:
+        host, port = "", None
+    if port is None:
+        raise DrakeTeleopError(
+            "has no port from 0 to 65535", where=address, remedy="udp://127.0.0.1:49152, say"
+        )
+    return host, port
+
+
+def listening(host: str, port: int) -> socket.socket:
+    """A socket that packets can be sent to.
+
+    Raises:
+        DrakeTeleopError: if the address is not this machine's, or taken.
+    """
+    receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        receiver.bind((host, port))
+    except OSError as error:
+        receiver.close()
+        raise DrakeTeleopError(str(error), where=f"udp://{host}:{port}") from error
+    return receiver
+
+
+class UdpSource:
+    """Readings that are sent to a port. Only this machine can, unless HOST says otherwise."""
+
+    live = True
+
+    def __init__(self, address: str, dt: float) -> None:
+        self.dt = dt
+        self._socket = listening(*endpoint(address))
+        self.port = self._socket.getsockname()[1]
+
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        """See `Source`."""
+        found: list[Reading] = []
+        self._socket.settimeout(timeout_s)
+        try:
+            while len(found) < _MOST:
+                found.append(unpacked(self._socket.recv(READING.size + 1)))
+                self._socket.settimeout(0.0)
+        except (TimeoutError, BlockingIOError):
+            pass
+        return found
+
+    def close(self) -> None:
+        """See `Source`."""
+        self._socket.close()
+
+
+class UdpSink:
+    """Wrenches, sent to HOST:PORT. Nobody has to listen."""
+
+    def __init__(self, address: str) -> None:
+        self._to = endpoint(address)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+    def write(self, out: Compensated) -> None:
+        """See `Sink`. What cannot be sent now is too old later."""
+        try:
+            self._socket.sendto(packed_wrench(out), self._to)
+        except OSError as error:
+            if isinstance(error, socket.gaierror):
+                raise DrakeTeleopError(
+                    "is not known", where=self._to[0], remedy="give a host"
+                ) from error
+
+    def close(self) -> None:
+        """See `Sink`."""
+        self._socket.close()

@@ -1,0 +1,227 @@
+"""The live wrench is that of `eliminate --causal`, and zero where it cannot be trusted."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.processing import eliminate_log
+from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.robots.compensate import run
+from drake_teleop.robots.compensator import JUMP_S, STALE_S, TARE_S, Compensator
+from drake_teleop.robots.replay_log import LogSource
+from drake_teleop.robots.streams import DAMAGED, Compensated, Flag, Reading
+
+DT, DELAY = 0.002, 0.0051
+PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
+OFFSETS = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.1])
+
+
+def load() -> Identification:
+    return Identification(
+        *(PHI, OFFSETS, 1e-6 * np.eye(16), np.ones(16, bool), 4.0, 0.0, np.full(6, 0.01)),
+        *("batch least squares", 100),
+    )
+
+
+def moving(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    omega = np.column_stack([np.sin(5 * t + k) for k in range(3)])
+    alpha = np.column_stack([5 * np.cos(5 * t + k) for k in range(3)])
+    return 3.0 * omega + [0.0, 0.0, 9.81], omega, alpha
+
+
+def readings(count: int, *, touched: float = 0.0, start: float = 0.0) -> list[Reading]:
+    """Of a load that moves, with a force of `touched` N along x."""
+    t = start + DT * np.arange(count)
+    motion = moving(t)
+    wrench = non_contact_wrench(*motion, PHI) + OFFSETS
+    wrench[:, 0] += touched
+    values = np.hstack([wrench, *motion])
+    return [Reading(k, float(t[k]), values[k]) for k in range(count)]
+
+
+def resting(count: int, wrench: np.ndarray) -> list[Reading]:
+    values = np.concatenate([wrench, [0.0, 0.0, 9.81], np.zeros(6)])
+    values[:6] += non_contact_wrench(values[6:9], values[9:12], values[12:15], PHI)
+    return [Reading(k, DT * k, values) for k in range(count)]
+
+
+class Kept:
+    """A sink."""
+
+    def __init__(self) -> None:
+        self.rows: list[Compensated] = []
+
+    def write(self, out: Compensated) -> None:
+        self.rows.append(out)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """2 s with a push, noise, a motion that comes late, and a gap."""
+    t = DT * np.arange(1000)
+    rng = np.random.default_rng(3)
+    wrench = non_contact_wrench(*moving(t), PHI) + OFFSETS + 0.1 * rng.normal(size=(1000, 6))
+    wrench[600:700, 2] += 8.0
+    path = tmp_path_factory.mktemp("log") / "log.parquet"
+    kept = (t < 1.5) | (t > 1.56)
+    write_log(Log(t[kept], wrench[kept], *(x[kept] for x in moving(t - DELAY))), path)
+    return path
+
+
+@pytest.mark.parametrize("mode", ["delayed", "predicted"])
+def test_replayed_it_is_what_eliminate_writes(log: Path, mode: str) -> None:
+    options = {"sigma": 0.3, "gamma": 1.5}
+    wanted = eliminate_log(log, load(), **options, causal=mode, delay=DELAY)
+    assert wanted.causal is not None and len(wanted.log) < 960
+
+    @settings(max_examples=3, deadline=None, derandomize=True)
+    @given(chunk=st.integers(1, 2000))
+    def at(chunk: int) -> None:
+        source, kept = LogSource(log, load(), delay=DELAY, chunk=chunk), Kept()
+        late = {"wait": source.wait, "predicted": mode == "predicted"}
+        counts = run(source, Compensator(load(), source.dt, **options, **late), kept)
+        good = [row for row in kept.rows if not row.flags]
+        assert counts["gap"] == counts["wrenches"] - len(good) > 0
+        assert set(counts) == {"wrenches", "gap"}
+        np.testing.assert_array_equal([row.t for row in good], wanted.log.t)
+        np.testing.assert_array_equal([row.contact for row in good], wanted.causal.contact)
+        np.testing.assert_array_equal([row.scaled for row in good], wanted.causal.scaled)
+        assert all(not row.contact.any() for row in kept.rows if row.flags)
+
+    at()
+
+
+def bad(reading: Reading, name: str) -> Reading:
+    values = reading.values.copy()
+    if name == "damaged":
+        return DAMAGED
+    if name == "not finite":
+        values[7] = math.nan
+    if name == "out of range":
+        values[13] = 1e9
+    if name == "saturated":
+        values[2] = -60.0
+    late = {"reordered": reading.t - 3 * DT}.get(name, reading.t)
+    return Reading(reading.number, late, values, int(Flag.SATURATED) if name == "told" else 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "flag"),
+    [
+        ("damaged", Flag.DAMAGED), ("not finite", Flag.NOT_FINITE), ("reordered", Flag.REORDERED),
+        ("out of range", Flag.OUT_OF_RANGE), ("saturated", Flag.SATURATED),
+        ("told", Flag.SATURATED),
+    ],
+)  # fmt: skip
+def test_a_bad_reading_is_zero_and_the_next_is_not(name: str, flag: Flag) -> None:
+    compensator = Compensator(load(), DT, largest=np.full(6, 60.0))
+    stream = readings(40, touched=5.0)
+    for reading in stream[:20]:
+        before = compensator.step(reading, reading.t)
+    wrong = compensator.step(bad(stream[20], name), stream[20].t)
+    assert wrong.flags & flag and not wrong.contact.any() and not wrong.scaled.any()
+    assert math.isfinite(wrong.t)
+    for reading in stream[21:]:
+        after = compensator.step(reading, reading.t)
+        assert after.flags == 0
+        np.testing.assert_allclose(after.contact, before.contact, atol=1e-9)
+    np.testing.assert_allclose(after.contact, [5.0, 0, 0, 0, 0, 0], atol=1e-9)
+
+
+def test_nothing_for_a_while_is_zero_and_then_it_settles_anew() -> None:
+    compensator = Compensator(load(), DT)
+    first = compensator.idle(0.0)
+    assert first is not None and first.flags == Flag.STALE
+    for reading in readings(20, touched=5.0):
+        compensator.step(reading, reading.t)
+    last = 19 * DT
+    assert compensator.idle(last + 0.9 * STALE_S) is None
+    stale = compensator.idle(last + 1.1 * STALE_S)
+    assert stale is not None and stale.flags == Flag.STALE and not stale.contact.any()
+    again = readings(1200, touched=-4.0)[1000]  # two seconds later, another contact
+    out = compensator.step(again, again.t)
+    assert out.flags == 0
+    np.testing.assert_allclose(out.contact[0], -4.0, atol=1e-9)
+
+
+def test_what_is_late_is_stale_until_it_proves_another_clock() -> None:
+    compensator, delay = Compensator(load(), DT), 0.2
+    flags = []
+    for reading in readings(800, touched=5.0):
+        now = reading.t + (delay if reading.t > 0.2 else 0.0)
+        flags.append(compensator.step(reading, now).flags)
+    at = round(0.2 / DT) + 1
+    assert not any(flags[:at]) and flags[at] == Flag.STALE
+    here = flags.index(Flag.CLOCK_JUMP)
+    assert here * DT == pytest.approx(0.2 + JUMP_S, abs=delay + 5 * DT)
+    assert not any(flags[here + 1 :])
+
+
+@pytest.mark.parametrize(
+    ("start", "number", "flag"),
+    [(50.0, 20, Flag.CLOCK_JUMP), (-50.0, 20, Flag.CLOCK_JUMP), (-50.0, 0, Flag.RESTART),
+     (20 * DT, 0, Flag.RESTART)],
+)  # fmt: skip
+def test_clocks_that_are_set_and_sources_that_begin_anew_are_named(
+    start: float, number: int, flag: Flag
+) -> None:
+    compensator = Compensator(load(), DT)
+    for reading in readings(20):
+        compensator.step(reading, reading.t)
+    after = [
+        compensator.step(reading._replace(number=reading.number + number), (20 + k) * DT)
+        for k, reading in enumerate(readings(20, touched=5.0, start=start))
+    ]
+    assert [row.flags for row in after] == [flag] + [0] * 19
+    assert not after[0].contact.any()
+    np.testing.assert_allclose(after[-1].contact[0], 5.0, atol=1e-9)
+
+
+def test_another_rate_than_the_stated_one_is_named() -> None:
+    flags = {}
+    for share in (1.0, 1.2):
+        compensator = Compensator(load(), share * DT)
+        flags[share] = [compensator.step(each, each.t).flags for each in readings(300)][-1]
+    assert flags == {1.0: 0, 1.2: Flag.WRONG_RATE}
+
+
+def test_no_wrench_is_above_the_sensors_range() -> None:
+    compensator = Compensator(load(), DT, gamma=30.0, largest=np.full(6, 60.0))
+    out = [compensator.step(each, each.t) for each in readings(20, touched=5.0)][-1]
+    assert out.flags == Flag.CLIPPED and out.scaled[0] == 60.0
+    np.testing.assert_allclose(out.contact[0], 5.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("free", "done"), ("short", "not 0.5 s"), ("moving", "it moves"), ("push", "is touched"),
+     ("wavers", "wavers")],
+)  # fmt: skip
+def test_a_tare_refuses_and_says_why(name: str, said: str) -> None:
+    compensator, count = Compensator(load(), DT), round(TARE_S / DT)
+    drift = np.array([0.5, -0.3, 0.2, 0.01, 0.0, 0.02])
+    stream = resting(count, OFFSETS + drift)
+    if name == "short":
+        stream = stream[1:]
+    if name == "moving":
+        stream = readings(count)
+    for reading in stream:
+        values = reading.values.copy()
+        values[2] += {"push": 8.0, "wavers": 0.5 * math.sin(30 * reading.t)}.get(name, 0.0)
+        compensator.step(reading._replace(values=values), reading.t)
+    assert said in compensator.tare()
+    moved = drift if name == "free" else np.zeros(6)
+    np.testing.assert_allclose(compensator.offsets, OFFSETS + moved, atol=1e-12)
+    assert compensator.tare().startswith("refused") or name != "free"

@@ -1,0 +1,156 @@
+"""Packets and lines: nothing that comes in raises, and what goes out can be read."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import socket
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from test_compensator import DT, load, readings
+
+import drake_teleop.robots.udp as udp
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.robots.compensate import Control, run, sink_of, source_of
+from drake_teleop.robots.compensator import Compensator
+from drake_teleop.robots.lines import LineSource, read_line, written_line
+from drake_teleop.robots.streams import DAMAGED, Compensated, Flag
+
+HEADER = Path(udp.__file__).with_name("drake_teleop_udp.h").read_text()
+
+
+def line_of(reading) -> bytes:
+    parts = np.split(reading.values, [6, 9, 12])
+    names = zip(("wrench", "s", "omega", "alpha"), parts, strict=True)
+    return json.dumps({"t": reading.t} | {name: x.tolist() for name, x in names}).encode()
+
+
+def test_packets_and_lines_are_read_as_they_were_written() -> None:
+    reading = readings(3)[2]
+    back = udp.unpacked(udp.packed(reading._replace(flags=int(Flag.SATURATED))))
+    assert back[:2] == reading[:2] and back.flags == Flag.SATURATED
+    np.testing.assert_array_equal(back.values, reading.values)
+    back = read_line(line_of(reading), 7)
+    assert back.number == 7
+    np.testing.assert_array_equal(back.values, reading.values)
+    out = Compensated(5, 0.5, np.arange(6.0), -np.arange(6.0), 34)
+    again = udp.unpacked_wrench(udp.packed_wrench(out))
+    assert again.flags == 34 and again.scaled.tolist() == out.scaled.tolist()
+    assert json.loads(written_line(out))["flags"] == ["damaged", "stale"]
+    with pytest.raises(DrakeTeleopError, match="is no wrench"):
+        udp.unpacked_wrench(b"x")
+
+
+def test_the_header_says_the_same() -> None:
+    sizes = {"char": 1, "uint32_t": 4, "uint64_t": 8, "double": 8}
+    lengths = []
+    for body in re.findall(r"typedef struct \{(.*?)\n\}", HEADER, re.S):
+        fields = re.findall(r"^ +(\w+) ([^;]+);", re.sub(r"/\*.*?\*/", "", body), re.M)
+        counts = [
+            sum(int((re.findall(r"\d+", x) or [1])[0]) for x in n.split(",")) for _, n in fields
+        ]
+        lengths.append(sum(sizes[kind] * n for (kind, _), n in zip(fields, counts, strict=True)))
+    assert lengths == [udp.READING.size, udp.WRENCH.size]
+    bits = {name: int(value) for name, value in re.findall(r"DT_(\w+) = (\d+)", HEADER)}
+    assert bits == {str(flag.name): flag.value for flag in Flag}
+
+
+@pytest.mark.parametrize("kind", ["packet", "line"])
+def test_no_damage_raises_or_makes_a_number_that_is_not_finite(kind: str) -> None:
+    """10^4 of them, between good ones; the fuzz target `wrenches` makes more."""
+    rng, compensator = random.Random(4), Compensator(load(), DT, gamma=2.0)
+    good = [udp.packed(each) if kind == "packet" else line_of(each) for each in readings(50)]
+    flags = 0
+    for k in range(5000):
+        data = bytearray(good[k % 50])
+        for _ in range(rng.randrange(1, 4)):
+            data[rng.randrange(len(data))] = rng.randrange(256)
+        if rng.random() < 0.1:
+            data = data[: rng.randrange(len(data))]
+        reading = udp.unpacked(bytes(data)) if kind == "packet" else read_line(bytes(data), k)
+        out = compensator.step(reading, k * DT)
+        assert np.isfinite([out.t, *out.contact, *out.scaled]).all()
+        flags |= out.flags
+    assert flags & Flag.DAMAGED
+    for k, reading in enumerate(readings(1200, touched=5.0)):
+        out = compensator.step(reading, (6000 + k) * DT)
+    assert out.flags & ~Flag.WRONG_RATE == 0
+    np.testing.assert_allclose(out.contact[0], 5.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "line", [b"", b"[]", b"3", b"{}", b"\xff", b"[" * 4000, b"{" * 9000, b'{"t":1,"wrench":"x"}']
+)
+def test_a_line_that_is_none(line: bytes) -> None:
+    assert read_line(line, 0) is DAMAGED
+
+
+def test_from_socket_to_socket_on_this_machine_alone() -> None:
+    source = udp.UdpSource("udp://:0", DT)
+    with udp.listening(udp.THIS_MACHINE, 0) as there:
+        there.settimeout(5.0)
+        sink = sink_of(f"udp://127.0.0.1:{there.getsockname()[1]}")
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            for reading in readings(3, touched=5.0):
+                sender.sendto(udp.packed(reading), ("127.0.0.1", source.port))
+            sender.sendto(b"x" * 1000, ("127.0.0.1", source.port))
+        assert source._socket.getsockname()[0] == "127.0.0.1"
+        found = source.read(5.0)
+        assert found is not None
+        compensator = Compensator(load(), DT)
+        for reading in found:
+            sink.write(compensator.step(reading, reading.t))
+        back = [udp.unpacked_wrench(there.recv(1000)) for _ in range(4)]
+    assert [row.flags for row in back] == [0, 0, 0, Flag.DAMAGED]
+    np.testing.assert_allclose(back[2].contact[0], 5.0, atol=1e-9)
+    assert source.read(0.0) == []
+    source.close()
+    sink.close()
+
+
+def test_lines_from_a_pipe_to_a_table(tmp_path: Path) -> None:
+    out, into = os.pipe()
+    lines = b"\n".join(map(line_of, readings(30, touched=5.0)))
+    os.write(into, lines[:1000])
+    os.write(into, lines[1000:] + b"\n{}\n")
+    os.close(into)
+    sink, said = sink_of(str(tmp_path / "x" / "out.csv")), []
+    counts = run(LineSource(out, DT), Compensator(load(), DT), sink, say=said.append)
+    os.close(out)
+    sink.close()
+    table = pl.read_csv(tmp_path / "x" / "out.csv")
+    assert counts["wrenches"] == len(table) == 31 and counts["damaged"] == 1
+    assert table["contact_f_x"][29] == pytest.approx(5.0) and table["flags"][30] == 2
+    assert any(text.endswith("damaged") for text in said)
+
+
+def test_the_control_port_tares_and_says_so() -> None:
+    control = Control(0)
+    control.answer(lambda: "")  # nothing was asked
+    with udp.listening(udp.THIS_MACHINE, 0) as asker:
+        asker.settimeout(5.0)
+        for word in (b"tare\n", b"tear"):
+            asker.sendto(word, (udp.THIS_MACHINE, control.port))
+            control.answer(Compensator(load(), DT).tare)
+        said = [asker.recv(100) for _ in range(2)]
+    control.close()
+    assert said[0].startswith(b"refused: there are not 0.5 s") and said[1].startswith(b"unknown")
+
+
+@pytest.mark.parametrize("address", ["udp://:x", "udp://:70000", "udp://a", "tcp://:1", "log.csv"])
+def test_an_address_that_is_none(address: str) -> None:
+    with pytest.raises(DrakeTeleopError):
+        source_of(address, load(), rate_hz=500.0)
+    if address != "log.csv":
+        with pytest.raises(DrakeTeleopError):
+            sink_of(address)
+
+
+def test_a_live_source_needs_its_rate() -> None:
+    with pytest.raises(DrakeTeleopError, match="give --rate HZ"):
+        source_of("udp://:0", load())
