@@ -78,4 +78,16 @@ late = late["detection_time_s"].to_numpy().reshape(2, 2)
 assert (late[1] > late[0]).all() and (np.diff(late[1]) < 0).all()
 assert 0 < points["front"].sum() < 4
 """,
+    "05_own_station": """
+assert first["warnings"] == [] and first["mass_error_percent"] < 0.1
+assert any("finger" in line for line in first["assumed"])
+assert abs(load.identification.mass - 0.76) < 0.01
+kf = scenario.force_scaling.force_scale
+free, held = runs[0.0].t < 2.5, runs[0.0].t > 4.0
+felt = {sigma: run["force_to_master"][:, 2] / kf for sigma, run in runs.items()}
+assert abs(felt[0.0][free]).max() < 0.5
+assert abs(felt[1.0][free].mean() + 0.76 * 9.81) < 0.5
+wall = runs[0.0]["true_contact_wrench_W"][held, 2].mean()
+assert wall > 4.0 and abs(felt[0.0][held].mean() / wall - 1) < 0.02
+""",
 }
