@@ -10,6 +10,8 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
+from sphinx.ext import autosummary
+
 sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 project = "drake_teleop"
@@ -25,12 +27,14 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "myst_nb",
     "mathml",
+    "formulas",
+    "keywords",
     "pydrake_system",
     "repository",
+    "offline",
 ]
 exclude_patterns = [
     "gallery",
-    "sg_execution_times.rst",
     "examples/*.json",
     "examples/*.ipynb",
     "examples/*.py*",
@@ -49,6 +53,7 @@ nb_execution_timeout = 240
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_merge_streams = True
+nb_ipywidgets_js = {}  # they come from elsewhere; of a slider the page shows where it stands
 sphinx_gallery_conf = {
     "examples_dirs": ["gallery"],
     "gallery_dirs": ["examples"],
@@ -57,14 +62,20 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "show_memory": False,
     "min_reported_time": 1e9,
+    "write_computation_times": False,
     "matplotlib_animations": False,
-    "parallel": 2,
+    "capture_repr": (),
+    "reset_modules": ("matplotlib", "house.set_style"),
+    "image_scrapers": ("house.picture",),
+    "within_subsection_order": "house.Order",
 }
 
 # The reference
+autosummary.WELL_KNOWN_ABBREVIATIONS += ("Eq.", "Eqs.", "Fig.", "Figs.")  # end no sentence
 autosummary_generate = True
 autodoc_default_options = {"members": True, "member-order": "bysource", "exclude-members": "set"}
 autodoc_typehints = "signature"
+toc_object_entries_show_parents = "hide"
 autodoc_preserve_defaults = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True

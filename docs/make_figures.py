@@ -1,7 +1,7 @@
 """Draws the pictures of README and docs into docs/figures.
 
-The station, Fig. 8 as `reproduce` makes it and its scene in 3D, the sample log, the frames of a log
-and the noise of the wrist sensor.
+The station, its frames and signs, Fig. 8 as `reproduce` makes it and its scene in 3D, the sample
+log, the frames of a log and the noise of the wrist sensor.
 
 Run it as `python docs/make_figures.py`. The scene is a picture of `replay.html` as Chromium shows
 it; without Chromium it stays as it is.
@@ -245,6 +245,83 @@ def _pointer(axes: Axes, start: object, end: object, colour: str) -> None:
     axes.annotate("", end, start, arrowprops=arrow)
 
 
+def station_frames_figure() -> Picture:
+    """Where the frames are: W, S, Bcm and contact at the slave, B and E at the master."""
+    with house_style(), mpl.rc_context({"mathtext.fontset": "dejavuserif"}):
+        figure = Picture(figsize=(9.9, 3.3), facecolor="white", layout="none")
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set(xlim=(0, 9.9), ylim=(0.1, 3.4), aspect="equal")
+        axes.axis("off")
+        axes.plot([0.2, 3.0], [0.5, 0.5], color=GREY, linewidth=0.9)
+        axes.plot([4.2, 8.4], [0.5, 0.5], color=GREY, linewidth=0.9)
+        # The master: base, two links, stylus.
+        axes.plot([0.8, 0.8, 1.7, 2.3], [0.5, 1.5, 2.3, 1.7], color=GREY, linewidth=6, alpha=0.5)
+        _axes_of(axes, (0.8, 0.5), "B", "base of the device; x to the operator", side=-1)
+        _axes_of(axes, (2.3, 1.7), "E", "stylus, in the hand", side=1)
+        # The slave: three links, sensor, tool.
+        axes.plot([4.9, 4.9, 6.2, 7.2], [0.5, 1.9, 3.0, 2.6], color=GREY, linewidth=8, alpha=0.5)
+        _box(axes, (7.0, 2.35), 0.4, 0.2, GREEN)
+        _box(axes, (7.08, 1.0), 0.24, 1.35, GREY)
+        _axes_of(axes, (4.9, 0.5), "W", "world, z up", side=-1)
+        _axes_of(axes, (7.2, 2.35), "S", "wrist sensor; its origin is So", side=1, z=-1)
+        axes.plot(7.2, 1.6, "o", color=BLACK, markersize=5, zorder=5)
+        axes.text(7.42, 1.6, "Bcm, of all beyond S", va="center", color=BLACK)
+        _line(axes, (7.2, 2.35), (7.2, 1.6), BLACK, "arc3,rad=0.6")
+        axes.text(6.86, 1.93, r"$p_{SoBcm}$", ha="right", va="center", color=BLACK, fontsize=11)
+        _line(axes, (7.2, 0.52), (7.2, 0.98), VERMILION, "arc3")
+        axes.text(7.42, 0.75, "contact", va="center", color=VERMILION)
+    return figure
+
+
+def signs_figure() -> Picture:
+    """The load alone: at rest, swung upwards, put on a table, and what the sensor exerts then."""
+    cases = (
+        ("at rest", 1.0, 0.0, "f = −m g"),
+        ("swung upwards", 1.5, 0.0, "f = m (a − g)"),
+        ("put on a table", 0.5, 0.5, "f = −m g − what the table does"),
+    )
+    with house_style():
+        figure = Picture(figsize=(8.6, 2.9), facecolor="white", layout="none")
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set(xlim=(0, 8.6), ylim=(-0.15, 2.75), aspect="equal")
+        axes.axis("off")
+        for k, (name, force, contact, words) in enumerate(cases):
+            x = 1.3 + 2.9 * k
+            _box(axes, (x - 0.12, 0.95), 0.24, 0.75, GREY)
+            _line(axes, (x, 1.7), (x, 1.7 + 0.6 * force), GREEN, "arc3")
+            axes.text(x + 0.12, 1.7 + 0.4 * force, "f", color=GREEN, fontsize=11)
+            _line(axes, (x + 0.2, 1.3), (x + 0.2, 0.7), BLACK, "arc3")
+            axes.text(x + 0.28, 1.02, "m g", color=BLACK)
+            if contact:
+                axes.plot([x - 0.6, x + 0.6], [0.93, 0.93], color=GREY, linewidth=1.2)
+                _line(axes, (x - 0.3, 0.45), (x - 0.3, 0.93), VERMILION, "arc3")
+                axes.text(x - 0.38, 0.62, "of the table", color=VERMILION, ha="right")
+            axes.text(x, 0.06, f"{name}\n{words}", ha="center", color=BLACK, linespacing=1.4)
+    return figure
+
+
+def _axes_of(
+    axes: Axes, origin: tuple[float, float], name: str, words: str, *, side: int, z: int = 1
+) -> None:
+    """x and z of a frame as arrows, its name at the origin and what it is beside that."""
+    x0, z0 = origin
+    _line(axes, (x0, z0), (x0 + 0.42, z0), BLUE, "arc3")
+    _line(axes, (x0, z0), (x0, z0 + 0.42 * z), BLUE, "arc3")
+    axes.text(x0 + 0.44, z0 + 0.05, "x", color=BLUE, fontsize=8.5)
+    axes.text(x0 + 0.07, z0 + 0.4 * z, "z", color=BLUE, fontsize=8.5, va="center", zorder=6)
+    place = (x0 - 0.1, z0 - 0.22) if side < 0 else (x0 + 0.3, z0 + 0.2)
+    axes.text(*place, f"{name}: {words}", color=BLUE, fontsize=9, zorder=6)
+
+
+def _box(axes: Axes, corner: tuple[float, float], width: float, height: float, colour: str) -> None:
+    axes.add_patch(
+        FancyBboxPatch(
+            corner, width, height, boxstyle="round,pad=0,rounding_size=0.04",
+            facecolor="white", edgecolor=colour, linewidth=1.2, zorder=1,
+        )
+    )  # fmt: skip
+
+
 def noise_figure() -> Picture:
     """Spectrum and Allan deviation of fx at rest: predicted (lines), simulated for 5 min (dots)."""
     period, count = 125e-6, 300 * 8000
@@ -335,6 +412,8 @@ def main() -> None:
     with mpl.rc_context({"svg.hashsalt": "drake_teleop"}):
         station_figure().savefig(FIGURES / "station.svg", metadata={"Date": None})
         frames_figure().savefig(FIGURES / "frames.svg", metadata={"Date": None})
+        station_frames_figure().savefig(FIGURES / "station_frames.svg", metadata={"Date": None})
+        signs_figure().savefig(FIGURES / "signs.svg", metadata={"Date": None})
         noise_figure().savefig(FIGURES / "sensor_noise.svg", metadata={"Date": None})
     with tempfile.TemporaryDirectory() as folder:
         log_figure(Path(folder) / "sample").savefig(FIGURES / "log.png")

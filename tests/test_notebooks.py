@@ -28,4 +28,6 @@ def test_it_is_committed_without_outputs(path):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_it_is_a_page_of_the_site(path):
-    assert f"notebooks/{path.stem}\n" in (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    assert f"notebooks/{path.stem}\n" in (ROOT / "docs" / "tutorials.md").read_text(
+        encoding="utf-8"
+    )

@@ -10,6 +10,7 @@ from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 
 _TAG = re.compile(r"\\tag\{([^}]*)\}")
+_MATRIX = re.compile(r"<mo>&#x0005B;</mo><mtable>(.*?)</mtable><mo>&#x0005D;</mo>")
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -19,7 +20,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
 
 def _inline(translator: Any, node: nodes.math) -> None:
-    translator.body.append(f'<span class="math">{convert(node.astext())}</span>')
+    translator.body.append(f'<span class="math">{_mathml(node.astext())}</span>')
     raise nodes.SkipNode
 
 
@@ -27,8 +28,13 @@ def _block(translator: Any, node: nodes.math_block) -> None:
     """A formula of its own, with its number at the right if it has a tag."""
     text = node.astext()
     tag = _TAG.search(text)
-    formula = convert(_TAG.sub("", text).strip(), display="block")
+    formula = _mathml(_TAG.sub("", text).strip(), display="block")
     number = f'<span class="eqno">({tag[1]})</span>' if tag else ""
     anchor = f' id="eq-{tag[1].lower()}"' if tag else ""
-    translator.body.append(f'<div class="math"{anchor}>{formula}{number}</div>')
+    translator.body.append(f'<div class="math" tabindex="0"{anchor}>{formula}{number}</div>')
     raise nodes.SkipNode
+
+
+def _mathml(formula: str, **options: str) -> str:
+    """With brackets about matrices that the style sheet draws: not every font has high ones."""
+    return _MATRIX.sub(r'<mtable class="matrix">\1</mtable>', convert(formula, **options))

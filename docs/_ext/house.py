@@ -1,0 +1,52 @@
+"""The gallery: its order, the look of its pictures, and which picture is whose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib import pyplot as plt
+from sphinx_gallery.scrapers import figure_rst
+
+from drake_teleop.pages.style import house_style
+
+with house_style():
+    _HOUSE = dict(mpl.rcParams)
+_STYLE = {name: value for name, value in _HOUSE.items() if value != mpl.rcParams[name]}
+
+
+def set_style(_settings: dict[str, Any], _file: str) -> None:
+    """That of the house: scripts of the gallery need not ask for it."""
+    mpl.rcParams.update(_STYLE)
+
+
+def picture(_block: Any, names: dict[str, Any], settings: dict[str, Any]) -> str:
+    """What a script has made as `figure`, whether it is pyplot's or not."""
+    path = Path(next(names["image_path_iterator"]))
+    figure = names["example_globals"]["figure"]
+    figure.savefig(path, dpi=160)
+    plt.close("all")
+    return figure_rst([str(path)], settings["src_dir"], Path(names["src_file"]).stem)
+
+
+class Order:
+    """As one would tell it; a script that is not named here is an error."""
+
+    STORY = (
+        *("free_motion", "contact", "sigma", "grasp", "task", "own_arm", "own_device", "own_block"),
+        *("log_identification", "log_contact", "conventions", "excitation", "sensor_noise"),
+        *("networks", "energy", "passivity_methods", "ledger_under_loss", "letting_go"),
+        *("stability_map", "felt_impedance", "z_width", "study"),
+    )
+
+    def __init__(self, folder: str) -> None:
+        """Of the scripts in a folder."""
+
+    def __call__(self, name: str) -> int:
+        """The place of a script."""
+        return self.STORY.index(Path(name).stem)
+
+    def __repr__(self) -> str:
+        """The same at every build, so that the second finds the first's pictures."""
+        return f"<{self.STORY}>"

@@ -1,0 +1,78 @@
+"""Words that people look for, and the section that answers: the search puts it first.
+
+They stand here and not in the pages, whose Markdown is read elsewhere too.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
+from sphinx.transforms import SphinxTransform
+
+#: By page and id of its section.
+KEYWORDS = {
+    "analysis": {
+        "what-each-criterion-means": "Llewellyn, Raisbeck, absolute stability, Z-width, Nyquist",
+        "how-far-from-the-limit": "delay margin, gain margin, phase margin",
+    },
+    "choose": {
+        "sigma-gamma-eta": "sigma, gamma, eta",
+        "a-method-of-passivity": "passivity, wave variables, TDPA",
+        "rates": "sampling rate",
+    },
+    "concepts": {
+        "frames": "frame, monogram notation",
+        "signs": "sign, specific force",
+        "what-a-verdict-means": "verdict, identified, weakly",
+    },
+    "delay": {"the-network": "network, jitter, packet loss", "the-safe-state": "safe state"},
+    "detection": {"the-threshold": "contact detection, threshold"},
+    "logs": {
+        "where-the-pose-is-and-how-noisy": "TCP, flange, tracker",
+        "bags": "ROS, rosbag, MCAP",
+        "where-the-imu-is": "IMU, accelerometer",
+        "from-an-excitation-to-the-load": "excitation",
+    },
+    "robot": {"your-robot-s-own-words": "Franka, UR, URScript, payload"},
+    "sensor": {"the-presets": "ATI, JR3, Bota, Robotiq, OnRobot, sensor noise"},
+    "station": {
+        "another-haptic-device": "haptic device, omega.6, Falcon, Phantom",
+        "a-side-of-your-own": "LeafSystem",
+        "ports": "port",
+    },
+    "studies": {"how-long-it-takes": "Dask, cluster"},
+    "wrench-not-zero": {"a-robot-s-log-after-eliminate": "tare, offset, drift"},
+}
+
+
+class Keywords(SphinxTransform):
+    """Enters them into the index, before Sphinx collects it."""
+
+    default_priority = 500
+
+    def apply(self, **_options: Any) -> None:
+        """Of the page that is read.
+
+        Raises:
+            ExtensionError: for a section that the page does not have.
+        """
+        sections = {
+            name: section
+            for section in self.document.findall(nodes.section)
+            for name in section["ids"]
+        }
+        for name, words in KEYWORDS.get(self.env.docname, {}).items():
+            if name not in sections:
+                raise ExtensionError(f"{self.env.docname} has no section {name}: keywords.py")
+            entries = [("single", word, name, "main", None) for word in words.split(", ")]
+            sections[name].insert(1, addnodes.index(entries=entries))
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Registers the transform."""
+    app.add_transform(Keywords)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

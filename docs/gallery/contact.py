@@ -1,0 +1,22 @@
+"""
+Contact: no threshold on the measured force finds it
+====================================================
+
+The paper's Fig. 8. The tool touches a leaf spring in the middle of a fast swing (shaded: the truth
+of the simulation). In the measured force the touch is smaller than the swing around it.
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import drake_teleop as dt
+from drake_teleop.pages.style import shade_contact
+
+result = dt.run_scenario(dt.LoadScenario("contact_transition"), progress=False).result
+touched = np.linalg.norm(result["true_contact_wrench_W"], axis=1) > 0
+figure, panels = plt.subplots(2, 1, figsize=(7, 4.2), sharex=True)
+for axes, signal in zip(panels, ("measured_wrench_S", "contact_wrench_S"), strict=True):
+    axes.plot(result.t, np.linalg.norm(result[signal][:, :3], axis=1))
+    axes.set(ylabel=signal.replace("_wrench_S", " force [N]"))
+    shade_contact(axes, result.t, touched)
+panels[1].set(xlabel="t [s]")

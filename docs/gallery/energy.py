@@ -1,0 +1,24 @@
+"""
+A network creates energy
+========================
+
+What hand and wall have put into a station without a passivity method, and with the ledger, over a
+round trip of 50 ms. Below zero the station has given out more than it was given.
+"""
+
+import matplotlib.pyplot as plt
+
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.comparison.one_dof import ACTUAL, HAND, REFERENCE, run_one_dof
+from drake_teleop.passivity.methods import PassivityConfig
+
+figure, panels = plt.subplots(1, 2, figsize=(8.5, 3.2))
+for axes, method in zip(panels, ("none", "ledger"), strict=True):
+    run = run_one_dof(REFERENCE, PassivityConfig(method=method), NetworkConfig(delay=0.025))
+    hand, wall = run.accounts[:, HAND], run.accounts[:, ACTUAL]
+    axes.plot(run.t, hand, label="hand")
+    axes.plot(run.t, wall, label="wall")
+    axes.plot(run.t, run.start_energy + hand + wall, "k", label="both, and the start")
+    axes.set(title=method, xlabel="t [s]", ylabel="energy put in [J]")
+    print(f"{method:6}: least energy {run.least(ACTUAL):8.3f} J")
+panels[0].legend()

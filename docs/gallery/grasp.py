@@ -1,0 +1,32 @@
+"""
+Something heavy is grasped
+==========================
+
+The tool holds 0.8 kg. With the load of the empty tool the object's weight and inertia reach the
+hand; with the load identified anew they do not. What was grasped is the difference of the two, Eq.
+(14).
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import drake_teleop as dt
+from drake_teleop.identification import identification_scenario
+
+empty = dt.LoadScenario("free_motion_force")
+holding = dt.LoadScenario("free_motion_force")
+holding.slave.payload.mass = 0.8
+loads = {
+    name: dt.identify_load(identification_scenario(scenario, seed=1), progress=False)
+    for name, scenario in (("of the empty tool", empty), ("identified anew", holding))
+}
+figure, axes = plt.subplots(figsize=(7, 3.5))
+for name, load in loads.items():
+    station = dt.MakeTeleopStation(holding, load_estimate=load.estimate)
+    result = dt.simulate(station, holding.simulation, progress=False)
+    axes.plot(result.t, result["force_to_master"][:, 2], label=f"load {name}")
+tool, total = (load.identification.phi for load in loads.values())
+grasped = total - tool
+print(f"grasped: {grasped[0]:.3f} kg at {np.round(1e3 * grasped[1:4] / grasped[0], 1)} mm")
+axes.set(xlabel="t [s]", ylabel="force to the hand, vertical [N]")
+axes.legend()

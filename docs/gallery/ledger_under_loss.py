@@ -1,0 +1,27 @@
+"""
+The ledger while packets are lost
+=================================
+
+A third of all packets is lost, in bursts of 50 ms, on a round trip of 100 ms. The books of the
+ledger hold nevertheless, for its counters are cumulative: the next packet has all that the lost
+ones had.
+"""
+
+import matplotlib.pyplot as plt
+
+from drake_teleop.channel.network import NetworkConfig
+from drake_teleop.comparison.one_dof import ACTUAL, HAND, REFERENCE, run_one_dof
+from drake_teleop.passivity.methods import PassivityConfig
+
+lossy = NetworkConfig(delay=0.05, jitter=0.3, loss=0.33, burst=0.05, burst_loss=0.9)
+run = run_one_dof(REFERENCE, PassivityConfig(method="ledger"), lossy)
+figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.5), sharex=True)
+above.plot(run.t, REFERENCE.force_scale * run.wall, label="wall / 17.5", color="grey")
+above.plot(run.t, run.felt, label="felt")
+above.set(ylabel="force at the hand [N]")
+above.legend()
+energy = run.start_energy + run.accounts[:, HAND] + run.accounts[:, ACTUAL]
+below.plot(run.t, 1e3 * energy, "k")
+below.axhline(0, color="red", linewidth=0.8)
+below.set(xlabel="t [s]", ylabel="left in the station [mJ]")
+print(f"least: {1e3 * run.least(ACTUAL):.1f} mJ, never below zero")

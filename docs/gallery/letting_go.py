@@ -1,0 +1,28 @@
+"""
+The hand lets go while it presses
+=================================
+
+The device is left alone with a force that is a round trip old (100 ms). Every method but none
+fades what would throw it away.
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from drake_teleop.channel.network import PRESETS
+from drake_teleop.comparison.one_dof import OneDof, Task, operators_intent, run_one_dof
+from drake_teleop.passivity.methods import PassivityConfig
+
+model, gone = OneDof(), 3000  # the station's grip and servo; ms
+task = Task(0.1, 0.6, 0.7, 1.5, release=9.0, released=10.0, end=4.0, judged=0.1)
+intent = operators_intent(task)
+grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(intent), 1))
+grip[gone:] = 0.0
+figure, axes = plt.subplots(figsize=(7, 3.5))
+for method in ("none", "tdpa", "charged_tdpa", "ledger"):
+    passivity = PassivityConfig(method=method)
+    run = run_one_dof(model, passivity, PRESETS["internet"], intent=intent, grip=grip)
+    axes.plot(run.t - run.t[gone], 1e3 * (run.master - run.master[gone]), label=method)
+axes.set(xlabel="t after letting go [s]", ylabel="way of the device [mm]")
+axes.set(xlim=(-0.2, 0.8), ylim=(-120, 20))
+axes.legend()

@@ -1,0 +1,20 @@
+"""
+When was the robot touched?
+===========================
+
+A second record of the same gripper: somebody pushes at it three times. The load's own wrench is
+taken away, and contact is what stands out of the noise floor of free motion.
+"""
+
+import tempfile
+from pathlib import Path
+
+import drake_teleop as dt
+from drake_teleop.logs.detection import detect_log, draw_detection
+from drake_teleop.logs.sample import sample_log_command
+
+folder = Path(tempfile.mkdtemp())
+sample_log_command(folder, quiet=True)
+load = dt.identify_log(folder / "free.yaml").identification
+found = detect_log(folder / "touched.yaml", load, free=folder / "free.yaml")
+figure = draw_detection(found)

@@ -1,0 +1,25 @@
+"""
+An arm and a tool of your own
+=============================
+
+The same hand with another arm (`arm.urdf`, beside this script) and another tool: a block of 1.8
+kg. Both are identified before the run, as everything else.
+"""
+
+import matplotlib.pyplot as plt
+
+import drake_teleop as dt
+from drake_teleop.slave.tool import Tool
+
+scenario = dt.LoadScenario("free_motion_force")
+scenario.slave.model = "arm.urdf"
+scenario.slave.tool = Tool(mass=1.8, com=[0.01, 0.0, 0.08])
+run = dt.run_scenario(scenario, progress=False)
+print(run.identification)
+
+figure, (above, below) = plt.subplots(2, 1, figsize=(7, 4.2), sharex=True)
+above.plot(run.result.t, run.result["measured_wrench_S"][:, 2])
+above.set(ylabel="measured $f_z$ [N]")
+below.plot(run.result.t, run.result["contact_wrench_S"][:, :3], label=["x", "y", "z"])
+below.set(ylabel="contact force [N]", xlabel="t [s]", ylim=(-5, 5))
+below.legend(ncols=3)

@@ -1,0 +1,27 @@
+"""
+Every passivity method over one network
+=======================================
+
+In one degree of freedom: the hand swings freely, presses a wall of 5.1 kN/m, holds and goes back,
+over a round trip of 100 ms with jitter and loss. Blue is what the hand feels, grey what the wall
+gives.
+"""
+
+import matplotlib.pyplot as plt
+
+from drake_teleop.channel.network import PRESETS
+from drake_teleop.comparison.one_dof import REFERENCE, figures, run_one_dof
+from drake_teleop.pages.style import BLUE, GREY
+from drake_teleop.passivity.methods import METHODS, PassivityConfig
+
+columns = 3
+figure, panels = plt.subplots(3, columns, figsize=(9, 6), sharex=True, sharey=True)
+for axes, method in zip(panels.flat, METHODS, strict=True):
+    run = run_one_dof(REFERENCE, PassivityConfig(method=method), PRESETS["internet"])
+    found = figures(run, REFERENCE)
+    axes.plot(run.t, REFERENCE.force_scale * run.wall, color=GREY, linewidth=0.8)
+    axes.plot(run.t, run.felt, color=BLUE, linewidth=0.8)
+    axes.set_title(f"{method}: {'stable' if found.stable else 'unstable'}")
+    axes.set_ylim(-6, 3)
+figure.supxlabel("t [s]", fontsize="medium")
+figure.supylabel("force at the hand [N]", fontsize="medium")

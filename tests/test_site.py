@@ -1,0 +1,148 @@
+"""The site that docs/conf.py describes, as far as it can be judged without building it.
+
+Code that its pages show is run here, or by the test of the page (`TESTED`).
+"""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shlex
+from pathlib import Path
+
+import click
+import pytest
+
+import drake_teleop
+from drake_teleop.cli import cli
+from drake_teleop.scenario import LoadScenario
+from drake_teleop.studies.study import LoadStudy
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+COPIED = {"benchmarks.md", "changelog.md", "contributing.md"}  # by a build, from elsewhere
+TESTED = {
+    "README.md": "tests/test_readme.py",
+    "analysis.md": "tests/test_analysis_doc.py",
+    "delay.md": "tests/test_delay_doc.py",
+    "detection.md": "tests/test_detection_doc.py",
+    "logs.md": "tests/logs/test_log_description.py",
+    "station.md": "tests/test_sides.py",
+}
+BLOCKS = [
+    (page.name, language, text)
+    for page in PAGES
+    if page.name not in COPIED
+    for language, text in re.findall(
+        r"^```([^\n]*)\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S
+    )
+    if not language.startswith("{")
+]
+loaded_from_elsewhere = runpy.run_path(str(DOCS / "_ext" / "offline.py"))["loaded_from_elsewhere"]
+links = runpy.run_path(str(DOCS / "_ext" / "formulas.py"))["links"]
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        '<script src="https://code.example/a.js"></script>',
+        "<script async src='//code.example/a.js'></script>",
+        '<link href="https://code.example/a.css" rel="stylesheet" />',
+        '<link rel="preload" as="font" href="https://code.example/a.woff2">',
+        '<img alt="x" src="http://code.example/a.png">',
+        '@import "https://code.example/a.css";',
+        "@font-face { src: url(https://code.example/a.woff2) }",
+    ],
+)
+def test_what_is_loaded_from_elsewhere_is_found(foreign):
+    """The build ends with an error then."""
+    assert len(loaded_from_elsewhere(f"<p>before</p>{foreign}<p>after</p>")) == 1
+
+
+def test_links_and_own_files_are_not():
+    own = """<a href="https://example.org/paper">the paper</a> <script src="_static/a.js"></script>
+    <link rel="canonical" href="https://example.org"> <img src="figures/a.png"> url(../a.woff2)"""
+    assert loaded_from_elsewhere(own) == []
+
+
+def test_numbers_of_formulas_are_links():
+    said = "The floor (T12), as Eqs. (7)-(8) have it, not Eq. (99) nor (3) of them nor (T999)."
+    found = [(piece, name) for piece, name in links(said) if name]
+    assert found == [("(T12)", "eq-t12"), ("(7)", "eq-7"), ("(8)", "eq-8")]
+    assert "".join(piece for piece, _ in links(said)) == said
+
+
+def test_a_script_of_the_gallery_is_short_and_says_what_it_shows():
+    scripts = sorted((DOCS / "gallery").glob("*.py"))
+    assert scripts
+    for path in scripts:
+        text = path.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= 40, path.name
+        assert text.startswith('"""\n'), path.name
+        assert f'"{path.stem}"' in (DOCS / "_ext" / "house.py").read_text(), path.name
+
+
+def test_every_block_says_what_it_is():
+    """Code in one of these languages is run; "text" is a drawing, a file, or what is printed."""
+    assert len(BLOCKS) > 40
+    assert {language for _, language, _ in BLOCKS} == {"sh", "python", "yaml", "text"}
+
+
+def test_every_command_has_the_arguments_that_are_shown():
+    shown = [
+        line
+        for _, language, text in BLOCKS
+        if language == "sh"
+        for line in text.replace("\\\n", " ").splitlines()
+        if "drake-teleop " in line
+    ]
+    assert len(shown) > 25
+    for line in shown:
+        name, *arguments = shlex.split(line.partition("drake-teleop ")[2].partition(" > ")[0])
+        command = cli.commands[name]
+        parsed, _, _ = command.make_parser(click.Context(command)).parse_args(arguments)
+        assert set(parsed) <= {parameter.name for parameter in command.params}, line
+
+
+@pytest.mark.parametrize(
+    ("page", "text"),
+    [
+        pytest.param(page, text, id=f"{page}-{k}")
+        for k, (page, language, text) in enumerate(BLOCKS)
+        if language == "yaml" and page not in TESTED.keys() - {"station.md"}
+    ],
+)
+def test_a_file_that_is_shown_can_be_read(page, text, tmp_path):
+    file = tmp_path / "shown.yaml"
+    file.write_text(text)
+    if page == "studies.md":
+        assert len(LoadStudy(file).factors) == 3
+    else:
+        LoadScenario(file).check()
+
+
+def test_code_that_no_other_test_runs(capsys):
+    shown = [text for page, language, text in BLOCKS if language == "python" and page not in TESTED]
+    ran = [text for text in shown if "study_command(" not in text]  # that one is for hours
+    assert (len(ran), len(shown)) == (1, 2)
+    (parts,) = re.findall(r"# (calibration, .*)", ran[0])
+    exec(compile(ran[0], "sensor.md", "exec"), {})
+    assert capsys.readouterr().out.strip() == parts
+
+
+def test_who_is_said_to_run_it_reads_the_page():
+    for page, test in TESTED.items():
+        assert page in (ROOT / test).read_text(encoding="utf-8")
+
+
+def test_every_room_is_in_the_reference():
+    """Each with all that is public in it, which the site's build finds by itself."""
+    package = Path(drake_teleop.__file__).parent
+    rooms = {path.stem for path in package.iterdir() if path.suffix in ("", ".py")}
+    public = {room for room in rooms if not room.startswith("_")} - {"scenarios"}
+    text = (DOCS / "reference.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^   ([a-zA-Z_]+)$", text, re.M))
+    assert (public | set(drake_teleop.__all__) - {"__version__"}) ^ listed == set(), (
+        "one more, or one less, in docs/reference.md"
+    )
