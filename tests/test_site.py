@@ -12,6 +12,7 @@ from pathlib import Path
 
 import click
 import pytest
+from docutils.nodes import make_id
 
 import drake_teleop
 from drake_teleop.cli import cli
@@ -40,6 +41,7 @@ BLOCKS = [
     if not language.startswith("{")
 ]
 loaded_from_elsewhere = runpy.run_path(str(DOCS / "_ext" / "offline.py"))["loaded_from_elsewhere"]
+KEYWORDS = runpy.run_path(str(DOCS / "_ext" / "keywords.py"))["KEYWORDS"]
 links = runpy.run_path(str(DOCS / "_ext" / "formulas.py"))["links"]
 
 
@@ -71,6 +73,12 @@ def test_numbers_of_formulas_are_links():
     found = [(piece, name) for piece, name in links(said) if name]
     assert found == [("(T12)", "eq-t12"), ("(7)", "eq-7"), ("(8)", "eq-8")]
     assert "".join(piece for piece, _ in links(said)) == said
+
+
+def test_words_to_look_for_lead_to_sections_that_exist():
+    for page, sections in KEYWORDS.items():
+        text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
+        assert sections.keys() <= set(map(make_id, re.findall(r"^#+ (.+)$", text, re.M))), page
 
 
 def test_a_script_of_the_gallery_is_short_and_says_what_it_shows():

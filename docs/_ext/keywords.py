@@ -37,7 +37,10 @@ KEYWORDS = {
         "where-the-imu-is": "IMU, accelerometer",
         "from-an-excitation-to-the-load": "excitation",
     },
-    "robot": {"your-robot-s-own-words": "Franka, UR, URScript, payload"},
+    "robot": {
+        "the-load-in-the-robot-s-format": "Franka, UR, URScript, payload",
+        "the-wrench-without-the-tool-live": "compensate, gravity compensation",
+    },
     "sensor": {"the-presets": "ATI, JR3, Bota, Robotiq, OnRobot, sensor noise"},
     "station": {
         "another-haptic-device": "haptic device, omega.6, Falcon, Phantom",
