@@ -388,8 +388,8 @@ def compensate(
     """Take the load out of a live wrench.
 
     SOURCE is udp://[HOST]:PORT, - for lines of JSON on stdin, or replay:LOG; SINK is udp://HOST:PORT,
-    - for stdout, or a .csv or .parquet file. What cannot be trusted is zero, with a flag. The low-
-    pass is causal here; --delay is for logs. Until the source ends, or Ctrl-C.
+    - for stdout, or a .csv or .parquet file. What cannot be trusted is zero, with a flag. --cutoff
+    is causal here; --delay is for logs. Until the source ends, or Ctrl-C.
     """
     from drake_teleop.robots.compensate import compensate_command
 
