@@ -44,6 +44,10 @@ from drake_teleop.logs.read.reading import read_log
 from drake_teleop.passivity.packet import PACKET_SIZE
 from drake_teleop.resources import models_dir, scenarios_dir, studies_dir
 from drake_teleop.result import Signal, SimulationResult
+from drake_teleop.robots import udp
+from drake_teleop.robots.compensator import Compensator
+from drake_teleop.robots.lines import read_line
+from drake_teleop.robots.streams import ONLY_SAID, Reading
 from drake_teleop.scenario import LoadScenario, ScenarioFromData
 from drake_teleop.scenario_reference import commented
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
@@ -507,6 +511,55 @@ def _floats(value: Any) -> np.ndarray:
     return np.array([x if isinstance(x, (int, float)) else math.nan for x in numbers], float)
 
 
+# What a robot sends to `compensate`.
+
+
+def _readings() -> list[Reading]:
+    values = np.tile([*np.arange(6.0), 0.0, 0.0, 9.81, *np.zeros(6)], (20, 1))
+    values[:, 0] += np.sin(np.arange(20.0))
+    return [Reading(k, 1e-3 * k, row) for k, row in enumerate(values)]
+
+
+def _reading_packets(_: Path) -> list[bytes]:
+    return [b"".join(map(udp.packed, _readings()))]
+
+
+def _reading_lines(_: Path) -> list[bytes]:
+    names = {"wrench": slice(6), "s": slice(6, 9), "omega": slice(9, 12), "alpha": slice(12, 15)}
+    rows = [
+        {"t": each.t} | {name: each.values[part].tolist() for name, part in names.items()}
+        for each in _readings()
+    ]
+    return ["\n".join(map(json.dumps, rows)).encode()]
+
+
+def _wrenches(path: Path) -> None:
+    """Whatever comes, what goes out is finite, and zero if it is flagged."""
+    content, size = path.read_bytes(), udp.READING.size
+    if path.suffix == ".bin":
+        parts = [content[k : k + size] for k in range(0, len(content), size)]
+        readings = [udp.unpacked(part) for part in parts]
+    else:
+        readings = [read_line(line, k) for k, line in enumerate(content.split(b"\n"))]
+    compensator = Compensator(_LOAD, 1e-3, gamma=2.0, largest=np.full(6, 50.0))
+    for k, reading in enumerate(readings):
+        out = compensator.step(reading, 1e-3 * k)
+        numbers = np.array([out.t, *out.contact, *out.scaled])
+        zero = bool(out.flags & ~ONLY_SAID)
+        if not np.isfinite(numbers).all() or (np.abs(numbers[1:]) > 50.0).any():
+            raise AssertionError(f"{out!r}")
+        if zero and numbers[1:].any():
+            raise AssertionError(f"{out!r}")
+    compensator.tare()
+
+
+_LOAD = Identification(
+    phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003])),
+    *(np.zeros(6), 1e-6 * np.eye(16), np.ones(16, bool), 4.0, 0.0, np.full(6, 0.01)),
+    *("batch least squares", 100),
+)
+
+
 # Options.
 
 _COMMANDS = (
@@ -520,6 +573,8 @@ _COMMANDS = (
     "eliminate log.csv --load l.json --sigma 0.5 --gamma 2 --eta 0.1 --causal delayed "
     "--causal-tare 2 --free f.csv --delay auto",
     "detect log.csv --load l.json --statistic cusum",
+    "compensate udp://:9000 --load l.json --out udp://:9001 --rate 1000 --range 200 10 --tare "
+    "--control 9002 --sigma 0.5 --gamma 2 --predicted --cutoff 20",
     "inspect log.csv",
     "sample-log --seed 1",
     "analyze press --direction x",
@@ -595,6 +650,8 @@ TARGETS = (
         _json,
         _message,
     ),
+    Target("wrenches", ".bin", 1, _reading_packets, mutations.damaged, _wrenches),
+    Target("wrenches_lines", ".jsonl", 1, _reading_lines, mutations.text, _wrenches),
     Target("options", ".json", 2, _commands, mutations.arguments, _command_line),
 )
 
