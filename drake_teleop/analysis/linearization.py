@@ -380,6 +380,13 @@ class _Period:
 
     def __init__(self, scenario: Scenario, load_estimate: Array | None) -> None:
         _check_rates(scenario)
+        own_period = scenario.master.own_period(scenario.rates.hand_hz)
+        if own_period is not None:
+            raise DrakeTeleopError(
+                f"the device has a rate of its own, {1 / own_period:g} Hz, below that of the hand",
+                where="rates.hand_hz",
+                remedy=f"set it to {1 / own_period:g}, or master.figures.rate_hz to 0",
+            )
         self.dt = 1 / scenario.rates.hand_hz
         smooth = _smooth(scenario)
         self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)

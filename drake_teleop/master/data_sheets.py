@@ -12,6 +12,14 @@ across and 110 mm, of a Virtuose a ball of 450 mm across, D.
 | haply_inverse3 | 0.2 kg E | 0.15 N E | 10 N D | 200 x 340 x 190 mm E |
 | virtuose_6d | 1 kg E | 1 N E | 35 N D | 260 mm cube E |
 
+| name | step of position | of the turns | own rate |
+|---|---|---|---|
+| geomagic_touch | 55 um, 450 dpi D | 2 mrad E | 1 kHz D |
+| omega_3, _6, _7 | 10 um D | 0.09 degrees D | 4 kHz D |
+| falcon | 64 um, 400 dpi D | - | 1 kHz D |
+| haply_inverse3 | 20 um E | 2 mrad E | 4 kHz E |
+| virtuose_6d | 20 um E | 0.2 mrad E | 1 kHz D |
+
 Of them only the Virtuose displays torque (3.1 N m D); an omega.3 and a Falcon do not turn. The
 omega.7's gripper and the buttons of all are left out.
 """
@@ -26,6 +34,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fields import settings
@@ -94,6 +103,11 @@ class DeviceFigures:
     turn: list[float] = quantity(
         [1.2, 1.2, 2.4], "rad", 0.0, math.pi, "largest yaw, pitch (below 1.5) and roll, both ways"
     )
+    resolution: float = quantity(0.0, "m", 0.0, 0.01, "step in which its position is read; 0: none")
+    turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "likewise of its turns")
+    rate_hz: float = quantity(
+        0.0, "Hz", 0.0, 1e5, "at which it is read and takes a force; 0, or above: rates.hand_hz"
+    )
 
 
 def _sheet(mass: float, friction: float, force: float, size: list[float], **others: Any) -> Any:
@@ -105,17 +119,43 @@ def _sheet(mass: float, friction: float, force: float, size: list[float], **othe
 _FIXED = [0.0, 0.0, 0.0]
 _OMEGA = [0.11, 0.113, 0.113]
 _OMEGA_TURN = np.radians([120.0, 70.0, 160.0]).tolist()  # D
+_OMEGA_READ = {"resolution": 1e-5, "turn_resolution": math.radians(0.09), "rate_hz": 4000.0}
 
 #: What the devices by name have, for `Master.figures`.
 FIGURES: dict[str, DeviceFigures] = {
-    "geomagic_touch": _sheet(0.045, 0.26, 3.3, [0.07, 0.16, 0.12]),
-    "omega_3": _sheet(0.25, 0.3, 12.0, _OMEGA, turn=_FIXED),
-    "omega_6": _sheet(0.3, 0.3, 12.0, _OMEGA, turn=_OMEGA_TURN),
-    "omega_7": _sheet(0.35, 0.3, 12.0, _OMEGA, turn=_OMEGA_TURN),
-    "falcon": _sheet(0.2, 0.5, 8.9, [0.102] * 3, turn=_FIXED),
-    "haply_inverse3": _sheet(0.2, 0.15, 10.0, [0.2, 0.34, 0.19]),
+    "geomagic_touch": _sheet(
+        0.045,
+        0.26,
+        3.3,
+        [0.07, 0.16, 0.12],
+        resolution=5.5e-5,
+        turn_resolution=2e-3,
+        rate_hz=1000.0,
+    ),
+    "omega_3": _sheet(0.25, 0.3, 12.0, _OMEGA, turn=_FIXED, **_OMEGA_READ),
+    "omega_6": _sheet(0.3, 0.3, 12.0, _OMEGA, turn=_OMEGA_TURN, **_OMEGA_READ),
+    "omega_7": _sheet(0.35, 0.3, 12.0, _OMEGA, turn=_OMEGA_TURN, **_OMEGA_READ),
+    "falcon": _sheet(0.2, 0.5, 8.9, [0.102] * 3, turn=_FIXED, resolution=6.35e-5, rate_hz=1000.0),
+    "haply_inverse3": _sheet(
+        0.2,
+        0.15,
+        10.0,
+        [0.2, 0.34, 0.19],
+        resolution=2e-5,
+        turn_resolution=2e-3,
+        rate_hz=4000.0,
+    ),
     "virtuose_6d": _sheet(
-        1.0, 1.0, 35.0, [0.26] * 3, inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3
+        1.0,
+        1.0,
+        35.0,
+        [0.26] * 3,
+        inertia=5e-3,
+        friction_torque=0.03,
+        peak_torque=[3.1] * 3,
+        resolution=2e-5,
+        turn_resolution=2e-4,
+        rate_hz=1000.0,
     ),
 }
 
@@ -165,14 +205,28 @@ class Master:
         numbers[TURN] = figures.turn
         return HapticDevice(numbers, self.model)
 
+    def steps(self) -> NDArray[np.float64]:
+        """(6,) in which its axes are read [m, rad]; 0 if exactly."""
+        if self.model in (PHANTOM, LEADER):
+            return np.zeros(6)
+        figures = self._figures()
+        return np.repeat([figures.resolution, figures.turn_resolution], 3)
+
+    def own_period(self, hand_hz: float) -> float | None:
+        """Of a device that is slower than the rate of the hand [s]; None of any other."""
+        rate = 0.0 if self.model in (PHANTOM, LEADER) else self._figures().rate_hz
+        return 1 / rate if 0.0 < rate < hand_hz else None
+
     def without_coulomb_friction(self) -> "Master":
-        """The same, linear."""
+        """The same, linear: its encoders have no steps either."""
         if self.model == PHANTOM:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
         if self.leader is not None:
             return dataclasses.replace(self, leader=dataclasses.replace(self.leader, friction=[]))
-        figures = dataclasses.replace(self._figures(), friction=0.0, friction_torque=0.0)
+        figures = dataclasses.replace(
+            self._figures(), friction=0.0, friction_torque=0.0, resolution=0.0, turn_resolution=0.0
+        )
         return dataclasses.replace(self, figures=figures)
 
     def found_from(self, folder: Path) -> "Master":

@@ -9,6 +9,8 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_teleop.channel.network import mean_delay
 from drake_teleop.master.device import AddDevice
+from drake_teleop.master.dynamics import HapticDevice
+from drake_teleop.master.electronics import Encoders, Held
 from drake_teleop.operator.decision import Training
 from drake_teleop.operator.operator import Operator
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
@@ -51,7 +53,8 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
 
     operator = builder.AddNamedSystem("operator", _operator(scenario, start_B))
     period, model = 1 / scenario.rates.hand_hz, scenario.master.device(hand.mass, hand.inertia)
-    device, display = AddDevice(builder, period, model, model.inverse_kinematics(start_B))
+    q_start = model.inverse_kinematics(start_B)
+    device, display = AddDevice(builder, period, model, q_start)
     builder.Connect(operator.GetOutputPort("hand_wrench_E"), device.GetInputPort("hand_wrench_E"))
     builder.Connect(device.GetOutputPort("pose_master"), operator.GetInputPort("pose_master"))
     builder.Connect(device.GetOutputPort("twist_master"), operator.GetInputPort("twist_master"))
@@ -66,13 +69,24 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
     kinematic_scaling = builder.AddNamedSystem(
         "kinematic_scaling", KinematicScaling(scaling, CLUTCH_PERIOD, start_W)
     )
-    builder.Connect(
-        device.GetOutputPort("pose_master"), kinematic_scaling.GetInputPort("pose_master")
-    )
+    read, command = device.GetOutputPort("pose_master"), display.GetInputPort("wrench_command")
+    if scenario.master.steps().any() and isinstance(model, HapticDevice):
+        encoders = Encoders(model, q_start, scenario.master.steps())
+        builder.AddNamedSystem("encoders", encoders)
+        builder.Connect(device.GetOutputPort("state"), encoders.get_input_port())
+        read = encoders.get_output_port()
+    own_period = scenario.master.own_period(scenario.rates.hand_hz)
+    if own_period is not None:
+        held_pose = builder.AddNamedSystem("held_pose", Held(own_period, start_B))
+        held_wrench = builder.AddNamedSystem("held_wrench", Held(own_period, np.zeros(6)))
+        builder.Connect(read, held_pose.get_input_port())
+        builder.Connect(held_wrench.get_output_port(), command)
+        read, command = held_pose.get_output_port(), held_wrench.get_input_port()
+    builder.Connect(read, kinematic_scaling.GetInputPort("pose_master"))
     builder.ExportInput(kinematic_scaling.GetInputPort("clutch"), "clutch")
     export(builder, kinematic_scaling, "pose_command")
 
-    builder.ExportInput(display.GetInputPort("wrench_command"), "wrench_command")
+    builder.ExportInput(command, "wrench_command")
     export(builder, display, "force_to_master", "fault_at_hand", "displayed_and_fault")
     return builder.Build()
 

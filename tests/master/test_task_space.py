@@ -13,7 +13,9 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.master import dynamics
 from drake_teleop.master.data_sheets import FIGURES, JointFriction, Master
 from drake_teleop.master.device import MasterDevice
+from drake_teleop.master.electronics import read_pose_into
 from drake_teleop.master.force_display import display_into, initial_display
+from drake_teleop.operator.operator import Sine
 from drake_teleop.scenario import LoadScenario, ScenarioFromData, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
@@ -176,3 +178,40 @@ def test_a_station_feels_what_its_device_can_display(model):
     np.testing.assert_array_equal(result["force_to_master"][:, 3:], 0.0)
     moved = result["pose_master"][:, 4:] - result["pose_master"][0, 4:]
     assert np.abs(moved).max() > 0.01
+
+
+def test_encoders_count_whole_steps_from_the_start():
+    """Position and turns each in their own; what moves by less than half a step is not seen."""
+    omega, steps = device(), np.repeat([1e-3, 0.01], 3)
+    pose = np.empty(7)
+    for away, counts in ((0.4, 0.0), (0.6, 1.0), (-2.3, -2.0)):
+        read_pose_into(Q + away * steps, Q, steps, omega.numbers, pose)
+        np.testing.assert_allclose(pose, omega.forward_kinematics(Q + counts * steps), atol=1e-12)
+    read_pose_into(Q + V, Q, np.zeros(6), omega.numbers, pose)
+    np.testing.assert_allclose(pose, omega.forward_kinematics(Q + V), atol=1e-12)
+
+
+def test_a_slower_device_is_read_and_takes_a_force_at_its_own_rate():
+    """Command and force are held for 2 ms; the hand's own pose is not."""
+    slow = dataclasses.replace(FIGURES["falcon"], rate_hz=500.0)
+    move = Sine(duration=10.0, ramp=0.05, frequency=3.0, translation=[0.01, 0.01, 0.02])
+    scenario = replace(
+        LoadScenario("free_motion_force"),
+        master=Master(model="falcon", figures=slow),
+        operator__intent=[move],
+        rates__log_hz=2000.0,
+        simulation__settle=0.1,
+        simulation__duration=0.04,
+        force_scaling__sigma=1.0,
+    )
+    assert scenario.master.own_period(2000.0) == 2e-3
+    assert scenario.master.own_period(500.0) is None
+    result = simulate(MakeTeleopStation(scenario), scenario.simulation, progress=False)
+    for values in (result["pose_command"][:, 4:], result["force_to_master"][:, :3]):
+        changes = np.flatnonzero(np.diff(values, axis=0).any(axis=1))
+        assert len(changes) > 10
+        assert len(np.unique(changes % 4)) == 1
+    assert np.diff(result["pose_master"][:, 4:], axis=0).any(axis=1).all()
+    moved = result["pose_command"][:, 4:] - scenario.slave.position
+    counts = moved / scenario.kinematic_scaling.translation_scale / slow.resolution
+    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
