@@ -21,9 +21,13 @@ from drake_teleop.comparison.one_dof import (
     PERIOD,
     REFERENCE,
     OneDofRun,
+    Task,
+    figures,
+    operators_intent,
     run_one_dof,
 )
 from drake_teleop.passivity.energy import ledger, port_work
+from drake_teleop.passivity.force_limit import ForceLimitConfig
 from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.passivity.packet import ENERGY, difference_into
 from drake_teleop.passivity.tdpa import TdpaConfig
@@ -163,3 +167,25 @@ def test_set_positions_are_paid_for_at_motor_and_slave(seed, timeout):
 @pytest.mark.parametrize(("seed", "timeout"), [(2, 0.1), (4, 1.0)])
 def test_waves_create_nothing_at_the_command(seed, timeout):
     assert pressed("wave", seed, timeout).least(COMMAND) >= -1e-9
+
+
+def test_force_limit_is_what_the_hand_feels_at_most():
+    """And reaches: the wall pushes back with twice as much; nothing is promised about energy."""
+    found = pressed("force_limit", 2, 1.0)
+    limit = ForceLimitConfig().force
+    assert MEDIUM.force_scale * np.abs(found.wall).max() > 2.0 * limit
+    assert np.abs(found.felt).max() == pytest.approx(limit, rel=1e-12)
+    assert found.least(ACTUAL) < -0.01
+
+
+def test_four_channels_are_transparent_without_delay():
+    """Felt is what is pressed, and the slave is where the hand is, though its servo gives way."""
+    task = Task(press=0.5, pressed=1.5, release=4.0, released=5.0, end=6.0, judged=1.0)
+    found = run_one_dof(
+        MEDIUM, PassivityConfig(method="four_channel"), NetworkConfig(),
+        intent=operators_intent(task), timeout=1.0,
+    )  # fmt: skip
+    assert abs(figures(found, MEDIUM, task).force_error) < 0.02
+    held = slice(3500, 3900)
+    assert found.wall[held].mean() / MEDIUM.servo_stiffness < -2e-4
+    np.testing.assert_allclose(found.slave[held], found.master[held], atol=1e-6)
