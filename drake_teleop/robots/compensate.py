@@ -6,6 +6,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -103,7 +104,7 @@ def run(
     tare: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
-    """Compensates until the source ends.
+    """Compensates until the source ends, or Ctrl-C.
 
     Args:
         control: answers requests to tare.
@@ -124,16 +125,17 @@ def run(
                 say(f"t = {out.t:.3f} s: {name}")
             counts[name] += 1
 
-    while (readings := source.read(_IDLE_S)) is not None:
-        if source.live and (stale := compensator.idle(time.monotonic())) and not readings:
-            put(stale)
-        for reading in readings:
-            put(compensator.step(reading, time.monotonic() if source.live else reading.t))
-            if compensator.rested >= tare_at:
-                tare_at = np.inf
-                say(f"tare {compensator.tare()}")
-        if control is not None:
-            control.answer(compensator.tare)
+    with suppress(KeyboardInterrupt):
+        while (readings := source.read(_IDLE_S)) is not None:
+            if source.live and (stale := compensator.idle(time.monotonic())) and not readings:
+                put(stale)
+            for reading in readings:
+                put(compensator.step(reading, time.monotonic() if source.live else reading.t))
+                if compensator.rested >= tare_at:
+                    tare_at = np.inf
+                    say(f"tare {compensator.tare()}")
+            if control is not None:
+                control.answer(compensator.tare)
     return counts
 
 

@@ -175,7 +175,8 @@ class Compensator:
     def _anew(self, reading: Reading, ahead: float, flags: int) -> int:
         """Believes the clock from here on."""
         self._offset, self._number, self._t = ahead, reading.number, reading.t
-        self._readings, self.rested, self._in_time = 0, 0, reading.t + ahead
+        self._readings, self._rate_off, self.rested = 0, 0, 0
+        self._in_time = reading.t + ahead
         self._settle_anew()
         return flags
 

@@ -19,7 +19,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.robots.compensate import Control, run, sink_of, source_of
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.lines import LineSource, read_line, written_line
-from drake_teleop.robots.streams import DAMAGED, Compensated, Flag
+from drake_teleop.robots.streams import DAMAGED, Compensated, Flag, Reading
 
 HEADER = Path(udp.__file__).with_name("drake_teleop_udp.h").read_text()
 
@@ -127,6 +127,28 @@ def test_lines_from_a_pipe_to_a_table(tmp_path: Path) -> None:
     assert counts["wrenches"] == len(table) == 31 and counts["damaged"] == 1
     assert table["contact_f_x"][29] == pytest.approx(5.0) and table["flags"][30] == 2
     assert any(text.endswith("damaged") for text in said)
+
+
+class Interrupted:
+    """A source with one reading, and then Ctrl-C."""
+
+    dt, live = DT, True
+
+    def __init__(self) -> None:
+        self._left = readings(1)
+
+    def read(self, timeout_s: float) -> list[Reading]:
+        if not self._left:
+            raise KeyboardInterrupt
+        return [self._left.pop()]
+
+    def close(self) -> None:
+        pass
+
+
+def test_ctrl_c_ends_it_with_what_there_was(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(Interrupted(), Compensator(load(), DT), sink_of("-")) == {"wrenches": 1}
+    assert json.loads(capsys.readouterr().out)["number"] == 0
 
 
 def test_the_control_port_tares_and_says_so() -> None:
