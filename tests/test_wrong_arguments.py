@@ -64,6 +64,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "identify_load": (lambda: dt.identify_load(NAME), "scenario"),
     "run_scenario": (lambda: dt.run_scenario(NAME), "scenario"),
     "run_scenario of a path": (lambda: dt.run_scenario(Path("mine.yaml")), "scenario"),  # type: ignore[arg-type]
+    "drive": (lambda: dt.drive(7), "scenario"),  # type: ignore[arg-type]
     "replace": (lambda: replace(NAME, simulation__seed=1), "scenario"),
     "LoadScenario": (lambda: dt.LoadScenario(dt.Scenario()), "scenario"),  # type: ignore[arg-type]
     "simulate": (lambda: simulate(NAME, NAME), "diagram"),
