@@ -108,8 +108,6 @@ def measured(rate: float, seconds: float, kind: type[Compensator]) -> dict[str, 
         there.bind(("127.0.0.1", 0))
         timed = Timed(source, UdpSink(f"udp://127.0.0.1:{there.getsockname()[1]}"))
         loop = kind(load, timed.dt)
-        loop.step(Reading(0, 0.0, np.zeros(15)), 0.0)  # compiled by now
-        loop = kind(load, timed.dt)
         context = multiprocessing.get_context("spawn")
         sender = context.Process(target=send, args=(source.port, rate, seconds), daemon=True)
         sender.start()

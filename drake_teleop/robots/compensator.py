@@ -98,6 +98,9 @@ class Compensator:
         self._since, self._first, self._readings, self._rate_off = 0.0, 0, 0, 0
         self._rest = np.zeros((max(2, round(TARE_S / dt)), VALUES + 6))
         self.rested = 0
+        # What is compiled is loaded now: the first readings would be stale before they are judged.
+        self._eliminated(np.zeros(VALUES))
+        self.rested = 0
 
     def step(self, reading: Reading, now: float) -> Compensated:
         """Takes a reading that came at `now` [s], of a clock that never goes back."""
