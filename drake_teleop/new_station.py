@@ -328,7 +328,7 @@ def _text(
     lines = [
         "# Made by drake-teleop new. Fields that are not here have their defaults; all, with their",
         "# unit, range and meaning: drake-teleop scenario station.yaml",
-        f"description: {Path(arm).stem} led by a {device}",
+        f"description: {Path(arm).stem} led by {device}",
         "simulation: {duration: 5.0, settle: 0.8}",
         "slave:",
         f"  model: {arm}",
