@@ -38,6 +38,7 @@ from drake_teleop.slave.arm import (
 )
 from drake_teleop.slave.inverse_kinematics import IkStatus
 from drake_teleop.slave.numeric_inverse_kinematics import find_posture
+from drake_teleop.slave.servo import mass_matrix
 from drake_teleop.vectors import cross, put, three
 
 Array = NDArray[np.float64]
@@ -280,23 +281,12 @@ class LeaderDevice:
 
     def mass_matrix(self, q: Array) -> Array:
         """(n, n) with the hand."""
-        return _mass_matrix(self.arm, np.asarray(q))
+        return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
         """(n, n) of the joint forces against dq/dt; see `HapticDevice.damping_matrix`."""
         own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING]
         return np.diag(own + creeping * self.joints[_COULOMB] / FRICTION_SPEED)
-
-
-def _mass_matrix(arm: ArmModel, q: Array) -> Array:
-    """(n, n): inverse dynamics of unit accelerations."""
-    still, weight = np.zeros(len(q)), np.empty(len(q))
-    inverse_dynamics(arm.table, q, still, still, weight)
-    columns = np.empty((len(q), len(q)))
-    for unit, column in zip(np.eye(len(q)), columns, strict=True):
-        inverse_dynamics(arm.table, q, still, unit, column)
-        column -= weight
-    return columns.T
 
 
 def of_the_joints(
@@ -311,7 +301,7 @@ def of_the_joints(
         limit: (n,) of the motors.
         carried: share of the arm's weight that the motors carry.
     """
-    inertia, w = np.diag(_mass_matrix(arm, home)), 2 * np.pi * _STOP_HZ
+    inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _STOP_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]
     return np.array([*rows, np.full(len(home), carried)])
 
