@@ -71,6 +71,7 @@ sphinx_gallery_conf = {
 }
 
 # The reference
+viewcode_follow_imported_members = False
 autosummary.WELL_KNOWN_ABBREVIATIONS += ("Eq.", "Eqs.", "Fig.", "Figs.")  # end no sentence
 autosummary_generate = True
 autodoc_default_options = {"members": True, "member-order": "bysource", "exclude-members": "set"}
