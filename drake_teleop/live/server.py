@@ -89,9 +89,9 @@ class LiveDrive:
             self._live = self._make(scenario, load, record)
             asyncio.run(self._serve())
         except Exception as error:
-            self._failed = error.with_traceback(None)
+            self._failed = _without_frames(error)
         finally:
-            del self._live
+            self.__dict__.pop("_live", None)  # none, if it could not be made
             gc.collect()
             self._over.set()
             self._ready.set()
@@ -191,6 +191,15 @@ class LiveDrive:
             pass
         finally:
             live.leave(you, time.perf_counter())
+
+
+def _without_frames(error: Exception) -> Exception:
+    """It and what led to it hold no frames, whose variables another thread would unmake."""
+    link: BaseException | None = error
+    while link is not None:
+        link.__traceback__ = None
+        link = link.__cause__ or link.__context__
+    return error
 
 
 def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import time
 from urllib.error import HTTPError
@@ -15,7 +16,9 @@ from websockets.sync.client import connect
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.live import server
 from drake_teleop.live.messages import LONGEST
-from drake_teleop.scenario import Scenario
+from drake_teleop.scenario import Scenario, replace
+
+LEARNING = replace(Scenario(), load_estimator__enabled=True)  # identifies nothing beforehand
 
 
 def status(url: str, **headers: str) -> int:
@@ -39,6 +42,13 @@ def until(socket, wanted) -> dict:
         if frame is not None and wanted(frame):
             return frame
     raise AssertionError("there was no such frame")
+
+
+def test_a_record_that_cannot_be_written_is_said_and_nothing_waits(tmp_path):
+    (tmp_path / "file").write_text("a file, and no folder")
+    with pytest.raises(DrakeTeleopError, match="cannot be made a folder"):
+        server.drive(LEARNING, record=tmp_path / "file" / "record")
+    gc.collect()  # what Meshcat was made for is gone: in this thread it would end the process
 
 
 @pytest.mark.slow
