@@ -37,6 +37,7 @@ from drake_teleop.live.messages import LONGEST
 from drake_teleop.live.session import live_scenario
 from drake_teleop.replay import ReplayScene
 from drake_teleop.scenario import LoadScenario, Scenario, check_scenario
+from drake_teleop.writing import make_folder
 
 _HOST = "127.0.0.1"
 _MOST_CLIENTS = 8
@@ -53,6 +54,8 @@ class LiveDrive:
     def __init__(self, scenario: Scenario, record: Path | None, port: int) -> None:
         setup = live_scenario(scenario)
         setup.check()
+        if record is not None:
+            make_folder(record)  # before there is a Meshcat, which only its own thread may unmake
         load = None if setup.load_estimator.enabled else identified_load(setup)
         self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
         self._failed: Exception | None = None
