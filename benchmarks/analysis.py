@@ -1,6 +1,6 @@
 """Is what the analysis says of stability what a simulation does, and how long does it take?
 
-`python benchmarks/analysis.py [--json]` prints three things.
+`python benchmarks/analysis.py [--json FILE]` prints three things.
 
 * The round trip at which a simulation of one axis becomes unstable, by bisection, next to the delay
   margin of the sampled loop: three grips before four environments each, with and without the tool
@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -307,7 +308,7 @@ def analyse(axis: OneAxis, omega: Array) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Runs the comparisons and prints them; returns 0 if `holds`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    parser.add_argument("--json", type=Path, help="write the figures here")
     options = parser.parse_args(arguments)
     axis = replace(OneAxis(), delay=10e-3)
     omega = 2 * np.pi * np.geomspace(0.1, 500.0, 1000)
@@ -315,14 +316,13 @@ def main(arguments: list[str] | None = None) -> int:
     result: dict[str, Any] = {"margins": margin_rows(), "maps": map_rows()}
     result["analysis"] = seconds(lambda: analyse(axis, omega), 50)
     if options.json:
-        print(json.dumps(result))
-    else:
-        print_tables(result)
+        options.json.write_text(json.dumps(result, indent=2) + "\n")
+    print_tables(result)
     return 0 if holds(result) else 1
 
 
 def print_tables(result: dict[str, Any]) -> None:
-    """What `main` prints without --json."""
+    """What `main` prints."""
     print("delay margin, ms of round trip")
     print("grip    sigma  wall kN/m  N s/m  simulated  sampled  continuous")
     for row in result["margins"]:

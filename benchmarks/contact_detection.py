@@ -1,6 +1,6 @@
 """Which contact is noticed, how soon, and by which detector?
 
-`python benchmarks/contact_detection.py [--json] [--hours 1]` moves a load of 3.1 kg fast and
+`python benchmarks/contact_detection.py [--json FILE] [--hours 1]` moves a load of 3.1 kg fast and
 touches it 500 times with 0.05 to 5 N in any direction, 0.3 s each. The wrench has white noise
 (0.08 N, 3 mN m) and gains that are off by 0.3 %; the motion has noise of its own and comes 1 ms
 late, uncorrected. Load and offsets are identified from another such motion by the same sensors, and
@@ -29,6 +29,7 @@ import argparse
 import json
 import time
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -242,14 +243,13 @@ def at_equal_rate(gains: Array, lag: int, hours: float) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--json", action="store_true", help="Figures as JSON.")
+    parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--hours", type=float, default=1.0, help="Free motion for thresholds.")
     figures = measure() if (given := parser.parse_args()) else {}
     figures["gains and delay right"] = at_equal_rate(RIGHT, 0, given.hours)
     figures["gains and delay wrong"] = at_equal_rate(GAINS, LATE, given.hours)
     if given.json:
-        print(json.dumps(figures))
-        return
+        given.json.write_text(json.dumps(figures, indent=2) + "\n")
     bands = [key for key in figures["table"][0] if key.endswith(" N")]
     print(f"{'AUC, noticed, median delay':36s} elsewhere " + "".join(f"{b:>24s}" for b in bands))
     for row in figures["table"]:

@@ -1,8 +1,8 @@
 """How often do the stated 95 % intervals of an identification hold, whatever the noise's colour?
 
-`python benchmarks/intervals.py [--json] [--seeds N]` identifies the same load N times (500) from
-the same motion with new noise of six colours, counts for each of the 16 parameters how often the
-interval of `uncertainty.intervals` holds the truth, and prints the table. With 500 seeds the
+`python benchmarks/intervals.py [--json FILE] [--seeds N]` identifies the same load N times (500)
+from the same motion with new noise of six colours, counts for each of the 16 parameters how often
+the interval of `uncertainty.intervals` holds the truth, and prints the table. With 500 seeds the
 standard error of a count is 1 %. Then records that do not excite some parameters, in the same
 noise: how often each of these was called identified.
 """
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,7 +158,7 @@ def false_verdicts(name: str, seeds: int) -> dict[str, int]:
 def main(arguments: list[str] | None = None) -> int:
     """Runs the study and prints it; returns 0 if every share is within 90-98 %, 1 otherwise."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--seeds", type=int, default=500, help="records for each colour")
     options = parser.parse_args(arguments)
     shares = {colour: coverage(colour, options.seeds) for colour in COLOURS}
@@ -165,16 +166,16 @@ def main(arguments: list[str] | None = None) -> int:
     every = np.array([shares[colour]["coverage"] for colour in COLOURS])
     if options.json:
         study = {c: {k: v.tolist() for k, v in r.items()} for c, r in shares.items()}
-        print(json.dumps({"seeds": options.seeds, "colours": study, "called identified": verdicts}))
-    else:
-        print(f"Coverage of nominal 95 % intervals [%], {options.seeds} seeds, {SECONDS:.0f} s")
-        print("parameter " + "".join(f"{name:>24}" for name in COLOURS))
-        for i, name in enumerate(PARAMETERS):
-            print(f"{name:<10}" + "".join(f"{100.0 * share:24.1f}" for share in every[:, i]))
-        print(f"smallest {100.0 * every.min():.1f}, largest {100.0 * every.max():.1f}")
-        print(f"\nCalled identified without excitation, of {options.seeds} (AR(1) 0.9)")
-        for name, counts in verdicts.items():
-            print(f"{name:<16}" + ", ".join(f"{p} {n}" for p, n in counts.items()))
+        found = {"seeds": options.seeds, "colours": study, "called identified": verdicts}
+        options.json.write_text(json.dumps(found, indent=2) + "\n")
+    print(f"Coverage of nominal 95 % intervals [%], {options.seeds} seeds, {SECONDS:.0f} s")
+    print("parameter " + "".join(f"{name:>24}" for name in COLOURS))
+    for i, name in enumerate(PARAMETERS):
+        print(f"{name:<10}" + "".join(f"{100.0 * share:24.1f}" for share in every[:, i]))
+    print(f"smallest {100.0 * every.min():.1f}, largest {100.0 * every.max():.1f}")
+    print(f"\nCalled identified without excitation, of {options.seeds} (AR(1) 0.9)")
+    for name, counts in verdicts.items():
+        print(f"{name:<16}" + ", ".join(f"{p} {n}" for p, n in counts.items()))
     quiet = not any(n for counts in verdicts.values() for n in counts.values())
     return 0 if every.min() >= 0.90 and every.max() <= 0.98 and quiet else 1
 
