@@ -1,11 +1,12 @@
 """The contact wrench as a loop would have had it: from the past alone, late or predicted.
 
-The zero-phase low-pass of `alignment` looks ahead. A loop cannot: its low-pass, here a Butterworth
-filter of second order with the same cut-off, lags by sqrt(2) / (2 pi cut-off) at low frequencies
-(7.5 ms at 30 Hz), and a motion that comes later than the wrench has to be waited for. Wrench and
-motion are aligned first and the result is filtered, so that the elimination itself does not
-suffer from the lag; all that is late is the contact wrench. The sensor's offsets are those that a
-loop knows beforehand: the load file's, or of a start of the record in which nothing is touched.
+The zero-phase low-pass of `alignment` looks ahead. A loop cannot: its low-pass is a Butterworth
+filter of second order that halves the amplitude at the same cut-off. It lags by sqrt(2) / w at low
+frequencies (9.8 ms at 30 Hz), w = 2 pi cut-off / 3^(1/4), and a motion that comes later than the
+wrench has to be waited for. Wrench and motion are aligned first and the result is filtered, so that
+the elimination itself does not suffer from the lag; all that is late is the contact wrench. The
+sensor's offsets are those that a loop knows beforehand: the load file's, or of a start of the
+record in which nothing is touched.
 
 Prediction extrapolates the filter's output by its slope over the whole lag L: the filter becomes
 (1 + L s) H(s), whose delay is zero at low frequencies. The price is noise and overshoot: with no
@@ -52,8 +53,8 @@ def causal_low_pass(
     Args:
         x: (N, ...) samples.
         dt: their spacing [s].
-        cutoff_hz: where the amplitude is 1 / sqrt(2); None, or anything above the Nyquist rate,
-            leaves `x` as it is.
+        cutoff_hz: where the amplitude is halved, as by `alignment.low_pass`; None, or anything
+            above the Nyquist rate, leaves `x` as it is.
         ahead_s: the output's slope times this is added [s].
 
     Raises:
@@ -136,5 +137,5 @@ def causal_wrenches(
 
 
 def _prewarped(cutoff_hz: float, dt: float) -> float:
-    """The analogue rate [rad/s] that the bilinear transform puts at `cutoff_hz`."""
-    return 2.0 / dt * math.tan(math.pi * cutoff_hz * dt)
+    """The analogue rate w [rad/s]: 1 / (1 + (v / w)^4) is 1/4 for v that falls on `cutoff_hz`."""
+    return 2.0 / dt * math.tan(math.pi * cutoff_hz * dt) / 3.0**0.25
