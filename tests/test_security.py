@@ -58,6 +58,9 @@ LISTENING = {
     ("live/server.py", "serve("),
     # On this machine, unless the user names another address: tests/robots/test_udp.py.
     ("robots/udp.py", "socket"),
+    # Connected to the box that was named, which alone is heard; and its page, read once.
+    ("robots/netft.py", "socket"),
+    ("robots/netft.py", "http."),
 }
 """All that can listen; tests look at the sockets of both."""
 WRITES = re.compile(

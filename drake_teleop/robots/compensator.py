@@ -158,9 +158,11 @@ class Compensator:
         ahead = now - reading.t
         known = not math.isinf(self._offset)
         step = reading.t - self._t
-        if known and reading.number <= self._number and abs(step) > JUMP_S:
+        # What is out of order comes between what is not; if nothing else comes, it is the order.
+        lost = now - self._now > STALE_S
+        if known and reading.number <= self._number and (abs(step) > JUMP_S or lost):
             return self._anew(reading, ahead, flags | Flag.RESTART)
-        if known and abs(ahead - self._offset) > JUMP_S:
+        if known and (abs(ahead - self._offset) > JUMP_S or (step <= 0.0 and lost)):
             return self._anew(reading, ahead, flags | Flag.CLOCK_JUMP)
         if known and step <= 0.0:
             return flags | Flag.REORDERED
@@ -179,7 +181,7 @@ class Compensator:
         """Believes the clock from here on."""
         self._offset, self._number, self._t = ahead, reading.number, reading.t
         self._readings, self._rate_off, self.rested = 0, 0, 0
-        self._in_time = reading.t + ahead
+        self._now = self._in_time = reading.t + ahead
         self._settle_anew()
         return flags
 

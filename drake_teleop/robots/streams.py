@@ -47,6 +47,27 @@ class Reading(NamedTuple):
     flags: int = 0
 
 
+class Part(NamedTuple):
+    """What one stream of several told, on its own clock; readings are made of them.
+
+    Args:
+        stream: one of `WRENCH`, `POSE`, `JOINTS`, `IMU`, whose values are the wrench of S (6), the
+            pose X_WF of a frame on the wrist (7), positions of joints (n), or specific force and
+            angular velocity of S (6) or the first of them alone (3).
+        number: of the stream, one more each time.
+        t: of the stream [s].
+    """
+
+    stream: str
+    number: int
+    t: float
+    values: Array
+    flags: int = 0
+
+
+WRENCH, POSE, JOINTS, IMU = "wrench", "pose", "joints", "imu"
+
+
 class Compensated(NamedTuple):
     """A sample for a sink: number and time of the reading; contact and scaled (6,); flags."""
 

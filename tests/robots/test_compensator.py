@@ -189,6 +189,22 @@ def test_clocks_that_are_set_and_sources_that_begin_anew_are_named(
     np.testing.assert_allclose(after[-1].contact[0], 5.0, atol=1e-9)
 
 
+@pytest.mark.parametrize(("number", "flag"), [(0, Flag.RESTART), (60, Flag.CLOCK_JUMP)])
+def test_less_than_a_second_back_is_believed_when_nothing_else_comes(
+    number: int, flag: Flag
+) -> None:
+    compensator = Compensator(load(), DT)
+    for reading in readings(60):
+        compensator.step(reading, reading.t)
+    flags = [
+        compensator.step(reading._replace(number=reading.number + number), (60 + k) * DT).flags
+        for k, reading in enumerate(readings(50))
+    ]
+    at = flags.index(flag)
+    assert at * DT == pytest.approx(STALE_S, abs=2 * DT)
+    assert flags == [Flag.REORDERED] * at + [flag] + [0] * (49 - at)
+
+
 def test_another_rate_than_the_stated_one_is_named() -> None:
     flags = {}
     for share in (1.0, 1.2):

@@ -1,0 +1,173 @@
+"""ATI's Net F/T, and OnRobot's sensors that speak it: RDT, raw data transfer over UDP.
+
+A request of 8 bytes starts the stream, records of 36 come until another stops it; both are
+big-endian. A record has its number in the stream (rdt_sequence), the number of the measurement
+(ft_sequence), a status, and six whole numbers, counts of force and torque. It has no time: `Pace`
+makes one of the number. Counts, units and rate are read once from the box's page netftapi2.xml,
+unless the address says them.
+
+The stream is asked for again whenever nothing has come for a while, so that it goes on after the
+box was off. It is of the box that was named: the socket is connected.
+"""
+
+from __future__ import annotations
+
+import math
+import socket
+import struct
+import time
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.robots.address import Address
+from drake_teleop.robots.pace import Pace
+from drake_teleop.robots.streams import WRENCH, Flag, Part
+
+PORT = 49152
+REQUEST = struct.Struct(">HHI")
+RECORD = struct.Struct(">III6i")
+START, STOP = 2, 0
+_HEADER = 0x1234
+_SATURATED, _ERROR = 1 << 17, 1 << 31  # of the status
+_ASK_AGAIN_S, _FROZEN_S = 0.1, 0.05
+_MOST = 256  # records at once
+_PAGE_S, _PAGE_BYTES = 2.0, 1 << 20
+# What a unit of the box's page is in N or N m.
+_UNITS = {
+    "lbf": 4.4482216152605, "N": 1.0, "klbf": 4448.2216152605, "kN": 1e3,
+    "kgf": 9.80665, "gf": 9.80665e-3,
+    "lbf-in": 0.1129848290276, "lbf-ft": 1.3558179483314, "N-m": 1.0, "N-mm": 1e-3,
+    "kgf-cm": 0.0980665, "kN-m": 1e3,
+}  # fmt: skip
+
+
+class Record(NamedTuple):
+    """A record as it comes."""
+
+    rdt_sequence: int
+    ft_sequence: int
+    status: int
+    counts: tuple[int, ...]
+
+
+def unpacked_record(packet: bytes) -> Record | None:
+    """The record in a packet; None if it is none. It never raises."""
+    if len(packet) != RECORD.size:
+        return None
+    rdt, ft, status, *counts = RECORD.unpack(packet)
+    return Record(rdt, ft, status, tuple(counts))
+
+
+class NetFtSource:
+    """Wrenches of netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1].
+
+    Args:
+        address: counts are those of 1 N and 1 N m; sign -1, the default, is for a sensor that tells
+            what the load exerts on it.
+        dt: between records, if the address does not say it [s].
+
+    Raises:
+        DrakeTeleopError: if the address cannot be used, or the box's page cannot be had.
+    """
+
+    live = True
+
+    def __init__(self, address: str, dt: float | None = None) -> None:
+        told = Address(address, PORT, known=("counts", "rate", "sign"))
+        counts, rate = told.numbers("counts", 2), told.numbers("rate", 1)
+        sign = told.sign()
+        if rate is None and dt is not None:
+            rate = [1.0 / dt]
+        if counts is None or rate is None:
+            page = _page(told)
+            counts = counts or page[:2]
+            rate = rate or page[2:]
+        self.dt = 1.0 / rate[0]
+        self._per_count = sign / np.repeat(counts, 3)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.connect((told.host, told.port))
+        except OSError as error:
+            self._socket.close()
+            raise DrakeTeleopError(str(error), where=address) from error
+        self._pace, self._number = Pace(self.dt), 0
+        self._heard = self._asked = -math.inf
+        self._measured, self._measured_at = -1, -math.inf
+
+    def read(self, timeout_s: float) -> list[Part] | None:
+        """See `Source`."""
+        self._ask()
+        found: list[Part] = []
+        self._socket.settimeout(timeout_s)
+        try:
+            while len(found) < _MOST:
+                packet = self._socket.recv(RECORD.size + 1)
+                found.append(self.part(packet, time.monotonic()))
+                self._socket.settimeout(0.0)
+        except OSError:  # nothing more, or nobody there
+            pass
+        return found
+
+    def part(self, packet: bytes, now: float) -> Part:
+        """The wrench in a packet that came at `now`, flagged as damaged if there is none."""
+        record = unpacked_record(packet)
+        if record is None:
+            return Part(WRENCH, -1, math.nan, np.full(6, math.nan), int(Flag.DAMAGED))
+        # rdt_sequence has 32 bits: what is less by half of them has begun again from zero.
+        self._number += (record.rdt_sequence - self._number + 2**31) % 2**32 - 2**31
+        self._heard = now
+        flags = 0
+        if record.status & _SATURATED:
+            flags = int(Flag.SATURATED)
+        elif record.status & _ERROR:
+            flags = int(Flag.DAMAGED)
+        if record.ft_sequence != self._measured:
+            self._measured, self._measured_at = record.ft_sequence, now
+        elif now - self._measured_at > _FROZEN_S:
+            flags |= int(Flag.STALE)
+        t = self._pace.time_of(self._number, now)
+        return Part(WRENCH, self._number, t, np.array(record.counts) * self._per_count, flags)
+
+    def _ask(self) -> None:
+        now = time.monotonic()
+        if now - max(self._heard, self._asked) > _ASK_AGAIN_S:
+            self._asked = now
+            self._send(START)
+
+    def _send(self, command: int) -> None:
+        with suppress(OSError):  # nobody there yet
+            self._socket.send(REQUEST.pack(_HEADER, command, 0))
+
+    def close(self) -> None:
+        """See `Source`."""
+        self._send(STOP)
+        self._socket.close()
+
+
+def _page(told: Address) -> list[float]:
+    """Counts of 1 N and of 1 N m, and the rate [Hz], as the box says them."""
+    from http.client import HTTPConnection, HTTPException
+    from xml.etree import ElementTree
+
+    remedy = "or say them: netft://HOST?counts=FORCE,TORQUE&rate=HZ"
+    where = f"http://{told.host}/netftapi2.xml"
+    connection = HTTPConnection(told.host, timeout=_PAGE_S)
+    try:
+        connection.request("GET", "/netftapi2.xml")
+        answer = connection.getresponse().read(_PAGE_BYTES)
+        root = ElementTree.fromstring(answer)
+        text = {each.tag: (each.text or "").strip() for each in root.iter()}
+        counts = [float(text[f"cfgcp{kind}"]) / _UNITS[text[f"scfg{kind}u"]] for kind in ("f", "t")]
+        values = [*counts, float(text["comrdtrate"])]
+    except (OSError, HTTPException, ElementTree.ParseError, ValueError, KeyError) as error:
+        raise DrakeTeleopError(
+            f"counts, units and rate cannot be read ({error!r})", where=where, remedy=remedy
+        ) from error
+    finally:
+        connection.close()
+    if not all(0.0 < value < 1e12 for value in values):
+        raise DrakeTeleopError("counts and rate are no positive numbers", where=where)
+    return values

@@ -1,0 +1,92 @@
+"""A robot or sensor that plays a story with everything that can go wrong, as a process of its own.
+
+`python peer.py netft` prints its port, serves whoever asks, and ends with the story. It imports
+nothing but what its protocol needs. Each wrench is (number, 2, 3, 0.1, 0.2, 0.3), so that what was
+received tells which it was; the pose is that of a tool that rests.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import sys
+import time
+
+DT = 0.002
+FLAWS = ("good", "lost", "twice", "swapped", "nan", "short", "saturated", "silent", "late", "good")
+EACH = 8  # samples of a chapter; what is wrong stands in its middle
+SILENCE_S = 0.09
+
+
+def chapters(flaws=FLAWS):
+    """(seconds to wait, number, flaw) in the order of sending."""
+    number = 0
+    for flaw in flaws:
+        rows = [(DT, number + k, "") for k in range(EACH)]
+        number += EACH
+        middle = EACH // 2
+        if flaw == "lost":
+            del rows[middle : middle + 3]
+        elif flaw == "twice":
+            rows.insert(middle, (0.0, *rows[middle - 1][1:]))
+        elif flaw == "swapped":
+            rows[middle], rows[middle - 1] = rows[middle - 1], rows[middle]
+        elif flaw == "silent":  # and the clock goes on meanwhile
+            rows[middle] = (SILENCE_S, *rows[middle][1:])
+            gone = round(SILENCE_S / DT)
+            rows = rows[:middle] + [(wait, n + gone, f) for wait, n, f in rows[middle:]]
+            number += gone
+        elif flaw == "late":  # what was taken long ago comes now
+            rows[middle] = (0.0, number - EACH - 60, "")
+        elif flaw not in ("good",):
+            rows[middle] = (*rows[middle][:2], flaw)
+        yield from rows
+
+
+def play(send, flaws=FLAWS):
+    """Calls send(number, flaw) when it is time."""
+    due = time.monotonic()
+    for wait, number, flaw in chapters(flaws):
+        due += wait
+        time.sleep(max(0.0, due - time.monotonic()))
+        send(number, flaw)
+
+
+def wrench(number):
+    return (float(number), 2.0, 3.0, 0.1, 0.2, 0.3)
+
+
+def netft():
+    """An RDT box that is switched off and on: its numbers begin again, and it has to be asked."""
+    box = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    box.bind(("127.0.0.1", 0))
+    box.settimeout(5.0)
+    print(box.getsockname()[1], flush=True)
+
+    def asked():
+        while True:
+            packet, there = box.recvfrom(16)
+            if struct.unpack(">HHI", packet) == (0x1234, 2, 0):
+                return there
+
+    for flaws in (FLAWS, ("good",) * 3):
+        there = asked()
+
+        def send(number, flaw, there=there):
+            counts = [round(1000 * x) for x in wrench(number)]
+            status = {"saturated": 0x80020000, "nan": 0x80010000}.get(flaw, 0)
+            record = struct.pack(">III6i", number + 1, 7 * number, status, *counts)
+            box.sendto(record[: 20 if flaw == "short" else 36], there)
+
+        play(send, flaws)
+        box.setblocking(False)
+        with contextlib.suppress(BlockingIOError):  # what was asked meanwhile, as nothing came
+            while True:
+                box.recv(16)
+        box.settimeout(5.0)
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(OSError, KeyboardInterrupt):
+        {"netft": netft}[sys.argv[1]](*sys.argv[2:])
