@@ -22,7 +22,8 @@ from drake_teleop.studies.study import LoadStudy
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
-COPIED = {"benchmarks.md", "changelog.md", "contributing.md"}  # by a build, from elsewhere
+# By a build, from elsewhere.
+COPIED = {"benchmarks.md", "changelog.md", "contributing.md", "evidence.md"}
 TESTED = {
     "README.md": "tests/test_readme.py",
     "analysis.md": "tests/test_analysis_doc.py",

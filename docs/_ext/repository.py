@@ -1,4 +1,4 @@
-"""What lies beside `docs` in the repository comes into the site: notebooks, changes, benchmarks.
+"""What lies beside `docs` in the repository comes into the site: notebooks, changes, evidence.
 
 They are copied before a build reads anything, and links between them and `docs` are made to fit:
 written so as to be right in the repository, they are right on the site as well.
@@ -6,6 +6,8 @@ written so as to be right in the repository, they are right on the site as well.
 
 from __future__ import annotations
 
+import importlib
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,16 @@ def _copy(_app: Sphinx, _config: Config) -> None:
     for source, page in PAGES.items():
         text = (ROOT / source).read_text(encoding="utf-8")
         _write(DOCS / page, text.replace("](../docs/", "](").replace("](docs/", "]("))
+    _write(DOCS / "evidence.md", _evidence())
+
+
+def _evidence() -> str:
+    """What `benchmarks/evidence.py` says of the records that are kept."""
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    try:
+        return importlib.import_module("evidence").page()
+    finally:
+        sys.path.pop(0)
 
 
 def _checked(path: Path) -> nbformat.NotebookNode:

@@ -1,0 +1,378 @@
+"""What README and docs claim, and which figure of which run shows it, for `evidence.py`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+RUNS = {
+    "adversary": "benchmarks/adversary.py --method ledger --runs 10000 --json FILE",
+    "adversary_drag": (
+        "benchmarks/adversary.py --method ledger --runs 10000 --drag --imperfect --json FILE"
+    ),
+    "adversary_methods": "benchmarks/adversary.py --runs 900 --json FILE",
+    "analysis": "benchmarks/analysis.py --json FILE",
+    "calls": "benchmarks/calls.py --json FILE",
+    "compensate": "benchmarks/compensate.py --json FILE",
+    "contact_detection": "benchmarks/contact_detection.py --json FILE",
+    "domain": "benchmarks/domain.py --json FILE",
+    "errors_in_variables": "benchmarks/errors_in_variables.py --json FILE",
+    "frequency_response": "benchmarks/frequency_response.py --json FILE",
+    "identification": "benchmarks/identification.py --json FILE",
+    "intervals": "benchmarks/intervals.py --json FILE",
+    "inverse_kinematics": "benchmarks/inverse_kinematics.py --json FILE",
+    "live": "benchmarks/live.py --json FILE",
+    "load_change": "benchmarks/load_change.py --json FILE",
+    "planted_mistakes": "benchmarks/planted_mistakes.py --json FILE",
+    "pose_noise": "benchmarks/pose_noise.py --runs 24 --no-present --json FILE",
+    "realistic_sensor": "benchmarks/realistic_sensor.py --json FILE",
+    "recovery": "benchmarks/recovery.py --networks 300 --json FILE",
+    "reproduce": "drake-teleop reproduce --quiet --out FOLDER",
+    "station": "benchmarks/station.py --json FILE",
+    "stations": "benchmarks/stations.py --json FILE",
+}
+"""Name of a record -> its command; FILE is where the figures go, FOLDER where summary.json does."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One promise, and the figure that shows it."""
+
+    section: str
+    says: str
+    where: str
+    """Port, range and assumption."""
+    page: str
+    """Where in docs/ it is promised."""
+    run: str
+    """One of `RUNS`."""
+    figure: Callable[[Any], float]
+    """Of what that run wrote."""
+    unit: str = ""
+    least: float = -math.inf
+    most: float = math.inf
+
+    def value(self, figures: Any) -> float:
+        """The figure, in `unit`."""
+        return float(self.figure(figures))
+
+    def met(self, figures: Any) -> bool:
+        """Whether it is within the bounds; a NaN is not."""
+        return self.least <= self.value(figures) <= self.most
+
+    def text(self, figures: Any) -> str:
+        """The figure as people write it."""
+        return _said(self.value(figures), self.unit)
+
+    @property
+    def bound(self) -> str:
+        """The bounds as people write them."""
+        if self.least == self.most:
+            return _said(self.most, self.unit)
+        parts = [
+            f"{sign} {_said(x, self.unit)}"
+            for sign, x in (("≥", self.least), ("≤", self.most))
+            if math.isfinite(x) and (x != 0.0 or sign == "≤")  # what cannot be negative, say
+        ]
+        return " and ".join(parts)
+
+
+@dataclass(frozen=True)
+class InTests:
+    """A promise that a test checks in every run of the tests."""
+
+    section: str
+    says: str
+    where: str
+    page: str
+    test: str
+
+
+@dataclass(frozen=True)
+class NotShown:
+    """A promise, or what one may take for one, that nothing here shows."""
+
+    section: str
+    says: str
+    why: str
+
+
+def _said(value: float, unit: str) -> str:
+    digits = f"{value:.3g}"
+    if "e" in digits:
+        mantissa, exponent = digits.split("e")
+        digits = f"{mantissa}·10{str(int(exponent)).translate(_RAISED)}"
+    return f"{digits} {unit}".strip()
+
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def _rows(figures: Any, key: str, **such: Any) -> list[Any]:
+    """A column of those rows that are `such`; what a row has not measured is left out."""
+    found = [
+        row[key]
+        for row in figures
+        if row[key] is not None and all(row[name] == is_ for name, is_ in such.items())
+    ]
+    return found or [math.nan]
+
+
+def _of_domain(method: str, what: str) -> Callable[[Any], float]:
+    return lambda f: sum(bool(row[what]) for row in f[method].values())
+
+
+def _response(sigma: str, part: str) -> Callable[[Any], float]:
+    return lambda f: max(
+        x for name, x in f.items() if name.startswith(f"sigma {sigma}: ") and part in name
+    )
+
+
+LOAD, LOGS, WRENCH, PAPER = "The load", "A robot's log", "The wrist's wrench", "The paper's figures"
+CONTACT, NETWORK, ANALYSIS = "Contact noticed", "Over networks", "Stability and transparency"
+OWN, SPEED, LIVE = "Stations of one's own", "What it costs", "Live"
+
+CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
+    # The paper
+    Claim(
+        *(PAPER, "Raw force in free motion is that of the paper's Fig. 6, 100 N"),
+        *("scenario `free_motion_force`, measured at the wrist", "theory.md", "reproduce"),
+        *(lambda f: f["free_force"]["peak_raw_N"], "N", 95.0, 105.0),
+    ),
+    Claim(
+        *(PAPER, "Half of the load (σ = 0.5) is felt as half"),
+        *("the same, ratio of forces to the master", "theory.md", "reproduce"),
+        *(lambda f: f["free_force"]["half_ratio"], "", 0.49, 0.51),
+    ),
+    Claim(
+        *(PAPER, "What elimination leaves is less than the paper's 5 N"),
+        *("largest component of the force, JR3 with its noise", "theory.md", "reproduce"),
+        *(lambda f: f["free_force"]["residual_max_N"], "N", 0.0, 5.0),
+    ),
+    Claim(
+        *(PAPER, "Without noise it leaves rounding"),
+        *("ideal sensor, true load", "theory.md", "reproduce"),
+        *(lambda f: f["free_force"]["residual_ideal_max_N"], "N", 0.0, 1e-9),
+    ),
+    Claim(
+        *(PAPER, "A contact is found that no threshold on the measured force finds (Fig. 8)"),
+        *("scenario `contact_transition`; delay of the detection", "theory.md", "reproduce"),
+        *(lambda f: 1e3 * (f["contact"]["detected_s"] - f["contact"]["true_s"]), "ms", 0.0, 5.0),
+    ),
+    # The load
+    Claim(
+        *(LOAD, "Mass by the shipped identification", "JR3, median of 20 seeds", "sensor.md"),
+        "realistic_sensor",
+        *(lambda f: f["identification"]["total"]["mass %"], "%", 0.0, 0.1),
+    ),
+    Claim(
+        *(LOAD, "Centre of mass", "the same", "sensor.md", "realistic_sensor"),
+        *(lambda f: f["identification"]["total"]["com mm"], "mm", 0.0, 0.3),
+    ),
+    Claim(
+        *(LOAD, "Principal inertias", "the same", "sensor.md", "realistic_sensor"),
+        *(lambda f: f["identification"]["total"]["inertia %"], "%", 0.0, 5.0),
+    ),
+    Claim(
+        *(LOAD, "Its 95 % intervals hold", "the same, 16 parameters", "sensor.md"),
+        "realistic_sensor",
+        *(lambda f: f["identification"]["total"]["in 95 %"], "%", 90.0, 98.0),
+    ),
+    Claim(
+        *(LOAD, "95 % intervals hold whatever the noise's colour, at least"),
+        *("500 records, six colours, each of 16 parameters", "logs.md", "intervals"),
+        *(lambda f: 100 * min(min(c["coverage"]) for c in f["colours"].values()), "%", 90.0, 98.0),
+    ),
+    Claim(
+        *(LOAD, "What the motion did not excite is called identified never"),
+        *("poses, one axis, one pose; 500 records", "logs.md", "intervals"),
+        lambda f: sum(n for counts in f["called identified"].values() for n in counts.values()),
+        *("", 0.0, 0.0),
+    ),
+    Claim(
+        *(LOAD, "Total least squares takes out the bias of noisy accelerations, but for"),
+        *("JR3, 200 records of 1.5 s", "theory.md", "errors_in_variables"),
+        *(lambda f: 100 * f["JR3"]["RTLS"]["bias_over_rls_max"], "%", 0.0, 10.0),
+    ),
+    Claim(
+        *(LOAD, "False alarms of another load in free motion"),
+        *("JR3, noisy accelerations, 500 motions", "theory.md", "load_change"),
+        lambda f: 500 - f["JR3"]["free"]["highest"]["known"],
+        *("of 500", 0.0, 0.0),
+    ),
+    # Logs
+    InTests(
+        *(LOGS, "A log's identification and a station's are one code", "bit for bit", "logs.md"),
+        "tests/test_station_identification.py",
+    ),
+    Claim(
+        *(LOGS, "95 % intervals hold with noisy poses, the worst kind of noise"),
+        *("up to 0.2 mm / 0.4 mrad, 125 Hz to 1 kHz; 24 records each", "logs.md", "pose_noise"),
+        lambda f: min(
+            case[motion]["new"]["coverage_percent"]
+            for name, case in f.items()
+            if name != "runs" and "1 mm" not in name
+            for motion in case
+        ),
+        *("%", 93.0, 97.0),
+    ),
+    Claim(
+        *(LOGS, "Planted mistakes are named, with the line that mends them"),
+        *("28 kinds, two motions, poses, IMU, both", "logs.md", "planted_mistakes"),
+        lambda f: 100 * f["total"]["named"][0] / f["total"]["named"][1],
+        *("%", 95.0),
+    ),
+    # Contact
+    Claim(
+        *(CONTACT, "Contacts of 0.2 to 1 N are noticed in fast free motion"),
+        *("one false alarm in 100 windows of 0.3 s", "detection.md", "contact_detection"),
+        lambda f: (
+            100
+            * _rows(f["table"], "0.2 to 1 N", wrench="eliminated", statistic="glr")[0]["noticed"]
+        ),
+        *("%", 95.0),
+    ),
+    Claim(
+        *(CONTACT, "The measured force notices fewer of them"),
+        *("the same windows", "detection.md", "contact_detection"),
+        lambda f: (
+            100 * _rows(f["table"], "0.2 to 1 N", wrench="raw", statistic="level")[0]["noticed"]
+        ),
+        *("%", 0.0, 10.0),
+    ),
+    # Networks
+    Claim(
+        *(NETWORK, "`ledger` creates no energy at the slave's actual motion"),
+        *("one axis, reserve 0.12 J, 10⁴ adversarial runs with search", "delay.md", "adversary"),
+        *(lambda f: f["ledger"]["searched"]["actual"], "J", -1e-6),
+    ),
+    Claim(
+        *(NETWORK, "Nor if it begins with nothing and the servo is not as told"),
+        *("the same, charged by drag, servo ±20 %, 3 ms lag, encoder, noise", "delay.md"),
+        *("adversary_drag", lambda f: f["ledger"]["searched"]["actual"], "J", -1e-6),
+    ),
+    Claim(
+        *(NETWORK, "`pspm` creates none if the servo is as told"),
+        *("one axis, 100 runs with search", "delay.md", "adversary_methods"),
+        *(lambda f: f["pspm"]["searched"]["actual"], "J", -1e-6),
+    ),
+    Claim(
+        *(NETWORK, "Without a method energy without bound"),
+        *("the same adversary", "delay.md", "adversary_methods"),
+        *(lambda f: f["none"]["searched"]["actual"], "J", -math.inf, -1.0),
+    ),
+    Claim(
+        *(NETWORK, "`ledger` is at rest on every wall, whoever holds"),
+        *("3 grips, 0.5 to 50 kN/m, 1 to 2600 ms: 162 holds, one axis", "delay.md", "domain"),
+        *(_of_domain("ledger", "stable"), "of 162", 155.0),
+    ),
+    Claim(
+        *(NETWORK, "and what is felt is what is pressed"),
+        *("within 1 % and quiet, the same holds", "delay.md", "domain"),
+        *(_of_domain("ledger", "good"), "of 162", 155.0),
+    ),
+    Claim(
+        *(NETWORK, "Every method recovers when the network does"),
+        *("300 random networks, one axis, all methods", "delay.md", "recovery"),
+        lambda f: 100 * min(row["recovered"] / row["runs"] for row in f["rows"]),
+        *("%", 100.0, 100.0),
+    ),
+    NotShown(
+        NETWORK, "That a person feels any of it", "no person has tried it; the hand is simulated"
+    ),
+    # Analysis
+    Claim(
+        *(ANALYSIS, "The linearised Diagram predicts the hand's force over its velocity, but for"),
+        *("σ = 0.5, 0.5 to 30 Hz, without Coulomb friction", "analysis.md", "frequency_response"),
+        *(_response("0.5", "hand_force / hand_velocity, magnitude"), "%", 0.0, 1.0),
+    ),
+    Claim(
+        *(ANALYSIS, "The apparent mass is σ m: for 0.5 of 3.13 kg"),
+        *("the same multi-sine", "analysis.md", "frequency_response"),
+        *(lambda f: f["sigma 0.5: apparent mass, kg"], "kg", 1.5337, 1.5963),
+    ),
+    Claim(
+        *(ANALYSIS, "Delay margins are where a simulation becomes unstable, but for"),
+        *("one axis, sampled; 12 walls and grips; round trip", "analysis.md", "analysis"),
+        lambda f: (
+            max(
+                abs(row["sampled"] - row["simulated"])
+                for row in f["margins"]
+                if math.isfinite(row["sampled"]) and math.isfinite(row["simulated"])
+            )
+            * 1e3
+        ),
+        *("ms", 0.0, 1.0),
+    ),
+    # Stations of one's own
+    Claim(
+        *(OWN, "The sensor's force is that of the plant's reaction port"),
+        *("ideal sensor, all arms and devices, free and in contact", "station.md", "stations"),
+        *(lambda f: max(_rows(f, "port N")), "N", 0.0, 1e-12),
+    ),
+    Claim(
+        *(OWN, "The load is identified"),
+        *("the same stations, from the samples of their sensor", "station.md", "stations"),
+        *(lambda f: max(_rows(f, "mass %")), "%", 0.0, 0.1),
+    ),
+    Claim(
+        *(OWN, "Elimination leaves of the peak measured force"),
+        *("the same, free motion", "station.md", "stations"),
+        *(lambda f: max(_rows(f, "left %", surroundings="free motion")), "%", 0.0, 1.5),
+    ),
+    Claim(
+        *(OWN, "The hand feels σ m / scale, but for"),
+        *("the same, σ = 0.5", "station.md", "stations"),
+        *(lambda f: max(_rows(f, "felt %")), "%", 0.0, 2.0),
+    ),
+    Claim(
+        *(OWN, "Numeric inverse kinematics meets every pose to 10⁻⁸, or says why; not met"),
+        *("10⁵ random poses of each of six arms", "station.md", "inverse_kinematics"),
+        lambda f: max(arm["random"]["not_met"] for arm in f.values()),
+        *("of 10⁵", 0.0, 10.0),
+    ),
+    # Cost
+    Claim(
+        *(SPEED, "The station costs over its bare plant"),
+        *("free motion, CPU time", "station.md", "station"),
+        *(lambda f: f["free_motion_over_bare"], "times", 0.0, 2.0),
+    ),
+    Claim(
+        *(SPEED, "The same, over a contact"),
+        *("`contact_transition`", "station.md", "station"),
+        *(lambda f: f["contact_over_bare"], "times", 0.0, 3.0),
+    ),
+    Claim(
+        *(SPEED, "A reading of the sensor takes, of the 125 µs of its period"),
+        *("the slowest preset, compiled", "sensor.md", "calls"),
+        lambda f: 1e6 * max(v["seconds"] for k, v in f.items() if k.startswith("reading of")),
+        *("µs", 0.0, 2.5),
+    ),
+    Claim(
+        *(SPEED, "V φ of a sample takes pinocchio, from Python, as multiples of ours"),
+        *("the same wrench to 1e-9", "theory.md", "identification"),
+        *(lambda f: f["wrench_pin_inertia_over_call"], "times", 1.0),
+    ),
+    # Live
+    Claim(
+        *(LIVE, "`compensate` keeps up with 1 kHz"),
+        *("UDP from another process; 99 % of packets", "robot.md", "compensate"),
+        *(lambda f: f["ours.1000_Hz.processing_p99_us"], "µs", 0.0, 1000.0),
+    ),
+    Claim(
+        *(LIVE, "and takes of a core"),
+        *("the same", "robot.md", "compensate"),
+        *(lambda f: 100 * f["ours.1000_Hz.core"], "%", 0.0, 25.0),
+    ),
+    Claim(
+        *(LIVE, "A drive is as fast as the clock"),
+        *("60 s, sensor at 8 kHz, 60 frames/s", "live.md", "live"),
+        *(lambda f: f["factor"], "", 0.999),
+    ),
+    NotShown(
+        LIVE, "`compensate` on a robot", "all its sources were tried with recordings and mock peers"
+    ),
+    NotShown(LIVE, "A haptic device in the loop", "only a virtual one, a process of its own"),
+)
