@@ -22,7 +22,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from evidence_claims import CLAIMS, RUNS, Claim, NotShown, InTests
+from evidence_claims import CLAIMS, RUNS, Claim, InTests, NotShown
 
 import drake_teleop
 

@@ -161,7 +161,16 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *("scenario `contact_transition`; delay of the detection", "theory.md", "reproduce"),
         *(lambda f: 1e3 * (f["contact"]["detected_s"] - f["contact"]["true_s"]), "ms", 0.0, 5.0),
     ),
+    InTests(
+        *(PAPER, "The same seed gives the same bytes", "one machine", "running.md"),
+        "tests/test_run.py::test_the_same_seed_gives_the_same_bytes_and_another_does_not",
+    ),
     # The load
+    InTests(
+        *(LOAD, "A sample and a record, a log and a station, are computed by one code"),
+        *("V φ and elimination, to the last bit", "theory.md"),
+        "tests/load/test_compensation.py::test_one_sample_and_many_are_the_same_to_the_last_bit",
+    ),
     Claim(
         *(LOAD, "Mass by the shipped identification", "JR3, median of 20 seeds", "sensor.md"),
         "realistic_sensor",
@@ -203,10 +212,6 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *("of 500", 0.0, 0.0),
     ),
     # Logs
-    InTests(
-        *(LOGS, "A log's identification and a station's are one code", "bit for bit", "logs.md"),
-        "tests/test_station_identification.py",
-    ),
     Claim(
         *(LOGS, "95 % intervals hold with noisy poses, the worst kind of noise"),
         *("up to 0.2 mm / 0.4 mrad, 125 Hz to 1 kHz; 24 records each", "logs.md", "pose_noise"),
