@@ -68,7 +68,9 @@ class Rates:
 
     sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
     hand_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "haptic device and channel")
-    joint_control_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "slave's joint control")
+    joint_control_hz: float = quantity(
+        2000.0, "Hz", 10.0, 1e5, "slave's joint control; what is beyond 2 kHz samples inside steps"
+    )
     estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "load estimator, detection of contact")
     log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "log")
 

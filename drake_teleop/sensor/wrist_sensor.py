@@ -7,7 +7,7 @@ tool minus what the environment exerts on it (Eqs. 1, 2), and the motion is that
 
 The plant takes steps of its own, cut only where something drives it. When a step is over the sensor
 looks back: at each instant in it at which it samples, position and velocity are interpolated
-(Hermite), and the accelerations follow from the dynamics under the torque that the motors held. So
+(Hermite), and the accelerations follow from the dynamics under the torque that the motors had. So
 8 kHz need no events, and what is sampled is exact for the state it belongs to. Contact that the
 compiled law does not know (`Contact.beyond`) Drake tells, for the end of a step alone: then each
 sample is an event, and ends one.
@@ -68,12 +68,12 @@ from drake_teleop.sensor.sensor_chain import (
 from drake_teleop.slave.arm import (
     MOTION_SIZE,
     ArmModel,
-    forward_dynamics,
     forward_kinematics,
     sensor_motion,
 )
 from drake_teleop.slave.drake_contact import contact_wrench_W
 from drake_teleop.slave.plant import SlavePlant
+from drake_teleop.slave.plant_rates import joined, plant_rates, rates_under
 from drake_teleop.slave.tool_contact import environment_wrench
 from drake_teleop.vectors import apply, cross, minus, nine, put, three, transposed
 
@@ -107,29 +107,6 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
     tau = minus(three(contact_W, 3), cross(p_WS, f))
     wrench[0], wrench[1], wrench[2] = minus(three(wrench, 0), apply(R_SW, f))
     wrench[3], wrench[4], wrench[5] = minus(three(wrench, 3), apply(R_SW, tau))
-
-
-@njit(cache=True)
-def _accelerations(physics, x, tau, applied_W, wrench_W, xdot):
-    """Time derivative of x = [q, sheet's deflection, v, its rate], and the environment's wrench."""
-    half = tau.shape[0] + 1
-    q, v = x[: half - 1], x[half:-1]
-    environment_wrench(physics[0], physics[2], applied_W, q, v, x[half - 1 :: half], wrench_W)
-    _motion(physics, x, tau, applied_W, wrench_W, xdot)
-
-
-@njit(cache=True)
-def _motion(physics, x, tau, applied_W, wrench_W, xdot):
-    """Time derivative of x, see `_accelerations`, under the environment's wrench."""
-    arm, _, pairs, leaf = physics
-    half = tau.shape[0] + 1
-    forward_dynamics(arm, x[: half - 1], x[half:-1], tau, wrench_W, xdot[half:-1])
-    put(xdot, 0, x, half, half)
-    push = 0.0
-    if pairs.shape[0] > 0:  # which all are of one body, the leaf, or of what does not move
-        for i in range(3):
-            push -= pairs[0, 19 + i] * (wrench_W[i] - applied_W[i])
-    xdot[-1] = (push - leaf[1] * x[half - 1] - leaf[2] * x[-1]) / leaf[0] + leaf[3]
 
 
 @njit(cache=True)
@@ -181,21 +158,12 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
 
 
 @njit(cache=True)
-def _join(state, sheet, x):
-    """x = [q, sheet's deflection, v, its rate] of [q; v] and [deflection, rate]."""
-    n = state.shape[0] // 2
-    put(x, 0, state, 0, n)
-    put(x, n + 1, state, n, n)
-    x[n], x[2 * n + 1] = sheet[0], sheet[1]
-
-
-@njit(cache=True)
 def remember_step(tail, time, state, sheet):
     """Puts a step's end into the queue that `sample_step` works off; see its `memory`."""
     width = state.shape[0] + 3
     entry = tail[2 + int(tail[1]) * width :][:width]
     entry[0] = time
-    _join(state, sheet, entry[1:])
+    joined(state, sheet, entry[1:])
     tail[1] += 1.0
 
 
@@ -209,8 +177,16 @@ def _postpone(memory, tail, longest, time, state, sheet):
 
 
 @njit(cache=True)
+def _torque_at(held, after, torque):
+    """The motors' torque (n,) `after` now [s]; `held` as of `sample_step`."""
+    put(torque, 0, held[0], 0, torque.shape[0])
+    for i in range(held[1].shape[0]):
+        torque[i] += after * held[1][i]
+
+
+@njit(cache=True)
 def sample_step(
-    physics, sensor, period, time, state, sheet, tau, applied_W, noise, memory, until_now,
+    physics, sensor, period, time, state, sheet, held, applied_W, noise, memory, until_now,
     touching_W, result,
 ):  # fmt: skip
     """Takes the samples that have become due in the steps since the last call.
@@ -224,7 +200,8 @@ def sample_step(
         time: now [s], the end of a step.
         state: (2 n,) [q; v] now.
         sheet: (2,) deflection and its rate now.
-        tau: (n,) torque that was held during these steps.
+        held: torque (n,) now, of these steps' motors [N m], and at which rate it changed in them;
+            (0,) if it was held.
         applied_W: (6,), see `environment_wrench`.
         noise: for the chain.
         memory: [last sample (16 + n) | the one before (16 + n) | chain's | estimator's | tail:
@@ -236,7 +213,8 @@ def sample_step(
         result: filled: [last sample before now (16 + n) | when that was taken [s] | memory, its
             queue now's end alone].
     """
-    size, width, half = BEFORE_JOINTS + tau.shape[0], state.shape[0] + 3, tau.shape[0] + 1
+    n = state.shape[0] // 2
+    size, width, half, tau = BEFORE_JOINTS + n, state.shape[0] + 3, n + 1, np.empty(n)
     after = result[size + 1 :]
     put(after, 0, memory, 0, memory.shape[0])
     tail = after[sensor[3] :]
@@ -244,14 +222,15 @@ def sample_step(
     now, now_dot, now_wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
     between, between_dot, wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
     start_dot, end_dot = np.empty(2 * half), now_dot
-    _join(state, sheet, now)
+    joined(state, sheet, now)
+    _torque_at(held, 0.0, tau)
     if until_now:
-        none, n = physics[2][:0], half - 1
+        none = physics[2][:0]
         environment_wrench(physics[0], none, applied_W, state[:n], state[n:], sheet, now_wrench_W)
         now_wrench_W += touching_W
-        _motion(physics, now, tau, applied_W, now_wrench_W, now_dot)
+        rates_under(physics, now, tau, applied_W, now_wrench_W, now_dot)
     else:
-        _accelerations(physics, now, tau, applied_W, now_wrench_W, now_dot)
+        plant_rates(physics, now, tau, applied_W, now_wrench_W, now_dot)
     for k in range(queued):
         start = tail[2 + k * width :][:width]
         until, end, end_dot = time, now, now_dot
@@ -260,14 +239,17 @@ def sample_step(
             until, end, end_dot = following[0], following[1:], np.empty(2 * half)
         if (count + _SAME) * period >= until:
             continue
-        _accelerations(physics, start[1:], tau, applied_W, wrench_W, start_dot)
+        _torque_at(held, start[0] - time, tau)
+        plant_rates(physics, start[1:], tau, applied_W, wrench_W, start_dot)
         if k < queued - 1:
-            _accelerations(physics, end, tau, applied_W, wrench_W, end_dot)
+            _torque_at(held, until - time, tau)
+            plant_rates(physics, end, tau, applied_W, wrench_W, end_dot)
         h = until - start[0]
         while (count + _SAME) * period < until:
             u = (count * period - start[0]) / h
             _interpolate(h, u, start[1:], start_dot, end, end_dot, between)
-            _accelerations(physics, between, tau, applied_W, wrench_W, between_dot)
+            _torque_at(held, count * period - time, tau)
+            plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
             _take(physics, sensor, between, between_dot, wrench_W, noise, after)
             count += 1.0
     # A step that is all rounding may have ended a little before, and have taken this sample.
@@ -289,7 +271,8 @@ class WristSensor(LeafSystem):
         name: WristSensor
         input_ports:
         - slave_state: [q; v] of the arm
-        - joint_torque: (n,) that the motors hold [N m]
+        - joint_torque: (n,) of the motors now [N m]
+        - torque_rate: (n,) at which it changes [N m/s] (only with `ramps`)
         - slave_acceleration: vdot of the arm, to see that nothing else moves it
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
         - contact_results: the plant's (only with something to touch)
@@ -305,8 +288,9 @@ class WristSensor(LeafSystem):
         config: the sensor.
         motion: how the motion of S is estimated from its readings.
         period: sampling period [s].
-        held: for how long the motors hold a torque [s].
+        held: for how long the motors hold a torque, or its rate [s].
         q_start: (n,) where the arm rests before the first sample [rad].
+        ramps: whether they hold a rate.
 
     Raises:
         DrakeTeleopError: from the simulation, if something moves the arm that the sensor is not
@@ -323,6 +307,8 @@ class WristSensor(LeafSystem):
         period: float,
         held: float,
         q_start: Array,
+        *,
+        ramps: bool = False,
     ) -> None:
         super().__init__()
         arm = slave.arm
@@ -330,9 +316,7 @@ class WristSensor(LeafSystem):
         constants, chain = sensor_chain(config, n, period)
         motion_constants, estimator = motion_estimator(motion, config, n, period)
         self._offset = constants[OFFSET]
-        # A copy, because something may be grasped; the joint control knows nothing of that.
-        carried = arm.with_load(arm.phi_load)
-        self._physics = (carried.table, carried.load, slave.contact_pairs, slave.contact.leaf)
+        self._physics = slave.physics
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
             first[WRENCH] += config.offset
@@ -345,10 +329,15 @@ class WristSensor(LeafSystem):
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
         self._period = period
         self._holds = (held, NOISE_BLOCK * period)
-        self._no_noise, self._nothing = np.zeros(NOISE_SIZE), np.zeros(6)
+        self._no_noise, self._nothing, self._no_rate = (
+            np.zeros(NOISE_SIZE),
+            np.zeros(6),
+            np.zeros(0),
+        )
 
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._torque = self.DeclareVectorInputPort("joint_torque", n)
+        self._rate = self.DeclareVectorInputPort("torque_rate", n) if ramps else None
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
         self._applied = self.DeclareVectorInputPort("applied_wrench_W", 6)
         self._sheet = self._contacts = self._noise = None
@@ -364,7 +353,8 @@ class WristSensor(LeafSystem):
         self._result = np.zeros(len(first) + 1 + len(memory))
         self._remains = slice(len(first) + 1, None)  # of a step: the memory
         # Not the acceleration: whatever changes in the plant would be passed on twice.
-        seen = (self._state, self._torque, self._applied, self._sheet, self._contacts, self._noise)
+        pushes = (self._torque, self._rate, self._applied)
+        seen = (self._state, *pushes, self._sheet, self._contacts, self._noise)
         tickets = {port.ticket() for port in seen if port is not None}
         tickets |= {self.time_ticket(), self.xd_ticket()}
         self._step = self.DeclareVectorOutputPort(
@@ -450,7 +440,10 @@ class WristSensor(LeafSystem):
             context.get_time(),
             self._state.Eval(context),
             self._sheet_state(context),
-            self._torque.Eval(context),
+            (
+                self._torque.Eval(context),
+                self._no_rate if self._rate is None else self._rate.Eval(context),
+            ),
             self._applied_W(context),
             self._no_noise if self._noise is None else self._noise.Eval(context),
             context.get_discrete_state_vector().value(),
@@ -479,13 +472,13 @@ class WristSensor(LeafSystem):
     def _check(self, context: Context) -> EventStatus:
         n = self._n
         x, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2)
-        _join(self._state.Eval(context), self._sheet_state(context), x)
+        joined(self._state.Eval(context), self._sheet_state(context), x)
         if not np.isfinite(x).all():  # nothing is known; the samples say so
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)
         if self._beyond:
             applied = applied + self._touching_So_W(context)
-        _accelerations(self._physics, x, torque, applied, np.empty(6), xdot)
+        plant_rates(self._physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
         if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ALIKE * (1.0 + np.abs(vdot).max()):
             raise DrakeTeleopError(
@@ -513,6 +506,8 @@ def AddWristSensor(
     period: float,
     held: float,
     q_start: Array,
+    *,
+    ramps: bool = False,
 ) -> dict[str, OutputPort]:
     """Adds "wrist_sensor" and its noise, and what divides its port, for Drake numbers the parts.
 
@@ -524,13 +519,14 @@ def AddWristSensor(
         config: the sensor.
         motion: how the motion of S is estimated.
         period: sampling period [s].
-        held: for how long the motors hold a torque [s].
+        held: for how long the motors hold a torque, or its rate [s].
         q_start: (n,) where the arm rests before the first sample [rad].
+        ramps: whether they hold a rate.
 
     Returns:
         The ports by name: "sample", with each of its parts, see `sample_parts`, and "sample_time".
     """
-    sensor = WristSensor(slave, config, motion, period, held, q_start)
+    sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
     builder.AddNamedSystem("wrist_sensor", sensor)
     if not config.ideal:
         noise = builder.AddNamedSystem(

@@ -29,6 +29,7 @@ from drake_teleop.slave.joint_trajectory import JointTrajectory
 from drake_teleop.slave.monitor import SlaveMonitor
 from drake_teleop.slave.moving_pose import MovingPose
 from drake_teleop.slave.plant import AddSlavePlant, SlavePlant
+from drake_teleop.slave.sampled_servo import SampledServo, samples_within
 from drake_teleop.slave.tool_contact import ToolContact
 
 Array = NDArray[np.float64]
@@ -83,9 +84,7 @@ def MakeSlaveSide(
 
     start = body.slave.start
     make_ik = METHODS[method_of(scenario.slave.inverse_kinematics, arm)]
-    ik = builder.AddNamedSystem(
-        "inverse_kinematics", make_ik(arm, start, 1 / scenario.rates.joint_control_hz)
-    )
+    ik = builder.AddNamedSystem("inverse_kinematics", make_ik(arm, start, body.command_period))
     builder.Connect(body.sample["joint_position"], ik.GetInputPort("joint_position"))
     builder.Connect(
         ik.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
@@ -167,6 +166,7 @@ class _Body:
     monitor: LeafSystem
     load_estimator: LeafSystem
     sample: dict[str, OutputPort]
+    command_period: float  # in which it takes joint commands [s]
 
 
 def _add_body(
@@ -183,10 +183,15 @@ def _add_body(
     state = plant.get_state_output_port(slave.instance)
     builder.ExportOutput(state, "slave_state")
 
+    samples = 1 if q_start is not None else _samples_within(scenario, slave)
+    ramps = samples > 1
     control = builder.AddNamedSystem(
         "joint_control",
-        MakeJointControl(arm, scenario.joint_control, 1 / rates.joint_control_hz, start),
+        SampledServo(slave, scenario.joint_control, 1 / rates.joint_control_hz, samples, start)
+        if ramps
+        else MakeJointControl(arm, scenario.joint_control, 1 / rates.joint_control_hz, start),
     )
+    held = samples / rates.joint_control_hz
     torque = control.GetOutputPort("joint_torque")
     builder.Connect(state, control.GetInputPort("slave_state"))
     builder.Connect(torque, plant.get_actuation_input_port(slave.instance))
@@ -201,14 +206,21 @@ def _add_body(
         sensor,
         scenario.motion_estimation,
         1 / rates.sensor_hz,
-        1 / rates.joint_control_hz,
+        held,
         start,
+        ramps=ramps,
     )
     wrist = builder.GetSubsystemByName("wrist_sensor")
     acceleration = plant.get_generalized_acceleration_output_port(slave.instance)
     builder.Connect(state, wrist.GetInputPort("slave_state"))
     builder.Connect(acceleration, wrist.GetInputPort("slave_acceleration"))
     builder.Connect(torque, wrist.GetInputPort("joint_torque"))
+    if ramps:
+        rate = control.GetOutputPort("torque_rate")
+        builder.Connect(rate, wrist.GetInputPort("torque_rate"))
+        if slave.sensed_sheet is not None:
+            sheet = plant.get_state_output_port(slave.sensed_sheet)
+            builder.Connect(sheet, control.GetInputPort("sheet_state"))
     for name, port in sample.items():
         builder.ExportOutput(port, name)
 
@@ -237,7 +249,14 @@ def _add_body(
 
     if slave.can_touch:
         _add_tool_contact(builder, slave, state)
-    return _Body(slave, control, monitor, estimator, sample)
+    return _Body(slave, control, monitor, estimator, sample, held)
+
+
+def _samples_within(scenario: Scenario, slave: SlavePlant) -> int:
+    """Of the servo for one event; 1 where nothing but the plant itself can foresee its motion."""
+    if slave.contact.beyond or scenario.joint_control.position_interface is not None:
+        return 1
+    return samples_within(scenario.rates.joint_control_hz, scenario.rates.hand_hz)
 
 
 def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputPort) -> None:

@@ -121,6 +121,18 @@ def joint_control_torque(
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 
 
+def servo_numbers(
+    arm: ArmModel, config: JointControlConfig
+) -> tuple[float, float, NDArray[np.float64], NDArray[np.float64]]:
+    """Gains and limits for `joint_control_torque`."""
+    return (
+        2 * np.pi * config.position_bandwidth_hz,
+        2 * np.pi * config.velocity_bandwidth_hz,
+        arm.velocity_limit,
+        arm.effort_limit,
+    )
+
+
 class JointControl(LeafSystem):
     """Sampled joint position controller.
 
@@ -155,13 +167,7 @@ class JointControl(LeafSystem):
         super().__init__()
         n = arm.num_joints
         self._arm = arm.table
-        self._constants = (
-            2 * np.pi * config.position_bandwidth_hz,
-            2 * np.pi * config.velocity_bandwidth_hz,
-            arm.velocity_limit,
-            arm.effort_limit,
-            np.zeros(3 * n),
-        )
+        self._constants = (*servo_numbers(arm, config), np.zeros(3 * n))
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         still, holding = np.zeros(n), np.zeros(n)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -73,6 +73,15 @@ class SlavePlant:
     def contact_pairs(self) -> NDArray[np.float64]:
         """(k, 27) what may touch by the compiled contact law, see `ContactPairs`."""
         return self.contact.pairs
+
+    @cached_property
+    def physics(self) -> tuple[NDArray[np.float64], ...]:
+        """For `plant_rates`: the arm's table, phi in it, `contact_pairs`, the leaf.
+
+        A copy, because something may be grasped; the joint control knows nothing of that.
+        """
+        carried = self.arm.with_load(self.arm.phi_load)
+        return carried.table, carried.load, self.contact_pairs, self.contact.leaf
 
     @property
     def sheet(self) -> ModelInstanceIndex | None:

@@ -1,0 +1,106 @@
+"""Joint control sampled inside the step, against an event for each of its samples."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from drake_teleop.environment.wall import Wall
+from drake_teleop.slave.joint_control import (
+    JointControl,
+    JointControlConfig,
+    joint_control_torque,
+    servo_numbers,
+)
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.sampled_servo import SampledServo, samples_within, torque_line
+from drake_teleop.slave.slave_config import Slave
+
+CONFIG = JointControlConfig()
+
+
+def moved(samples, hz, wall=None):
+    """Where the joints are after 20 ms of a step of the command; an event for each `samples`."""
+    builder = DiagramBuilder()
+    slave = AddSlavePlant(builder, Slave(), wall)
+    if samples > 1:
+        control = SampledServo(slave, CONFIG, 1 / hz, samples, slave.start)
+    else:
+        control = JointControl(slave.arm, CONFIG, 1 / hz, slave.start)
+    builder.AddSystem(control)
+    command = builder.AddSystem(
+        ConstantVectorSource(slave.start + np.array([3, 20, -10, 20, 10, -20]) / 1e3)
+    )
+    builder.Connect(command.get_output_port(), control.GetInputPort("joint_command"))
+    state = slave.plant.get_state_output_port(slave.instance)
+    builder.Connect(state, control.GetInputPort("slave_state"))
+    torque = control.GetOutputPort("joint_torque")
+    builder.Connect(torque, slave.plant.get_actuation_input_port(slave.instance))
+    simulator = Simulator(builder.Build())
+    ResetIntegratorFromFlags(simulator, "runge_kutta3", 1e-3)
+    simulator.get_mutable_integrator().set_target_accuracy(1e-6)
+    simulator.AdvanceTo(0.02)
+    context = slave.plant.GetMyContextFromRoot(simulator.get_context())
+    return slave.plant.GetPositions(context, slave.instance)
+
+
+@pytest.mark.parametrize(
+    # The second pushes the tool, which is 3 mm in it, with 60 N.
+    ("wall", "share"),
+    [(None, 0.03), (Wall(position=[0.55, 0.0, 0.253], stiffness=2e4), 0.045)],
+)
+def test_samples_inside_a_step_move_the_arm_as_events_do(wall, share):
+    honest = moved(1, 1e4, wall)
+    rate = np.abs(moved(1, 2e3, wall) - honest).max()
+    assert rate > 5e-5  # rad, of five times the rate
+    assert np.abs(moved(5, 1e4, wall) - honest).max() < share * rate
+
+
+def test_one_sample_is_the_controller_itself_to_the_last_bit():
+    slave = AddSlavePlant(DiagramBuilder(), Slave(), None)
+    n, random = slave.arm.num_joints, np.random.default_rng(0)
+    servo, torque = servo_numbers(slave.arm, CONFIG), np.zeros(6)
+    for _ in range(20):
+        command = slave.start + random.normal(0.0, 0.05, n)
+        state = np.concatenate([slave.start, np.zeros(n)]) + random.normal(0.0, 0.3, 2 * n)
+        scratch, line = np.zeros(3 * n), np.zeros(3 * n)
+        joint_control_torque(slave.arm.table, command, state, *servo, scratch, torque)
+        torque_line(
+            slave.arm.table, command, state, np.zeros(2), servo, slave.physics, 1, 5e-4, scratch,
+            line,
+        )  # fmt: skip
+        assert line.tobytes() == np.concatenate([torque, np.zeros(n), torque]).tobytes()
+
+
+def test_a_line_stays_within_the_motors_torque_and_outlives_a_command_that_is_none():
+    slave = AddSlavePlant(DiagramBuilder(), Slave(), None)
+    arm, n = slave.arm, slave.arm.num_joints
+    servo, rest = servo_numbers(arm, CONFIG), np.concatenate([slave.start, np.zeros(n)])
+    line = np.zeros(3 * n)
+
+    def torques(command):
+        torque_line(
+            arm.table, command, rest, np.zeros(2), servo, slave.physics, 5, 1e-4, np.zeros(3 * n),
+            line,
+        )  # fmt: skip
+        return line[:n], line[:n] + 5e-4 * line[n : 2 * n], line[2 * n :].copy()
+
+    clipped = 0
+    for far in np.linspace(0.001, 0.1, 40):
+        start, end, last = torques(slave.start + far)
+        largest = np.maximum(np.abs(start), np.abs(end)) / arm.effort_limit
+        assert (largest <= 1 + 1e-12).all()
+        clipped += ((largest > 1 - 1e-12) & (line[n : 2 * n] != 0.0)).sum()
+    assert clipped > 0
+    start, end, _ = torques(np.full(n, np.nan))
+    np.testing.assert_allclose(start, last, rtol=1e-14)
+    np.testing.assert_allclose(end, last, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("control", "hand", "samples"),
+    [(2e3, 2e3, 1), (1e4, 2e3, 5), (1e4, 1e3, 5), (4e3, 500.0, 2), (2e3, 1e3, 1), (1e4, 3e3, 1)],
+)
+def test_events_come_at_2_khz_or_more_and_with_each_sample_of_the_hand(control, hand, samples):
+    assert samples_within(control, hand) == samples
