@@ -76,7 +76,7 @@ def netft():
         def send(number, flaw, there=there):
             counts = [round(1000 * x) for x in wrench(number)]
             status = {"saturated": 0x80020000, "nan": 0x80010000}.get(flaw, 0)
-            record = struct.pack(">III6i", number + 1, 7 * number, status, *counts)
+            record = struct.pack(">III6i", number, 7 * number, status, *counts)
             box.sendto(record[: 20 if flaw == "short" else 36], there)
 
         play(send, flaws)
@@ -87,6 +87,52 @@ def netft():
         box.settimeout(5.0)
 
 
+def rtde(host):
+    """A controller that is started again: its time begins anew. It says nothing of its own."""
+    types = {
+        "timestamp": "DOUBLE",
+        "ft_raw_wrench": "VECTOR6D",
+        "actual_TCP_pose": "VECTOR6D",
+        "actual_tool_accelerometer": "VECTOR3D",
+    }
+    print(host, flush=True)
+    for flaws, start in ((FLAWS, 100.0), (("good",) * 5, 1.0)):
+        with socket.create_server((host, 30004)) as door:
+            robot, _ = door.accept()
+        robot.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+        def say(kind, content, robot=robot):
+            robot.sendall(struct.pack(">HB", 3 + len(content), ord(kind)) + content)
+
+        names = []
+        asked = robot.makefile("rb")
+        while (head := asked.read(3))[2:] != b"S":
+            kind, content = chr(head[2]), asked.read(int.from_bytes(head[:2], "big") - 3)
+            if kind == "V":
+                say(kind, b"\x01")
+            elif kind == "v":
+                say(kind, struct.pack(">4I", 5, 12, 0, 0))
+            elif kind == "O":
+                names = [name for name in content[8:].decode().split(",") if name]
+                say(kind, b"\x01" + ",".join(types[name] for name in names).encode())
+        say("S", b"\x01")
+
+        def send(number, flaw, start=start, say=say, names=names):
+            values = {
+                "timestamp": (start + DT * number,),
+                "ft_raw_wrench": wrench(number) if flaw != "nan" else (float("nan"),) * 6,
+                "actual_TCP_pose": (0.4, 0.1, 0.3, 0.0, 0.0, 1.0),
+                "actual_tool_accelerometer": (0.0, 0.0, 9.81),
+            }
+            numbers = [x for name in names for x in values[name]]
+            say("U", b"\x01" + struct.pack(f">{len(numbers)}d", *numbers))
+
+        play(send, flaws)
+        robot.close()
+        asked.close()
+        time.sleep(0.06)
+
+
 if __name__ == "__main__":
     with contextlib.suppress(OSError, KeyboardInterrupt):
-        {"netft": netft}[sys.argv[1]](*sys.argv[2:])
+        {"netft": netft, "rtde": rtde}[sys.argv[1]](*sys.argv[2:])

@@ -1,0 +1,121 @@
+"""Universal Robots: wrench, pose and acceleration of the tool by RTDE, with the library ur_rtde.
+
+Of each sample of the controller, 500 or 125 a second: `ft_raw_wrench`, what the sensor in the wrist
+of an e-Series measures; `actual_TCP_pose` in the frame of the robot's base, z upwards; and
+`actual_tool_accelerometer`. With a TCP of zero in the robot's installation the pose is that of the
+flange, where the sensor is. The library runs in a process of its own, see `rtde_reader`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import select
+import subprocess
+import sys
+import time
+from itertools import pairwise
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.quaternions import exponential
+from drake_teleop.robots.address import Address
+from drake_teleop.robots.rtde_reader import SAMPLE
+from drake_teleop.robots.streams import IMU, POSE, WRENCH, Part
+
+PORT = 30004
+_FIRST_S = 3.0  # to wait for the robot at the start
+_AGAIN_S = 0.2  # from one start of the child to the next
+_FIRST = 5  # samples that tell the rate
+_BLOCK = 65536
+
+
+class RtdeSource:
+    """Parts of rtde://HOST[?sign=-1]: wrench, pose and acceleration, of the same instants.
+
+    Args:
+        address: sign -1, the default, is for a sensor that tells what the load exerts on it.
+
+    Raises:
+        DrakeTeleopError: if the address cannot be used, ur_rtde is missing, or no robot answers.
+    """
+
+    live = True
+
+    def __init__(self, address: str) -> None:
+        told = Address(address, PORT, known=("sign",))
+        if told.port != PORT:
+            raise DrakeTeleopError("RTDE has one port, 30004", where=address)
+        if importlib.util.find_spec("rtde_receive") is None:
+            raise DrakeTeleopError(
+                "robots of UR are read by the library ur_rtde, which is not installed",
+                where=address,
+                remedy="pip install 'drake_teleop[robots]'",
+            )
+        self._host, self._sign, self._rest, self._began = told.host, told.sign(), b"", 0.0
+        self._start()
+        exponential((0.0, 0.0, 0.0))  # what is compiled is loaded now
+        self._first: list[tuple[float, ...]] = []
+        until = time.monotonic() + _FIRST_S
+        while len(self._first) < _FIRST and (left := until - time.monotonic()) > 0.0:
+            self._first += self._samples(left)
+        if len(self._first) < _FIRST:
+            self.close()
+            raise DrakeTeleopError("no robot answers on port 30004", where=address)
+        spacing = min(abs(b[0] - a[0]) for a, b in pairwise(self._first))
+        self.dt = 0.002 if spacing < 0.005 else 0.008
+
+    def read(self, timeout_s: float) -> list[Part] | None:
+        """See `Source`."""
+        samples, self._first = [*self._first, *self._samples(timeout_s)], []
+        return [part for sample in samples for part in self.parts(sample)]
+
+    def parts(self, sample: tuple[float, ...]) -> list[Part]:
+        """What a sample of `rtde_reader` tells. It never raises."""
+        t, values = sample[0], np.array(sample[1:])
+        number = round(t / self.dt) if abs(t) < 1e12 else -1
+        told = {
+            WRENCH: self._sign * values[:6],
+            POSE: np.array([*exponential(sample[10:13]), *sample[7:10]]),
+            IMU: values[12:15],
+        }
+        return [Part(stream, number, t, each) for stream, each in told.items()]
+
+    def _samples(self, timeout_s: float) -> list[tuple[float, ...]]:
+        """Those that have come; starts the child anew if it has ended."""
+        if not select.select([self._pipe], [], [], max(0.0, timeout_s))[0]:
+            return []
+        block = os.read(self._pipe, _BLOCK)
+        if not block:
+            if time.monotonic() - self._began > _AGAIN_S:
+                self._end()
+                self._start()
+            else:
+                time.sleep(min(timeout_s, _AGAIN_S))
+            return []
+        block = self._rest + block
+        whole = len(block) - len(block) % SAMPLE.size
+        self._rest = block[whole:]
+        return list(SAMPLE.iter_unpack(block[:whole]))
+
+    def _start(self) -> None:
+        code = "from drake_teleop.robots.rtde_reader import main; main()"
+        self._pipe, into = os.pipe()
+        self._child = subprocess.Popen(
+            [sys.executable, "-c", code, self._host, str(into)],
+            pass_fds=[into],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        os.close(into)
+        self._rest, self._began = b"", time.monotonic()
+
+    def _end(self) -> None:
+        self._child.kill()
+        self._child.wait()
+        os.close(self._pipe)
+
+    def close(self) -> None:
+        """See `Source`."""
+        self._end()
