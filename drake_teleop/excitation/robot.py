@@ -30,6 +30,7 @@ from drake_teleop.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.slave.arm import ArmModel
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.assumed_limits import with_all_limits
+from drake_teleop.slave.model_check import check_size
 from drake_teleop.slave.models import ParseModel, drakes_errors_said
 from drake_teleop.slave.plant import NominalSlave, ParseSlave, finalize
 from drake_teleop.slave.surroundings import AddEnvironment
@@ -161,6 +162,7 @@ def RobotFromModel(
     assumptions = ["a table at z = 0"]
     with drakes_errors_said(path):
         arm = _arm_of(parse)
+    check_size(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
         reserve = (_LOAD_FACTOR - 1) * load

@@ -7,6 +7,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
+    Frame,
     Joint,
     JointActuator,
     ModelInstanceIndex,
@@ -61,7 +62,7 @@ def ArmModelFromPlant(
     inboard = {
         joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
     }
-    joints = _chain(inboard, frame_S.body())
+    joints = _chain(inboard, frame_S)
     n = len(joints)
     table = np.zeros((n + 1, WIDTH))
     for row, joint in enumerate(joints):
@@ -116,11 +117,9 @@ def _axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
     return axis
 
 
-def _chain(
-    inboard: dict[BodyIndex, Joint], body: RigidBody
-) -> list[RevoluteJoint | PrismaticJoint]:
-    """The moving joints from the world to ``body``, from the base outwards."""
-    joints: list[RevoluteJoint | PrismaticJoint] = []
+def _chain(inboard: dict[BodyIndex, Joint], frame_S: Frame) -> list[RevoluteJoint | PrismaticJoint]:
+    """The moving joints from the world to S, from the base outwards."""
+    body, joints = frame_S.body(), list[RevoluteJoint | PrismaticJoint]()
     while body.index() in inboard:
         joint = inboard[body.index()]
         if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
@@ -134,7 +133,9 @@ def _chain(
         body = joint.parent_body()
     if not joints:
         raise DrakeTeleopError(
-            "no moving joint between the world and the sensor frame", where=body.name()
+            f"no moving joint between the world and {frame_S.name()}",
+            where="sensor_frame",
+            remedy="name a frame or link that the arm moves",
         )
     return joints[::-1]
 

@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 
 # Range [rad], speed [rad/s] of a joint that turns; of one that slides [m], [m/s].
 _TURNS, _SLIDES = (np.pi, np.pi), (1.0, 1.0)
+# A joint turns about itself at most so far [rad]; limits farther apart may be in degrees.
+_TURNS_AT_MOST = 8 * np.pi
 # To full speed [s].
 _TIME_TO_SPEED = 0.4
 
@@ -67,6 +69,7 @@ def with_all_limits(
         acceleration_limit=np.where(_given(own), own, velocity / _TIME_TO_SPEED),
         effort_limit=effort,
     )
+    in_reason = slides | endless | (arm.upper - arm.lower < _TURNS_AT_MOST)
     reaching = f"acceleration limits that reach full speed in {_TIME_TO_SPEED:g} s{hint}"
     for missing, of_turning, of_sliding in (
         (endless, f"a range of +-{_TURNS[0]:.4g} rad", f"a range of +-{_SLIDES[0]:g} m"),
@@ -77,6 +80,7 @@ def with_all_limits(
         ),
         (~_given(own), reaching, reaching),
         (~np.isfinite(effort), "no torque limit", "no force limit"),
+        (~in_reason, f"limits in rad, though more than {_TURNS_AT_MOST:.4g} apart,", ""),
     ):
         for words, of_kind in ((of_turning, ~slides), (of_sliding, slides)):
             lacking = missing & of_kind

@@ -1,8 +1,9 @@
 """What cannot be true of a robot model, said before Drake reads it.
 
 Drake follows a link with two parents or a circle of joints into an abort or for ever, and replaces
-an inertia that no body has by another one without telling. Here each is one error with the name of
-joint or link; what is merely missing is an assumption.
+an inertia that no body has by another one without telling, even if only the last digit is wrong.
+Here each is one error with the name of joint or link; what is merely missing is an assumption, and
+what the file's rounding made wrong is made right.
 """
 
 from __future__ import annotations
@@ -12,14 +13,19 @@ from collections.abc import Iterable
 from xml.etree.ElementTree import Element
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.slave.arm import PHI, TRANSLATION, ArmModel
 
 _INERTIAS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 # What places, shapes and masses are said with, in URDF and SDF.
 _MEASURES = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
 _MEASURES |= {"radius", "radii", "length", "scale", "mass", "inertia", *_INERTIAS}
+_MEASURES |= {"drake:rotor_inertia", "drake:gear_ratio"}
 WORLD = "world"  # as URDF and SDF call it
+_JOINTS = ("joint", "drake:joint")
+_SMALLEST, _LONGEST = 0.01, 50.0  # of an arm [m]
 _LARGEST = 1e6  # of these in SI; limits may be larger, where there is none
 # How far principal moments may be from those of a body, for rounding in the file.
 _ROUNDING = 1e-3
@@ -29,12 +35,12 @@ def check_model(root: Element, where: str) -> list[str]:
     """Checks tree, limits and masses of a URDF or SDF.
 
     Returns:
-        Assumptions: which links have no mass or no inertia.
+        Assumptions: which links have no mass or no inertia, and what Drake leaves out.
 
     Raises:
         DrakeTeleopError: for a link with two parents, a second root in a URDF, joints that form a
-            circle, limits that are no numbers or the wrong way round, a negative mass, an inertia
-            that no body has, a length or a mass that no arm has.
+            circle, names that stand twice, limits that are no numbers or the wrong way round, a
+            negative mass, an inertia that no body has, a length or a mass that no arm has.
     """
     for scope in root.iter():
         _check_scope(scope, where)
@@ -44,8 +50,36 @@ def check_model(root: Element, where: str) -> list[str]:
     for joint in root.iter("joint"):
         for limit in joint.iter("limit"):
             _check_limit(limit, f"{where}: joint {joint.get('name', '')}")
-    without = [link.get("name", "") for link in root.iter("link") if _is_massless(link, where)]
-    return [f"no inertia of {', '.join(without)}"] if without else []
+    moved = {
+        _end(joint, "child")
+        for joint in (each for tag in _JOINTS for each in root.iter(tag))
+        if joint.get("type") != "fixed"
+    }
+    without, rounded, one_kg = list[str](), list[str](), list[str]()
+    for link in root.iter("link"):
+        name = link.get("name", "")
+        if root.tag == "sdf" and link.find("inertial") is None:
+            one_kg.append(name)
+        elif _is_massless(link, where, name in moved):
+            without.append(name)
+        if _made_right(link, f"{where}: link {name}"):
+            rounded.append(name)
+    rough = [
+        joint.get("name", "")
+        for joint in root.iter("joint")
+        for dynamics in joint.iter("dynamics")
+        if float(dynamics.get("friction") or dynamics.findtext("friction") or 0.0) != 0.0
+    ]
+    return [
+        f"{what} {', '.join(names)}"
+        for what, names in (
+            ("no inertia of", without),
+            ("1 kg, as SDF has it, for", one_kg),
+            ("an inertia of rounded numbers made a body's for", rounded),
+            ("no dry friction of", rough),
+        )
+        if names
+    ]
 
 
 def check_tree(joints: Iterable[tuple[str, str, str]], where: str) -> dict[str, tuple[str, str]]:
@@ -89,14 +123,17 @@ def _check_scope(scope: Element, where: str) -> None:
     """Checks the tree of a robot or a model; models inside it have names of their own."""
     joints = [
         (joint.get("name", ""), parent, child)
-        for joint in scope.findall("joint")
+        for joint in (each for tag in _JOINTS for each in scope.findall(tag))
         for parent, child in [(_end(joint, "parent"), _end(joint, "child"))]
         if parent and child  # or Drake says what lacks
     ]
+    links = [link.get("name", "") for link in scope.findall("link")]
+    for kind, names in (("links", links), ("joints", [name for name, _, _ in joints])):
+        for name in names:
+            if name and names.count(name) > 1:
+                raise DrakeTeleopError(f"two {kind} are named {name}", where=where)
     parents = check_tree(joints, where)
-    loose = [
-        name for link in scope.findall("link") if (name := link.get("name", "")) not in parents
-    ]
+    loose = [name or "a link without name" for name in links if name not in parents]
     if scope.tag == "robot" and len(loose) > 1:
         raise DrakeTeleopError(
             f"{loose[0]} and {loose[1]} are both the child of no joint",
@@ -121,6 +158,8 @@ def _check_measure(element: Element, where: str) -> None:
                 raise DrakeTeleopError(
                     f"{element.tag} {word} is no finite number up to {_LARGEST:g}", where=where
                 )
+            if element.tag == "drake:rotor_inertia" and value < 0.0:
+                raise DrakeTeleopError(f"a rotor inertia of {word} kg m^2", where=where)
 
 
 def _check_limit(limit: Element, where: str) -> None:
@@ -136,37 +175,83 @@ def _check_limit(limit: Element, where: str) -> None:
         # Of SDF, -1 says that there is no limit.
         if value is not None and value < 0 and not (value == -1 and limit.get(name) is None):
             raise DrakeTeleopError(f"{name} limit {value:g} is negative", where=where)
+    for name, text in limit.attrib.items():  # of a URDF
+        if math.isinf(_number(text, name, where)):
+            raise DrakeTeleopError(
+                f"{name} {text} is not finite",
+                where=where,
+                remedy="leave out what has no limit: what is assumed will be said",
+            )
 
 
-def _is_massless(link: Element, where: str) -> bool:
-    """Whether a link has shapes but no inertia; one that cannot be is an error.
+def _is_massless(link: Element, where: str, moves: bool) -> bool:
+    """Whether a link that has shapes, or that a joint moves, has no inertia.
 
-    A link without shapes is a frame, such as tool0.
+    Without either it is a frame, such as tool0.
+
+    Raises:
+        DrakeTeleopError: for a mass or an inertia that cannot be.
     """
     place = f"{where}: link {link.get('name', '')}"
     inertial = link.find("inertial")
     mass_element = None if inertial is None else inertial.find("mass")
-    has_shape = link.find("collision") is not None or link.find("visual") is not None
+    counts = moves or link.find("collision") is not None or link.find("visual") is not None
     if inertial is None or mass_element is None:
-        return has_shape
+        return counts
     mass = _number(mass_element.get("value") or mass_element.text or "", "mass", place)
     if mass < 0:
         raise DrakeTeleopError(f"mass {mass:g} kg is negative", where=place)
     element = inertial.find("inertia")
     if element is None:
-        return has_shape
-    texts = {name: element.get(name) or element.findtext(name) or "0" for name in _INERTIAS}
-    xx, xy, xz, yy, yz, zz = (_number(texts[name], name, place) for name in _INERTIAS)
-    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    rounding = _ROUNDING * abs(moments[2])
-    if moments[0] < -rounding or moments[0] + moments[1] < moments[2] - rounding:
+        turns = mass_element.get("value") is None  # of SDF it is 1 kg m^2 then
+    else:
+        turns = bool(_moments(element, place)[2] > 0.0)
+    if mass == 0.0 and turns:
+        raise DrakeTeleopError("an inertia, but no mass", where=place, remedy="give both or none")
+    return counts and not turns
+
+
+def _made_right(link: Element, where: str) -> bool:
+    """Makes a body's inertia of one that rounding in the file has made none.
+
+    By the same addition to each of its moments, at most `_ROUNDING` of the largest.
+
+    Raises:
+        DrakeTeleopError: if it takes more.
+    """
+    element = link.find("inertial/inertia")
+    if element is None:
+        return False
+    moments = _moments(element, where)
+    lacking = max(-moments[0], moments[2] - moments[1] - moments[0])
+    if lacking <= 0.0:
+        return False
+    if lacking > _ROUNDING * abs(moments[2]):
         raise DrakeTeleopError(
             "no body has this inertia: its principal moments are "
             f"{moments[0]:.3g}, {moments[1]:.3g}, {moments[2]:.3g} kg m^2",
-            where=place,
+            where=where,
             remedy="all are positive, and none is more than the sum of the other two",
         )
-    return has_shape and (mass == 0.0 or moments[2] == 0.0)
+    for name in ("ixx", "iyy", "izz"):
+        value = f"{float(_entry(element, name)) + 1.001 * lacking:.17g}"
+        child = element.find(name)
+        if child is None:
+            element.set(name, value)
+        else:
+            child.text = value
+    return True
+
+
+def _entry(inertia: Element, name: str) -> str:
+    return inertia.get(name) or inertia.findtext(name) or "0"
+
+
+def _moments(inertia: Element, where: str) -> NDArray[np.float64]:
+    """(3,) principal moments, the smallest first."""
+    xx, xy, xz, yy, yz, zz = (_number(_entry(inertia, name), name, where) for name in _INERTIAS)
+    tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return np.asarray(np.linalg.eigvalsh(tensor), dtype=np.float64)
 
 
 def _number(text: str, name: str, where: str) -> float:
@@ -177,3 +262,22 @@ def _number(text: str, name: str, where: str) -> float:
     if math.isnan(value):
         raise DrakeTeleopError(f"{name} {text.strip()!r} is not a number", where=where)
     return value
+
+
+def check_size(arm: ArmModel, where: str) -> None:
+    """Refuses an arm that is too large or too small for its lengths to be metres.
+
+    Raises:
+        DrakeTeleopError: for its length, or a link whose mass is far from its joint.
+    """
+    length = float(np.linalg.norm(arm.table[1:, TRANSLATION:PHI], axis=1).sum())
+    remedy = "give lengths in m, and inertias in kg m^2"
+    if 0.0 < length < _SMALLEST or length > _LONGEST:
+        what = f"from its first joint to the sensor it is {length:.3g} m long"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
+    for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI:], strict=True):
+        # The root mean square of the distance of its mass from the joint's origin.
+        away = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
+        if away > _LONGEST:
+            what = f"what {name} moves is {away:.3g} m away from it"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple, NoReturn, TypeAlias
+from typing import NamedTuple, TypeAlias, TypeVar
 from xml.etree import ElementTree
-from xml.parsers import expat
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
@@ -34,7 +33,14 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.silence import silent_stderr
 from drake_teleop.slave.meshes import Packages, without_lost_meshes
 from drake_teleop.slave.model_check import WORLD, check_model, check_tree
-from drake_teleop.texts import read_text, read_yaml
+from drake_teleop.slave.model_files import (
+    XACRO,
+    efforts,
+    floating_links,
+    peculiar_joints,
+    read_roots,
+)
+from drake_teleop.texts import read_text
 
 # What ties links to each other besides joints: Drake's tags in URDF and SDF, MJCF's.
 _LOOP = re.compile(rb"<(drake:ball_constraint|drake:linear_bushing_rpy|connect|weld|distance)\b")
@@ -42,6 +48,7 @@ _LOOP = re.compile(rb"<(drake:ball_constraint|drake:linear_bushing_rpy|connect|w
 _MISSING = "shapes are missing of"
 # What a file should be, and where its packages are looked for.
 _Said: TypeAlias = tuple[str, str]
+_Found = TypeVar("_Found")
 _ROBOT = ("robot", "with --package-path for package://")
 _SCENE = ("scene", "its package:// addresses in folders around it")
 
@@ -95,14 +102,8 @@ def ParseModel(
         DrakeTeleopError: if the file cannot be read, has no such frame, says what cannot be true of
             an arm, see `check_model`, or fastens the base elsewhere than at `X_WBase`.
     """
-    before, forces = set(plant.GetJointIndices()), plant.num_force_elements()
+    before = set(plant.GetJointIndices())
     read = _read(plant, path, package_paths)
-    if plant.num_force_elements() > forces:
-        raise DrakeTeleopError(
-            "has springs, or other forces of its own",
-            where=str(path),
-            remedy="take them out: what moves the arm are its motors, gravity and what it touches",
-        )
     having = [i for i in read.instances if plant.HasFrameNamed(sensor_frame, i)]
     if len(having) != 1:
         frames = [
@@ -112,17 +113,19 @@ def ParseModel(
         ]
         # Drake's own, of joints.
         frames = [name for name in frames if not name.endswith(("_parent", "_child", "__model__"))]
+        known = ", ".join(sorted(set(frames)))
         raise DrakeTeleopError(
             f"{len(having) or 'no'} frames are named {sensor_frame!r}",
             where=str(path),
-            remedy=f"name one of {', '.join(sorted(set(frames)))}",
+            remedy=f"name one of {known}" if known else "give a model that has links",
         )
     frame = plant.GetFrameByName(sensor_frame, having[0])
-    chain = _weld_base(plant, frame, _peculiar_joints(read.root), X_WBase, str(path))
+    chain = _weld_base(plant, frame, read.of_all(peculiar_joints), X_WBase, str(path))
+    _check_loose(plant, read.instances, str(path))
+    _check_chain(plant, chain, str(path))
     with drakes_errors_said(path):
         held = _hold_others(plant, before, chain)
-        _actuate(plant, chain, _efforts(read.root))
-    # Of a chain that is none, `ArmModelFromPlant` tells.
+        _actuate(plant, chain, read.of_all(efforts))
     instances = {plant.get_joint(k).model_instance() for k in chain if _moves(plant, k)}
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
@@ -132,7 +135,9 @@ def ParseModel(
             remedy="write the chain up to the sensor as one model",
         )
     instance = next(iter(instances), having[0])
-    return ParsedModel(instance, frame, [*read.assumptions, *held], read.folder)
+    afloat = [name for root in read.roots for name in floating_links(root)]
+    welded = [f"welded to the world, where it may float: {', '.join(afloat)}"] if afloat else []
+    return ParsedModel(instance, frame, [*read.assumptions, *welded, *held], read.folder)
 
 
 def ParseTool(
@@ -186,8 +191,7 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
     """
     read = _read(plant, path, (), _SCENE)
     missing = [text for text in read.assumptions if text.startswith(_MISSING)]
-    if read.root is not None:
-        missing += [f"{name} {what}" for name, what in _peculiar_joints(read.root).items()]
+    missing += [f"{name} {what}" for name, what in read.of_all(peculiar_joints).items()]
     if missing:
         raise DrakeTeleopError(
             missing[0], where=str(path), remedy="nothing may be left out that the tool could touch"
@@ -196,12 +200,16 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
 
 
 class _Read(NamedTuple):
-    """What stands in a file; the XML's root, if it is a URDF or SDF."""
+    """What stands in a file; the roots of the XML that it is made of."""
 
     instances: list[ModelInstanceIndex]
-    root: ElementTree.Element | None
+    roots: list[ElementTree.Element]
     assumptions: list[str]
     folder: TemporaryDirectory[str]
+
+    def of_all(self, find: Callable[[ElementTree.Element], dict[str, _Found]]) -> dict[str, _Found]:
+        """What `find` finds in any of the roots."""
+        return {name: what for root in self.roots for name, what in find(root).items()}
 
 
 def _read(
@@ -209,6 +217,8 @@ def _read(
 ) -> _Read:
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path))
+    if path.suffix.lower() == ".xacro":
+        raise DrakeTeleopError("is a macro", where=str(path), remedy=XACRO)
     packages = Packages(path, package_paths)
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
@@ -219,31 +229,59 @@ def _read(
     kind = path.suffix.lower().removeprefix(".")
     assumptions: list[str] = []
     converted = TemporaryDirectory(prefix="drake_teleop_")
-    root = _xml(path) if kind in ("urdf", "sdf") else None
-    if kind == "yaml":
-        read_yaml(path, tagged=True)  # Drake's parser overflows its stack over many brackets
-    elif kind == "xml":
+    forces = plant.num_force_elements()
+    if kind == "xml":
         read_text(path)  # or names cannot be said
+    roots = read_roots(path, packages)
     _check_no_loop(path, kind)
     with drakes_errors_said(path, said):
-        if root is None:
-            with _drakes_errors_raised():
-                instances = parser.AddModels(str(path))
-        else:
-            inertias = check_model(root, str(path))
+        for file, root in roots.items():
+            assumptions += check_model(root, str(file))
+        if kind in ("urdf", "sdf"):
+            root = roots[path]
             lost = without_lost_meshes(root, packages, Path(converted.name))
-            assumptions = [f"{_MISSING} {', '.join(links)}: {what}" for what, links in lost.items()]
-            assumptions += inertias
+            assumptions += [f"{_MISSING} {', '.join(ls)}: {what}" for what, ls in lost.items()]
             text = ElementTree.tostring(root, encoding="unicode")
             with _drakes_errors_raised():
                 instances = parser.AddModelsFromString(text, kind)
-    return _Read(instances, root, assumptions, converted)
+        else:
+            with _drakes_errors_raised():
+                instances = parser.AddModels(str(path))
+    if said is _ROBOT and plant.num_force_elements() > forces:
+        raise DrakeTeleopError(
+            "has springs, or other forces of its own",
+            where=str(path),
+            remedy="take them out: what moves the arm are its motors, gravity and what it touches",
+        )
+    return _Read(instances, list(roots.values()), assumptions, converted)
+
+
+def _check_chain(plant: MultibodyPlant, chain: list[JointIndex], where: str) -> None:
+    """Refuses what moves otherwise than about or along one axis."""
+    for joint in (plant.get_joint(index) for index in chain if _moves(plant, index)):
+        if not isinstance(joint, (RevoluteJoint, PrismaticJoint)):
+            raise DrakeTeleopError(
+                f"{joint.name()} is a {joint.type_name()} joint",
+                where=where,
+                remedy="up to the sensor, use joints that turn about one axis or slide along it",
+            )
+
+
+def _check_loose(plant: MultibodyPlant, instances: list[ModelInstanceIndex], where: str) -> None:
+    held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
+    for index in (k for instance in instances for k in plant.GetBodyIndices(instance)):
+        if index not in held:
+            raise DrakeTeleopError(
+                f"{plant.get_body(index).name()} hangs on nothing, beside the arm",
+                where=where,
+                remedy="take it out, and put what there is to touch into the environment",
+            )
 
 
 def _check_no_loop(path: Path, kind: str) -> None:
     """Refuses what closes loops in a tree of links: Drake would drop it, or the chain be another.
 
-    Of joints that move together, `_peculiar_joints` tells.
+    Of joints that move together, `peculiar_joints` tells.
     """
     found = None if kind == "yaml" else _LOOP.search(path.read_bytes())
     if found:
@@ -325,7 +363,7 @@ def drakes_errors_said(path: Path, said: _Said = _ROBOT) -> Iterator[None]:
         raise
     # SystemExit: a condition of Drake's; LookupError: of the containers of C++.
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
-        reason = str(error).replace("<literal-string>", "")
+        reason = str(error).replace("<literal-string>", "").replace(str(path), path.name)
         raise DrakeTeleopError(
             f"cannot be read as a {said[0]} ({reason.strip()})",
             where=str(path),
@@ -337,13 +375,15 @@ def drakes_errors_said(path: Path, said: _Said = _ROBOT) -> Iterator[None]:
 def _drakes_errors_raised() -> Iterator[None]:
     """Raises RuntimeError for an error that Drake only logs, going on without what it cannot read.
 
-    Its warnings are of elements that it does not know; they are not said.
+    And for an inertia in whose place it takes another one. Its other warnings are of elements that
+    it does not know; they are not said.
     """
     errors: list[str] = []
 
     def keep(record: logging.LogRecord) -> bool:
-        if record.levelno >= logging.ERROR:
-            errors.append(record.getMessage())
+        message = record.getMessage()
+        if record.levelno >= logging.ERROR or "inertia" in message:
+            errors.append(" ".join(message.split()))
         return False
 
     log = logging.getLogger("drake")
@@ -355,27 +395,6 @@ def _drakes_errors_raised() -> Iterator[None]:
         log.removeFilter(keep)
     if errors:
         raise RuntimeError(errors[0])
-
-
-def _xml(path: Path) -> ElementTree.Element:
-    """The root of an XML file, with names as they stand there: Drake knows its own by `drake:`.
-
-    Drake's parser reads what is no XML too. That would be checked by nobody, so it is an error.
-    """
-    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
-    parser.CharacterDataHandler = builder.data
-
-    def unread(name: str | None, *_: object) -> NoReturn:
-        raise ValueError(f"the entity {name} is not in this file")
-
-    parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = unread
-    try:
-        parser.Parse(path.read_bytes(), True)
-        return builder.close()
-    except (expat.ExpatError, ValueError, LookupError) as error:  # the last two of its encoding
-        remedy = "give a URDF or SDF that other readers of XML take too"
-        raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
 
 
 def _weld_base(
@@ -419,30 +438,3 @@ def _weld_base(
             remedy="leave the base pose out, or take that joint out of the model",
         )
     return [joint.index() for joint in reversed(chain)]
-
-
-def _peculiar_joints(root: ElementTree.Element | None) -> dict[str, str]:
-    """Joints that move with another one, and links that float on another link: Drake ignores both.
-
-    By the name of joint or link, what it does.
-    """
-    found: dict[str, str] = {}
-    for joint in () if root is None else root.iter("joint"):
-        if joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
-            found[joint.get("name", "")] = "moves with another joint (mimic)"
-        for parent, child in zip(joint.findall("parent"), joint.findall("child"), strict=False):
-            if joint.get("type") == "floating" and parent.get("link") != "world":
-                found[child.get("link", "")] = f"floats on {parent.get('link')}"
-    return found
-
-
-def _efforts(root: ElementTree.Element | None) -> dict[str, float]:
-    """Torque limits of URDF joints, which Drake drops where there is no transmission."""
-    if root is None:
-        return {}
-    limits = ((joint.get("name"), joint.find("limit")) for joint in root.findall("joint"))
-    return {
-        name: float(limit.get("effort", "0"))
-        for name, limit in limits
-        if name is not None and limit is not None
-    }

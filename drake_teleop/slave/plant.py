@@ -23,6 +23,7 @@ from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.assumed_limits import with_all_limits
 from drake_teleop.slave.forward_kinematics import pose_into
 from drake_teleop.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
+from drake_teleop.slave.model_check import check_size
 from drake_teleop.slave.models import ParseModel, drakes_errors_said
 from drake_teleop.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.slave.payload import AddPayload
@@ -243,7 +244,11 @@ class ParsedSlave:
                 where="slave.tool",
                 remedy="give the tool, or a sensor_frame before the model's own",
             )
-        return with_all_limits(arm, str(self.slave.path))
+        check_size(arm, str(self.slave.path))
+        arm, assumed = with_all_limits(arm, str(self.slave.path))
+        if arm.num_joints < 6:
+            assumed.append(f"with {arm.num_joints} joints the tool follows as far as it can")
+        return arm, assumed
 
 
 def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave:

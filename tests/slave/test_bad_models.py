@@ -1,0 +1,309 @@
+"""Models that something is wrong with: one error that says what, or an assumption that is named."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.slave.plant import ParseSlave, check_strength, finalize, start_posture
+from drake_teleop.slave.slave_config import Slave
+from drake_teleop.slave.tool import Tool
+
+AXES = ["0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1"]
+HOME = [0.1, 0.4, 1.2, 0.2, 1.4, 0.3]
+LIMIT = '<limit lower="-2.5" upper="2.5" velocity="3" effort="200"/>'
+MASS, INERTIA = '<mass value="2"/>', 'ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"'
+INERTIAL = f'<inertial><origin xyz="0 0 0.1"/>{MASS}<inertia {INERTIA}/></inertial>'
+
+
+def link(name, inside=INERTIAL):
+    return f'<link name="{name}">{inside}</link>'
+
+
+def joint(k, kind="revolute", inside="", parent=None, child=None, name=None, tag="joint"):
+    return (
+        f'<{tag} name="{name or f"j{k}"}" type="{kind}"><parent link="{parent or f"l{k - 1}"}"/>'
+        f'<child link="{child or f"l{k}"}"/><origin xyz="0 0 0.25"/>'
+        f'<axis xyz="{AXES[(k - 1) % 6]}"/>{LIMIT}{inside}</{tag}>'
+    )
+
+
+def arm(joints=6, beyond="", j3=None, l3=None, l0=None):
+    """A URDF whose third joint and link are as given."""
+    parts = [l0 or link("l0")]
+    for k in range(1, joints + 1):
+        parts += [j3 if j3 and k == 3 else joint(k), l3 if l3 and k == 3 else link(f"l{k}")]
+    return f'<robot name="arm" xmlns:drake="d">{"".join(parts)}{beyond}</robot>'
+
+
+def with_limit(text):
+    return arm(j3=joint(3).replace(LIMIT, text))
+
+
+def with_inertial(*changes):
+    inside = INERTIAL
+    for old, new in changes:
+        inside = inside.replace(old, new)
+    return arm(l3=link("l3", inside))
+
+
+def scaled(factor):
+    return re.sub(r'xyz="0 0 (0\.\d+)"', lambda m: f'xyz="0 0 {factor * float(m[1]):g}"', arm())
+
+
+def shaped(geometry):
+    return arm(l3=link("l3", INERTIAL + f"<collision><geometry>{geometry}</geometry></collision>"))
+
+
+def adding(*models):
+    added = ", ".join(f"{{add_model: {{name: m{k}, file: {m}}}}}" for k, m in enumerate(models))
+    return f"directives: [{added}]"
+
+
+def mjcf(bodies, rest=""):
+    return f"<mujoco model='m'><worldbody>{bodies}</worldbody>{rest}</mujoco>"
+
+
+def sdf(inside, version="1.7"):
+    return f"<sdf version='{version}'><model name='m'>{inside}</model></sdf>"
+
+
+def sdf_joint(kind, axis="<axis><xyz>0 0 1</xyz></axis>"):
+    ends = "<parent>l0</parent><child>l6</child>"
+    return f"<link name='l0'/><link name='l6'/><joint name='j' type='{kind}'>{ends}{axis}</joint>"
+
+
+def read(slave):
+    """What `run` and `new` do first, and `excite` but for tool and start; the assumptions."""
+    slave.check("slave")
+    plant = MultibodyPlant(0.0)
+    parsed = ParseSlave(plant, slave)
+    finalize(plant)
+    model, assumed = parsed.arm()
+    check_strength(model, start_posture(slave, model))
+    return [*parsed.assumptions, *assumed]
+
+
+TWO = mjcf(
+    "<body name='b'><joint name='a'/><geom size='.1'/><body name='l6' pos='0 0 1'>"
+    "<joint name='c' axis='0 1 0'/><geom size='.1'/></body></body>{}"
+)
+FINGER = joint(9, parent="l5", child="f", inside='<mimic joint="j2"/>') + link("f")
+WORLD = link("world", "") + link("l0")
+BALL = '<drake:joint name="j3" type="ball"><parent link="l2"/><child link="l3"/></drake:joint>'
+ANOTHER = re.sub("</?robot.*?>", "", arm()).replace('="l', '="m').replace('="j', '="k')
+DAMPED = '<dynamics damping="-1"/>'
+ROTOR = '<transmission type="SimpleTransmission"><joint name="j3"/><actuator name="a">{}</actuator>'
+ROTOR += "</transmission>"
+OF_GEAR = ROTOR.format('<drake:rotor_inertia value="-1"/>')
+
+ERRORS = {
+    # Files
+    "empty": ("urdf", "", "arm.urdf: is not XML"),
+    "broken XML": ("urdf", arm()[:300], "arm.urdf: is not XML"),
+    "binary": ("urdf", "\x00\x01", "arm.urdf: is not XML"),
+    "two arms after each other": ("urdf", arm() + arm(), "is not XML .junk after"),
+    "two arms in one robot": ("urdf", arm(beyond=ANOTHER), "l0 and m0 are both the child of"),
+    "no robot": ("urdf", "<machine/>", "does not contain a robot tag"),
+    "URDF called SDF": ("sdf", arm(), "arm.sdf: cannot be read as a robot"),
+    "URDF called MJCF": ("xml", arm(), "does not contain a mujoco tag"),
+    "no such kind": ("usda", "#usda 1.0", "not a recognized type.*give a URDF, SDF, MJCF"),
+    "a macro by its name": ("urdf.xacro", arm(), "is a macro; run it through xacro first"),
+    "a macro by what is in it": ("urdf", '<robot name="a" xmlns:xacro="x"><xacro:arm/></robot>',
+                                 "arm.urdf: is a macro; run it through xacro first"),
+    "a macro's number": ("urdf", with_inertial((MASS, '<mass value="${m}"/>')),
+                         "link l3: mass '..m.' is not a number"),
+    # Trees
+    "a loop": ("urdf", arm(beyond=joint(9, parent="l6", child="l2")),
+               "l2 hangs on two joints, j2 and j9"),
+    "a circle": ("urdf", arm(j3=joint(3, parent="l5")), "joints form a circle through l"),
+    "a joint on itself": ("urdf", arm(j3=joint(3, parent="l3")), "a circle through l3"),
+    "a bushing": ("urdf", arm(beyond="<drake:linear_bushing_rpy/>"), "form a loop, by drake:"),
+    "no parent": ("urdf", arm(j3=joint(3).replace('<parent link="l2"/>', "")),
+                  "l0 and l3 are both the child of no joint"),
+    "no such parent": ("urdf", arm(j3=joint(3, parent="zz")), "Could not find link named 'zz'"),
+    "a second root": ("urdf", arm(beyond=link("cup")), "l0 and cup are both the child of no joint"),
+    "links of one name": ("urdf", arm(beyond=FINGER.replace('"f"', '"l2"')),
+                          "two links are named l2"),
+    "joints of one name": ("urdf", arm(j3=joint(3, name="j2")), "two joints are named j2"),
+    "a link without name": ("urdf", arm(l3="<link/>"), "a link without name"),
+    # Joints
+    "mimic": ("urdf", arm(j3=joint(3, inside='<mimic joint="j2"/>')), "j3 moves with another"),
+    "planar": ("urdf", arm(j3=joint(3, "planar")), "j3 is a planar joint; up to the sensor, use"),
+    "ball": ("urdf", arm(j3=BALL), "j3 is a ball_rpy joint; up to the sensor, use"),
+    "screw": ("urdf", arm(j3=joint(3, "screw", '<drake:screw_thread_pitch value="1"/>',
+                                   tag="drake:joint")), "j3 is a screw joint"),
+    "floating in the chain": ("urdf", arm(j3=joint(3, "floating")), "l3 floats on l2"),
+    "no such type": ("urdf", arm(j3=joint(3, "hinge")), "unrecognized type: 'hinge'"),
+    "an axis of no length": ("urdf", arm(j3=joint(3).replace("0 1 0", "0 0 0")),
+                             "Joint 'j3' axis is zero"),
+    "an axis of two numbers": ("urdf", arm(j3=joint(3).replace("0 1 0", "0 1")),
+                               "Expected 3 values"),
+    "an origin that is none": ("urdf", arm(j3=joint(3).replace("0.25", "nan")),
+                               "origin nan is no finite number"),
+    "damping that drives": ("urdf", arm(j3=joint(3, inside=DAMPED)), "damping must be nonnegative"),
+    "a motor's negative inertia": ("urdf", arm(beyond=OF_GEAR), "a rotor inertia of -1 kg"),
+    "two motors": ("urdf", arm(beyond=2 * ROTOR.format("")), "already contains a joint actuator"),
+    # Limits
+    "lower above upper": ("urdf", with_limit('<limit lower="2" upper="-2"/>'),
+                          "joint j3: lower limit 2 is above upper limit -2"),
+    "a range of nothing": ("urdf", with_limit('<limit lower="1" upper="1"/>'),
+                           "j3 cannot move: both of its limits are 1 rad"),
+    "a limit that is none": ("urdf", with_limit('<limit lower="nan" upper="1"/>'),
+                             "joint j3: lower 'nan' is not a number"),
+    "an infinite limit": ("urdf", with_limit('<limit effort="inf"/>'),
+                          "joint j3: effort inf is not finite; leave out what has no limit"),
+    "a negative speed": ("urdf", with_limit('<limit velocity="-1"/>'), "velocity limit -1 is neg"),
+    # Masses
+    "a negative mass": ("urdf", with_inertial(('"2"', '"-2"')), "link l3: mass -2 kg is negative"),
+    "a mass that is none": ("urdf", with_inertial(('"2"', '"nan"')), "mass nan is no finite"),
+    "an inertia without mass": ("urdf", with_inertial(('"2"', '"0"')),
+                                "link l3: an inertia, but no mass; give both or none"),
+    "a negative inertia": ("urdf", with_inertial(('ixx="0.02"', 'ixx="-0.02"')),
+                           "link l3: no body has this inertia"),
+    "no triangle": ("urdf", with_inertial(('izz="0.01"', 'izz="0.05"')),
+                    "link l3: no body has this inertia.*0.02, 0.02, 0.05"),
+    "massless, without a tool": ("urdf", re.sub("<inertial>.*?</inertial>", "", arm()),
+                                 "slave.model: nothing resists a torque"),
+    # Units
+    "in mm": ("urdf", scaled(1000), "is 1.25e.03 m long; give lengths in m"),
+    "in km": ("urdf", scaled(0.001), "is 0.00125 m long; give lengths in m"),
+    "inertia in kg mm^2": ("urdf", with_inertial(('"0.02"', '"2e4"'), ('"0.01"', '"1e4"')),
+                           r"what j\d moves is \d+\.?\d* m away from it"),
+    # MJCF, SDF, directives
+    "MJCF without bodies": ("xml", mjcf(""), "no frames are named 'l6'; give a model"),
+    "MJCF of a loop": ("xml", mjcf("<body name='l6'/>", "<equality><weld body1='l6'/></equality>"),
+                       "form a loop, by weld"),
+    "MJCF of tied joints": ("xml", TWO.format("").replace(
+        "</mujoco>", "<equality><joint joint1='a' joint2='c'/></equality></mujoco>"),
+        "c moves with another joint .equality"),
+    "MJCF of a tendon": ("xml", TWO.format("").replace(
+        "</mujoco>", "<tendon><fixed><joint joint='a' coef='1'/></fixed></tendon></mujoco>"),
+        "a is pulled by a tendon"),
+    "MJCF of a spring": ("xml", TWO.format("").replace("name='a'", "name='a' stiffness='5.0'"),
+                         "a has a spring .stiffness"),
+    "MJCF of something loose": ("xml", TWO.format("<body name='cup'><freejoint/>"
+                                                  "<geom size='.1'/></body>"),
+                                "cup hangs on nothing, beside the arm"),
+    "MJCF without its other file": ("xml", "<mujoco><include file='x.xml'/></mujoco>",
+                                    "Failed to load <include> file"),
+    "SDF of two models": ("sdf", sdf("</model><model name='n'>"), "cannot be read as a robot"),
+    "SDF of the future": ("sdf", sdf("", "99"), "Unable to convert from SDF version 99"),
+    "SDF without an axis": ("sdf", sdf(sdf_joint("revolute", "")), "axis must be specified for"),
+    "SDF of a gearbox": ("sdf", sdf(sdf_joint("gearbox")), "gearbox. not supported"),
+    "SDF of a fixed arm": ("sdf", sdf(sdf_joint("fixed")),
+                           "sensor_frame: no moving joint between the world and l6"),
+    "directives that are none": ("dmd.yaml", "directives: [{add_modell: {}}]", "add_modell"),
+    "directives with a field too many": ("dmd.yaml", "directives: [{add_model: {name: a, file: "
+                                         "file:///a.urdf, color: red}}]", "color"),
+    "directives to nothing": ("dmd.yaml", adding("file:///none/a.urdf"), "does not exist"),
+    "directives that are broken": ("dmd.yaml", "directives: [{", "arm.dmd.yaml: is not YAML"),
+    "directives to two arms": ("dmd.yaml", adding("{good}", "{good}"), "2 frames are named 'l6'"),
+    "directives to a bad inertia": ("dmd.yaml", adding("{bad}"), "other.urdf: link l3: no body"),
+}  # fmt: skip
+ASSUMED = {
+    "nothing": (arm(), "acceleration limits that reach full speed"),
+    "no limits": (arm().replace(LIMIT, ""), "a range of .* rad for all joints"),
+    "no range": (with_limit("<limit/>"), "a range of .* rad for j3"),
+    "continuous": (with_limit("").replace('"j3" type="revolute"', '"j3" type="continuous"'),
+                   "a range of .* rad for j3"),
+    "no speed": (with_limit('<limit velocity="0" effort="200"/>'), "a speed limit of .* for j3"),
+    "no strength": (with_limit('<limit velocity="3" effort="0"/>'), "no torque limit for j3"),
+    "limits in degrees": (with_limit('<limit lower="-170" upper="170"/>'),
+                          "limits in rad, though more than 25.13 apart, for j3"),
+    "massless": (arm(l3=link("l3", "")), "no inertia of l3"),
+    "an inertia of rounded numbers": (with_inertial(('izz="0.01"', 'izz="0.040001"')),
+                                      "rounded numbers made a body's for l3"),
+    "a mesh missing": (shaped('<mesh filename="package://none/a.stl"/>'),
+                       "shapes are missing of l3: meshes were not found .--package-path"),
+    "a mesh of no kind": (shaped('<mesh filename="arm.urdf"/>'), ".urdf meshes cannot be read"),
+    "a finger": (arm(beyond=FINGER), "held: j9"),
+    "a base that floats": (arm(l0=WORLD + joint(1, "floating", "", "world", "l0", "free")),
+                           "welded to the world, where it may float: l0"),
+    "dry friction": (arm(j3=joint(3, inside='<dynamics friction="2"/>')), "no dry friction of j3"),
+    "four joints": (arm(4).replace('"l4"', '"l6"'), "with 4 joints the tool follows as far as"),
+    "nine joints": (arm(9).replace('"l6"', '"x"').replace('"l9"', '"l6"'), "acceleration limits"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ERRORS)
+def test_what_cannot_be_is_one_error(tmp_path, case):
+    suffix, text, expected = ERRORS[case]
+    path, other = tmp_path / f"arm.{suffix}", tmp_path / "other.urdf"
+    tool = Tool(mass=1.0)
+    if suffix == "dmd.yaml":
+        text = text.replace("{good}", other.as_uri()).replace("{bad}", other.as_uri())
+        other.write_text(ERRORS["no triangle"][1] if "bad" in case else arm())
+    if "without a tool" in case:
+        tool = Tool(mass=1e-9)
+    path.write_text(text)
+    with pytest.raises(DrakeTeleopError, match=expected) as error:
+        read(Slave(model=str(path), sensor_frame="l6", home=HOME, tool=tool))
+    said = str(error.value)
+    assert said.startswith((str(path), str(other), "slave.", "sensor_frame: "))
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize("case", ASSUMED)
+def test_what_is_missing_is_assumed_and_named(tmp_path, case):
+    path = tmp_path / "arm.urdf"
+    path.write_text(ASSUMED[case][0])
+    joints = {"four joints": 4, "nine joints": 9}.get(case, 6)
+    home = (HOME + 3 * [0.1])[:joints]
+    assumed = read(Slave(model=str(path), sensor_frame="l6", home=home, tool=Tool(mass=1.0)))
+    assert re.search(ASSUMED[case][1], "; ".join(assumed))
+
+
+def test_an_inertia_of_rounded_numbers_stays_what_it_is(tmp_path):
+    """In its place Drake takes a ball's: 0.005, and not 0.02 and 0.04 kg m^2."""
+    path, plant = tmp_path / "arm.urdf", MultibodyPlant(0.0)
+    path.write_text(ASSUMED["an inertia of rounded numbers"][0])
+    ParseSlave(plant, Slave(model=str(path), sensor_frame="l6", home=HOME, tool=Tool(mass=1.0)))
+    moments = plant.GetBodyByName("l3").default_rotational_inertia().get_moments()
+    np.testing.assert_allclose(moments - 2.0 * 0.1**2 * np.array([1, 1, 0]), [0.02, 0.02, 0.04],
+                               rtol=1e-4)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"sensor_frame": "nose"}, "arm.urdf: no frames are named 'nose'; name one of l0, l1"),
+        ({"sensor_frame": "l0"}, "sensor_frame: no moving joint"),
+        ({"home": [], "position": [3.0, 0.0, 0.4]}, "slave.position: the arm cannot reach"),
+        ({"home": [3.0, *HOME[1:]]}, "slave.home: j1 at 3 is outside -2.5 to 2.5"),
+        ({"home": HOME[:5]}, "slave.home: 5 joint positions for 6 joints"),
+        ({"tip": [0.0, 0.1]}, "slave.tip: has to be a list"),
+        ({"tool": Tool(mass=90.0)}, "slave.tool: the arm cannot hold its 90 kg .* j2 needs"),
+        ({"tool": Tool(model="none.sdf")}, "none.sdf: there is no such file"),
+        ({"tool": None, "sensor_frame": "tcp"}, "slave.tool: nothing with a mass hangs on tcp"),
+    ],
+)  # fmt: skip
+def test_what_a_scenario_says_of_a_good_model(tmp_path, change, expected):
+    path = tmp_path / "arm.urdf"
+    tcp = '<joint name="t" type="fixed"><parent link="l6"/><child link="tcp"/></joint>'
+    path.write_text(arm(beyond=link("tcp", "") + tcp))
+    given = {"sensor_frame": "l6", "home": HOME, "tool": Tool(mass=1.0)} | change
+    with pytest.raises(DrakeTeleopError, match=expected):
+        read(Slave(model=str(path), **given))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (sdf("<link name='a'/><link name='b'/>"), "a, b can be put on the sensor"),
+        (sdf("<link name='a'><inertial><mass>0</mass></inertial></link>"), "an inertia, but no"),
+        (sdf(sdf_joint("revolute", "<axis><xyz>0 0 1</xyz><dynamics><spring_stiffness>3"
+                       "</spring_stiffness></dynamics></axis>")), "has springs"),
+        ("", "tool.sdf: is not XML"),
+    ],
+)  # fmt: skip
+def test_tools_that_are_none(tmp_path, text, expected):
+    path, tool = tmp_path / "arm.urdf", tmp_path / "tool.sdf"
+    path.write_text(arm())
+    tool.write_text(text)
+    with pytest.raises(DrakeTeleopError, match=expected):
+        read(Slave(model=str(path), sensor_frame="l6", home=HOME, tool=Tool(model=str(tool))))
