@@ -25,6 +25,7 @@ RUNS = {
     "inverse_kinematics": "benchmarks/inverse_kinematics.py --json FILE",
     "live": "benchmarks/live.py --json FILE",
     "load_change": "benchmarks/load_change.py --json FILE",
+    "mujoco_wrench": "benchmarks/mujoco_wrench.py --json FILE",
     "planted_mistakes": "benchmarks/planted_mistakes.py --json FILE",
     "pose_noise": "benchmarks/pose_noise.py --runs 24 --no-present --json FILE",
     "realistic_sensor": "benchmarks/realistic_sensor.py --json FILE",
@@ -316,6 +317,16 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(OWN, "The sensor's force is that of the plant's reaction port"),
         *("ideal sensor, all arms and devices, free and in contact", "station.md", "stations"),
         *(lambda f: max(_rows(f, "port N")), "N", 0.0, 1e-12),
+    ),
+    Claim(
+        *(OWN, "It is MuJoCo's, which reads the same URDF by itself"),
+        *("Panda and UR5, free motion, ideal sensor, MuJoCo 4.0.0", "station.md", "mujoco_wrench"),
+        *(lambda f: max(f[arm]["force_off_N"] for arm in ("panda", "ur5")), "N", 0.0, 1e-9),
+    ),
+    Claim(
+        *(OWN, "and its torque"),
+        *("the same", "station.md", "mujoco_wrench"),
+        *(lambda f: max(f[arm]["torque_off_Nm"] for arm in ("panda", "ur5")), "N m", 0.0, 1e-9),
     ),
     Claim(
         *(OWN, "The load is identified"),
