@@ -411,6 +411,68 @@ def compensate(
 
 
 @cli.command()
+@click.argument("source")
+@click.option(
+    "--until",
+    default="mass 0.5 %, com 0.5 mm, inertia 5 %",
+    show_default=True,
+    metavar="TOLERANCE",
+    help="What is to be known, and how well; what is left out is not asked.",
+)
+@click.option(
+    "--range",
+    "largest",
+    type=option.Number(0, 1e5, min_open=True),
+    nargs=2,
+    metavar="N NM",
+    help="Of the sensor: readings at its ends are left out.",
+)
+@click.option(
+    "--seconds",
+    type=option.Number(1, 36000),
+    default=120.0,
+    show_default=True,
+    help="Of the record, at most.",
+)
+@click.option("--real-time", is_flag=True, help="Replay a log in its own time.")
+@option.out("calibrate")
+@option.cutoff
+@option.delay
+@option.quiet
+def calibrate(
+    source: str,
+    until: str,
+    largest: tuple[float, float] | None,
+    seconds: float,
+    real_time: bool,
+    out: Path,
+    cutoff_hz: float,
+    delay: float | str,
+    quiet: bool,
+) -> int:
+    """Identify a load from a live stream, guided.
+
+    SOURCE is as for `compensate`. Move the tool by hand or by the motion of `excite`, and touch
+    nothing. It ends when all that is asked is known, and writes the log, and what `identify` says
+    of it. The exit status is 1 if it ended before.
+    """
+    from drake_teleop.robots.calibrate import calibrate_command
+
+    summary = calibrate_command(
+        source,
+        out,
+        until=until,
+        largest=largest,
+        seconds=seconds,
+        real_time=real_time,
+        cutoff_hz=cutoff_hz,
+        delay=delay,
+        quiet=quiet,
+    )
+    return 0 if summary["all_known"] else 1
+
+
+@cli.command()
 @click.argument("identification", type=option.PATH)
 @click.option(
     "--to",

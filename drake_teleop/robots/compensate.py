@@ -49,7 +49,7 @@ class Control:
 
 def source_of(
     address: str,
-    load: Identification,
+    load: Identification | None,
     *,
     rate_hz: float | None = None,
     cutoff_hz: float | None = 30.0,

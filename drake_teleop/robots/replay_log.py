@@ -27,7 +27,7 @@ class LogSource:
 
     Args:
         path: canonical table or log description.
-        load: whose wrench tells the delay.
+        load: whose wrench tells the delay; None leaves wrench and motion as they were recorded.
         cutoff_hz, delay: as of `eliminate_log`.
         real_time: in the log's own time; else as fast as they are taken.
         chunk: readings at once.
@@ -42,7 +42,7 @@ class LogSource:
     def __init__(
         self,
         path: str | Path,
-        load: Identification,
+        load: Identification | None,
         *,
         cutoff_hz: float | None = 30.0,
         delay: str | float = "auto",
@@ -52,10 +52,12 @@ class LogSource:
         log = read_log(path, bandwidth_hz=cutoff_hz)
         if log.static:
             raise DrakeTeleopError("poses at rest have no order in time", where=str(path))
-        delay_s, source = delay_of(log, cutoff_hz, delay, usable_phi(load)[0])
-        if source == "undetermined":
-            delay_s = load.delay_s
-        log = undelayed(log, delay_s)
+        delay_s = 0.0
+        if load is not None:
+            delay_s, source = delay_of(log, cutoff_hz, delay, usable_phi(load)[0])
+            if source == "undetermined":
+                delay_s = load.delay_s
+            log = undelayed(log, delay_s)
         self.dt, self.live = log.dt, real_time
         self.wait = max(0, math.ceil(delay_s / log.dt - 1e-6))
         self._t, self._values = log.t, np.hstack([log.wrench, *log.motion])

@@ -1,0 +1,199 @@
+"""Does `calibrate` stop in time, and is what it then calls known true?
+
+`python benchmarks/calibrate.py [--json FILE] [--loads 100]` lets it calibrate simulated loads (0.8
+to 6 kg, radii of gyration of 4 to 9 cm) in virtual time, at 500 Hz, until "mass 0.5 %, com 0.5 mm"
+is known from a hand's motion, and until "inertia 5 %" is known, too, from that of `excite` for the
+shipped station:
+
+* hand: rotations and accelerations of sines from 0.2 to 1.5 Hz with a rms of 1 to 3 rad/s, another
+  for each load, which begin with half a second of rest;
+* noise of the wrench 0.25 N and 0.012 N m per sample at 1 kHz, white, AR(1) 0.5 or 0.9; of the
+  motion 0.05 m/s^2, 0.002 rad/s, 0.2 rad/s^2, white; motion late by 0 to 8 ms; offsets.
+
+Counted: numbers that were called known and are wrong by more than their tolerance; how often the
+stated 95 % intervals hold at the moment when it stops; seconds until then. Baseline: stopping at
+the first look whose 95 % intervals are inside the tolerances. Gains of the sensor are right: no
+interval here knows of wrong ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.tolerance import Tolerance, read_tolerance, sizes_of, values_of
+from drake_teleop.robots.calibrate import calibrate
+from drake_teleop.robots.calibration import Look
+from drake_teleop.robots.streams import Reading
+
+Array = NDArray[np.float64]
+
+HZ, SECONDS = 500.0, 40.0
+NOISE = np.repeat([0.25, 0.012], 3) / np.sqrt(2.0)  # the density of 1 kHz
+MOTION_NOISE = np.repeat([0.05, 0.002, 0.2], 3)
+COLOURS = (0.0, 0.5, 0.9)
+Motion = tuple[Array, Array, Array]
+
+
+def load_of(rng: np.random.Generator) -> Array:
+    """(10,) phi of some tool."""
+    R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    m, radii = rng.uniform(0.8, 6.0), rng.uniform(0.04, 0.09, 3)
+    squares = m * radii**2
+    inertia = (
+        R @ np.diag([squares[1] + squares[2], squares[0] + squares[2], squares[:2].sum()]) @ R.T
+    )
+    com = rng.normal(size=3) * 0.02 + np.array([0.0, 0.0, rng.uniform(0.03, 0.12)])
+    return phi_from_mass_com_inertia(m, com, 0.5 * (inertia + inertia.T))
+
+
+def hand(rng: np.random.Generator, t: Array) -> Motion:
+    """A hand that turns and shifts the tool, from rest."""
+    rates = rng.uniform(0.2, 1.5, (6, 5)) * 2.0 * np.pi
+    phases = rng.uniform(0.0, 2.0 * np.pi, (6, 5))
+    waves = np.sin(t[:, None, None] * rates + phases).sum(axis=2) / np.sqrt(2.5)
+    start = np.clip((t - 0.5) / 0.5, 0.0, 1.0)[:, None]
+    start = start**2 * (3.0 - 2.0 * start)
+    omega = rng.uniform(1.0, 3.0) / np.sqrt(3.0) * waves[:, :3] * start
+    dt = t[1] - t[0]
+    up = np.empty((len(t), 3))
+    up[0] = [0.0, 0.0, 1.0]
+    for k in range(1, len(t)):  # gravity in S turns by -omega
+        w = 0.5 * (omega[k] + omega[k - 1]) * dt
+        angle = float(np.linalg.norm(w))
+        e = w / angle if angle > 0.0 else w
+        u = up[k - 1]
+        up[k] = (
+            u * np.cos(angle) - np.cross(e, u) * np.sin(angle) + e * (e @ u) * (1 - np.cos(angle))
+        )
+    s = 9.81 * up + rng.uniform(0.5, 2.0) * waves[:, 3:] * start
+    return s, omega, np.gradient(omega, dt, axis=0)
+
+
+def excited(t: Array) -> Motion:
+    """The motion of `excite` for the station's slave, period after period."""
+    from drake_teleop.excitation.excite import excite, sensor_motion
+    from drake_teleop.excitation.robot import RobotFromScenario
+    from drake_teleop.scenario import LoadScenario
+
+    robot = RobotFromScenario(LoadScenario("contact_transition"))
+    found = excite(robot, seed=0, progress=False)
+    period = found.trajectory.period
+    rows = np.round((t % period) * 1000.0).astype(int)
+    s, omega, alpha = (
+        x[np.minimum(rows, len(x) - 1)] for x in sensor_motion(robot, found.trajectory)
+    )
+    return s, omega, alpha
+
+
+class Stream:
+    """Readings as fast as they are taken."""
+
+    live = False
+
+    def __init__(self, t: Array, values: Array) -> None:
+        self.dt = float(t[1] - t[0])
+        self._t, self._values, self._at = t, values, 0
+
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        """See `Source`."""
+        start, self._at = self._at, min(self._at + 64, len(self._t))
+        if start == len(self._t):
+            return None
+        return [Reading(k, float(self._t[k]), self._values[k]) for k in range(start, self._at)]
+
+    def close(self) -> None:
+        """See `Source`."""
+
+
+def stream_of(rng: np.random.Generator, phi: Array, t: Array, motion: Motion) -> Stream:
+    """What sensors say of it."""
+    a = rng.choice(COLOURS)
+    white = rng.normal(size=(len(t) + 500, 6)) * np.sqrt(1.0 - a * a)
+    noise = lfilter([1.0], [1.0, -a], white, axis=0)[500:] * NOISE
+    wrench = (
+        non_contact_wrench(*motion, phi) + rng.normal(size=6) * np.repeat([5.0, 0.3], 3) + noise
+    )
+    late = int(rng.integers(0, 5))
+    moved = np.hstack(motion)
+    moved = np.concatenate([np.repeat(moved[:1], late, axis=0), moved[: len(moved) - late]])
+    return Stream(t, np.hstack([wrench, moved + MOTION_NOISE * rng.normal(size=moved.shape)]))
+
+
+def judged(at: Look, tolerance: Tolerance, phi: Array) -> dict[str, Any]:
+    """Errors over tolerances, and which intervals hold, at a look."""
+    assert at.found is not None
+    found = at.found.identification.phi
+    error = np.abs(values_of(tolerance, found) - values_of(tolerance, phi)) / sizes_of(
+        tolerance, phi
+    )
+    return {"t": at.t, "error": error.tolist(), "held": (error <= at.half).tolist()}
+
+
+def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
+    """Figures of one motion."""
+    tolerance, t = read_tolerance(until), np.arange(round(SECONDS * HZ)) / HZ
+    motion = excited(t) if name == "excite" else None
+    stops: list[dict[str, Any]] = []
+    first: list[dict[str, Any]] = []
+    false, unknown, counted = 0, 0, 0
+    for k in range(loads):
+        rng = np.random.default_rng([k, len(name)])
+        phi = load_of(rng)
+        stream = stream_of(rng, phi, t, motion or hand(rng, t))
+        looks, _ = calibrate(stream, folder / "log.parquet", tolerance)
+        for at in looks:
+            if at.found is not None:
+                wrong = np.array(judged(at, tolerance, phi)["error"]) > 1.0
+                false += int((wrong & at.known).sum())
+                counted += int(at.known.sum())
+        last = looks[-1]
+        if not last.known.all():
+            unknown += 1
+            continue
+        stops.append(judged(last, tolerance, phi))
+        hasty = next(at for at in looks if at.found is not None and (at.half <= 1.0).all())
+        first.append(judged(hasty, tolerance, phi))
+    figures: dict[str, float] = {"loads": loads, "not_known": unknown}
+    figures |= {"false_known": false, "called_known_at_any_look": counted}
+    for label, ends in (("", stops), ("baseline_", first)):
+        held = np.array([end["held"] for end in ends])
+        wrong = np.array([end["error"] for end in ends]) > 1.0
+        figures[f"{label}coverage"] = float(held.mean())
+        figures[f"{label}coverage_least"] = float(held.mean(axis=0).min())
+        figures[f"{label}coverage_most"] = float(held.mean(axis=0).max())
+        figures[f"{label}wrong_at_the_end"] = int(wrong.sum())
+        figures[f"{label}median_s"] = float(np.median([end["t"] for end in ends]))
+        figures[f"{label}longest_s"] = float(np.max([end["t"] for end in ends]))
+    return figures
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--loads", type=int, default=100, help="for each motion")
+    options = parser.parse_args()
+    figures = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, until in (
+            ("hand", "mass 0.5 %, com 0.5 mm"),
+            ("excite", "mass 0.5 %, com 0.5 mm, inertia 5 %"),
+        ):
+            for key, value in study(name, until, options.loads, Path(folder)).items():
+                figures[f"{name}.{key}"] = round(value, 4)
+                print(f"{name + '.' + key:40} {value:.4g}", flush=True)
+    if options.json is not None:
+        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""How well a load has to be known: "mass 0.5 %, com 0.5 mm, inertia 5 %", and how well it is.
+
+The mass in percent of itself, the centre of mass along each axis in metres, and the six entries of
+the inertia about the centre of mass in percent of the mean of its principal moments: what a robot
+is told. They follow from [offsets; phi] by first order, and their covariance with them.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array
+from drake_teleop.load.inertia import mass_com_inertia
+
+QUANTITIES = ("mass", "com", "inertia")
+"""What may be asked for."""
+ENTRIES = {
+    "mass": ("mass",),
+    "com": ("com x", "com y", "com z"),
+    "inertia": tuple(f"inertia {axes}" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
+}
+"""The numbers that each is made of."""
+UNITS = {"mass": "kg", "com": "mm", "inertia": "kg m^2"}
+"""In which the numbers of each are shown."""
+
+_UNITS = {"%": 0.01, "mm": 1e-3, "m": 1.0}
+_ONE = re.compile(r"\s*([a-z]+)\s+([0-9.eE+-]+)\s*(%|mm|m)\s*")
+_LEAST, _MOST = 1e-9, 10.0
+
+
+class Tolerance(NamedTuple):
+    """How well each is to be known; None where nothing is asked.
+
+    Attributes:
+        mass: share of itself.
+        com: along each axis [m].
+        inertia: of each entry about the centre of mass, share of the mean principal moment.
+    """
+
+    mass: float | None = None
+    com: float | None = None
+    inertia: float | None = None
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """The `QUANTITIES` that are asked for."""
+        return tuple(name for name in QUANTITIES if getattr(self, name) is not None)
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """(k,) the numbers that are asked for, in the order of `errors_of`."""
+        return tuple(entry for name in self.asked for entry in ENTRIES[name])
+
+    def __str__(self) -> str:
+        """As `read_tolerance` reads it."""
+        return ", ".join(
+            f"com {1e3 * value:g} mm" if name == "com" else f"{name} {100.0 * value:g} %"
+            for name, value in zip(QUANTITIES, self, strict=True)
+            if value is not None
+        )
+
+
+def read_tolerance(text: str) -> Tolerance:
+    """The tolerance in words like "mass 0.5 %, com 0.5 mm, inertia 5 %".
+
+    Raises:
+        DrakeTeleopError: if it is no such list.
+    """
+    found: dict[str, float] = {}
+    for part in text.split(","):
+        match = _ONE.fullmatch(part)
+        name, unit = (match[1], match[3]) if match else ("", "")
+        try:
+            value = float(match[2]) * _UNITS[unit] if match else 0.0
+        except ValueError:
+            value = 0.0
+        if name not in QUANTITIES or (unit == "%") == (name == "com") or name in found:
+            raise DrakeTeleopError(
+                f"{part.strip()!r} is no tolerance",
+                where=text,
+                remedy="write, say, mass 0.5 %, com 0.5 mm, inertia 5 %",
+            )
+        if not _LEAST <= value <= _MOST:
+            raise DrakeTeleopError(f"{part.strip()!r} is out of reach", where=text)
+        found[name] = value
+    return Tolerance(**found)
+
+
+def errors_of(tolerance: Tolerance, phi: Array) -> Array:
+    """(k, 16) what a small error of [offsets; phi] is in the asked numbers, over their tolerances.
+
+    Args:
+        tolerance: with k numbers.
+        phi: (10,) about which it is small; its mass is not zero.
+    """
+    m, c, inertia = mass_com_inertia(phi)
+    rows = np.zeros((10, 10))
+    rows[0, 0] = 1.0 / m
+    rows[1:4, 0], rows[1:4, 1:4] = -c / m, np.eye(3) / m
+    # I_com = I - (h.h E - h h^T) / m with h = m c.
+    E = np.eye(3)
+    upper = np.triu_indices(3)
+    rows[4:, 0] = ((c @ c) * E - np.outer(c, c))[upper]
+    for k in range(3):
+        both = np.outer(E[k], c) + np.outer(c, E[k])
+        rows[4:, 1 + k] = -(2.0 * c[k] * E - both)[upper]
+    rows[4:, 4:] = np.eye(6)
+    # Where the inertia is hardly known yet the estimate may be anything, but not smaller than this.
+    scale = max(float(np.trace(inertia)) / 3.0, 1e-4 * abs(m) * (float(c @ c) + 1e-4))
+    out, at = [], {"mass": (0, 1, 1.0), "com": (1, 4, 1.0), "inertia": (4, 10, scale)}
+    for name in tolerance.asked:
+        start, stop, size = at[name]
+        out.append(rows[start:stop] / (size * getattr(tolerance, name)))
+    return np.hstack([np.zeros((sum(map(len, out)), 6)), np.concatenate(out)])
+
+
+def deviations_of(errors: Array, covariance: Array) -> Array:
+    """(k,) standard deviations of the asked numbers over their tolerances; inf: undetermined.
+
+    Args:
+        errors: (k, 16) from `errors_of`.
+        covariance: (16, 16) of [offsets; phi], as of an `Identification`.
+    """
+    unknown = np.isinf(np.diag(covariance))
+    finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
+    variances = np.einsum("ki,ij,kj->k", errors, finite, errors)
+    lacking = (errors[:, unknown] != 0.0).any(axis=1)
+    return np.where(lacking, np.inf, np.sqrt(np.maximum(variances, 0.0)))
+
+
+def values_of(tolerance: Tolerance, phi: Array) -> Array:
+    """(k,) the asked numbers in the units of `UNITS`."""
+    m, c, inertia = mass_com_inertia(phi)
+    all_ = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
+    return np.concatenate([all_[name] for name in tolerance.asked])
+
+
+def sizes_of(tolerance: Tolerance, phi: Array) -> Array:
+    """(k,) the tolerances in the units of `UNITS`."""
+    m, _, inertia = mass_com_inertia(phi)
+    sizes = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
+    return np.array(
+        [sizes[name] * getattr(tolerance, name) for name in tolerance.asked for _ in ENTRIES[name]]
+    )

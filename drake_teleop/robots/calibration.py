@@ -1,0 +1,193 @@
+"""Whether a load is known well enough yet, and which motion would tell more.
+
+What has been recorded is identified as `identify` does, again and again, each time the record has
+grown by `GROWS`. A number is known when the half-width of its interval of `SURE` is within its
+tolerance; the 95 % interval that is shown is then half of it or less. To look often and to stop at
+the first good news makes intervals too narrow; therefore the level is far above 95 %, the variance
+has to be known itself (`FEWEST_DEGREES`), and two looks in a row have to agree. Nothing is known
+while something speaks against the record: suspected errors, another load from some time on, poses.
+
+**What is missing.** The information of the recorded motion, G = sum of [E V]^T W [E V] over the
+samples that are independent behind the low-pass, and that of each of six motions from the present
+orientation, G_k: to tilt slowly and to swing briskly about x, y and z of S. The one is advised that
+leaves least of what is asked: the least sum of log max(1, deviation / tolerance).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array
+from drake_teleop.load.normal_equations import NormalEquations
+from drake_teleop.load.regressor import regressor
+from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
+from drake_teleop.logs.processing import IdentifiedLog, identify_log
+from drake_teleop.logs.read.alignment import low_passed
+from drake_teleop.logs.read.reading import read_log
+
+SURE = 0.999
+"""Level of the interval that has to be within the tolerance."""
+GROWS = 1.12
+"""By how much longer the record is at the next look."""
+FIRST_S = 1.0
+"""Length of the record at the first look [s]."""
+FEWEST_DEGREES = 20.0
+"""Of freedom of the variance of a number that is known."""
+_GRAVITY = 9.81
+# A load and a sensor [N, N m] to give advice with before anything is known.
+_GUESS = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
+_NOISE = np.repeat([0.25, 0.012], 3)
+_NOTHING = 1e-12  # information that keeps matrices regular, of natural columns
+# Motions: words, angle [rad], rate [Hz]; seconds and samples of each.
+_MOTIONS = (
+    ("turn the wrist about {axis}, slowly, by 60 deg and back", np.radians(60.0), 0.25),
+    ("swing the wrist about {axis}, briskly, by 20 deg to and fro", np.radians(20.0), 1.5),
+)
+_LASTS, _SAMPLES = 4.0, 80
+# Numbers per second and hertz of the low-pass that are independent.
+_INDEPENDENT = 2.2
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What is known at one time.
+
+    Attributes:
+        t: length of the record [s].
+        found: what was identified; None if nothing could be.
+        why: nothing could be; else "".
+        half: (k,) half-widths of the 95 % intervals of the asked numbers over their tolerances.
+        known: (k,) whether each is known.
+        doubts: what speaks against the record; nothing is known then.
+        advice: the motion that tells most of what is not known; "" if all is.
+    """
+
+    t: float
+    found: IdentifiedLog | None
+    why: str
+    half: Array
+    known: NDArray[np.bool_]
+    doubts: tuple[str, ...]
+    advice: str
+
+
+def look(path: Path, tolerance: Tolerance, *, cutoff_hz: float | None, delay: str | float) -> Look:
+    """Identifies the record so far, as `identify` would.
+
+    Args:
+        path: the record, a canonical log.
+        tolerance: what is asked.
+        cutoff_hz, delay: as of `identify_log`.
+    """
+    count, found, why = len(tolerance.entries), None, ""
+    try:
+        found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
+    except DrakeTeleopError as error:
+        why = str(error)
+    half, known = np.full(count, np.inf), np.zeros(count, bool)
+    doubts: tuple[str, ...] = ()
+    phi, noise, log = _GUESS, _NOISE, None
+    if found is not None:
+        load, log = found.identification, found.log
+        half, sure, degrees = half_widths(found, tolerance)
+        doubts = doubts_of(found)
+        known = (sure <= 1.0) & (degrees >= FEWEST_DEGREES) & (not doubts)
+        if load.mass > 0.0:
+            phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _NOISE)
+    if log is not None and known.all():
+        return Look(float(log.t[-1]), found, why, half, known, doubts, "")
+    try:
+        log = log or low_passed(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
+    except DrakeTeleopError:  # hardly anything yet
+        return Look(0.0, found, why, half, known, doubts, _MOTIONS[0][0].format(axis="x"))
+    advice = missing_motion(log.motion, log.dt, cutoff_hz, errors_of(tolerance, phi), noise)
+    return Look(float(log.t[-1]), found, why, half, known, doubts, advice)
+
+
+def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
+    """Half-widths of the intervals of 95 % and of `SURE` over the tolerances, and their degrees.
+
+    The degrees of freedom of a number are the least of the parameters that it depends on.
+    """
+    load = found.identification
+    errors = errors_of(tolerance, load.phi)
+    deviations = deviations_of(errors, load.covariance)
+    depends = np.where(errors != 0.0, load.degrees_of_freedom, np.inf)
+    degrees = np.minimum(depends.min(axis=1), 1e6)
+    half, sure = (stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, SURE))
+    return half, sure, degrees
+
+
+def doubts_of(found: IdentifiedLog) -> tuple[str, ...]:
+    """Why the numbers of a record are not to be trusted, whatever their intervals."""
+    doubts = [finding.message for finding in found.findings]
+    if len(found.loads) > 1:
+        at = found.log.t[found.loads[1].start]
+        doubts.append(f"the load changes at t = {at:.2f} s")
+    if found.log.static:
+        doubts.append("there are only poses at rest")
+    if found.identification.mass <= 0.0:
+        doubts.append("the mass is negative: the wrench has the other sign")
+    return tuple(doubts)
+
+
+def missing_motion(
+    motion: tuple[Array, Array, Array],
+    dt: float,
+    cutoff_hz: float | None,
+    errors: Array,
+    noise: Array,
+) -> str:
+    """The advice, in words (module docstring).
+
+    Args:
+        motion: s, omega, alpha, (N, 3) each, of the record.
+        dt: of the record [s].
+        cutoff_hz: of the low-pass it has passed.
+        errors: (k, 16) from `errors_of`.
+        noise: (6,) of a sample's wrench [N, N m].
+    """
+    rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _INDEPENDENT * cutoff_hz)
+    equations = NormalEquations(noise)
+    equations.add(np.zeros((len(motion[0]), 6)), *motion)
+    gram = rate * dt * equations.normal_equations()[0]
+    size = np.sqrt(np.diag(gram).max()) + 1.0
+    gram = gram + _NOTHING * size**2 * np.eye(16)
+    last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
+    best, least = "", np.inf
+    for words, of_motion in _primitives(last, noise, rate):
+        left = deviations_of(errors, np.linalg.inv(gram + of_motion))
+        cost = float(np.log(np.maximum(left, 1.0)).sum()) + 1e-6 * float(left.sum())
+        if cost < least:
+            best, least = words, cost
+    return best
+
+
+def _primitives(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Array]]:
+    """Words, and (16, 16) information, of each motion from where the specific force is `up`."""
+    s0 = _GRAVITY * up / max(float(np.linalg.norm(up)), 1e-9)
+    t = np.arange(_SAMPLES) * (_LASTS / _SAMPLES)
+    for words, size, hertz in _MOTIONS:
+        w = 2.0 * np.pi * hertz
+        angle, speed = 0.5 * size * (1.0 - np.cos(w * t)), 0.5 * size * w * np.sin(w * t)
+        change = 0.5 * size * w * w * np.cos(w * t)
+        for k, axis in enumerate("xyz"):
+            e = np.eye(3)[k]
+            # What is fixed in W turns about -e in S (Rodrigues).
+            s = (
+                np.outer(np.cos(angle), s0)
+                - np.outer(np.sin(angle), np.cross(e, s0))
+                + np.outer(1.0 - np.cos(angle), e * (e @ s0))
+            )
+            V = regressor(s, np.outer(speed, e), np.outer(change, e))
+            rows = np.concatenate([np.tile(np.eye(6), (_SAMPLES, 1, 1)), V], axis=2)
+            rows = (rows / noise[:, np.newaxis]).reshape(-1, 16)
+            share = rate * _LASTS / _SAMPLES
+            yield words.format(axis=axis), share * (rows.T @ rows)

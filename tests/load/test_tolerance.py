@@ -1,0 +1,53 @@
+"""How well a load is asked to be known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.tolerance import (
+    deviations_of,
+    errors_of,
+    read_tolerance,
+    sizes_of,
+    values_of,
+)
+
+ALL = "mass 0.5 %, com 0.5 mm, inertia 5 %"
+INERTIA = np.array([[0.012, 0.001, -0.002], [0.001, 0.009, 0.003], [-0.002, 0.003, 0.006]])
+PHI = phi_from_mass_com_inertia(3.1, [0.02, -0.03, 0.085], INERTIA)
+
+
+def test_words_are_read_as_they_are_written() -> None:
+    asked = read_tolerance(ALL)
+    assert (asked.mass, asked.com, asked.inertia) == (0.005, 0.0005, 0.05)
+    assert str(asked) == ALL and len(asked.entries) == 10
+    assert read_tolerance("com 1e-3 m").entries == ("com x", "com y", "com z")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "mass 0.5", "mass 0.5 mm", "com 1 %", "mass 1 %, mass 2 %", "weight 1 %",
+             "mass 0 %", "mass nan %", "mass 1e5 %", "mass 1.1.1 %"],
+)  # fmt: skip
+def test_what_is_no_tolerance_is_refused(text: str) -> None:
+    with pytest.raises(DrakeTeleopError, match=r"tolerance|out of reach"):
+        read_tolerance(text)
+
+
+def test_small_errors_are_those_of_the_numbers_themselves() -> None:
+    asked, step = read_tolerance(ALL), 1e-6
+    moved = [values_of(asked, PHI + step * row) - values_of(asked, PHI - step * row)
+             for row in np.eye(10)]  # fmt: skip
+    numbers = np.array(moved).T / (2.0 * step) / sizes_of(asked, PHI)[:, None]
+    errors = errors_of(asked, PHI)
+    np.testing.assert_array_equal(errors[:, :6], 0.0)
+    np.testing.assert_allclose(errors[:, 6:], numbers, rtol=1e-6, atol=1e-6 * np.abs(numbers).max())
+
+
+def test_what_depends_on_the_unknown_is_unknown() -> None:
+    covariance = np.diag(np.full(16, 1e-8))
+    covariance[10, 10] = np.inf  # I_xx
+    known = np.isfinite(deviations_of(errors_of(read_tolerance(ALL), PHI), covariance))
+    np.testing.assert_array_equal(known, [True] * 4 + [False] + [True] * 5)
