@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -123,11 +124,29 @@ def columns(station: Diagram) -> dict[str, slice]:
 
 
 class LogOnDisk:
-    """Moves the log of a running station into a folder of parts."""
+    """Moves the log of a running station into a folder of parts.
 
-    def __init__(self, folder: Path, simulator: Simulator, start: float) -> None:
+    Args:
+        folder: of the log; one that is there is replaced.
+        simulator: of the station.
+        start: the time that is called 0 [s].
+        form: brings the rows into a form that all parts of the log have.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        simulator: Simulator,
+        start: float,
+        form: Callable[[SimulationResult], SimulationResult] = lambda rows: rows,
+    ) -> None:
         remove_log(folder)
-        self._folder, self._simulator, self._start, self._rows = folder, simulator, start, 0
+        self._folder, self._start, self._rows, self._form = folder, start, 0, form
+        self.follow(simulator)
+
+    def follow(self, simulator: Simulator) -> None:
+        """The next rows are of this one; those of the last one have been taken."""
+        self._simulator = simulator
         sink = simulator.get_system().GetSubsystemByName(LOG)
         self._sink = sink.FindMutableLog(simulator.get_mutable_context())
 
@@ -141,14 +160,17 @@ class LogOnDisk:
         After an interrupt anywhere in here it may be called once more: that replaces the part by
         the same rows, or has none to write.
         """
-        part = read_log(self._simulator, self._start)
+        part = self._read()
         part.write_part(self._folder, self._rows)
         self._sink.Clear()
         self._rows += len(part.t)
 
     def keep(self) -> None:
         """Writes them, and keeps them: the next `take` writes the same part with more rows."""
-        read_log(self._simulator, self._start).write_part(self._folder, self._rows)
+        self._read().write_part(self._folder, self._rows)
+
+    def _read(self) -> SimulationResult:
+        return self._form(read_log(self._simulator, self._start))
 
 
 def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:

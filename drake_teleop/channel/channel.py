@@ -413,6 +413,7 @@ class TeleopChannel(LeafSystem):
         carried = np.zeros(PACKET_SIZE if self._tells_apart else LOAD.start)
         state = [*(network.initial_state(p, carried) for p in lines), ends]
         state += [np.array(start), np.zeros(PORTS)]
+        self._begin = (passivity.method, parameters)
         received = np.zeros(7)
         self._groups = [self.DeclareDiscreteState(part) for part in state]
         self.DeclareStateOutputPort("pose_received", self._groups[3])
@@ -431,6 +432,21 @@ class TeleopChannel(LeafSystem):
         self.DeclareVectorOutputPort("wrench_received", 6, weak_callback(self._calc_wrench), taken)
         self.DeclareVectorOutputPort("contact_at_hand", 1, weak_callback(self._calc_contact), taken)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def Begin(
+        self, context: Context, command: NDArray[np.float64], slave: NDArray[np.float64]
+    ) -> None:
+        """Begins in a running station: nothing is on its way yet, and the slave keeps its command.
+
+        Args:
+            context: of this block.
+            command: (7,) X_WS that the slave follows now; the master's command has to be the same.
+            slave: (7,) X_WS of the slave, actual.
+        """
+        ends = initial_ends(*self._begin, command)
+        ends[_POSE_S][:7] = slave
+        context.SetDiscreteState(self._groups[2], ends)
+        context.SetDiscreteState(self._groups[3], command)
 
     def _calc_step(self, context: Context, step: AbstractValue) -> None:
         *state, received = step.get_mutable_value()

@@ -10,6 +10,8 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 
 from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT, weak_callback
+from drake_teleop.live.handing_on import GoesOver
+from drake_teleop.operator.operator import HandImpedance
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.scenario import Scenario
 from drake_teleop.sides.master import MakeMasterSide
@@ -82,6 +84,7 @@ class LiveHand(LeafSystem):
         name: LiveHand
         input_ports:
         - pose_master: (7,) X_BE
+        - twist_master: (6,) [v; omega] of E in B, read by `Hold`
         output_ports:
         - intended_pose: (7,) X_BE that the operator wants
         - intended_twist: (6,) its twist [v; omega] in B [m/s, rad/s]
@@ -98,6 +101,7 @@ class LiveHand(LeafSystem):
         path[_HELD], path[_TARGET:_AWAY] = 1.0, start
         self._path = self.DeclareNumericParameter(BasicVector(path))
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
+        self._twist = self.DeclareVectorInputPort("twist_master", 6)
         self._wanted = np.empty(13)
         needed = {self.all_parameters_ticket(), self.time_ticket(), self._pose.ticket()}
         for name, size, calc in (
@@ -122,6 +126,32 @@ class LiveHand(LeafSystem):
             path[_TURNED : _TURNED + 3], path[_TURNED + 3 :] = r, _rate_of(r, now[10:])
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
+    def Hold(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
+        """The hand's impedance becomes another one, and it goes on to pull as it did.
+
+        What it wants is as much nearer to the stylus as the hand has become stiffer, and as much
+        nearer to its speed as it has become more damped; until it is led elsewhere.
+        """
+        path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
+        if path[_HELD] < 0.5:
+            return
+        pose, twist = self._pose.Eval(context), self._twist.Eval(context)
+        wanted = self._now(context)
+        turn = np.array(logarithm(multiply(tuple(wanted[:4]), conjugate(tuple(pose[:4])))))
+        turn *= before.rotational_stiffness / after.rotational_stiffness
+        way = before.stiffness / after.stiffness * (wanted[4:7] - pose[4:])
+        damping = np.repeat(
+            [before.damping / after.damping, before.rotational_damping / after.rotational_damping],
+            3,
+        )
+        speed = twist + damping * (wanted[7:] - twist)
+        path[_START] = context.get_time()
+        path[_TARGET : _TARGET + 4] = multiply(exponential(tuple(turn)), tuple(pose[:4]))
+        path[_TARGET + 4 : _AWAY] = pose[4:] + way
+        path[_AWAY:] = 0.0
+        path[_AWAY + 3 : _TURNED], path[_TURNED + 3 :] = speed[:3], speed[3:]
+        context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
+
     def _now(self, context: Context) -> Array:
         path = context.get_numeric_parameter(self._path).value()
         _wanted_into(path, context.get_time(), self._pose.Eval(context), self._wanted)
@@ -134,20 +164,27 @@ class LiveHand(LeafSystem):
         output.SetFromVector(self._now(context)[7:])
 
 
-def MakeLiveMasterSide(scenario: Scenario) -> Diagram:
+def MakeLiveMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Diagram:
     """`MakeMasterSide` with a hand that is led while the station runs: `LiveHand.Lead`.
 
-    The scenario's operator gives the grip; it should intend nothing, and have no task.
+    The scenario's operator gives the grip; it should intend nothing, and have no task. One that
+    follows another station goes over to what is felt now: `GoesOver`.
     """
     builder = DiagramBuilder()
     side = builder.AddNamedSystem("led", MakeMasterSide(scenario))
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = builder.AddNamedSystem("live_hand", LiveHand(start))
-    builder.Connect(side.GetOutputPort("pose_master"), hand.get_input_port())
+    for name in ("pose_master", "twist_master"):
+        builder.Connect(side.GetOutputPort(name), hand.GetInputPort(name))
     for name in ("intended_pose", "intended_twist"):
         builder.Connect(hand.GetOutputPort(name), side.GetInputPort(name))
-    for name in ("wrench_command", "clutch"):
-        builder.ExportInput(side.GetInputPort(name), name)
+    felt = side.GetInputPort("wrench_command")
+    if goes_over:
+        block = builder.AddNamedSystem("goes_over", GoesOver())
+        builder.Connect(block.get_output_port(), felt)
+        felt = block.get_input_port()
+    builder.ExportInput(felt, "wrench_command")
+    builder.ExportInput(side.GetInputPort("clutch"), "clutch")
     for index in range(side.num_output_ports()):
         builder.ExportOutput(side.get_output_port(index), side.get_output_port(index).get_name())
     return builder.Build()

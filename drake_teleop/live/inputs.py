@@ -16,6 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.live.choices import NETWORKS, SENSORS, first_choices
+from drake_teleop.operator.operator import GRIPS
+from drake_teleop.passivity.methods import METHODS
 from drake_teleop.quaternions import exponential, logarithm
 from drake_teleop.scenario import Scenario
 from drake_teleop.texts import read_text
@@ -43,6 +46,10 @@ class Inputs:
         sigma_object: share of a gripped object's [%].
         gamma: scale of the contact wrench [%].
         force_scale: of force and torque, slave to master [1e-5].
+        network, method, grip, sensor: which of `choices.NAMES`.
+        delay, jitter, loss: of the network that is "custom" [0.1 ms, %, 0.1 %].
+        object: 1 while the tool holds an object.
+        detection: 1 if contact is detected.
     """
 
     x: int = 0
@@ -57,6 +64,15 @@ class Inputs:
     sigma_object: int = 0
     gamma: int = 100
     force_scale: int = 5714
+    network: int = 0
+    delay: int = 500
+    jitter: int = 20
+    loss: int = 0
+    method: int = 0
+    grip: int = 1
+    object: int = 0
+    detection: int = 0
+    sensor: int = 0
 
     @classmethod
     def of(cls, scenario: Scenario) -> Inputs:
@@ -64,7 +80,7 @@ class Inputs:
         sigma, sigma_object, gamma = (round(s / _SHARE) for s in scenario.force_scaling.scales())
         scale = round(scenario.force_scaling.force_scale / _SCALE)
         started = cls(sigma=sigma, sigma_object=sigma_object, gamma=gamma, force_scale=scale)
-        return started.changed({})
+        return started.changed(first_choices(scenario))
 
     def changed(self, values: Mapping[str, Any]) -> Inputs:
         """With other values, each brought into its range; what is no finite number is left out."""
@@ -79,6 +95,18 @@ class Inputs:
     def target(self) -> tuple[int, ...]:
         """What leads the hand."""
         return self.x, self.y, self.z, self.rx, self.ry, self.rz, self.held
+
+    @property
+    def station(self) -> tuple[int, ...]:
+        """What decides which station it is."""
+        line = (self.delay, self.jitter, self.loss) if NETWORKS[self.network] == "custom" else ()
+        choices = (self.network, self.method, self.grip, self.object, self.detection, self.sensor)
+        return (*choices, *line)
+
+    @property
+    def channel(self) -> tuple[int, ...]:
+        """What of that decides about network and method."""
+        return self.station[:2] + self.station[6:]
 
     def pose(self, start: Array) -> Array | None:
         """The wanted X_BE (7,), of (3,) the stylus' position at the start [m]; None: let go."""
@@ -105,6 +133,18 @@ class Inputs:
         }
 
 
+_CHOICES = {
+    "network": (0, len(NETWORKS) - 1),
+    "delay": (0, 20_000),
+    "jitter": (0, 100),
+    "loss": (0, 500),
+    "method": (0, len(METHODS) - 1),
+    "grip": (0, len(GRIPS) - 1),
+    **dict.fromkeys(("object", "detection"), (0, 1)),
+    "sensor": (0, len(SENSORS) - 1),
+}
+#: The inputs that another station follows from.
+CHOICES = frozenset(_CHOICES)
 #: Of each input. The hand's box is 0.3 m wide: beyond it the device has its end stops.
 RANGES = {
     **dict.fromkeys(("x", "y", "z"), (-15_000, 15_000)),
@@ -112,6 +152,7 @@ RANGES = {
     **dict.fromkeys(("held", "clutch"), (0, 1)),
     **dict.fromkeys(("sigma", "sigma_object", "gamma"), (0, 300)),
     "force_scale": (0, 100_000),
+    **_CHOICES,
 }
 _COLUMNS = ("ms", *RANGES)
 

@@ -7,6 +7,7 @@ stands still and the record is complete on the disk.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,12 @@ from pydrake.math import RollPitchYaw
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identified_load import IdentifiedLoad
+from drake_teleop.live.choices import NAMES
 from drake_teleop.live.cockpit import Cockpit
-from drake_teleop.live.inputs import RANGES, SLICE_MS
+from drake_teleop.live.inputs import CHOICES, RANGES, SLICE_MS
 from drake_teleop.live.messages import parse
 from drake_teleop.live.pace import Pace
+from drake_teleop.live.scenes import SCENES
 from drake_teleop.live.session import Session
 from drake_teleop.scenario import Scenario
 
@@ -39,6 +42,8 @@ class Live:
 
     Attributes:
         refused: how many messages were none.
+        asked: the scene that is asked for, "" for none; time stands still until `change`.
+        scene: that is driven.
         pace: when slices are due.
 
     Args:
@@ -57,7 +62,7 @@ class Live:
         show: Show,
         now: float,
     ) -> None:
-        self.refused = 0
+        self.refused, self.asked, self.scene = 0, "", SCENES[0]
         self._scenario, self._load, self._record, self._show = scenario, load, record, show
         self._clients: list[int] = []
         self._driver: int | None = None
@@ -71,13 +76,29 @@ class Live:
         """A drive from the scenario's start."""
         folder = self._record
         if folder is not None and self._drives:
-            folder = folder.with_name(f"{folder.name}-{self._drives + 1}")
+            folder = _next_to(folder)
         self._drives += 1
+        self._folder = "" if folder is None else str(folder)
         log = None if folder is None else folder / "log.parquet"
         self._session = Session(self._scenario, self._load, log=log, record=folder)
         self._cockpit, self._stopped, self._asleep = Cockpit(self._scenario), "", False
+        self._refusal = ""
         self._wanted = self._session.inputs
         self._frame: dict[str, Any] = {}
+        self.pace.start(now)
+
+    def change(
+        self, scenario: Scenario, load: IdentifiedLoad | None, show: Show, now: float
+    ) -> None:
+        """A drive of another scenario, the scene that was asked for."""
+        self._try(self._session.close)
+        self._scenario, self._load, self._show = scenario, load, show
+        self.scene, self.asked = self.asked, ""
+        self._begin(now)
+
+    def refuse(self, why: str, now: float) -> None:
+        """The scene that was asked for cannot be driven; the present one goes on."""
+        self.asked, self._refusal = "", why
         self.pace.start(now)
 
     def hello(self) -> dict[str, Any]:
@@ -86,10 +107,13 @@ class Live:
         return {
             "scenario": self._scenario.description or "a station",
             "ranges": RANGES,
+            "names": NAMES,
             "object": self._scenario.force_scaling.gripper_phi is not None,
+            "known": self._load is not None,
+            "noise": self._load is not None and self._load.noise_floor is not None,
             "scale": scaling.translation_scale,
             "alignment": RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix().tolist(),
-            "record": None if self._record is None else str(self._record),
+            "scenes": SCENES,
         }
 
     def join(self, client: int, now: float) -> None:
@@ -116,12 +140,16 @@ class Live:
         if client != self._driver:
             return
         if "set" in said:
+            if not CHOICES.isdisjoint(said["set"]):
+                self._refusal = ""
             self._wanted = self._wanted.changed(said["set"])
         if "slow" in said:
             self.pace.slow = said["slow"]
         if "pause" in said and said["pause"] != self._paused:
             self._paused = said["pause"]
             self.pace.start(now)
+        if "scene" in said and not self.asked:
+            self.asked = said["scene"]
         if "reset" in said:
             self._try(self._session.close)
             self._begin(now)
@@ -137,7 +165,7 @@ class Live:
     @property
     def still(self) -> bool:
         """Whether simulated time stands still."""
-        return self._paused or self._asleep or bool(self._stopped)
+        return self._paused or self._asleep or bool(self._stopped or self.asked)
 
     def wait(self, now: float) -> float:
         """How long there is nothing to do [s]."""
@@ -159,7 +187,7 @@ class Live:
         if now < self._frame_due:
             return None
         self._frame_due = max(self._frame_due + FRAME, now - FRAME)
-        return self._picture()
+        return self.frame()
 
     def _try(self, action: Callable[[], None]) -> None:
         """Where the station or the disk cannot go on, the drive stops and says why."""
@@ -169,30 +197,49 @@ class Live:
             self._stopped = str(error)
 
     def _slice(self) -> None:
-        self._try(lambda: self._session.apply(self._wanted))
+        try:
+            self._session.apply(self._wanted)
+        except DrakeTeleopError as error:
+            now = self._session.inputs
+            if self._wanted.station == now.station:
+                self._stopped = str(error)
+            else:  # there is no such station: the present one goes on
+                self._refusal = str(error)
+                self._wanted = self._wanted.changed({name: getattr(now, name) for name in CHOICES})
         if not self._stopped:
             self._try(self._session.advance)
         if self._session.ms >= _LONGEST_MS:
             self._stopped = "ten hours are over"
 
-    def _picture(self) -> dict[str, Any]:
+    def frame(self) -> dict[str, Any]:
+        """What a page is shown now."""
         rows = self._session.news()
         if len(rows["t"]):
             self._frame = self._cockpit.frame(rows, self._session.inputs)
             self._show(rows)
         inputs = self._wanted
+        words = self._frame.get("words", [])
+        if self._session.filling:
+            words = ["another channel fills: the clutch is open until it has", *words]
+        if self._refusal:
+            words = [self._refusal, *words]
         return self._frame | {
+            "words": words,
             "factor": round(self.pace.factor * self.pace.slow, 3),
             "late": round(1e3 * self.pace.lateness(), 1),
             "lost": round(self.pace.given_up, 2),
             "state": self._state(),
             "driver": self._driver,
             "drive": self._drives,
+            "scene": self.asked or self.scene,
+            "record": self._folder,
             "stopped": self._stopped,
             "inputs": {name: getattr(inputs, name) for name in RANGES},
         }
 
     def _state(self) -> str:
+        if self.asked:
+            return "preparing"
         if self._stopped:
             return "stopped"
         return "paused" if self._paused else "waiting" if self._asleep else "running"
@@ -200,3 +247,9 @@ class Live:
     def close(self) -> None:
         """Ends the drive; its record is complete."""
         self._session.close()
+
+
+def _next_to(folder: Path) -> Path:
+    """The first of DIR-2, DIR-3, ... that is not there."""
+    names = (folder.with_name(f"{folder.name}-{k}") for k in itertools.count(2))
+    return next(name for name in names if not name.exists())

@@ -6,6 +6,8 @@ import json
 import math
 from typing import Any
 
+from drake_teleop.live.scenes import SCENES
+
 #: Bytes of a message; a longer one closes the connection.
 LONGEST = 4096
 #: Seconds for one simulated second.
@@ -16,8 +18,8 @@ def parse(text: Any) -> dict[str, Any] | None:
     """What a message asks for; None if it is not one.
 
     Returns:
-        Any of "set" (a dict of numbers by input), "pause" (bool), "slow" (1 to 20), "reset" and
-        "drive" (True); nothing else is in it.
+        Any of "set" (a dict of numbers by input), "pause" (bool), "slow" (1 to 20), "scene" (one of
+        `SCENES`), "reset" and "drive" (True); nothing else is in it.
     """
     if not isinstance(text, str) or len(text) > LONGEST:
         return None
@@ -35,6 +37,8 @@ def parse(text: Any) -> dict[str, Any] | None:
         found["pause"] = said["pause"]
     if _is_number(said.get("slow")):
         found["slow"] = min(max(float(said["slow"]), 1.0), SLOWEST)
+    if isinstance(said.get("scene"), str) and said["scene"] in SCENES:
+        found["scene"] = said["scene"]
     found |= {name: True for name in ("reset", "drive") if said.get(name) is True}
     return found or None
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import gc
 import itertools
 import json
@@ -30,10 +31,12 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.film import quiet_drake
 from drake_teleop.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.live import Live, Show
 from drake_teleop.live.messages import LONGEST
+from drake_teleop.live.scenes import scene
 from drake_teleop.live.session import live_scenario
 from drake_teleop.replay import ReplayScene
 from drake_teleop.scenario import LoadScenario, Scenario, check_scenario
@@ -56,7 +59,9 @@ class LiveDrive:
         setup.check()
         if record is not None:
             make_folder(record)  # before there is a Meshcat, which only its own thread may unmake
-        load = None if setup.load_estimator.enabled else identified_load(setup)
+        load = _load_of(setup)
+        self._pages: dict[ServerConnection, int] = {}
+        self._own = setup
         self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
         self._failed: Exception | None = None
         self._ready, self._over = threading.Event(), threading.Event()
@@ -94,16 +99,17 @@ class LiveDrive:
         except Exception as error:
             self._failed = _without_frames(error)
         finally:
-            self.__dict__.pop("_live", None)  # none, if it could not be made
+            for name in ("_live", "_meshcat"):  # none, if it could not be made
+                self.__dict__.pop(name, None)
             gc.collect()
             self._over.set()
             self._ready.set()
 
     def _make(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> Live:
         with quiet_drake():
-            meshcat = Meshcat(MeshcatParams(host="localhost"))
-        self._scene_url = meshcat.ws_url()
-        return Live(scenario, load, record, show_in(meshcat, scenario), time.perf_counter())
+            self._meshcat = Meshcat(MeshcatParams(host="localhost"))
+        show = show_in(self._meshcat, scenario)
+        return Live(scenario, load, record, show, time.perf_counter())
 
     async def _serve(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
@@ -140,6 +146,8 @@ class LiveDrive:
         gc.disable()  # a full collection takes as long as ten slices
         try:
             while not self._stop.is_set():
+                if self._live.asked:
+                    await self._change_scene()
                 frame = self._live.tick(time.perf_counter)
                 if frame is not None:
                     ready = [
@@ -154,6 +162,27 @@ class LiveDrive:
         finally:
             gc.enable()
             gc.unfreeze()
+
+    async def _change_scene(self) -> None:
+        """Identifies the load beside the loop, which may take a while; all else is Meshcat's."""
+        live = self._live
+        frame = json.dumps({"frame": live.frame()})
+        broadcast(self._pages, frame)
+        try:
+            scenario = scene(live.asked, self._own)
+            load = await asyncio.to_thread(_load_of, scenario)
+        except DrakeTeleopError as error:
+            live.refuse(str(error), time.perf_counter())
+            return
+        self._meshcat.Delete()
+        live.change(scenario, load, show_in(self._meshcat, scenario), time.perf_counter())
+        for page in tuple(self._pages):
+            with contextlib.suppress(ConnectionClosed):
+                await page.send(self._hello(page))
+
+    def _hello(self, page: ServerConnection) -> str:
+        more = {"you": self._pages[page], "meshcat": self._meshcat.ws_url()}
+        return json.dumps({"hello": self._live.hello() | more})
 
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Serves a file, or lets a socket be opened; refuses whatever is not from our own page."""
@@ -183,17 +212,25 @@ class LiveDrive:
         if len(connection.server.connections) > _MOST_CLIENTS:
             await connection.close(1013, "too many pages")
             return
-        you = next(self._numbers)
+        you = self._pages[connection] = next(self._numbers)
         live.join(you, time.perf_counter())
         try:
-            hello = live.hello() | {"you": you, "meshcat": self._scene_url}
-            await connection.send(json.dumps({"hello": hello}))
+            await connection.send(self._hello(connection))
             async for text in connection:
                 live.hear(you, text, time.perf_counter())
         except ConnectionClosed:
             pass
         finally:
+            del self._pages[connection]
             live.leave(you, time.perf_counter())
+
+
+def _load_of(scenario: Scenario) -> IdentifiedLoad | None:
+    """What the station is told of its load; with its noise, so that contact may be detected."""
+    if scenario.load_estimator.enabled:
+        return None
+    detection = scenario.contact_detection or ContactDetectionConfig()
+    return identified_load(dataclasses.replace(scenario, contact_detection=detection))
 
 
 def _without_frames(error: Exception) -> Exception:

@@ -7,23 +7,30 @@ the station knew of its load), `inputs.csv` and `log.parquet`.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.analysis import InitializeParams
+from pydrake.systems.framework import Context
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identified_load import IdentifiedLoad, read_load, write_load
+from drake_teleop.live.choices import BLEND, chosen, filled_after, known_estimate
 from drake_teleop.live.hand import MakeLiveMasterSide
+from drake_teleop.live.handing_on import hand_on
 from drake_teleop.live.inputs import INPUTS, SLICE_MS, Inputs, header, read_inputs, row
 from drake_teleop.pages.progress import Progress
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.scenario_reference import commented
-from drake_teleop.signals import LOG
+from drake_teleop.signals import LOG, SIGNALS, signal_of
 from drake_teleop.simulation import LogOnDisk, MakeSimulator, advance, columns, read_log
 from drake_teleop.station import GetBlock, MakeTeleopStation
 from drake_teleop.writing import make_folder, naming, write_text
@@ -53,11 +60,105 @@ def live_scenario(scenario: Scenario) -> Scenario:
     )
 
 
+def with_all_signals(log: SimulationResult) -> SimulationResult:
+    """A log with what only some stations have: a channel's signals, and contact that is detected.
+
+    Without a channel the slave receives the command of now, and no energy is counted.
+    """
+    n = len(log.t)
+    missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
+    missing |= dict.fromkeys(("contact", "contact_at_hand"), np.zeros((n, 1)))
+    values = missing | {name: log[name] for name in log.signals}
+    order = [name for name in SIGNALS if name in values]
+    order += [name for name in values if name not in SIGNALS]
+    specs = [signal_of(name, values[name].shape[-1]) for name in order]
+    return SimulationResult(log.t, {name: values[name] for name in order}, specs)
+
+
+class _Station:
+    """A station that runs, and what of it is spoken to.
+
+    Args:
+        scenario: of the station.
+        estimate: what it knows of its load.
+        load: whose noise floor it knows.
+        number: of the stations of this drive, which have different noise; the first is 0.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        estimate: NDArray[np.float64] | None,
+        load: IdentifiedLoad | None,
+        number: int,
+    ) -> None:
+        self.scenario = scenario
+        self.station = MakeTeleopStation(
+            scenario,
+            load_estimate=estimate,
+            noise_floor=None if load is None else load.noise_floor,
+            master=MakeLiveMasterSide(scenario, goes_over=number > 0),
+        )
+        seeded = dataclasses.replace(scenario.simulation, seed=scenario.simulation.seed + number)
+        self.simulator = MakeSimulator(self.station, seeded)
+        self.context = self.simulator.get_mutable_context()
+        self.sink = self.station.GetSubsystemByName(LOG).FindMutableLog(self.context)
+        self.columns = columns(self.station)
+
+    def block(self, name: str) -> tuple[Any, Context]:
+        """A block, and its context."""
+        side = self.station.GetSubsystemByName("master_side")
+        found = (
+            side.GetSubsystemByName("led").GetSubsystemByName(name)
+            if name == "kinematic_scaling"
+            else GetBlock(self.station, name)
+        )
+        return found, found.GetMyMutableContextFromRoot(self.context)
+
+    def value(self, signal: str) -> NDArray[np.float64]:
+        """A signal now."""
+        values: NDArray[np.float64] = self.station.GetOutputPort(signal).Eval(self.context).copy()
+        return values
+
+    def open(self, closed: bool) -> None:
+        """Opens or closes the clutch."""
+        self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
+
+    def follow(self, other: _Station, channel_anew: bool) -> float:
+        """Goes on where another station is; returns how long its clutch has to be open [s]."""
+        anew = {"channel"} if channel_anew else set()
+        if not self.scenario.load_estimator.enabled:
+            anew.add("load_estimator")  # it was told something else
+        hand_on(other.station, other.context, self.station, self.context, anew)
+        if other.scenario.wrist_sensor != self.scenario.wrist_sensor:
+            sensor, context = self.block("wrist_sensor")
+            sensor.bring_up_to_date(context)
+        wait = filled_after(self.scenario) if channel_anew else 0.0
+        over, context = self.block("goes_over")
+        over.Begin(context, self.context.get_time() + wait, BLEND, other.value("force_to_master"))
+        grips = other.scenario.operator.hand, self.scenario.operator.hand
+        if grips[0] != grips[1]:
+            hand, context = self.block("live_hand")
+            hand.Hold(context, *grips)
+        if not channel_anew:
+            return 0.0
+        name = "pose_command" if other.scenario.is_direct else "pose_received"
+        command = other.value(name)
+        scaling, context = self.block("kinematic_scaling")
+        scaling.Open(context, command)
+        if not self.scenario.is_direct:
+            channel, context = self.block("channel")
+            side = self.station.GetSubsystemByName("slave_side")
+            pose = side.GetOutputPort("pose_slave").Eval(side.GetMyContextFromRoot(self.context))
+            channel.Begin(context, command, pose)
+        return wait + BLEND
+
+
 class Session:
     """A running station with a hand that is led.
 
     Attributes:
-        scenario: of the station, as `live_scenario` makes it.
+        scenario: that is driven, as `live_scenario` makes it.
         inputs: that hold now.
         ms: simulated time since the start [ms].
 
@@ -76,70 +177,100 @@ class Session:
         log: Path | None = None,
         record: Path | None = None,
     ) -> None:
-        self.scenario = scenario
+        self.scenario, self._load = scenario, load
         self.inputs, self.ms = Inputs.of(scenario), 0
-        self._station = MakeTeleopStation(
-            scenario,
-            load_estimate=None if load is None else load.estimate,
-            noise_floor=None if load is None else load.noise_floor,
-            master=MakeLiveMasterSide(scenario),
-        )
-        self._hand = GetBlock(self._station, "live_hand")
-        self._scaling = GetBlock(self._station, "force_scaling")
-        self._clutch = self._station.GetInputPort("clutch")
         self._start = np.array(scenario.master.position)
-        self._simulator = MakeSimulator(self._station, scenario.simulation)
-        self._context = self._simulator.get_mutable_context()
-        self._sink = self._station.GetSubsystemByName(LOG).FindMutableLog(self._context)
-        self._columns = columns(self._station)
-        self._seen = 0
+        self._stations, self._seen, self._fills_ms = 1, 0, 0
+        estimate = None if load is None else load.estimate
+        self._now = _Station(scenario, estimate, load, 0)
         self._record = None if record is None else _Record(record, scenario, load, self.inputs)
-        self._on_disk = None if log is None else LogOnDisk(log, self._simulator, 0.0)
-        self._simulator.Initialize()
+        self._on_disk = None
+        if log is not None:
+            self._on_disk = LogOnDisk(log, self._now.simulator, 0.0, with_all_signals)
+        self._earlier: list[SimulationResult] = []
+        self._now.simulator.Initialize()
 
     def apply(self, inputs: Inputs) -> None:
-        """Sets the inputs from now on, and records them if they are others."""
-        before, self.inputs = self.inputs, inputs
+        """Sets the inputs from now on, and records them if they are others.
+
+        Raises:
+            DrakeTeleopError: if there is no such station; then nothing has changed.
+        """
+        before = self.inputs
         if inputs == before:
             return
-        if inputs.target != before.target:
-            context = self._hand.GetMyMutableContextFromRoot(self._context)
-            self._hand.Lead(context, inputs.pose(self._start))
-        if inputs.clutch != before.clutch:
-            self._clutch.FixValue(self._context, [float(inputs.clutch)])
+        if inputs.station != before.station:
+            self._change(inputs)
+        self.inputs = inputs
+        if (inputs.target, inputs.grip) != (before.target, before.grip):
+            hand, context = self._now.block("live_hand")
+            hand.Lead(context, inputs.pose(self._start))
+        if inputs.clutch != before.clutch or inputs.station != before.station:
+            self._now.open(bool(inputs.clutch) and self.ms >= self._fills_ms)
         if inputs.scales != before.scales:
-            context = self._scaling.GetMyMutableContextFromRoot(self._context)
-            self._scaling.SetScales(context, **inputs.scales, duration=_RAMP)
+            scaling, context = self._now.block("force_scaling")
+            scaling.SetScales(context, **inputs.scales, duration=_RAMP)
         if self._record is not None:
             self._record.write(self.ms, inputs)
 
+    def _change(self, inputs: Inputs) -> None:
+        """Goes on with another station."""
+        scenario = chosen(self.scenario, self._load, inputs)
+        scenario.check()
+        estimate = known_estimate(self.scenario, self._load, scenario)
+        station = _Station(scenario, estimate, self._load, self._stations)
+        filled = station.follow(self._now, inputs.channel != self.inputs.channel)
+        if filled:
+            self._fills_ms = self.ms + math.ceil(1e3 * filled)
+        if self._on_disk is not None:
+            self._on_disk.take()
+            self._on_disk.follow(station.simulator)
+        else:
+            self._earlier.append(self._rows())
+        station.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+        station.sink.Clear()  # the row of now, which the other station has recorded
+        self._now, self._seen, self._stations = station, 0, self._stations + 1
+
+    @property
+    def filling(self) -> bool:
+        """Whether the clutch is open because a new channel is not filled yet."""
+        return self.ms < self._fills_ms
+
     def advance(self, ms: int = SLICE_MS) -> None:
         """Simulates the next `ms` milliseconds."""
-        self.ms += ms
-        # A product, as Drake's event times are: see `simulate`.
-        advance(self._simulator, 1e-3 * self.ms)
+        end = self.ms + ms
+        if self.ms < self._fills_ms <= end:
+            self._advance_to(self._fills_ms)
+            self._now.open(bool(self.inputs.clutch))
+        self._advance_to(end)
         if self._on_disk is not None and self._on_disk.waiting() >= _PART_ROWS:
             self._on_disk.take()
             self._seen = 0
+
+    def _advance_to(self, ms: int) -> None:
+        self.ms = ms
+        # A product, as Drake's event times are: see `simulate`.
+        advance(self._now.simulator, 1e-3 * ms)
 
     def news(self) -> dict[str, NDArray[np.float64]]:
         """The rows of the log since the last call: (n, k) by signal, and "t" (n,) [s].
 
         What was not recorded is forgotten. Call it at least once a second.
         """
-        data, times = self._sink.data()[:, self._seen :], self._sink.sample_times()[self._seen :]
-        found = {name: data[part].T.copy() for name, part in self._columns.items()}
+        sink, seen = self._now.sink, self._seen
+        data, times = sink.data()[:, seen:], sink.sample_times()[seen:]
+        found = {name: data[part].T.copy() for name, part in self._now.columns.items()}
         found["t"] = times.copy()
         self._seen += len(times)
         if self._on_disk is None:
-            self._sink.Clear()
+            sink.Clear()
             self._seen = 0
+            self._earlier.clear()
         return found
 
     def stylus(self) -> Inputs:
         """The inputs of a hand that takes hold of the stylus where it is, without pulling."""
-        pose = self._station.GetOutputPort("pose_master").Eval(self._context)
-        return self.inputs.held_at(pose, self._start)
+        return self.inputs.held_at(self._now.value("pose_master"), self._start)
 
     def keep(self) -> None:
         """Brings everything until now to the disk; the session may go on."""
@@ -148,9 +279,15 @@ class Session:
         if self._on_disk is not None:
             self._on_disk.keep()
 
+    def _rows(self) -> SimulationResult:
+        return with_all_signals(read_log(self._now.simulator, 0.0))
+
     def log(self) -> SimulationResult:
         """What is in memory of the log."""
-        return read_log(self._simulator, 0.0)
+        parts = [*self._earlier, self._rows()]
+        values = {name: np.concatenate([p[name] for p in parts]) for name in parts[0].signals}
+        t = np.concatenate([part.t for part in parts])
+        return SimulationResult(t, values, parts[0].specs)
 
     def close(self) -> None:
         """Ends the record."""

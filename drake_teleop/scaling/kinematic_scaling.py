@@ -121,6 +121,12 @@ class KinematicScaling(LeafSystem):
         # The command follows from the first instant on.
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
+    def Open(self, context: Context, command: NDArray[np.float64]) -> None:
+        """Opens the clutch with the slave's command (7,) at `command`, X_WS."""
+        references = context.get_discrete_state(0).CopyToVector()
+        references[:7], references[14] = command, 0.0
+        context.SetDiscreteState(0, references)
+
     def _calc_command(self, context: Context, output: BasicVector) -> None:
         pose, references = self._pose.Eval(context), context.get_discrete_state(0).value()
         _command_into(pose, references, *self._scaling, output.get_mutable_value())

@@ -167,7 +167,7 @@ def test_ten_thousand_messages_of_nonsense_leave_every_number_finite(scenario, l
             live.hear(1, '{"pause": false, "slow": 1}', clock())
             live._session.apply(live._wanted)
             live._session.advance()
-    frame = live._picture()
+    frame = live.frame()
     assert live.refused > 3000
     assert frame["state"] == "running" and math.isfinite(sum(frame["inputs"].values()))
     rows = live._session.log()

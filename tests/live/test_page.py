@@ -34,7 +34,7 @@ class Browser:
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
         while True:
-            message = json.loads(self._socket.recv(30.0))
+            message = json.loads(self._socket.recv(90.0))
             if message.get("method") == "Runtime.exceptionThrown":
                 self.errors.append(
                     message["params"]["exceptionDetails"]["exception"]["description"]
@@ -51,9 +51,9 @@ class Browser:
         return found["result"].get("value")
 
     def until(self, condition: str) -> None:
-        """Waits for what becomes true in the page, 20 s at most."""
+        """Waits for what becomes true in the page, 60 s at most."""
         assert self.run(
-            f"new Promise((done) => {{ const end = Date.now() + 20000; const look = () => {{"
+            f"new Promise((done) => {{ const end = Date.now() + 60000; const look = () => {{"
             f" if ({condition}) done(true); else if (Date.now() > end) done(false);"
             " else setTimeout(look, 20); }; look(); })"
         ), f"{condition}; {self.errors}"

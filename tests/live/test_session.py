@@ -19,13 +19,15 @@ END = 300  # ms
 
 
 def script(scenario: Scenario) -> list[tuple[int, Inputs]]:
-    """Down into the leaf with sliders on ramps; clutch out and in; the hand lets go at the end."""
+    """Down into the leaf with sliders on ramps; clutch out and in; an object is grasped; the hand
+    lets go, and network and method become others at the end."""
     now, changes = Inputs.of(scenario), []
     for ms in range(0, END, 20):
         now = now.changed(
             {"z": -20 * ms, "rx": 2 * ms, "sigma": ms // 3, "gamma": 100 + ms // 5}
             | {"force_scale": 5714 + 10 * ms, "clutch": ms not in (160, 180)}
-            | {"held": ms < 240}
+            | {"held": ms < 240, "object": ms >= 220}
+            | ({"network": 2, "method": 4} if ms >= 260 else {})
         )
         changes.append((ms, now))
     return [*changes, (END, now)]
@@ -82,6 +84,56 @@ def test_nothing_jumps_when_inputs_change(driven, scenario):
 
 
 @pytest.mark.slow
+def test_another_network_and_method_go_on_where_the_station_is(scenario, load):
+    """In contact; over another channel and back to wires. What is felt goes over, slowly."""
+    session = Session(scenario, load)
+    now = session.inputs.changed({"z": -2900})
+    for end, change in ((250, {}), (1050, {"network": 2, "method": 4}), (1400, {"network": 0})):
+        now = now.changed(change | ({"method": 0} if end == 1400 else {}))
+        session.apply(now)
+        assert session.filling == bool(change)
+        while session.ms < end:
+            session.advance()
+    log = session.log()
+    np.testing.assert_allclose(np.diff(log.t), 1e-3, atol=1e-12)
+    assert np.linalg.norm(log["true_contact_wrench_W"][200:, :3], axis=1).min() > 3.0
+    felt, command = log["force_to_master"][:, 2], log["pose_received"][:, 4:]
+    for k in (250, 1050):
+        np.testing.assert_array_equal(command[k + 2], command[k])
+        np.testing.assert_allclose(felt[k : k + 6], felt[k], atol=1e-3)
+        assert np.abs(np.diff(felt[k:])).max() < 0.02
+    # The clutch is closed again at last, and the channel passes on what it gets.
+    assert np.ptp(command[260:1000], axis=0).max() < 1e-15
+    assert not session.filling and session.apply(now.changed({"z": -1000})) is None
+    session.advance(100)
+    assert session.log()["pose_command"][-1, 6] > command[-1, 2] + 1e-3
+
+
+@pytest.mark.slow
+def test_every_other_choice_goes_on_without_a_jump(scenario, load):
+    """A firmer hand, an object, another sensor; the hand's pull and the arm stay what they are."""
+    session = Session(scenario, load)
+    now = session.inputs.changed({"x": 1000, "grip": 0})
+    session.apply(now)
+    session.advance(120)
+    ends = []
+    for change in ({"grip": 2}, {"object": 1}, {"sensor": 2}, {"detection": 1}):
+        now = now.changed(change)
+        session.apply(now)
+        ends.append(session.ms)
+        session.advance(30)
+    log = session.log()
+    pull, felt = log["hand_wrench_E"][:, :3], log["force_to_master"][:, :3]
+    assert np.abs(pull[115:120]).max() > 0.05
+    for k in ends:
+        assert np.abs(np.diff(pull[k - 1 : k + 2], axis=0)).max() < 0.05
+        assert np.abs(np.diff(felt[k - 1 : k + 5], axis=0)).max() < 2e-3
+        assert np.abs(np.diff(log["slave_state"][k - 1 : k + 5, :6], axis=0)).max() < 1e-3
+    mass = log["load_estimate"][:, 6]
+    assert mass[ends[1] + 1] - mass[ends[1]] == pytest.approx(0.8)
+
+
+@pytest.mark.slow
 def test_a_hand_that_has_let_go_pulls_nowhere(driven):
     """Nothing but its damping is left, which opposes every motion."""
     _, log = driven
@@ -131,7 +183,7 @@ def test_inputs_are_brought_into_their_ranges_and_nonsense_is_left_out():
         (header() + row(5, Inputs()), "5 ms is no time"),
         (header() + row(0, Inputs()) + row(7, Inputs()), "7 ms is no time"),
         (header() + row(0, Inputs()) + row(5, Inputs(x=1_000_000)), ":3.*x = 1000000 is outside"),
-        (header() + "0,1\n", "has 2 numbers, not 13"),
+        (header() + "0,1\n", "has 2 numbers, not 22"),
         (header() + "0,a\n", "something other than whole numbers"),
     ],
 )
@@ -145,4 +197,4 @@ def test_a_line_that_a_killed_process_did_not_finish_is_left_out(tmp_path):
     path = tmp_path / INPUTS
     path.write_text(header() + row(0, Inputs()) + row(5, Inputs(x=3)) + row(10, Inputs())[:9])
     assert read_inputs(path) == [(0, Inputs()), (5, Inputs(x=3))]
-    assert len(RANGES) == 12
+    assert len(RANGES) == 21

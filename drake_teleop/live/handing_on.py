@@ -1,0 +1,110 @@
+"""One station goes on where another one is: its states, by the names of its blocks.
+
+What both have in the same form is handed on. The rest starts anew: what is random, and a channel
+with another network or method, which begins at the command of now with its clutch open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, Diagram, LeafSystem, System
+
+from drake_teleop._compiled import njit
+from drake_teleop.lifetime import ONE_DICT, weak_callback
+
+Array = NDArray[np.float64]
+
+#: The blocks whose numeric parameters change while a station runs.
+_WITH_PARAMETERS = ("live_hand", "force_scaling")
+
+
+def hand_on(
+    before: Diagram, then: Context, station: Diagram, context: Context, anew: set[str]
+) -> None:
+    """Sets the states of a station to those of another one.
+
+    Args:
+        before, then: the other station, and its context now.
+        station, context: that is to go on.
+        anew: names of blocks that begin anew.
+    """
+    context.SetTime(then.get_time())
+    others = dict(_blocks(before))
+    for path, block in _blocks(station):
+        other = others.get(path)
+        if other is None or type(other) is not type(block) or anew & set(path.split("/")):
+            continue
+        _copy(
+            other.GetMyContextFromRoot(then),
+            block.GetMyMutableContextFromRoot(context),
+            path.rpartition("/")[2] in _WITH_PARAMETERS,
+        )
+
+
+def _blocks(diagram: Diagram, path: str = "") -> Iterator[tuple[str, System]]:
+    for system in diagram.GetSystems():
+        name = f"{path}/{system.get_name()}"
+        if isinstance(system, Diagram):
+            yield from _blocks(system, name)
+        else:
+            yield name, system
+
+
+def _copy(source: Context, target: Context, with_parameters: bool) -> None:
+    if source.num_continuous_states() == target.num_continuous_states() > 0:
+        target.SetContinuousState(source.get_continuous_state_vector().CopyToVector())
+    groups = source.num_discrete_state_groups()
+    if groups == target.num_discrete_state_groups():
+        for k in range(groups):
+            values = source.get_discrete_state(k).value()
+            if values.size == target.get_discrete_state(k).size():
+                target.SetDiscreteState(k, values)
+    if with_parameters:
+        for k in range(source.num_numeric_parameter_groups()):
+            values = source.get_numeric_parameter(k).value()
+            target.get_mutable_numeric_parameter(k).SetFromVector(values)
+
+
+@njit(cache=True)
+def _felt_into(wrench, change, time, out):
+    """Writes what is felt (6,) of a wrench (6,); `change` as the parameter of `GoesOver`."""
+    length = change[1]
+    u = min(max((time - change[0]) / length, 0.0), 1.0) if length > 0.0 else 1.0
+    share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
+    for i in range(6):
+        out[i] = share * wrench[i] + (1.0 - share) * change[2 + i] if share < 1.0 else wrench[i]
+
+
+class GoesOver(LeafSystem):
+    """What the hand feels goes over from what it felt of another station, without a step.
+
+    .. pydrake_system::
+
+        name: GoesOver
+        input_ports:
+        - wrench: (6,) F_E_B that the hand shall feel [N, N m]
+        output_ports:
+        - felt: (6,) that, at last
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self) -> None:
+        super().__init__()
+        # When it begins [s], its length [s], the wrench that was felt before (6,).
+        self._change = self.DeclareNumericParameter(BasicVector(8))
+        self._wrench = self.DeclareVectorInputPort("wrench", 6)
+        self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc))
+
+    def Begin(self, context: Context, start: float, length: float, felt: Array) -> None:
+        """From `start` [s] on and within `length` [s]; until then it is `felt` (6,)."""
+        change = np.concatenate([[start, length], felt])
+        context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        change = context.get_numeric_parameter(self._change).value()
+        wrench = self._wrench.Eval(context)
+        _felt_into(wrench, change, context.get_time(), output.get_mutable_value())
