@@ -63,6 +63,19 @@ class Address:
             )
         return values
 
+    def choice(self, name: str, among: tuple[str, ...]) -> str:
+        """One of some words, the first if it says none.
+
+        Raises:
+            DrakeTeleopError: if it is another.
+        """
+        text = self._said.get(name, among[0])
+        if text not in among:
+            raise DrakeTeleopError(
+                f"{name}={text!r} is neither {' nor '.join(among)}", where=self.text
+            )
+        return text
+
     def sign(self) -> float:
         """+1 for what the sensor exerts on the load, Eq. (1); -1, the default, for the opposite.
 

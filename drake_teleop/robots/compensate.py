@@ -21,6 +21,10 @@ from drake_teleop.robots.streams import Compensated, Sink, Source
 from drake_teleop.robots.table import TableSink
 from drake_teleop.robots.udp import THIS_MACHINE, UdpSink, UdpSource, listening
 
+SINKS = (
+    "udp://HOST:PORT, zenoh://HOST/TOPIC, foxglove://[HOST][:PORT], -, or a .csv, .parquet or"
+    " .mcap file"
+)
 _REPLAY = "replay:"
 _IDLE_S = 0.01  # between wrenches of zero while nothing comes
 
@@ -79,20 +83,27 @@ def source_of(
 
 
 def sink_of(address: str) -> Sink:
-    """The sink at an address: udp://HOST:PORT, - for stdout, or a .csv or .parquet file.
+    """The sink at an address: one of `SINKS`.
 
     Raises:
-        DrakeTeleopError: for another address.
+        DrakeTeleopError: for another address, or as the sink does.
     """
+    kind, path = address.split("://")[0], Path(address)
     if address == "-":
         return LineSink(sys.stdout)
-    if address.startswith("udp://"):
+    if kind == "udp":
         return UdpSink(address)
-    if Path(address).suffix not in (".csv", ".parquet"):
-        raise DrakeTeleopError(
-            "is no sink", where=address, remedy="udp://HOST:PORT, -, or a .csv or .parquet file"
-        )
-    return TableSink(Path(address))
+    if kind == "zenoh":
+        from drake_teleop.robots.ros2_sink import Ros2Sink
+
+        return Ros2Sink(address)
+    if kind == "foxglove" or path.suffix == ".mcap":
+        from drake_teleop.robots.foxglove import FoxgloveSink, McapSink
+
+        return FoxgloveSink(address) if kind == "foxglove" else McapSink(path)
+    if kind != address or path.suffix not in (".csv", ".parquet"):
+        raise DrakeTeleopError("is no sink", where=address, remedy=SINKS)
+    return TableSink(path)
 
 
 def run(

@@ -54,15 +54,15 @@ def unpacked_wrench(packet: bytes) -> Compensated:
     return Compensated(number, t, np.array(values[:6]), np.array(values[6:]), flags)
 
 
-def endpoint(address: str) -> tuple[str, int]:
-    """Host and port of udp://HOST:PORT; without a host, this machine.
+def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
+    """Host and port of udp://HOST:PORT; without a host, this machine, without a port, that one.
 
     Raises:
         DrakeTeleopError: if there is no port.
     """
     try:
         parts = urlsplit(address)
-        host, port = parts.hostname or THIS_MACHINE, parts.port
+        host, port = parts.hostname or THIS_MACHINE, port if parts.port is None else parts.port
     except ValueError:
         host, port = "", None
     if port is None:

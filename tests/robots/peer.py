@@ -15,7 +15,8 @@ import time
 
 DT = 0.002
 FLAWS = ("good", "lost", "twice", "swapped", "nan", "short", "saturated", "silent", "late", "good")
-EACH = 8  # samples of a chapter; what is wrong stands in its middle
+TWO = ("good", "good")
+EACH = 6  # samples of a chapter; what is wrong stands in its middle
 SILENCE_S = 0.09
 
 
@@ -133,6 +134,59 @@ def rtde(host):
         time.sleep(0.06)
 
 
+def router(port):
+    import zenoh
+
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
+def ros(port):
+    """A driver behind a router: it is started again, and then its clock is set.
+
+    Its CDR is made by hand, as rmw_zenoh's attachment and key are.
+    """
+    kind = "geometry_msgs::msg::dds_::WrenchStamped_"
+    with router(port) as session:
+        publisher = session.declare_publisher(f"3/ft/wrench/{kind}/RIHS01_{HASH}")
+        print(port, flush=True)
+        while not publisher.matching_status.matching:
+            time.sleep(0.002)
+        for flaws, later, first in ((FLAWS, 0, 0), (TWO, 0, 0), (TWO, 50, 500)):
+            start = time.time() + later
+
+            def send(number, flaw, start=start, first=first):
+                ns = round((start + DT * number) * 1e9)
+                numbers = wrench(number) if flaw != "nan" else (float("nan"),) * 6
+                stamp = struct.pack("<iII6s6x", ns // 10**9, ns % 10**9, 6, b"tool0")
+                message = b"\0\1\0\0" + stamp + struct.pack("<6d", *numbers)
+                attached = struct.pack("<qqB16s", number + first, ns, 16, b"x" * 16)
+                publisher.put(message[: 20 if flaw == "short" else 76], attachment=attached)
+
+            play(send, flaws)
+
+
+def ros_echo(port):
+    """What a node of ROS would have seen of the first message: tokens, key, attachment, CDR."""
+    with router(port) as session:
+        tokens = session.liveliness().declare_subscriber("@ros2_lv/**", history=True)
+        messages = session.declare_subscriber("4/**")
+        print(port, flush=True)
+        for _ in range(2):
+            print(tokens.recv().key_expr)
+        message = messages.recv()
+        print(message.key_expr)
+        print(message.attachment.to_bytes().hex())
+        print(message.payload.to_bytes().hex(), flush=True)
+
+
+HASH = "8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77"
+
+
 if __name__ == "__main__":
     with contextlib.suppress(OSError, KeyboardInterrupt):
-        {"netft": netft, "rtde": rtde}[sys.argv[1]](*sys.argv[2:])
+        PEERS = {"netft": netft, "rtde": rtde, "ros": ros, "ros_echo": ros_echo}
+        PEERS[sys.argv[1]](*sys.argv[2:])

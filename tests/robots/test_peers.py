@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
+import socket
+import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,28 +17,34 @@ from pathlib import Path
 
 import numpy as np
 import sockets
+from mcap.reader import make_reader
+from peer import HASH
 from test_compensator import PHI, load
+from websockets.sync.client import connect
 
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.robots.compensate import sink_of
 from drake_teleop.robots.compensator import STALE_S, Compensator
 from drake_teleop.robots.netft import NetFtSource
+from drake_teleop.robots.ros2_source import Ros2Source
 from drake_teleop.robots.rtde import RtdeSource
 from drake_teleop.robots.streams import IMU, POSE, WRENCH, Compensated, Flag, Part, Reading, Source
 
 PEER = Path(__file__).with_name("peer.py")
 AT_REST = np.array([0.0, 0.0, 9.81, *np.zeros(6)])
 ADDRESS = f"127.{os.getpid() // 250 % 250}.{os.getpid() % 250}.7"  # ur_rtde has but one port
-LOST = {12, 13, 14}
+LOST = {9, 10, 11}
 OFFSETS = np.array([0.0, 2.0, 3.0, 0.1, 0.2, 0.3])
 
 
 @contextmanager
-def peer(*words: str) -> Iterator[str]:
-    """The peer while it runs, as it says where it is."""
-    with subprocess.Popen([sys.executable, "-S", PEER, *words], stdout=subprocess.PIPE) as process:
+def peer(*words: str) -> Iterator[tuple[str, Iterator[str]]]:
+    """The peer while it runs: where it is, and what it says later."""
+    with subprocess.Popen([sys.executable, PEER, *words], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
+        lines = (line.decode().strip() for line in process.stdout)
         try:
-            yield process.stdout.readline().decode().strip()
+            yield next(lines), lines
         finally:
             process.kill()
 
@@ -41,14 +52,14 @@ def peer(*words: str) -> Iterator[str]:
 class Seen(list[Compensated]):
     """What the loop of `compensate` makes of a source, with the times when."""
 
-    def __init__(self, source: Source, last: int) -> None:
-        """Until a good wrench of the last number after a restart; the tool is at rest."""
+    def __init__(self, source: Source, last: int, end: Flag = Flag.RESTART) -> None:
+        """Until a good wrench of the last number after that flag; the tool is at rest."""
         self.at: list[float] = []
         self.parts: list[Part] = []
         compensator = Compensator(load(), source.dt, cutoff_hz=None)
         compensator.offsets = OFFSETS - non_contact_wrench(*np.split(AT_REST, 3), PHI)
-        begun, end = False, time.monotonic() + 5.0
-        while time.monotonic() < end:
+        begun, until = False, time.monotonic() + 5.0
+        while time.monotonic() < until:
             parts = source.read(0.01)
             assert parts is not None
             if (stale := compensator.idle(time.monotonic())) and not parts:
@@ -60,7 +71,7 @@ class Seen(list[Compensated]):
                 values = np.concatenate([part.values, AT_REST])
                 reading = Reading(part.number, part.t, values, part.flags)
                 out = self._take(compensator.step(reading, time.monotonic()))
-                begun |= bool(out.flags & Flag.RESTART)
+                begun |= bool(out.flags & end)
                 if begun and not out.flags and out.number >= last:
                     return
 
@@ -88,19 +99,25 @@ class Seen(list[Compensated]):
         assert STALE_S <= self.at[first] - self.at[first - 1] < STALE_S + 0.04
 
 
+def free_port() -> str:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return str(free.getsockname()[1])
+
+
 def test_netft() -> None:
-    with peer("netft") as port:
+    with peer("netft") as (port, _):
         source = NetFtSource(f"netft://127.0.0.1:{port}?counts=1000,1000&sign=1", 0.002)
         seen = Seen(source, 10)
         source.close()
     flags = Flag.REORDERED | Flag.DAMAGED | Flag.SATURATED | Flag.STALE | Flag.RESTART
     seen.check(flags)
-    assert not LOST & {row.number for row in seen}
+    numbers = [row.number for row in seen]
+    assert numbers[numbers.index(12) - 1] == 8  # and nothing instead of what was lost
 
 
 def test_rtde() -> None:
     sockets.on_purpose.add(30004)  # of this machine, but not 127.0.0.1
-    with peer("rtde", ADDRESS) as host:
+    with peer("rtde", ADDRESS) as (host, _):
         source = RtdeSource(f"rtde://{host}?sign=1")
         seen = Seen(source, 510)
         source.close()
@@ -110,3 +127,63 @@ def test_rtde() -> None:
     poses = [part.values for part in seen.parts if part.stream == POSE]
     np.testing.assert_allclose(poses[0], [np.cos(0.5), 0, 0, np.sin(0.5), 0.4, 0.1, 0.3])
     assert next(part.values.tolist() for part in seen.parts if part.stream == IMU) == [0, 0, 9.81]
+
+
+def test_ros_2() -> None:
+    with peer("ros", free_port()) as (port, _):
+        source = Ros2Source(f"zenoh://127.0.0.1:{port}/ft/wrench?domain=3&sign=1", 0.002)
+        seen = Seen(source, 510, Flag.CLOCK_JUMP)
+        source.close()
+    flags = Flag.REORDERED | Flag.NOT_FINITE | Flag.DAMAGED | Flag.STALE | Flag.RESTART
+    seen.check(flags | Flag.CLOCK_JUMP)
+
+
+def test_a_wrench_for_ros_2_as_a_node_would_see_it() -> None:
+    wrench = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    with peer("ros_echo", free_port()) as (port, lines):
+        sink = sink_of(f"zenoh://127.0.0.1:{port}/tool/contact?frame=tool0&domain=4")
+        seen: list[str] = []
+        reader = threading.Thread(target=lambda: seen.extend(lines))
+        reader.start()
+        while reader.is_alive():
+            sink.write(Compensated(1, 0.0, wrench, -wrench, 0))
+            reader.join(0.01)
+        sink.close()
+    kind = f"geometry_msgs::msg::dds_::WrenchStamped_/RIHS01_{HASH}"
+    session = seen[0].split("/")[2]
+    assert sorted(seen[:2]) == [
+        f"@ros2_lv/4/{session}/0/0/NN/%/%/drake_teleop",
+        f"@ros2_lv/4/{session}/0/1/MP/%/%/drake_teleop/%tool%contact/{kind}/::,10:,:,:,,",
+    ]
+    assert seen[2] == f"4/tool/contact/{kind}"
+    number, ns, length, _ = struct.unpack("<qqB16s", bytes.fromhex(seen[3]))
+    assert number >= 1 and abs(ns * 1e-9 - time.time()) < 60.0 and length == 16
+    sec, nanosec, *rest = struct.unpack("<4xiII6s6x6d", bytes.fromhex(seen[4]))
+    assert (sec, nanosec) == divmod(ns, 10**9) and rest == [6, b"tool0\0", *wrench]
+
+
+def test_foxglove_and_mcap(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "out.mcap"
+    rows = [Compensated(k, 0.5 * k, np.arange(6.0), -np.arange(6.0), 32) for k in range(3)]
+    file, live = sink_of(str(path)), sink_of("foxglove://127.0.0.1:0")
+    with connect(f"ws://127.0.0.1:{live.port}", subprotocols=["foxglove.sdk.v1"]) as page:
+        page.recv()
+        channel = json.loads(page.recv())["channels"][0]["id"]
+        asked = {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": channel}]}
+        page.send(json.dumps(asked))
+        for row in rows:
+            file.write(row)
+        while True:  # the subscription is answered by nothing
+            live.write(rows[2])
+            with contextlib.suppress(TimeoutError):
+                shown = page.recv(timeout=0.01)
+                break
+    file.close()
+    live.close()
+    with path.open("rb") as back:
+        messages = [message for _, _, message in make_reader(back).iter_messages()]
+    assert [message.log_time for message in messages] == [0, 500_000_000, 1_000_000_000]
+    assert messages[2].data == shown[13:]
+    wrench = json.loads(messages[2].data)
+    assert wrench["contact"]["tau_z"] == 5.0 and wrench["scaled"]["f_y"] == -1.0
+    assert wrench["number"] == 2 and wrench["flags"] == ["stale"]

@@ -1,0 +1,114 @@
+"""Wrenches for Foxglove: live in its window, or in an MCAP file, by the library foxglove-sdk.
+
+Both have one topic, `/wrench`, of JSON: number and t of the reading, contact and scaled by name,
+and the flags.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.read.canonical import WRENCH
+from drake_teleop.robots.lines import names_of
+from drake_teleop.robots.streams import Compensated
+from drake_teleop.robots.udp import endpoint
+from drake_teleop.writing import make_folder, naming
+
+PORT = 8765
+TOPIC = "/wrench"
+_VECTOR = {"type": "object", "properties": {name: {"type": "number"} for name in WRENCH}}
+_SCHEMA = {
+    "title": "drake_teleop.Wrench",
+    "type": "object",
+    "properties": {
+        "number": {"type": "integer"},
+        "t": {"type": "number"},
+        "contact": _VECTOR,
+        "scaled": _VECTOR,
+        "flags": {"type": "array", "items": {"type": "string"}},
+    },
+}
+
+
+class _Channel:
+    def __init__(self, where: str) -> None:
+        if importlib.util.find_spec("foxglove") is None:
+            raise DrakeTeleopError(
+                "is written by the library foxglove-sdk, which is not installed",
+                where=where,
+                remedy="pip install 'drake_teleop[robots]'",
+            )
+        import foxglove
+
+        self.context = foxglove.Context()
+        self._channel = foxglove.Channel(TOPIC, schema=_SCHEMA, context=self.context)
+
+    def log(self, out: Compensated, ns: int | None) -> None:
+        data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": names_of(out.flags)}
+        for name, wrench in (("contact", out.contact), ("scaled", out.scaled)):
+            data[name] = dict(zip(WRENCH, wrench.tolist(), strict=True))
+        self._channel.log(json.dumps(data).encode(), log_time=ns)
+
+    def close(self) -> None:
+        self._channel.close()
+
+
+class FoxgloveSink:
+    """Live at foxglove://[HOST][:PORT]: whoever connects there sees them, now by our clock.
+
+    Raises:
+        DrakeTeleopError: if foxglove-sdk is missing, or the address is taken.
+    """
+
+    def __init__(self, address: str) -> None:
+        host, port = endpoint(address, PORT)
+        self._channel = _Channel(address)
+        import foxglove
+
+        try:
+            self._server = foxglove.start_server(
+                name="drake_teleop", host=host, port=port, context=self._channel.context
+            )
+        except (OSError, RuntimeError) as error:
+            raise DrakeTeleopError(str(error), where=address) from error
+        self.port = self._server.port
+
+    def write(self, out: Compensated) -> None:
+        """See `Sink`."""
+        self._channel.log(out, None)
+
+    def close(self) -> None:
+        """See `Sink`."""
+        self._channel.close()
+        self._server.stop()
+
+
+class McapSink:
+    """Into a file, as they come, at the times of the readings.
+
+    Raises:
+        DrakeTeleopError: if foxglove-sdk is missing, or the file cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._channel = _Channel(str(path))
+        import foxglove
+
+        make_folder(path.parent)
+        with naming(path):
+            self._file = foxglove.open_mcap(
+                path, allow_overwrite=True, context=self._channel.context
+            )
+
+    def write(self, out: Compensated) -> None:
+        """See `Sink`."""
+        self._channel.log(out, round(1e9 * min(max(out.t, 0.0), 1e9 * 18)))
+
+    def close(self) -> None:
+        """See `Sink`."""
+        self._file.close()
+        self._channel.close()

@@ -1,0 +1,77 @@
+"""Wrenches as topics of ROS 2, see `ros2`."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.robots.address import Address
+from drake_teleop.robots.ros2 import (
+    PORT,
+    WRENCH_STAMPED,
+    attachment,
+    domain_of,
+    key,
+    needed,
+    opened,
+    tokens,
+    topic_of,
+    types,
+)
+from drake_teleop.robots.streams import Compensated
+
+_NODE = "drake_teleop"
+
+
+class Ros2Sink:
+    """WrenchStamped at zenoh://HOST[:PORT]/TOPIC[?frame=NAME&wrench=scaled&domain=N].
+
+    Args:
+        address: the contact wrench, or with `wrench=scaled` the scaled one, of the frame NAME. It
+            is stamped with the time when it is sent, since what is zero for want of readings has
+            no other. The flags do not go with it.
+
+    Raises:
+        DrakeTeleopError: if the address cannot be used, or a library is missing.
+    """
+
+    def __init__(self, address: str) -> None:
+        told = Address(address, PORT, known=("frame", "wrench", "domain"))
+        domain, topic = domain_of(told), topic_of(told, told.path)
+        which = told.choice("wrench", ("contact", "scaled"))
+        needed(address)
+        self._types, self._which = types(), which
+        self._frame = told.text_of("frame") or ""
+        hashed = self._types.hash_rihs01(WRENCH_STAMPED)
+        self._session = opened(told)
+        session = str(self._session.info.zid())
+        self._sender, self._number = bytes.fromhex(session.rjust(32, "0"))[:16], 0
+        self._tokens = [
+            self._session.liveliness().declare_token(token)
+            for token in tokens(domain, session, _NODE, topic, WRENCH_STAMPED, hashed)
+        ]
+        self._publisher = self._session.declare_publisher(
+            key(domain, topic, WRENCH_STAMPED, hashed), express=True
+        )
+
+    def write(self, out: Compensated) -> None:
+        """See `Sink`."""
+        ns = time.time_ns()
+        self._number += 1
+        message = self.message(getattr(out, self._which), ns)
+        self._publisher.put(message, attachment=attachment(self._number, ns, self._sender))
+
+    def message(self, wrench: Array, ns: int) -> bytes:
+        """WrenchStamped in CDR."""
+        kinds = self._types.types
+        vector, stamp = kinds["geometry_msgs/msg/Vector3"], kinds["builtin_interfaces/msg/Time"]
+        header = kinds["std_msgs/msg/Header"](stamp(ns // 10**9, ns % 10**9), self._frame)
+        parts = (vector(*map(float, part)) for part in np.split(wrench, 2))
+        both = kinds["geometry_msgs/msg/Wrench"](*parts)
+        return bytes(self._types.serialize_cdr(kinds[WRENCH_STAMPED](header, both), WRENCH_STAMPED))
+
+    def close(self) -> None:
+        """See `Sink`."""
+        self._session.close()

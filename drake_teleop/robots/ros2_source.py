@@ -1,0 +1,177 @@
+"""Wrench and motion from topics of ROS 2, see `ros2`."""
+
+from __future__ import annotations
+
+import math
+import queue
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array
+from drake_teleop.quaternions import multiply, rotate
+from drake_teleop.robots.address import Address
+from drake_teleop.robots.ros2 import (
+    PORT,
+    WRENCH_STAMPED,
+    domain_of,
+    key,
+    needed,
+    number_of,
+    opened,
+    topic_of,
+    types,
+)
+from drake_teleop.robots.streams import IMU, JOINTS, POSE, WRENCH, Flag, Part
+
+_TF = "tf2_msgs/msg/TFMessage"
+KINDS = {
+    WRENCH: WRENCH_STAMPED,
+    "tf": _TF,
+    POSE: "geometry_msgs/msg/PoseStamped",
+    JOINTS: "sensor_msgs/msg/JointState",
+    IMU: "sensor_msgs/msg/Imu",
+}
+_STREAMS = {"tf": POSE}
+_MOST = 4096  # messages that wait; more are lost, the newest first
+_DEEPEST = 64  # frames from one to another
+
+
+class Ros2Source:
+    """Parts of zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&joints=TOPIC&imu=TOPIC&tf=PARENT,CHILD&...].
+
+    Args:
+        address: TOPIC is of WrenchStamped; sign -1, the default, is for a sensor that tells what
+            the load exerts on it. With tf=PARENT,CHILD the pose is that of one frame in another,
+            put together of what `/tf` tells: all frames between them have to be in it. `domain` is
+            that of ROS, 0 without.
+        dt: between wrenches [s].
+
+    Attributes:
+        joint_names: in the order of the newest joint positions.
+
+    Raises:
+        DrakeTeleopError: if the address cannot be used, or a library is missing.
+    """
+
+    live = True
+
+    def __init__(self, address: str, dt: float) -> None:
+        told = Address(address, PORT, known=("pose", "joints", "imu", "tf", "domain", "sign"))
+        self.dt, self._sign, domain = dt, told.sign(), domain_of(told)
+        topics = {WRENCH: topic_of(told, told.path)}
+        for stream in (POSE, JOINTS, IMU):
+            if (text := told.text_of(stream)) is not None:
+                topics[stream] = topic_of(told, text)
+        self._frames = (told.text_of("tf") or "").split(",")
+        if self._frames != [""]:
+            if len(self._frames) != 2 or not all(self._frames):
+                raise DrakeTeleopError("tf is not PARENT,CHILD", where=address)
+            topics["tf"] = "tf"
+        needed(address)
+        self._types = types()
+        self.joint_names: list[str] = []
+        self._links: dict[str, tuple[str, Array]] = {}
+        self._counts = dict.fromkeys(KINDS, 0)
+        self._came: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
+        for stream in topics:  # what reads it is made now: the first messages would wait for that
+            self.parts(stream, b"", b"")
+        self._counts = dict.fromkeys(KINDS, 0)
+        self._session = opened(told)
+        for stream, topic in topics.items():
+            self._session.declare_subscriber(key(domain, topic, KINDS[stream]), self._take(stream))
+
+    def read(self, timeout_s: float) -> list[Part] | None:
+        """See `Source`."""
+        found: list[Part] = []
+        try:
+            found += self.parts(*self._came.get(timeout=timeout_s))
+            while len(found) < _MOST:
+                found += self.parts(*self._came.get_nowait())
+        except queue.Empty:
+            pass
+        return found
+
+    def parts(self, name: str, message: bytes, attached: bytes) -> list[Part]:
+        """What a message says, flagged as damaged if it is none. It never raises.
+
+        Args:
+            name: a key of `KINDS`.
+            message: in CDR.
+            attached: to it, see `ros2.number_of`.
+        """
+        self._counts[name] += 1
+        number = number_of(attached)
+        if number is None:
+            number = self._counts[name]
+        stream = _STREAMS.get(name, name)
+        # What rosbags makes of damaged bytes fails in many ways.
+        try:
+            data = self._types.deserialize_cdr(message, KINDS[name])
+            told = self._posed(data) if name == "tf" else [(data.header, self._values(name, data))]
+            return [
+                Part(stream, number, stamp.sec + 1e-9 * stamp.nanosec, values)
+                for stamp, values in ((header.stamp, values) for header, values in told)
+            ]
+        except Exception:
+            return [Part(stream, -1, math.nan, np.full(6, math.nan), int(Flag.DAMAGED))]
+
+    def close(self) -> None:
+        """See `Source`."""
+        self._session.close()
+
+    def _take(self, stream: str) -> Callable[[Any], None]:
+        def take(sample: Any) -> None:
+            if self._came.qsize() < _MOST:
+                attached = sample.attachment
+                attached = b"" if attached is None else attached.to_bytes()
+                self._came.put((stream, sample.payload.to_bytes(), attached))
+
+        return take
+
+    def _values(self, name: str, data: Any) -> Array:
+        if name == WRENCH:
+            wrench = data.wrench
+            return self._sign * np.array([*_xyz(wrench.force), *_xyz(wrench.torque)])
+        if name == POSE:
+            return _pose(data.pose.position, data.pose.orientation)
+        if name == JOINTS:
+            self.joint_names = list(data.name)
+            return np.array(data.position, float)
+        return np.array([*_xyz(data.linear_acceleration), *_xyz(data.angular_velocity)])
+
+    def _posed(self, data: Any) -> list[tuple[Any, Array]]:
+        """The pose of the child in the parent, if this message says anything new of it."""
+        newest = {each.child_frame_id: each for each in data.transforms}
+        for child, each in newest.items():
+            motion = each.transform
+            self._links[child] = each.header.frame_id, _pose(motion.translation, motion.rotation)
+        parent, frame = self._frames
+        pose, header = np.array([1.0, 0, 0, 0, 0, 0, 0]), None
+        for _ in range(_DEEPEST):
+            if frame == parent:
+                return [] if header is None else [(header, pose)]
+            if frame not in self._links:
+                break
+            if frame in newest:
+                header = newest[frame].header
+            frame, link = self._links[frame]
+            pose = _moved(link, pose)
+        return []
+
+
+def _xyz(v: Any) -> tuple[float, float, float]:
+    return v.x, v.y, v.z
+
+
+def _pose(p: Any, q: Any) -> Array:
+    return np.array([q.w, q.x, q.y, q.z, p.x, p.y, p.z])
+
+
+def _moved(a: Array, b: Array) -> Array:
+    """X_a X_b."""
+    turn = tuple(a[:4].tolist())
+    p = rotate(turn, tuple(b[4:].tolist()))
+    return np.array([*multiply(turn, tuple(b[:4].tolist())), *(a[4:] + p)])
