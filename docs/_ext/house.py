@@ -34,7 +34,17 @@ class Order:
     """As one would tell it; a script that is not named here is an error."""
 
     STORY = (
-        *("free_motion", "contact", "sigma", "grasp", "task", "own_arm", "own_device", "own_block"),
+        *(
+            "free_motion",
+            "contact",
+            "sigma",
+            "grasp",
+            "load_change",
+            "task",
+            "own_arm",
+            "own_device",
+            "own_block",
+        ),
         *("log_identification", "log_contact", "conventions", "excitation", "sensor_noise"),
         *("networks", "energy", "passivity_methods", "ledger_under_loss", "letting_go"),
         *("stability_map", "felt_impedance", "z_width", "study"),

@@ -2,8 +2,8 @@
 An excitation for an arm of your own
 ====================================
 
-For any URDF or SDF of a serial arm, here `arm.urdf` beside this script. The trajectory shows all
-that a load has, respects the limits of joints and sensor, and begins and ends at rest.
+For any URDF or SDF of a serial arm, here :download:`arm.urdf </gallery/arm.urdf>`. The trajectory
+shows all that a load has, respects the limits of joints and sensor, and begins and ends at rest.
 """
 
 from pathlib import Path

@@ -2,8 +2,8 @@
 An arm and a tool of your own
 =============================
 
-The same hand with another arm (`arm.urdf`, beside this script) and another tool: a block of 1.8
-kg. Both are identified before the run, as everything else.
+The same hand with another arm (:download:`arm.urdf </gallery/arm.urdf>`) and another
+tool: a block of 1.8 kg. Both are identified before the run, as everything else.
 """
 
 import matplotlib.pyplot as plt
