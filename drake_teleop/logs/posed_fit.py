@@ -164,11 +164,18 @@ def _consistent(found: PoseEstimate) -> NDArray[np.float64]:
 
 
 def _note(found: PoseEstimate, stated: float) -> str:
-    if found.fit.explained:
-        return found.note
-    gains = "gains (state wrench.gain_std), " if stated == 0.0 else f"gains beyond {stated:g}, "
-    text = (
-        f"the wrench is not that of a rigid load alone: {gains}bending, or a frame that is not S;"
-        f" deviations are {found.fit.inflation:.2g} times as large as by noise"
-    )
-    return f"{found.note}; {text}" if found.note else text
+    notes = [found.note] if found.note else []
+    if found.clock_rate:
+        side = "faster" if found.clock_rate > 0.0 else "slower"
+        notes.append(
+            f"the clock of the pose runs {1e6 * abs(found.clock_rate):.0f} millionths {side} than"
+            " that of the wrench, which is taken out; to say so, multiply pose.time.scale (1 by"
+            f" default) by {1.0 / (1.0 + found.clock_rate):.6f}"
+        )
+    if not found.fit.explained:
+        gains = "gains (state wrench.gain_std), " if stated == 0.0 else f"gains beyond {stated:g}, "
+        notes.append(
+            f"the wrench is not that of a rigid load alone: {gains}bending, or a frame that is not"
+            f" S; deviations are {found.fit.inflation:.2g} times as large as by noise"
+        )
+    return "; ".join(notes)

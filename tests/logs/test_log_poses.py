@@ -91,6 +91,24 @@ def test_identify_takes_the_noise_of_poses_into_account(whole):
     assert load.residual_rms[:3].max() < 0.1  # of 0.1 N before the low-pass
 
 
+@pytest.mark.parametrize("bursts", [True, False])
+def test_stamps_need_not_be_exact(whole, folder, tmp_path, bursts):
+    """Five at once and to 1 ms, or off by 1.6 ms and 0.04 % faster than those of the wrench."""
+    table = pl.read_csv(folder / "own_pose.csv")
+    t = table["t"].to_numpy()
+    jitter = np.random.default_rng(1).uniform(-1.6e-3, 1.6e-3, len(t))
+    stamps = np.repeat(np.floor(1e3 * t[4::5]) / 1e3, 5) if bursts else 1.0004 * (t + jitter)
+    table[: len(stamps)].with_columns(t=pl.Series(stamps)).write_csv(tmp_path / "own_pose.csv")
+    (tmp_path / "own_wrench.csv").write_bytes((folder / "own_wrench.csv").read_bytes())
+    found = identify_log(described(tmp_path, "own"), cutoff_hz=10.0)
+    load, exact = found.identification, whole.identification
+    assert np.abs(deviations(found)).max() < 3.5
+    assert load.identifiable.all() and not found.findings
+    wider = load.standard_deviations[6:] / exact.standard_deviations[6:]
+    assert wider.max() < 1.35
+    assert any("pose.time.scale (1 by default) by 0.9996" in x for x in found.log.notes) != bursts
+
+
 def test_gains_that_are_stated_widen_the_deviations(folder):
     path = described(folder, "own", wrench={"gain_std": 0.01})
     load = identify_log(path).identification

@@ -402,6 +402,18 @@ def test_deviations_count_that_the_weights_are_estimated():
     assert fit.covariance[0, 0] == pytest.approx(variance, rel=1e-3)
 
 
+def test_a_clock_that_runs_away_costs_nothing():
+    """By 0.2 ms a second, over 20 s; the delay is that in the middle."""
+    t, wrench, poses = record(Kind())
+    late = Poses(1.0002 * (poses.t + 50.0) - 50.0, poses.position, poses.quaternion)
+    found, plain = estimate_from_poses(t, wrench, late, GRAVITY_W), estimated(Kind())
+    assert plain.clock_rate == 0.0
+    assert found.clock_rate == pytest.approx(2e-4, abs=1e-5)
+    assert found.delay_s == pytest.approx(LATE + 2e-4 * (50.0 + 10.0), abs=2e-4)
+    assert np.sqrt(found.covariance[6, 6] / plain.covariance[6, 6]) < 1.05
+    assert np.abs(deviations(found)).max() < 3.5
+
+
 def test_a_delay_that_is_given_stays():
     found = estimate_from_poses(*record(Kind(seed=1)), GRAVITY_W, delay=LATE)
     assert found.delay_s == LATE

@@ -1,6 +1,7 @@
 """The load, the delay and the pose's frame from a wrench and poses: the whole estimate.
 
-1. Splines with knots of a middle distance; a first delay; stretches in which something else acts.
+1. Splines with knots of a middle distance; a first delay; stretches in which something else acts;
+   the rate of the poses' clock (`clock_rate`).
 2. Distance of the knots and delay by the wrench (`saturated`), then splines of all poses.
 3. What the saturated model says (`read_off`), and a rigid load twice: with the frame as described,
    and with the transform between pose and sensor free (`rigid`).
@@ -18,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array, checked
+from drake_teleop.logs.pose_motion.clock_rate import at_rate, clock_rate
 from drake_teleop.logs.pose_motion.noise import noise_moments
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
@@ -100,6 +102,8 @@ class PoseEstimate:
         fit: the load with the frame as described, or as estimated if it was left to the data.
         delay_s: of the motion behind the wrench [s].
         delay_deviation: its standard deviation [s].
+        clock_rate: by how much the poses' clock is faster than the wrench's, such as 5e-5, if that
+            shows and the delay was not given; the splines are on the clock of the wrench.
         frame: of the poses, from the fit in which it is free.
         free: that fit.
         seen: what the saturated model says.
@@ -113,6 +117,7 @@ class PoseEstimate:
     fit: RigidFit
     delay_s: float
     delay_deviation: float
+    clock_rate: float
     frame: Frame
     free: RigidFit
     seen: ReadOff
@@ -174,7 +179,7 @@ def estimate_from_poses(
             remedy="record longer, without interruptions",
         )
     top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
-    splines, spectra, rejected, note = _searched(
+    splines, spectra, rejected, rate, note = _searched(
         grid, poses, lost, gravity, guess, top, known=delay is not None
     )
     Z = spectra.moments()
@@ -198,6 +203,7 @@ def estimate_from_poses(
         fit=fit,
         delay_s=spectra.delay + fit.state.tau,
         delay_deviation=float(np.sqrt(fit.covariance[16, 16])),
+        clock_rate=rate,
         frame=_frame(free, start),
         free=free,
         seen=seen,
@@ -218,7 +224,7 @@ def _searched(
     top: float,
     *,
     known: bool,
-) -> tuple[PoseSplines, Spectra, NDArray[np.bool_], str]:
+) -> tuple[PoseSplines, Spectra, NDArray[np.bool_], float, str]:
     """Splines with the knots, and spectra with the delay and taper, that are used."""
     part = _liveliest(grid)
     some = replace(grid, t=grid.t[part], wrench=_rows(grid, part))
@@ -227,13 +233,18 @@ def _searched(
     spacing, late = first_guess(few, some, taper, gravity, delay, top, known=known)
     first = spectra_of(PoseSplines(few, spacing), some, taper, gravity, late, top)
     clear = without(taper, disturbed(first, some, taper, spacing)[0], grid.dt)
+    rate = 0.0
+    if not known:
+        rate = clock_rate(few, some, clear, gravity, late, top, spacing)
+    if rate:
+        few, poses = (at_rate(x, rate, some, late) for x in (few, poses))
     spacing, late = best_spacing(few, some, clear, gravity, late, top, known=known)
     splines, base = PoseSplines(poses, spacing), _base_taper(grid, poses, lost, late)
     spectra = spectra_of(splines, grid, base, gravity, late, top)
     rejected, note = disturbed(spectra, grid, base, spacing)
     taper = without(base, rejected, grid.dt)
     spectra = spectra_of(splines, grid, taper, gravity, late, top)
-    return splines, spectra, rejected, note
+    return splines, spectra, rejected, rate, note
 
 
 def _rows(grid: Grid, part: slice) -> Array:
