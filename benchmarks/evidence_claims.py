@@ -131,7 +131,7 @@ def _response(sigma: str, part: str) -> Callable[[Any], float]:
     )
 
 
-LOAD, LOGS, WRENCH, PAPER = "The load", "A robot's log", "The wrist's wrench", "The paper's figures"
+LOAD, LOGS, PAPER = "The load", "A robot's log", "The paper's figures"
 CONTACT, NETWORK, ANALYSIS = "Contact noticed", "Over networks", "Stability and transparency"
 OWN, SPEED, LIVE = "Stations of one's own", "What it costs", "Live"
 
@@ -344,10 +344,27 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: max(_rows(f, "felt %")), "%", 0.0, 2.0),
     ),
     Claim(
-        *(OWN, "Numeric inverse kinematics meets every pose to 10⁻⁸, or says why; not met"),
+        *(OWN, "Numeric inverse kinematics meets every pose, but for (it says so)"),
         *("10⁵ random poses of each of six arms", "station.md", "inverse_kinematics"),
-        lambda f: max(arm["random"]["not_met"] for arm in f.values()),
+        lambda f: max(
+            arm["random"]["poses"] - arm["random"]["statuses"]["OK"] for arm in f.values()
+        ),
         *("of 10⁵", 0.0, 10.0),
+    ),
+    Claim(
+        *(OWN, "and what it says it meets it meets"),
+        *("largest error in position, the same poses", "station.md", "inverse_kinematics"),
+        *(lambda f: max(arm["random"]["worst_m"] for arm in f.values()), "m", 0.0, 1e-8),
+    ),
+    Claim(
+        *(OWN, "It is the closed form where there is one"),
+        *("RX90, 2·10⁴ poses, same branch", "station.md", "inverse_kinematics"),
+        *(lambda f: f["rx90"]["closed_form"]["largest_difference_rad"], "rad", 0.0, 1e-9),
+    ),
+    Claim(
+        *(SPEED, "A step of the numeric inverse kinematics takes, from Python"),
+        *("following a motion, slowest of six arms", "station.md", "inverse_kinematics"),
+        *(lambda f: max(arm["follow"]["median_us"] for arm in f.values()), "µs", 0.0, 30.0),
     ),
     # Cost
     Claim(
