@@ -316,6 +316,14 @@ def _check_channel(scenario: Scenario, where: str) -> None:
                 where=f"{where}:channel.timeout",
                 remedy="raise timeout or rate_hz, or the station is in its safe state all the time",
             )
+    if scenario.master.leads_joints and not (
+        scenario.is_direct and scenario.contact_detection is None
+    ):
+        raise DrakeTeleopError(
+            "a channel carries poses, not joints",
+            where=f"{where}:master.leader.leads",
+            remedy="lead by the pose, or without network, passivity and contact_detection",
+        )
     scaling = scenario.kinematic_scaling
     scales = (scaling.translation_scale, scaling.rotation_scale)
     if scenario.passivity.method != "none" and min(scales) == 0.0:

@@ -74,7 +74,8 @@ def MakeTeleopStation(
     sides = [master, slave]
     if scenario.is_direct and scenario.contact_detection is None:
         # A channel of two wires, which as a Diagram would cost 3 % of the time.
-        wire(builder, master, "pose_command", slave, "pose_command")
+        setpoint = "leader_joints" if scenario.master.leads_joints else "pose_command"
+        wire(builder, master, setpoint, slave, setpoint)
         wire(builder, slave, "wrench_B", master, "wrench_command")
     else:
         channel = builder.AddNamedSystem("channel", MakeChannel(scenario))

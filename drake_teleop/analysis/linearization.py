@@ -404,6 +404,7 @@ class _Period:
         self._sensor = self._system("wrist_sensor")
         servo = smooth.joint_control
         servo.check_is_torque("the linearisation")
+        scenario.master.check_leads_the_pose("the linearisation")
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
         largest = _ANGLE if smooth.surroundings is None else _IN_CONTACT
         self._joint_step = min(largest, _ACCELERATION / gain)

@@ -40,7 +40,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fields import settings
 from drake_teleop.master.dynamics import HapticDevice
 from drake_teleop.master.leader import LeaderDevice
-from drake_teleop.master.leader_model import Leader
+from drake_teleop.master.leader_model import JOINTS, Leader
 from drake_teleop.master.numbers import (
     CENTRE,
     COULOMB,
@@ -204,6 +204,24 @@ class Master:
         numbers[CENTRE], numbers[HALF_SIZE] = figures.centre, 0.5 * np.array(figures.size)
         numbers[TURN] = figures.turn
         return HapticDevice(numbers, self.model)
+
+    @property
+    def leads_joints(self) -> bool:
+        """Whether it is a leader that leads joint by joint."""
+        return self.leader is not None and self.leader.leads == JOINTS
+
+    def check_leads_the_pose(self, what: str) -> None:
+        """Refuses a leader that leads joint by joint.
+
+        Raises:
+            DrakeTeleopError: if it does, for what knows poses alone.
+        """
+        if self.leads_joints:
+            raise DrakeTeleopError(
+                f"{what} knows a hand that leads the pose",
+                where="master.leader.leads",
+                remedy="set it to pose there: the hand feels the same",
+            )
 
     def steps(self) -> NDArray[np.float64]:
         """(6,) in which its axes are read [m, rad]; 0 if exactly."""

@@ -22,12 +22,13 @@ from drake_teleop.master.numbers import (
     PEAK_FORCE,
     PEAK_TORQUE,
 )
-from drake_teleop.quantities import plain, quantity
+from drake_teleop.quantities import choice, plain, quantity
 from drake_teleop.slave.arm import PHI, ROTATION, ROTOR, TRANSLATION, ArmModel, forward_kinematics
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.models import ParsedModel, ParseModel, drakes_errors_said
 
 Array = NDArray[np.float64]
+JOINTS = "joints"
 
 
 @settings
@@ -58,6 +59,11 @@ class Leader:
     torque_limit: list[float] = plain([], "of the motors [N m], likewise; by default the model's")
     peak_force: float = quantity(30.0, "N", 0.0, 500.0, "that it displays at most")
     peak_torque: float = quantity(3.0, "N m", 0.0, 50.0, "likewise, about each axis")
+    leads: str = choice(
+        "pose",
+        ("pose", JOINTS),
+        "the pose of S; or each joint its own of a slave of the same kinematics, home to start",
+    )
 
     def check(self, where: str) -> None:
         """Checks what needs no file.

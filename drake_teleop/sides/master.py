@@ -11,8 +11,10 @@ from drake_teleop.channel.network import mean_delay
 from drake_teleop.master.device import AddDevice
 from drake_teleop.master.dynamics import HapticDevice
 from drake_teleop.master.electronics import Encoders, Held
+from drake_teleop.master.leader import LeaderDevice
 from drake_teleop.operator.decision import Training
 from drake_teleop.operator.operator import Operator
+from drake_teleop.scaling.joint_coupling import JointCoupling
 from drake_teleop.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.scenario import Scenario, check_scenario
 from drake_teleop.sides.ports import export
@@ -37,6 +39,7 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
         - slave_state: [q; v] of the slave, whose tool the operator sees (with a task)
         output_ports:
         - pose_command: (7,) X_WS, setpoint of the slave
+        - leader_joints: (n,) setpoint of its joints (of a leader that leads them) [rad]
         - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m]
         - intent, master_state, pose_master, twist_master, force_to_master, fault_at_hand: signals
         - displayed_and_fault: the last two side by side, for the log
@@ -66,9 +69,15 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
     export(builder, operator, "intent", "hand_wrench_E")
     export(builder, device, "pose_master", "twist_master", master_state="state")
 
-    kinematic_scaling = builder.AddNamedSystem(
-        "kinematic_scaling", KinematicScaling(scaling, CLUTCH_PERIOD, start_W)
-    )
+    if isinstance(model, LeaderDevice) and scenario.master.leads_joints:
+        slave = NominalSlave(scenario.slave)
+        kinematic_scaling = builder.AddNamedSystem(
+            "kinematic_scaling", JointCoupling(slave.arm, slave.start, model.home, CLUTCH_PERIOD)
+        )
+    else:
+        kinematic_scaling = builder.AddNamedSystem(
+            "kinematic_scaling", KinematicScaling(scaling, CLUTCH_PERIOD, start_W)
+        )
     read, command = device.GetOutputPort("pose_master"), display.GetInputPort("wrench_command")
     if scenario.master.steps().any() and isinstance(model, HapticDevice):
         encoders = Encoders(model, q_start, scenario.master.steps())
@@ -82,7 +91,12 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
         builder.Connect(read, held_pose.get_input_port())
         builder.Connect(held_wrench.get_output_port(), command)
         read, command = held_pose.get_output_port(), held_wrench.get_input_port()
-    builder.Connect(read, kinematic_scaling.GetInputPort("pose_master"))
+    if scenario.master.leads_joints:
+        state = device.GetOutputPort("state")
+        builder.Connect(state, kinematic_scaling.GetInputPort("master_state"))
+        export(builder, kinematic_scaling, "leader_joints")
+    else:
+        builder.Connect(read, kinematic_scaling.GetInputPort("pose_master"))
     builder.ExportInput(kinematic_scaling.GetInputPort("clutch"), "clutch")
     export(builder, kinematic_scaling, "pose_command")
 

@@ -25,6 +25,7 @@ from drake_teleop.slave.drake_contact import DrakeContact
 from drake_teleop.slave.forward_kinematics import ForwardKinematics
 from drake_teleop.slave.ik_methods import METHODS, method_of
 from drake_teleop.slave.joint_control import MakeJointControl
+from drake_teleop.slave.joint_follower import JointFollower
 from drake_teleop.slave.joint_trajectory import JointTrajectory
 from drake_teleop.slave.monitor import SlaveMonitor
 from drake_teleop.slave.moving_pose import MovingPose
@@ -51,7 +52,8 @@ def MakeSlaveSide(
 
         name: slave_side
         input_ports:
-        - pose_command: (7,) X_WS that it shall follow
+        - pose_command: (7,) X_WS that it shall follow; or leader_joints: (n,) [rad], if a leader
+          leads joint by joint
         output_ports:
         - wrench_B: (6,) F_E_B, what the hand should feel, in the master's base [N, N m]; not a
           number while there is a fault
@@ -82,15 +84,18 @@ def MakeSlaveSide(
     body = _add_body(builder, scenario, load_estimate, load_covariance)
     arm = body.slave.arm
 
-    start = body.slave.start
+    start, led = body.slave.start, scenario.master.leads_joints
     make_ik = METHODS[method_of(scenario.slave.inverse_kinematics, arm)]
+    make_ik = JointFollower if led else make_ik
     ik = builder.AddNamedSystem("inverse_kinematics", make_ik(arm, start, body.command_period))
-    builder.Connect(body.sample["joint_position"], ik.GetInputPort("joint_position"))
+    if not led:
+        builder.Connect(body.sample["joint_position"], ik.GetInputPort("joint_position"))
     builder.Connect(
         ik.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
     )
     builder.Connect(ik.GetOutputPort("ik_status"), body.monitor.GetInputPort("ik_status"))
-    builder.ExportInput(ik.GetInputPort("pose_command"), "pose_command")
+    setpoint = "leader_joints" if led else "pose_command"
+    builder.ExportInput(ik.GetInputPort(setpoint), setpoint)
     export(builder, ik, "joint_command")
     export(builder, body.monitor, "ik_status")
 

@@ -1,0 +1,143 @@
+"""A leader that leads joint by joint: two arms of the same kinematics, of different sizes."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.analysis.linearization import linearize
+from drake_teleop.channel.channel import Channel
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identification import true_load
+from drake_teleop.master.data_sheets import Master
+from drake_teleop.master.leader_model import Leader
+from drake_teleop.operator.operator import Sine
+from drake_teleop.resources import models_dir
+from drake_teleop.scaling.joint_coupling import JointCoupling
+from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.simulation import simulate
+from drake_teleop.slave.arm import jacobian
+from drake_teleop.slave.forward_kinematics import pose_into
+from drake_teleop.slave.inverse_kinematics import IkStatus
+from drake_teleop.slave.joint_follower import JointFollower
+from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.slave.slave_config import Slave
+from drake_teleop.slave.tool import Tool
+from drake_teleop.station import MakeTeleopStation
+
+HOME = [0.2, -0.6, 1.9, 0.3, 0.5, -0.2]
+FILE = models_dir() / "leader_arm.urdf"
+SCALE, FORCE = 2.0, 0.25  # lengths, slave over leader; forces, leader over slave
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory):
+    """The slave is the leader's model in twice its size, with motors for that."""
+    path = tmp_path_factory.mktemp("arms") / "slave.urdf"
+
+    def larger(match):
+        return f'xyz="{" ".join(f"{SCALE * float(x):g}" for x in match[1].split())}"'
+
+    origins = re.sub(r'(?<=<origin )xyz="([^"]*)"', larger, FILE.read_text())
+    path.write_text(re.sub('effort="[^"]*"', 'effort="50"', origins))
+    leader = Leader(file=str(FILE), hand_frame="hand", home=HOME, leads="joints")
+    tool = Tool(mass=0.3, com=[0.01, -0.02, 0.04])
+    slave = Slave(model=str(path), sensor_frame="hand", home=HOME, tool=tool)
+    return replace(
+        LoadScenario("free_motion_force"),
+        slave=slave,
+        master=Master(model="leader", leader=leader),
+        wrist_sensor__ideal=True,
+        force_scaling__sigma=0.5,
+        force_scaling__force_scale=FORCE,
+        simulation__settle=0.0,
+        simulation__duration=0.1,
+        operator__intent=[],
+    )
+
+
+def run(scenario):
+    station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
+    return simulate(station, scenario.simulation, progress=False)
+
+
+def test_each_joint_follows_its_own(scenario):
+    move = Sine(duration=1.0, ramp=0.02, frequency=4.0, translation=[0.03, 0.02, 0.03],
+                rotation=[0.2, -0.1, 0.3])  # fmt: skip
+    result = run(replace(scenario, operator__intent=[move]))
+    slave = result["joint_command"]
+    np.testing.assert_allclose(slave, result["master_state"][:, :6], rtol=0, atol=1e-12)
+    assert np.ptp(slave, axis=0).min() > 1e-3
+    assert (result["ik_status"] == IkStatus.OK).all()
+    # The pose is S where the joints shall be, twice as far from the base as the hand.
+    moved = result["pose_command"][-1, 4:] - result["pose_command"][0, 4:]
+    hand = result["pose_master"][-1, 4:] - result["pose_master"][0, 4:]
+    np.testing.assert_allclose(moved, SCALE * hand, rtol=1e-6, atol=1e-9)
+
+
+def test_the_hand_feels_sigma_of_the_load_along_the_axes_of_the_tool(scenario):
+    """Scaled, in world axes; and J^T of the leader is that of the slave but for its size."""
+    result = run(scenario)
+    felt, measured = (result[name][-1].copy() for name in ("force_to_master", "measured_wrench_S"))
+    slave, device = NominalSlave(scenario.slave), scenario.master.device(0.0, 0.0)
+    q, X_WS, J = np.array(result["joint_position"][-1]), np.empty(7), np.empty((6, 6))
+    pose_into(slave.arm.table, q, X_WS)
+    R_WS = Rotation.from_quat(X_WS[:4], scalar_first=True)
+    for part in (slice(0, 3), slice(3, 6)):
+        expected = -FORCE * 0.5 * R_WS.apply(measured[part])
+        np.testing.assert_allclose(felt[part], expected, atol=0.01 * np.abs(expected).max())
+    assert felt[2] == pytest.approx(-FORCE * 0.5 * 0.3 * 9.81, rel=0.05)
+    jacobian(slave.arm.table, q, J)
+    size = np.repeat([1.0 / SCALE, 1.0], 3)[:, None]
+    np.testing.assert_allclose(device.jacobian(q), size * J, atol=1e-12)
+
+
+def test_a_clutch_that_is_open_holds_and_one_that_closes_leads_back(scenario):
+    slave = NominalSlave(scenario.slave)
+    start = slave.start + np.linspace(-0.1, 0.2, 6)
+    coupling = JointCoupling(slave.arm, start, np.array(HOME), 0.01)
+    context = coupling.CreateDefaultContext()
+    leads, clutch = coupling.GetInputPort("master_state"), coupling.GetInputPort("clutch")
+    joints = coupling.GetOutputPort("leader_joints")
+    away = np.append(np.array(HOME) + 0.1, np.zeros(6))
+    for closed, expected in ((0.0, start), (1.0, start + 0.1), (0.0, start + 0.1)):
+        leads.FixValue(context, away)
+        clutch.FixValue(context, [closed])
+        coupling.ExecuteInitializationEvents(context)
+        np.testing.assert_allclose(joints.Eval(context), expected)
+        leads.FixValue(context, np.append(HOME, np.zeros(6)))
+    np.testing.assert_allclose(joints.Eval(context), start + 0.1)
+
+
+def test_the_follower_keeps_limits_and_speeds(scenario):
+    slave = NominalSlave(scenario.slave)
+    follower = JointFollower(slave.arm, slave.start, 0.001)
+    context = follower.CreateDefaultContext()
+    port, command = follower.get_input_port(), follower.GetOutputPort("joint_command")
+    port.FixValue(context, slave.arm.upper + 1.0)
+    assert follower.GetOutputPort("ik_status").Eval(context)[0] == IkStatus.JOINT_LIMIT
+    step = command.Eval(context) - slave.start
+    np.testing.assert_allclose(step, 1e-3 * slave.arm.velocity_limit)
+    port.FixValue(context, np.full(6, np.nan))
+    assert follower.GetOutputPort("ik_status").Eval(context)[0] == IkStatus.BAD_POSE
+    np.testing.assert_array_equal(command.Eval(context), slave.start)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"channel": Channel(delay=0.01)}, "master.leader.leads: a channel carries poses"),
+        ({"slave__sensor_frame": "wrist_2", "slave__home": HOME[:5]}, "has 6 joints, the slave 5"),
+    ],
+)
+def test_what_cannot_be_led(scenario, change, expected):
+    with pytest.raises(DrakeTeleopError, match=expected):
+        MakeTeleopStation(replace(scenario, **change), load_estimate=true_load(scenario))
+
+
+def test_the_analysis_knows_poses_alone(scenario):
+    with pytest.raises(DrakeTeleopError, match=r"master\.leader\.leads"):
+        linearize(scenario, load_estimate=true_load(scenario))
