@@ -349,7 +349,15 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
     "--rate",
     type=option.Number(0, 1e5, min_open=True),
     metavar="HZ",
-    help="Of the readings; a log tells its own.",
+    help="Of the wrenches; a log, a UR and a NetBox tell their own.",
+)
+@click.option("--motion", metavar="SOURCE", help="Who tells the motion, if SOURCE does not.")
+@click.option(
+    "--sensor-pose",
+    nargs=6,
+    type=option.Number(-1e3, 1e3),
+    metavar="X Y Z ROLL PITCH YAW",
+    help="Of the sensor in the frame whose poses come [m, deg].",
 )
 @click.option(
     "--range",
@@ -377,6 +385,8 @@ def compensate(
     sigma: float,
     gamma: float,
     rate: float | None,
+    motion: str | None,
+    sensor_pose: tuple[float, ...] | None,
     largest: tuple[float, float] | None,
     predicted: bool,
     tare: bool,
@@ -387,9 +397,11 @@ def compensate(
 ) -> None:
     """Take the load out of a live wrench.
 
-    SOURCE is udp://[HOST]:PORT, - for lines of JSON on stdin, or replay:LOG; SINK is udp://HOST:PORT,
-    - for stdout, or a .csv or .parquet file. What cannot be trusted is zero, with a flag. --cutoff
-    is causal here; --delay is for logs. Until the source ends, or Ctrl-C.
+    SOURCE is udp://[HOST]:PORT, rtde://HOST, netft://HOST, zenoh://HOST/TOPIC, - for lines of JSON
+    on stdin, or replay:LOG; SINK is udp://HOST:PORT, zenoh://HOST/TOPIC, foxglove://, - for stdout,
+    or a .csv, .parquet or .mcap file. What cannot be trusted is zero, with a flag. --cutoff is
+    causal here; --delay is of the motion behind the wrench, auto: as the load file says. Until the
+    source ends, or Ctrl-C.
     """
     from drake_teleop.robots.compensate import compensate_command
 
@@ -400,6 +412,8 @@ def compensate(
         sigma=sigma,
         gamma=gamma,
         rate_hz=rate,
+        motion=motion,
+        sensor_pose=sensor_pose,
         largest=largest,
         predicted=predicted,
         tare=tare,

@@ -11,21 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.identification import Identification
+from drake_teleop.robots.addresses import sink_of, source_of
 from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
-from drake_teleop.robots.lines import LineSink, LineSource, names_of
-from drake_teleop.robots.replay_log import LogSource
+from drake_teleop.robots.lines import names_of
 from drake_teleop.robots.streams import Compensated, Sink, Source
-from drake_teleop.robots.table import TableSink
-from drake_teleop.robots.udp import THIS_MACHINE, UdpSink, UdpSource, listening
+from drake_teleop.robots.udp import THIS_MACHINE, listening
 
-SINKS = (
-    "udp://HOST:PORT, zenoh://HOST/TOPIC, foxglove://[HOST][:PORT], -, or a .csv, .parquet or"
-    " .mcap file"
-)
-_REPLAY = "replay:"
 _IDLE_S = 0.01  # between wrenches of zero while nothing comes
 
 
@@ -49,61 +42,6 @@ class Control:
     def close(self) -> None:
         """Ends it."""
         self._socket.close()
-
-
-def source_of(
-    address: str,
-    load: Identification | None,
-    *,
-    rate_hz: float | None = None,
-    cutoff_hz: float | None = 30.0,
-    delay: str | float = "auto",
-    real_time: bool = False,
-) -> Source:
-    """The source at an address: udp://[HOST]:PORT, - for stdin, or replay:LOG.
-
-    Raises:
-        DrakeTeleopError: for another address, a live source without a rate, or as the source does.
-    """
-    if address.startswith(_REPLAY):
-        path = address.removeprefix(_REPLAY)
-        options = {"cutoff_hz": cutoff_hz, "delay": delay, "real_time": real_time}
-        return LogSource(path, load, **options)  # type: ignore[arg-type]
-    if address != "-" and not address.startswith("udp://"):
-        raise DrakeTeleopError(
-            "is no source", where=address, remedy="udp://:PORT, - for stdin, or replay:LOG"
-        )
-    if rate_hz is None:
-        raise DrakeTeleopError(
-            "the low-pass needs the rate of the readings", where=address, remedy="give --rate HZ"
-        )
-    if address == "-":
-        return LineSource(sys.stdin.fileno(), 1.0 / rate_hz)
-    return UdpSource(address, 1.0 / rate_hz)
-
-
-def sink_of(address: str) -> Sink:
-    """The sink at an address: one of `SINKS`.
-
-    Raises:
-        DrakeTeleopError: for another address, or as the sink does.
-    """
-    kind, path = address.split("://")[0], Path(address)
-    if address == "-":
-        return LineSink(sys.stdout)
-    if kind == "udp":
-        return UdpSink(address)
-    if kind == "zenoh":
-        from drake_teleop.robots.ros2_sink import Ros2Sink
-
-        return Ros2Sink(address)
-    if kind == "foxglove" or path.suffix == ".mcap":
-        from drake_teleop.robots.foxglove import FoxgloveSink, McapSink
-
-        return FoxgloveSink(address) if kind == "foxglove" else McapSink(path)
-    if kind != address or path.suffix not in (".csv", ".parquet"):
-        raise DrakeTeleopError("is no sink", where=address, remedy=SINKS)
-    return TableSink(path)
 
 
 def run(
@@ -165,11 +103,13 @@ def compensate_command(
     real_time: bool = False,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
+    motion: str | None = None,
+    sensor_pose: tuple[float, ...] | None = None,
 ) -> None:
     """The command `compensate`; what there is to know goes to stderr.
 
     Args:
-        source, sink, rate_hz, real_time, delay: see `source_of` and `sink_of`.
+        source, sink, rate_hz, real_time, delay, motion, sensor_pose: see `source_of` and `sink_of`.
         load: identification.json.
         sigma, gamma, cutoff_hz, predicted: see `Compensator`.
         largest: the sensor's range [N], [N m].
@@ -180,8 +120,16 @@ def compensate_command(
         DrakeTeleopError: if one of them cannot be used.
     """
     found = Identification.load(load)
-    options = {"rate_hz": rate_hz, "cutoff_hz": cutoff_hz, "delay": delay, "real_time": real_time}
-    readings = source_of(source, found, **options)  # type: ignore[arg-type]
+    readings = source_of(
+        source,
+        found,
+        rate_hz=rate_hz,
+        cutoff_hz=cutoff_hz,
+        delay=delay,
+        real_time=real_time,
+        motion=motion,
+        sensor_pose=sensor_pose,
+    )
     limits: Array | None = None if largest is None else np.repeat(largest, 3)
     compensator = Compensator(
         found,
@@ -199,7 +147,8 @@ def compensate_command(
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
-    say(f"late by {1e3 * (0.0 if predicted else compensator.lag_s):.1f} ms")
+    late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
+    say(f"late by {1e3 * late:.1f} ms")
     say(f"stale after {1e3 * STALE_S:.0f} ms; what cannot be trusted is zero")
     try:
         counts = run(readings, compensator, wrenches, control=asked, tare=tare, say=say)

@@ -73,7 +73,7 @@ class NetFtSource:
         DrakeTeleopError: if the address cannot be used, or the box's page cannot be had.
     """
 
-    live = True
+    streams: tuple[str, ...] = (WRENCH,)
 
     def __init__(self, address: str, dt: float | None = None) -> None:
         told = Address(address, PORT, known=("counts", "rate", "sign"))

@@ -50,13 +50,12 @@ class Ros2Source:
         dt: between wrenches [s].
 
     Attributes:
+        streams: see `PartSource`.
         joint_names: in the order of the newest joint positions.
 
     Raises:
         DrakeTeleopError: if the address cannot be used, or a library is missing.
     """
-
-    live = True
 
     def __init__(self, address: str, dt: float) -> None:
         told = Address(address, PORT, known=("pose", "joints", "imu", "tf", "domain", "sign"))
@@ -70,6 +69,7 @@ class Ros2Source:
             if len(self._frames) != 2 or not all(self._frames):
                 raise DrakeTeleopError("tf is not PARENT,CHILD", where=address)
             topics["tf"] = "tf"
+        self.streams = tuple(_STREAMS.get(name, name) for name in topics)
         needed(address)
         self._types = types()
         self.joint_names: list[str] = []

@@ -41,7 +41,7 @@ class RtdeSource:
         DrakeTeleopError: if the address cannot be used, ur_rtde is missing, or no robot answers.
     """
 
-    live = True
+    streams: tuple[str, ...] = (WRENCH, POSE, IMU)
 
     def __init__(self, address: str) -> None:
         told = Address(address, PORT, known=("sign",))

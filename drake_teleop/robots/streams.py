@@ -100,6 +100,24 @@ class Source(Protocol):
         """Ends it."""
 
 
+class PartSource(Protocol):
+    """Likewise of parts; `assembly` makes readings of them.
+
+    Attributes:
+        dt: between wrenches [s].
+        streams: that it tells.
+    """
+
+    dt: float
+    streams: tuple[str, ...]
+
+    def read(self, timeout_s: float) -> list[Part] | None:
+        """See `Source`."""
+
+    def close(self) -> None:
+        """See `Source`."""
+
+
 class Sink(Protocol):
     """Where wrenches go."""
 

@@ -15,7 +15,9 @@ import time
 
 DT = 0.002
 FLAWS = ("good", "lost", "twice", "swapped", "nan", "short", "saturated", "silent", "late", "good")
+SEEN = ("good", "lost", "nans", "silent", "old", "good")  # by who looks now and then
 TWO = ("good", "good")
+LONG = 20
 EACH = 6  # samples of a chapter; what is wrong stands in its middle
 SILENCE_S = 0.09
 
@@ -40,7 +42,13 @@ def chapters(flaws=FLAWS):
             number += gone
         elif flaw == "late":  # what was taken long ago comes now
             rows[middle] = (0.0, number - EACH - 60, "")
-        elif flaw not in ("good",):
+        elif flaw == "old":
+            rows = [(DT, number - 40 + k, "") for k in range(LONG)]
+            number += LONG - EACH
+        elif flaw == "nans":
+            rows = [(DT, number - EACH + k, "nan") for k in range(LONG)]
+            number += LONG - EACH
+        elif flaw != "good":
             rows[middle] = (*rows[middle][:2], flaw)
         yield from rows
 
@@ -97,7 +105,7 @@ def rtde(host):
         "actual_tool_accelerometer": "VECTOR3D",
     }
     print(host, flush=True)
-    for flaws, start in ((FLAWS, 100.0), (("good",) * 5, 1.0)):
+    for flaws, start in ((SEEN, 100.0), (("good",) * 20, 1.0)):
         with socket.create_server((host, 30004)) as door:
             robot, _ = door.accept()
         robot.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

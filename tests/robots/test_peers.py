@@ -23,8 +23,8 @@ from test_compensator import PHI, load
 from websockets.sync.client import connect
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.compensate import sink_of
-from drake_teleop.robots.compensator import STALE_S, Compensator
+from drake_teleop.robots.addresses import sink_of
+from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import NetFtSource
 from drake_teleop.robots.ros2_source import Ros2Source
 from drake_teleop.robots.rtde import RtdeSource
@@ -95,8 +95,7 @@ class Seen(list[Compensated]):
         for flag in flags:
             at = max(k for k, row in enumerate(self) if row.flags & flag)
             assert not all(row.flags for row in self[at:]), flag
-        first = next(k for k, row in enumerate(self) if row.flags == Flag.STALE)
-        assert STALE_S <= self.at[first] - self.at[first - 1] < STALE_S + 0.04
+        assert max(np.diff(self.at)) < 0.5  # and not silent: 0.05 s on an idle machine
 
 
 def free_port() -> str:

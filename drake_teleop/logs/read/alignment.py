@@ -119,7 +119,7 @@ def smooth_derivatives(
         x, dx/dt, d^2x/dt^2, each shaped as `x`.
     """
     n = len(x)
-    weights = _smoother(n, dt, bandwidth_hz)
+    weights = smoother(n, dt, bandwidth_hz)
     half = weights.shape[1] // 2
     flat = x.reshape(n, -1)
     inner = [
@@ -138,12 +138,17 @@ def smooth_derivatives(
 
 def noise_gain(dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
     """(3,) white-noise gains of `smooth_derivatives`: of x [1], dx/dt [1/s], d^2x/dt^2 [1/s^2]."""
-    weights = _smoother(10**9, dt, bandwidth_hz)
+    weights = smoother(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
 
-def _smoother(n: int, dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
-    """(6, w) weights of a window's samples in the coefficients of its polynomial."""
+def smoother(n: int, dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
+    """(6, w) weights of a window's samples in the coefficients of its polynomial.
+
+    Args:
+        n: samples that there are; the window is not longer.
+        dt, bandwidth_hz: see `smooth_derivatives`.
+    """
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW / bandwidth_hz
     half = max(_SMOOTHER_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
     powers = np.vander(np.arange(-half, half + 1) / half, _SMOOTHER_DEGREE + 1, increasing=True)

@@ -1,0 +1,147 @@
+"""Sources and sinks by their addresses."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.identification import Identification
+from drake_teleop.robots.assembly import Assembly, pose_of
+from drake_teleop.robots.lines import LineSink, LineSource
+from drake_teleop.robots.replay_log import LogSource
+from drake_teleop.robots.streams import PartSource, Sink, Source
+from drake_teleop.robots.table import TableSink
+from drake_teleop.robots.udp import UdpSink, UdpSource
+
+_SOURCES = "udp://:PORT, rtde://HOST, netft://HOST, zenoh://HOST/TOPIC, - for stdin, or replay:LOG"
+_SINKS = (
+    "udp://HOST:PORT, zenoh://HOST/TOPIC, foxglove://[HOST][:PORT], -, or a .csv, .parquet or"
+    " .mcap file"
+)
+_REPLAY = "replay:"
+_OF_PARTS = ("rtde", "netft", "zenoh")
+
+
+def source_of(
+    address: str,
+    load: Identification | None,
+    *,
+    rate_hz: float | None = None,
+    cutoff_hz: float | None = 30.0,
+    delay: str | float = "auto",
+    real_time: bool = False,
+    motion: str | None = None,
+    sensor_pose: tuple[float, ...] | None = None,
+) -> Source:
+    """The source at an address: udp, rtde, netft, zenoh, - for stdin, or replay:LOG.
+
+    Args:
+        address: see the sources; docs/robot.md lists them.
+        load: tells the delay, of a log that of which it is the wrench, else its own.
+        rate_hz: of the wrenches; a log, a UR and a NetBox tell their own.
+        cutoff_hz, delay: as of `eliminate_log`; see `Assembly`, too.
+        real_time: replays a log in its own time.
+        motion: address of another source that tells the motion, if the first does not.
+        sensor_pose: of the sensor in the frame whose poses come: x, y, z [m], and roll, pitch, yaw
+            [deg] about its axes, as in a URDF.
+
+    Raises:
+        DrakeTeleopError: for another address, a live source without a rate, or as the source does.
+    """
+    kind = _kind(address)
+    if kind in _OF_PARTS:
+        return _assembled(address, load, rate_hz, cutoff_hz, delay, motion, sensor_pose)
+    if motion is not None or sensor_pose is not None:
+        raise DrakeTeleopError(
+            "tells the motion of the sensor itself", where=address, remedy="without --motion"
+        )
+    if kind == "replay":
+        path = address.removeprefix(_REPLAY)
+        options = {"cutoff_hz": cutoff_hz, "delay": delay, "real_time": real_time}
+        return LogSource(path, load, **options)  # type: ignore[arg-type]
+    if kind not in ("-", "udp"):
+        raise DrakeTeleopError("is no source", where=address, remedy=_SOURCES)
+    dt = _period(rate_hz, address)
+    return LineSource(sys.stdin.fileno(), dt) if kind == "-" else UdpSource(address, dt)
+
+
+def sink_of(address: str) -> Sink:
+    """The sink at an address: udp, zenoh, foxglove, - for stdout, .csv, .parquet or .mcap.
+
+    Raises:
+        DrakeTeleopError: for another address, or as the sink does.
+    """
+    kind, path = _kind(address), Path(address)
+    if kind == "-":
+        return LineSink(sys.stdout)
+    if kind == "udp":
+        return UdpSink(address)
+    if kind == "zenoh":
+        from drake_teleop.robots.ros2_sink import Ros2Sink
+
+        return Ros2Sink(address)
+    if kind == "foxglove" or (not kind and path.suffix == ".mcap"):
+        from drake_teleop.robots.foxglove import FoxgloveSink, McapSink
+
+        return FoxgloveSink(address) if kind else McapSink(path)
+    if kind or path.suffix not in (".csv", ".parquet"):
+        raise DrakeTeleopError("is no sink", where=address, remedy=_SINKS)
+    return TableSink(path)
+
+
+def _kind(address: str) -> str:
+    """What stands before ://; "-", "replay", or "" for a file."""
+    if address.startswith(_REPLAY):
+        return "replay"
+    return address.partition("://")[0] if "://" in address or address == "-" else ""
+
+
+def _period(rate_hz: float | None, address: str) -> float:
+    if rate_hz is None:
+        raise DrakeTeleopError(
+            "the low-pass needs the rate of the readings", where=address, remedy="give --rate HZ"
+        )
+    return 1.0 / rate_hz
+
+
+def _of_parts(address: str, rate_hz: float | None) -> PartSource:
+    kind = _kind(address)
+    if kind == "rtde":
+        from drake_teleop.robots.rtde import RtdeSource
+
+        return RtdeSource(address)
+    if kind == "netft":
+        from drake_teleop.robots.netft import NetFtSource
+
+        return NetFtSource(address, None if rate_hz is None else 1.0 / rate_hz)
+    if kind == "zenoh":
+        from drake_teleop.robots.ros2_source import Ros2Source
+
+        return Ros2Source(address, _period(rate_hz, address))
+    raise DrakeTeleopError("tells no motion", where=address, remedy="rtde://HOST or zenoh://HOST")
+
+
+def _assembled(
+    address: str,
+    load: Identification | None,
+    rate_hz: float | None,
+    cutoff_hz: float | None,
+    delay: str | float,
+    motion: str | None,
+    sensor_pose: tuple[float, ...] | None,
+) -> Source:
+    wrench = _of_parts(address, rate_hz)
+    other: PartSource | None = None
+    try:
+        if motion is not None:
+            other = _of_parts(motion, 1.0 / wrench.dt)
+        if isinstance(delay, str):
+            delay = 0.0 if load is None else load.delay_s
+        X_FS = None if sensor_pose is None else pose_of(sensor_pose)
+        return Assembly(wrench, other, cutoff_hz=cutoff_hz, delay_s=delay, X_FS=X_FS)
+    except BaseException:
+        for each in (wrench, other):
+            if each is not None:
+                each.close()
+        raise

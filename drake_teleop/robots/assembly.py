@@ -1,0 +1,249 @@
+"""Readings from parts: the wrench of one stream, the motion at that instant of another.
+
+The motion follows from poses as in a log: around each a polynomial of degree 5 is fitted to a
+window of 1.8 / cut-off, and its derivatives in the middle are taken (`logs.read.alignment`). So a
+motion is known half a window after it was, and the wrench waits for it, 30 ms at 30 Hz; both are
+of the same instant then. Poses that come at uneven times are put onto a grid first, on straight
+lines; without one for `STALE_S` the window begins anew.
+
+Specific force and angular velocity of an IMU in S go the same way, if nobody tells poses.
+
+**Clocks.** Streams of one source have one clock. Those of two are related by what each took least
+time for, as in `compensator`: what the motion takes longer on its way than the wrench cannot be
+seen, and is the delay that `identify` finds.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array
+from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW, smoother
+from drake_teleop.logs.read.rotations import quaternions, rotation_matrices
+from drake_teleop.robots.compensator import DRIFT, JUMP_S, STALE_S
+from drake_teleop.robots.export import turn
+from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Flag, Part, PartSource, Reading
+
+_GRAVITY = np.array([0.0, 0.0, -9.81])
+_KEPT_S = 0.5  # of motions and wrenches
+_SPACINGS = 20  # that tell the rate of the motion
+
+
+class Window:
+    """Motions of S from samples as they come, late by half a window.
+
+    The grid's spacing is the median of the first ones.
+
+    Args:
+        cutoff_hz: see the module; None for the shortest window.
+        X_FS: (7,) pose of the sensor in the frame whose poses come.
+    """
+
+    def __init__(self, cutoff_hz: float | None, X_FS: Array) -> None:
+        self._cutoff_hz, self._dt = cutoff_hz, 0.0
+        self._weights, self._size = np.zeros((3, 1)), 1
+        self._R_FS, self._p_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0], X_FS[4:]
+        self._steps: list[float] = []
+        self.forget()
+
+    def forget(self) -> None:
+        """Begins anew."""
+        self._last: tuple[float, Array] | None = None
+        self._next, self._rows = 0.0, deque[Array](maxlen=self._size)
+        self._came = -math.inf
+
+    def _measure(self, step: float) -> None:
+        self._steps.append(step)
+        if len(self._steps) == _SPACINGS:
+            self._dt = float(np.median(self._steps))
+            self._weights = smoother(10**9, self._dt, self._cutoff_hz)[:3]
+            self._size = self._weights.shape[1]
+            self.forget()
+
+    def take(self, part: Part, now: float) -> list[tuple[float, Array]]:
+        """Times and motions (9,) that are known by a sample now."""
+        row = self._row(part)
+        if not (math.isfinite(part.t) and np.isfinite(row).all()) or part.flags:
+            return []
+        last = self._last
+        step = math.inf if last is None else part.t - last[0]
+        if step <= 0.0 and now - self._came <= STALE_S:
+            return []  # out of order, or the same
+        if not self._dt and 0.0 < step <= STALE_S:
+            self._measure(step)
+        if self._last is None or not 0.0 < step <= STALE_S:
+            self.forget()
+            self._next, last = part.t, (part.t, row)
+        self._last, self._came = (part.t, row), now
+        found: list[tuple[float, Array]] = []
+        if not self._dt or last is None:
+            return found
+        while self._next <= part.t:
+            share = (self._next - last[0]) / max(part.t - last[0], 1e-9)
+            self._rows.append(last[1] + share * (row - last[1]))
+            if len(self._rows) == self._size:
+                found.append((self._next - self._size // 2 * self._dt, self._middle()))
+            self._next += self._dt
+        return found
+
+    def _row(self, part: Part) -> Array:
+        """(12,) R_WS and p_WS, or (6,) as they come."""
+        if part.stream == IMU:
+            return part.values
+        R_WF = rotation_matrices(part.values[None, :4], "quaternion_wxyz")[0]
+        return np.concatenate([(R_WF @ self._R_FS).ravel(), part.values[4:] + R_WF @ self._p_FS])
+
+    def _middle(self) -> Array:
+        """(9,) specific force, angular velocity and acceleration in the middle of the window."""
+        rows = np.array(self._rows)
+        smooth, first, second = self._weights @ rows
+        if rows.shape[1] == 6:
+            return np.concatenate([smooth, first[3:]])
+        R_WS = rows[self._size // 2, :9].reshape(3, 3)
+        omega, alpha = R_WS.T @ first[:9].reshape(3, 3), R_WS.T @ (2.0 * second[:9]).reshape(3, 3)
+        s = R_WS.T @ (2.0 * second[9:] - _GRAVITY)
+        return np.concatenate([s, _axis(omega), _axis(alpha)])
+
+
+def _axis(A: Array) -> Array:
+    """The vector of a matrix's skew part."""
+    return 0.5 * np.array([A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]])
+
+
+def pose_of(numbers: Sequence[float]) -> Array:
+    """(7,) quaternion and position of x, y, z [m], roll, pitch, yaw [deg], as in a URDF."""
+    roll, pitch, yaw = np.radians(numbers[3:])
+    R = turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)
+    return np.concatenate([quaternions(R[None])[0], numbers[:3]])
+
+
+class _Offset:
+    """Our clock less another, by what took least time."""
+
+    def __init__(self) -> None:
+        self.now_less_t, self._now = math.inf, 0.0
+
+    def follow(self, t: float, now: float) -> None:
+        if math.isfinite(t):
+            ahead, faded = now - t, self.now_less_t + DRIFT * (now - self._now)
+            known = abs(ahead - self.now_less_t) <= JUMP_S
+            self.now_less_t, self._now = min(ahead, faded) if known else ahead, now
+
+
+class Assembly:
+    """A source of readings made of one or two of parts.
+
+    Args:
+        wrench: tells the wrench, and without `motion` the motion, too.
+        motion: tells the motion.
+        cutoff_hz: see the module.
+        delay_s: by how much the motion's stamps come behind the wrench's [s].
+        X_FS: (7,) [w, x, y, z] and position [m] of the sensor in the frame that is posed.
+
+    Attributes:
+        lag_s: by how much readings come late, if poses come often enough for the window [s].
+
+    Raises:
+        DrakeTeleopError: if nobody tells a motion.
+    """
+
+    live = True
+
+    def __init__(
+        self,
+        wrench: PartSource,
+        motion: PartSource | None = None,
+        *,
+        cutoff_hz: float | None = 30.0,
+        delay_s: float = 0.0,
+        X_FS: Array | None = None,
+    ) -> None:
+        self._wrench, self._motion, self._delay = wrench, motion, delay_s
+        self.dt = wrench.dt
+        streams = (wrench if motion is None else motion).streams
+        self._told = next((stream for stream in (POSE, IMU) if stream in streams), "")
+        if not self._told:
+            raise DrakeTeleopError(
+                "tells no motion", where="the source", remedy="give --motion rtde://HOST, say"
+            )
+        nowhere = np.array([1.0, 0, 0, 0, 0, 0, 0])
+        self._window = Window(cutoff_hz, nowhere if X_FS is None else X_FS)
+        self.lag_s = max(0.0, delay_s)
+        if cutoff_hz is not None:
+            self.lag_s = max(0.0, 0.5 * SMOOTHER_WINDOW / cutoff_hz + delay_s)
+        self._clocks = _Offset(), _Offset()
+        self._motions: deque[tuple[float, Array]] = deque()
+        self._waiting: deque[Part] = deque(maxlen=round(_KEPT_S / self.dt))
+
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        """See `Source`."""
+        found: list[Reading] = []
+        if self._motion is not None:
+            for part in self._motion.read(0.0) or ():
+                if part.stream != WRENCH:
+                    found += self.take(part, time.monotonic())
+        parts = self._wrench.read(timeout_s)
+        if parts is None:
+            return None
+        for part in parts:
+            if self._motion is None or part.stream == WRENCH:
+                found += self.take(part, time.monotonic())
+        return found
+
+    def take(self, part: Part, now: float) -> list[Reading]:
+        """The readings that are whole by a part that came at `now`. It never raises."""
+        if part.stream == WRENCH:
+            self._clocks[0].follow(part.t, now)
+            self._waiting.append(part)
+        elif part.stream == self._told:
+            self._clocks[1].follow(part.t, now)
+            shift = -self._delay
+            if self._motion is not None:
+                shift += self._clocks[1].now_less_t - self._clocks[0].now_less_t
+            for t, motion in self._window.take(part, now):
+                self._keep(t + shift, motion)
+        found = []
+        while self._waiting and (reading := self._whole(self._waiting[0])) is not None:
+            self._waiting.popleft()
+            found.append(reading)
+        return found
+
+    def _keep(self, t: float, motion: Array) -> None:
+        motions = self._motions
+        if motions and not motions[-1][0] - STALE_S < t < motions[-1][0] + _KEPT_S:
+            motions.clear()  # another clock: what waits for a motion by the old one waits for ever
+            waiting = [each for each in self._waiting if not abs(each.t - t) > _KEPT_S]
+            self._waiting = deque(waiting, self._waiting.maxlen)
+        if math.isfinite(t) and (not motions or t > motions[-1][0]):
+            motions.append((t, motion))
+            while t - motions[0][0] > _KEPT_S:
+                motions.popleft()
+
+    def _whole(self, part: Part) -> Reading | None:
+        """With the motion of its instant, or stale without; None while it has to wait for it."""
+        values, flags, motions = np.zeros(VALUES), part.flags, self._motions
+        values[:6] = part.values
+        if not math.isfinite(part.t):
+            return Reading(part.number, part.t, values, flags)
+        if not motions or part.t > motions[-1][0]:
+            return None
+        at = bisect_right(motions, part.t, key=lambda each: each[0])
+        after, before = motions[min(at, len(motions) - 1)], motions[max(0, at - 1)]
+        if part.t < before[0] or after[0] - before[0] > STALE_S:
+            return Reading(part.number, part.t, values, flags | Flag.STALE)
+        share = (part.t - before[0]) / max(after[0] - before[0], 1e-9)
+        values[6:] = before[1] + share * (after[1] - before[1])
+        return Reading(part.number, part.t, values, flags)
+
+    def close(self) -> None:
+        """See `Source`."""
+        self._wrench.close()
+        if self._motion is not None:
+            self._motion.close()

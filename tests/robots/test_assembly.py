@@ -1,0 +1,158 @@
+"""Wrench and motion of the same instant, made of streams that tell one or the other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from test_compensator import OFFSETS, PHI, load
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.robots.assembly import Assembly
+from drake_teleop.robots.compensator import Compensator
+from drake_teleop.robots.streams import IMU, POSE, WRENCH, Flag, Part, Reading
+
+DT, GRAVITY = 0.001, np.array([0.0, 0.0, 9.81])
+X_FS = np.array([math.cos(0.3), 0.0, math.sin(0.3), 0.0, 0.02, -0.03, 0.08])
+
+
+def turn(axis: int, angle: float) -> np.ndarray:
+    c, s, R = math.cos(angle), math.sin(angle), np.eye(3)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R[i, i], R[j, j], R[i, j], R[j, i] = c, c, -s, s
+    return R
+
+
+def truth(t: float) -> tuple[np.ndarray, np.ndarray]:
+    """X_WF (7,), and the motion of S (9,), by closed forms: R_WF = Rz(a) Rx(b), b constant rate."""
+    a, da, dda = 0.5 * math.sin(4 * t), 2.0 * math.cos(4 * t), -8.0 * math.sin(4 * t)
+    b, db = 0.7 * t, 0.7
+    R_WF = turn(2, a) @ turn(0, b)
+    z = turn(0, b).T @ [0.0, 0.0, 1.0]  # in F, as are those that follow
+    omega = da * z + [db, 0.0, 0.0]
+    alpha = dda * z + da * np.cross(z, [db, 0.0, 0.0])
+    p, ddp = np.array([0.1 * math.sin(5 * t), 0.2, 0.0]), np.array([-2.5 * math.sin(5 * t), 0, 0])
+    R_FS, r = turn(1, 0.6), X_FS[4:]
+    origin = R_WF.T @ (ddp + GRAVITY)
+    s = origin + np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
+    half = (math.cos(a / 2) * math.cos(b / 2), math.cos(a / 2) * math.sin(b / 2))
+    other = (math.sin(a / 2) * math.sin(b / 2), math.sin(a / 2) * math.cos(b / 2))
+    pose = np.array([*half, *other, *p])
+    return pose, np.concatenate([R_FS.T @ x for x in (s, omega, alpha)])
+
+
+class Told:
+    """A source of parts, or of its streams."""
+
+    def __init__(self, *streams: str) -> None:
+        self.dt, self.streams = DT, streams
+
+    def read(self, timeout_s: float) -> list[Part]:
+        return []
+
+    def close(self) -> None:
+        pass
+
+
+def wrench_at(t: float, k: int) -> Part:
+    motion = np.split(truth(t)[1], 3)
+    return Part(WRENCH, k, t, non_contact_wrench(*motion, PHI) + OFFSETS)
+
+
+def played(
+    assembly: Assembly, seconds: float, *, lost=lambda k: False, later: float = 0.0
+) -> list[Reading]:
+    """Wrench at 1 kHz, poses at 500 Hz, whose clock is `later`; some poses do not come."""
+    found = []
+    for k in range(round(seconds / DT)):
+        t = k * DT
+        if k % 2 == 0 and not lost(k):
+            found += assembly.take(Part(POSE, k // 2, t + later, truth(t)[0]), t)
+        found += assembly.take(wrench_at(t, k), t)
+    return found
+
+
+@pytest.mark.parametrize("lost", [lambda k: False, lambda k: k % 14 == 0])
+def test_the_motion_is_that_of_the_wrenchs_instant(lost) -> None:
+    found = played(Assembly(Told(WRENCH, POSE), X_FS=X_FS), 0.4, lost=lost)
+    good = [each for each in found if not each.flags]
+    assert len(good) > 200 and good[-1].t > 0.4 - 0.035  # half a window late
+    wanted = np.array([truth(each.t)[1] for each in good])
+    motion = np.array([each.values[6:] for each in good])
+    worst = np.abs(motion - wanted).max(axis=0)
+    np.testing.assert_array_less(worst, np.repeat([0.01, 0.002, 0.1], 3))
+    compensator = Compensator(load(), DT)
+    out = [compensator.step(each, each.t) for each in found]
+    assert not any(row.contact.any() for row in out if row.flags)
+    left = np.array([row.contact for row in out if not row.flags])
+    assert len(left) > 200 and np.abs(left).max() < 0.03  # of 17 N
+
+
+def test_two_clocks() -> None:
+    apart = Assembly(Told(WRENCH), Told(POSE), X_FS=X_FS)
+    same = Assembly(Told(WRENCH, POSE), X_FS=X_FS)
+    a, b = played(apart, 0.3, later=1e4), played(same, 0.3)
+    good = [each.values for each in a if not each.flags], [x.values for x in b if not x.flags]
+    np.testing.assert_allclose(good[0][-150:], good[1][-150:], atol=1e-4)
+    late = Assembly(Told(WRENCH), Told(POSE), X_FS=X_FS, delay_s=0.01)
+    shifted = [each for each in played(late, 0.3, later=1e4) if not each.flags]
+    np.testing.assert_allclose(shifted[-1].values[6:], truth(shifted[-1].t + 0.01)[1], atol=0.1)
+
+
+def test_without_poses_there_is_no_motion_and_it_begins_anew() -> None:
+    assembly = Assembly(Told(WRENCH, POSE), X_FS=X_FS)
+    found = played(assembly, 0.6, lost=lambda k: 200 <= k < 280)
+    assert not any(0.2 <= each.t < 0.28 for each in found if not each.flags)
+    assert {each.flags for each in found} == {0, int(Flag.STALE)}
+    assert [each.flags for each in found[-150:]] == [0] * 150
+
+
+def test_what_is_no_pose_or_out_of_order_is_left_out() -> None:
+    assembly = Assembly(Told(WRENCH, POSE), X_FS=X_FS)
+    played(assembly, 0.3)
+    for values, t in (
+        (np.full(7, math.nan), 0.3),
+        (truth(0.2)[0], 0.2),
+        (truth(0.3)[0], math.nan),
+        (truth(0.3)[0], math.inf),
+    ):
+        assert assembly.take(Part(POSE, 0, t, values), 0.3) == []
+    after = [each for k in range(300, 400) for each in assembly.take(wrench_at(k * DT, k), k * DT)]
+    assert after == []  # as no more motions are known
+
+
+def test_a_clock_that_is_set_back() -> None:
+    assembly = Assembly(Told(WRENCH, POSE), X_FS=X_FS)
+    compensator = Compensator(load(), DT)
+    for each in played(assembly, 0.2):
+        compensator.step(each, each.t + 0.03)
+    out = []
+    for k in range(300):
+        t, now = k * DT - 50.0, 0.2 + k * DT
+        parts = [Part(WRENCH, 200 + k, t, wrench_at(t, 0).values)]
+        if k % 2 == 0:
+            parts.insert(0, Part(POSE, k, t, truth(t)[0]))
+        for part in parts:
+            out += [compensator.step(each, now) for each in assembly.take(part, now)]
+    left = [row.contact for row in out if not row.flags]
+    assert len(left) > 50 and np.abs(left).max() < 0.03
+    assert any(row.flags & Flag.CLOCK_JUMP for row in out)
+
+
+def test_an_imu_tells_it_too() -> None:
+    assembly, found = Assembly(Told(WRENCH, IMU)), []
+    for k in range(250):
+        t = k * DT
+        found += assembly.take(Part(IMU, k, t, truth(t)[1][:6]), t)
+        found += assembly.take(wrench_at(t, k), t)
+    good = [each for each in found if not each.flags]
+    wanted = np.array([truth(each.t)[1] for each in good])
+    motion = np.array([each.values[6:] for each in good])
+    np.testing.assert_array_less(np.abs(motion - wanted).max(axis=0), [0.01] * 6 + [0.1] * 3)
+
+
+def test_a_wrench_alone_is_not_enough() -> None:
+    with pytest.raises(DrakeTeleopError, match="tells no motion; give --motion"):
+        Assembly(Told(WRENCH))
