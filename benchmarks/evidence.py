@@ -80,7 +80,7 @@ def keep(name: str, figures: Any, beside: str) -> None:
         "beside": beside,
         "figures": _rounded(figures),
     }
-    text = json.dumps(record, indent=1, ensure_ascii=False)
+    text = json.dumps(record, ensure_ascii=False)
     RECORDS.mkdir(exist_ok=True)
     (RECORDS / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 

@@ -13,9 +13,11 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import pytest
 import sockets
 from mcap.reader import make_reader
 from peer import HASH
@@ -114,6 +116,7 @@ def test_netft() -> None:
     assert numbers[numbers.index(12) - 1] == 8  # and nothing instead of what was lost
 
 
+@pytest.mark.skipif(find_spec("rtde_receive") is None, reason="ur_rtde has no wheel here")
 def test_rtde() -> None:
     sockets.on_purpose.add(30004)  # of this machine, but not 127.0.0.1
     with peer("rtde", ADDRESS) as (host, _):
