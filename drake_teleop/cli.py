@@ -89,7 +89,14 @@ def run(
     help="Of 127.0.0.1, for the page.",
 )
 @click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser.")
-def drive(scenario: str, record: Path | None, port: int, no_browser: bool) -> None:
+@click.option(
+    "--device",
+    metavar="ADDRESS",
+    help="A haptic device is the hand: udp://127.0.0.1:PORT or haply://localhost:10001.",
+)
+def drive(
+    scenario: str, record: Path | None, port: int, no_browser: bool, device: str | None
+) -> None:
     """Drive a station live in the browser.
 
     SCENARIO is the name of a shipped one or a YAML file; its operator gives the grip alone. One
@@ -98,7 +105,7 @@ def drive(scenario: str, record: Path | None, port: int, no_browser: bool) -> No
     """
     from drake_teleop.live.server import drive_command
 
-    drive_command(scenario, record=record, port=port, browser=not no_browser)
+    drive_command(scenario, record=record, port=port, browser=not no_browser, device=device)
 
 
 @cli.command("scenario")

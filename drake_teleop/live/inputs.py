@@ -199,11 +199,11 @@ def _checked(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]
             raise DrakeTeleopError("has something other than whole numbers", where=where) from None
         if len(values) != len(RANGES):
             raise DrakeTeleopError(f"has {len(line)} numbers, not {len(_COLUMNS)}", where=where)
-        if not max(earlier, 0) <= ms <= _LONGEST or ms % SLICE_MS or (earlier < 0 and ms):
+        if not max(earlier, 0) <= ms <= _LONGEST or (earlier < 0 and ms):
             raise DrakeTeleopError(
                 f"{ms} ms is no time here",
                 where=where,
-                remedy=f"times are multiples of {SLICE_MS} ms, from 0 on, in order",
+                remedy="times are whole milliseconds, from 0 on, in order",
             )
         earlier, inputs = ms, dict(zip(RANGES, values, strict=True))
         for name, (low, high) in RANGES.items():

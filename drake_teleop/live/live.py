@@ -19,6 +19,8 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identified_load import IdentifiedLoad
 from drake_teleop.live.choices import NAMES
 from drake_teleop.live.cockpit import Cockpit
+from drake_teleop.live.device_link import DeviceLink
+from drake_teleop.live.external_master import TICK_MS
 from drake_teleop.live.inputs import CHOICES, RANGES, SLICE_MS
 from drake_teleop.live.messages import parse
 from drake_teleop.live.pace import Pace
@@ -52,6 +54,7 @@ class Live:
         record: the folder of the record; None for none. After a reset another one beside it.
         show: what shows the scene.
         now: the clock [s].
+        link: to a haptic device that is the hand; None for that of a page.
     """
 
     def __init__(
@@ -61,14 +64,16 @@ class Live:
         record: Path | None,
         show: Show,
         now: float,
+        link: DeviceLink | None = None,
     ) -> None:
+        self._link, self._slice_ms = link, SLICE_MS if link is None else TICK_MS
         self.refused, self.asked, self.scene = 0, "", SCENES[0]
         self._scenario, self._load, self._record, self._show = scenario, load, record, show
         self._clients: list[int] = []
         self._driver: int | None = None
         self._drives, self._paused, self._stopped = 0, False, ""
         self._alone_since = now
-        self.pace = Pace(1e-3 * SLICE_MS, now)
+        self.pace = Pace(1e-3 * self._slice_ms, now)
         self._frame_due = now
         self._begin(now)
 
@@ -80,7 +85,11 @@ class Live:
         self._drives += 1
         self._folder = "" if folder is None else str(folder)
         log = None if folder is None else folder / "log.parquet"
-        self._session = Session(self._scenario, self._load, log=log, record=folder)
+        self._session = Session(
+            self._scenario, self._load, log=log, record=folder, device=self._link is not None
+        )
+        if self._link is not None:
+            self._link.begin_anew(now)
         self._cockpit, self._stopped, self._asleep = Cockpit(self._scenario), "", False
         self._refusal = ""
         self._wanted = self._session.inputs
@@ -179,8 +188,9 @@ class Live:
             if self.still or self.pace.wait(now) > 0:
                 break
             self.pace.begin(now)
-            self._slice()
+            self._slice(now)
         now = clock()
+        self._listen(now)
         if self._driver is None and not self._asleep and now - self._alone_since >= _ALONE:
             self._asleep = True
             self._try(self._session.keep)
@@ -189,6 +199,15 @@ class Live:
         self._frame_due = max(self._frame_due + FRAME, now - FRAME)
         return self.frame()
 
+    def _listen(self, now: float) -> None:
+        """A device that speaks drives without a page, too."""
+        if self._link is None or self._link.poll(now) is None:
+            return
+        self._alone_since = now
+        if self._asleep:
+            self._asleep = False
+            self.pace.start(now)
+
     def _try(self, action: Callable[[], None]) -> None:
         """Where the station or the disk cannot go on, the drive stops and says why."""
         try:
@@ -196,18 +215,22 @@ class Live:
         except DrakeTeleopError as error:
             self._stopped = str(error)
 
-    def _slice(self) -> None:
+    def _slice(self, now: float) -> None:
+        by_device = {} if self._link is None else self._link.lead(now)
         try:
-            self._session.apply(self._wanted)
+            self._session.apply(self._wanted.changed(by_device))
         except DrakeTeleopError as error:
-            now = self._session.inputs
-            if self._wanted.station == now.station:
+            present = self._session.inputs
+            if self._wanted.station == present.station:
                 self._stopped = str(error)
             else:  # there is no such station: the present one goes on
                 self._refusal = str(error)
-                self._wanted = self._wanted.changed({name: getattr(now, name) for name in CHOICES})
+                kept = {name: getattr(present, name) for name in CHOICES}
+                self._wanted = self._wanted.changed(kept)
         if not self._stopped:
-            self._try(self._session.advance)
+            self._try(lambda: self._session.advance(self._slice_ms))
+        if self._link is not None and not self._stopped:
+            self._link.send(self._session.force())
         if self._session.ms >= _LONGEST_MS:
             self._stopped = "ten hours are over"
 
@@ -225,6 +248,7 @@ class Live:
             words = [self._refusal, *words]
         return self._frame | {
             "words": words,
+            "device": "" if self._link is None else self._link.text(),
             "factor": round(self.pace.factor * self.pace.slow, 3),
             "late": round(1e3 * self.pace.lateness(), 1),
             "lost": round(self.pace.given_up, 2),
@@ -247,6 +271,8 @@ class Live:
     def close(self) -> None:
         """Ends the drive; its record is complete."""
         self._session.close()
+        if self._link is not None:
+            self._link.close()
 
 
 def _next_to(folder: Path) -> Path:

@@ -34,6 +34,8 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.film import quiet_drake
 from drake_teleop.identified_load import IdentifiedLoad, identified_load
+from drake_teleop.live.device import DrivenBy
+from drake_teleop.live.external_master import with_device
 from drake_teleop.live.live import Live, Show
 from drake_teleop.live.messages import LONGEST
 from drake_teleop.live.scenes import scene
@@ -54,8 +56,10 @@ class LiveDrive:
         url: of the page; whoever has it may drive.
     """
 
-    def __init__(self, scenario: Scenario, record: Path | None, port: int) -> None:
-        setup = live_scenario(scenario)
+    def __init__(
+        self, scenario: Scenario, record: Path | None, port: int, device: str | None = None
+    ) -> None:
+        setup = live_scenario(scenario if device is None else with_device(scenario))
         setup.check()
         if record is not None:
             make_folder(record)  # before there is a Meshcat, which only its own thread may unmake
@@ -63,6 +67,7 @@ class LiveDrive:
         self._pages: dict[ServerConnection, int] = {}
         self._own = setup
         self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
+        self._device = None if device is None else DrivenBy(device)
         self._failed: Exception | None = None
         self._ready, self._over = threading.Event(), threading.Event()
         self._numbers = itertools.count(1)  # of pages
@@ -102,6 +107,8 @@ class LiveDrive:
             for name in ("_live", "_meshcat"):  # none, if it could not be made
                 self.__dict__.pop(name, None)
             gc.collect()
+            if self._device is not None:
+                self._device.close()
             self._over.set()
             self._ready.set()
 
@@ -109,7 +116,8 @@ class LiveDrive:
         with quiet_drake():
             self._meshcat = Meshcat(MeshcatParams(host="localhost"))
         show = show_in(self._meshcat, scenario)
-        return Live(scenario, load, record, show, time.perf_counter())
+        link = None if self._device is None else self._device.link
+        return Live(scenario, load, record, show, time.perf_counter(), link)
 
     async def _serve(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
@@ -170,6 +178,8 @@ class LiveDrive:
         broadcast(self._pages, frame)
         try:
             scenario = scene(live.asked, self._own)
+            if self._device is not None:
+                scenario = with_device(scenario)
             load = await asyncio.to_thread(_load_of, scenario)
         except DrakeTeleopError as error:
             live.refuse(str(error), time.perf_counter())
@@ -273,6 +283,7 @@ def drive(
     record: str | Path | None = None,
     port: int = 0,
     browser: bool = False,
+    device: str | None = None,
 ) -> LiveDrive:
     """Drives a station in the browser: its hand by mouse, keys, gamepad or touch.
 
@@ -284,21 +295,23 @@ def drive(
         record: a folder for the drive, which `run --inputs` repeats; None for none.
         port: of 127.0.0.1; 0 for any that is free.
         browser: whether to open the page in the user's browser.
+        device: a haptic device that is the hand: udp://127.0.0.1:PORT, on which one is listened
+            to, or haply://localhost:10001.
 
     Raises:
-        DrakeTeleopError: if the scenario cannot be used, or the port is taken.
+        DrakeTeleopError: if the scenario cannot be used, or a port is taken.
     """
     if not isinstance(scenario, Scenario):
         scenario = LoadScenario(scenario)
     check_scenario(scenario)
-    live = LiveDrive(scenario, None if record is None else Path(record), port)
+    live = LiveDrive(scenario, None if record is None else Path(record), port, device)
     if browser:
         webbrowser.open(live.url)
     return live
 
 
 def drive_command(
-    scenario: str, *, record: Path | None, port: int, browser: bool, quiet: bool = False
+    scenario: str, *, record: Path | None, port: int, browser: bool, device: str | None = None
 ) -> None:
     """`drake-teleop drive`: until Ctrl-C.
 
@@ -306,7 +319,7 @@ def drive_command(
         DrakeTeleopError: as `drive`.
         KeyboardInterrupt: saying how the drive is repeated, if it is recorded.
     """
-    live = drive(scenario, record=record, port=port, browser=browser)
+    live = drive(scenario, record=record, port=port, browser=browser, device=device)
     print(f"drive it at {live.url}\nCtrl-C ends it", flush=True)
     try:
         live.wait()

@@ -23,6 +23,7 @@ from pydrake.systems.framework import Context
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identified_load import IdentifiedLoad, read_load, write_load
 from drake_teleop.live.choices import BLEND, chosen, filled_after, known_estimate
+from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
 from drake_teleop.live.handing_on import hand_on
 from drake_teleop.live.inputs import INPUTS, SLICE_MS, Inputs, header, read_inputs, row
@@ -41,6 +42,8 @@ _PART_ROWS = 1000
 # begins slowly: with longer ones nothing would happen until it rests.
 _RAMP = 0.05
 _LOAD, _SCENARIO = "load.npz", "scenario.yaml"
+# Where this is, the hand's place in the inputs is that of a device.
+_DEVICE = "device.txt"
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
@@ -83,6 +86,7 @@ class _Station:
         estimate: what it knows of its load.
         load: whose noise floor it knows.
         number: of the stations of this drive, which have different noise; the first is 0.
+        device: as of `Session`.
     """
 
     def __init__(
@@ -91,13 +95,16 @@ class _Station:
         estimate: NDArray[np.float64] | None,
         load: IdentifiedLoad | None,
         number: int,
+        *,
+        device: bool,
     ) -> None:
         self.scenario = scenario
+        make_master = MakeExternalMasterSide if device else MakeLiveMasterSide
         self.station = MakeTeleopStation(
             scenario,
             load_estimate=estimate,
             noise_floor=None if load is None else load.noise_floor,
-            master=MakeLiveMasterSide(scenario, goes_over=number > 0),
+            master=make_master(scenario, goes_over=number > 0),
         )
         seeded = dataclasses.replace(scenario.simulation, seed=scenario.simulation.seed + number)
         self.simulator = MakeSimulator(self.station, seeded)
@@ -167,6 +174,7 @@ class Session:
         load: what the station knows of its load; None if it learns it.
         log: a folder for the log; None keeps it in memory, until `news` has told of it.
         record: where scenario, load and inputs go to; None for nowhere.
+        device: whether the inputs' place is that of a haptic device, and not what a hand wants.
     """
 
     def __init__(
@@ -176,14 +184,17 @@ class Session:
         *,
         log: Path | None = None,
         record: Path | None = None,
+        device: bool = False,
     ) -> None:
-        self.scenario, self._load = scenario, load
+        self.scenario, self._load, self._device = scenario, load, device
         self.inputs, self.ms = Inputs.of(scenario), 0
         self._start = np.array(scenario.master.position)
         self._stations, self._seen, self._fills_ms = 1, 0, 0
         estimate = None if load is None else load.estimate
-        self._now = _Station(scenario, estimate, load, 0)
-        self._record = None if record is None else _Record(record, scenario, load, self.inputs)
+        self._now = _Station(scenario, estimate, load, 0, device=device)
+        self._record = None
+        if record is not None:
+            self._record = _Record(record, scenario, load, self.inputs, device=device)
         self._on_disk = None
         if log is not None:
             self._on_disk = LogOnDisk(log, self._now.simulator, 0.0, with_all_signals)
@@ -218,7 +229,7 @@ class Session:
         scenario = chosen(self.scenario, self._load, inputs)
         scenario.check()
         estimate = known_estimate(self.scenario, self._load, scenario)
-        station = _Station(scenario, estimate, self._load, self._stations)
+        station = _Station(scenario, estimate, self._load, self._stations, device=self._device)
         filled = station.follow(self._now, inputs.channel != self.inputs.channel)
         if filled:
             self._fills_ms = self.ms + math.ceil(1e3 * filled)
@@ -272,6 +283,10 @@ class Session:
         """The inputs of a hand that takes hold of the stylus where it is, without pulling."""
         return self.inputs.held_at(self._now.value("pose_master"), self._start)
 
+    def force(self) -> NDArray[np.float64]:
+        """(6,) what a device shall display now [N, N m]."""
+        return self._now.value("force_to_master")
+
     def keep(self) -> None:
         """Brings everything until now to the disk; the session may go on."""
         if self._record is not None:
@@ -300,13 +315,22 @@ class _Record:
     """The folder of a drive, but for the log."""
 
     def __init__(
-        self, folder: Path, scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs
+        self,
+        folder: Path,
+        scenario: Scenario,
+        load: IdentifiedLoad | None,
+        inputs: Inputs,
+        *,
+        device: bool,
     ) -> None:
         make_folder(folder)
         write_text(folder / _SCENARIO, commented(scenario))
         path = folder / INPUTS
         with naming(folder / _LOAD):
             (folder / _LOAD).unlink(missing_ok=True)
+            (folder / _DEVICE).unlink(missing_ok=True)
+        if device:
+            write_text(folder / _DEVICE, "x to rz of inputs.csv are the places of a device.\n")
         if load is not None:
             write_load(folder / _LOAD, load)
         with naming(path):
@@ -339,11 +363,13 @@ class Drive:
         scenario: that was driven, as long as it was.
         load: what the station knew of its load.
         changes: of the inputs, with their times [ms]; the last is the end.
+        device: whether a haptic device was its hand.
     """
 
     scenario: Scenario
     load: IdentifiedLoad | None
     changes: Sequence[tuple[int, Inputs]]
+    device: bool = False
 
 
 def read_drive(folder: str | Path) -> Drive:
@@ -359,7 +385,8 @@ def read_drive(folder: str | Path) -> Drive:
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
     if not known or (load is None and (folder / _LOAD).exists()):
         raise DrakeTeleopError("is damaged, or no load of a drive", where=str(folder / _LOAD))
-    return Drive(replace(scenario, simulation__duration=1e-3 * changes[-1][0]), load, changes)
+    driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
+    return Drive(driven, load, changes, (folder / _DEVICE).exists())
 
 
 def repeat(
@@ -373,7 +400,7 @@ def repeat(
         log: a folder that the log goes to; None for one in memory.
         slice_ms: what is simulated at once, between changes [ms].
     """
-    session = Session(drive.scenario, drive.load, log=log)
+    session = Session(drive.scenario, drive.load, log=log, device=drive.device)
     end = drive.changes[-1][0]
     for ms, inputs in drive.changes:
         while session.ms < ms:

@@ -1,0 +1,220 @@
+"""What runs beside a haptic device: its pose to the station, the force back, at 1 kHz.
+
+    python -m drake_teleop.live.device_client virtual udp://127.0.0.1:PORT [--grip light]
+    python -m drake_teleop.live.device_client haply://localhost:10001 udp://127.0.0.1:PORT
+
+In a process of its own, so that no slice of the station holds it up; all that keeps a hand safe is
+here (`device_guard`). The virtual device is a mass in a simulated hand that taps and presses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.live.device_guard import DeviceGuard, Limits
+from drake_teleop.live.device_packets import (
+    LONGEST,
+    DeviceState,
+    ForceCommand,
+    Place,
+    packed_state,
+    unpacked_force,
+)
+from drake_teleop.live.haply import HaplyDevice
+from drake_teleop.live.virtual_device import VirtualDevice, tapping
+from drake_teleop.operator.operator import GRIPS
+from drake_teleop.robots.udp import endpoint
+
+_PERIOD, _LATE = 1e-3, 0.1  # s
+_REMEMBERED = 100_000  # ticks
+
+
+class Device(Protocol):
+    """Any hardware, at its own pace."""
+
+    @property
+    def limits(self) -> Limits:
+        """What it may give."""
+
+    def read(self) -> Place | None:
+        """Waits for its next place, half a second at most; None if there is none."""
+
+    def set(self, wrench: Sequence[float]) -> None:
+        """Displays [f; tau] in B until the next call."""
+
+    def close(self) -> None:
+        """Lets it go, without force."""
+
+
+class Client:
+    """One device and one station.
+
+    Attributes:
+        guard: between the two.
+        behind: how old the place was that each force answered [s].
+
+    Args:
+        device: the hardware.
+        address: of the station, udp://127.0.0.1:PORT.
+        observe: whether passivity is observed.
+    """
+
+    def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
+        self.guard = DeviceGuard(device.limits, observe=observe)
+        self.behind: deque[float] = deque(maxlen=_REMEMBERED)
+        self._device, self._number = device, 0
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect(endpoint(address))
+        self._socket.setblocking(False)
+        self._command: ForceCommand | None = None
+        self._last: float | None = None
+
+    def tick(self, clock: Callable[[], float] = time.perf_counter) -> tuple[float, ...] | None:
+        """One place there and one force back; what was set, None without a place."""
+        place = self._device.read()
+        now = clock()
+        self._listen()
+        if place is None:
+            self._device.set((0.0,) * 6)
+            return None
+        command = self._command
+        age = now - command.t if command is not None else np.inf
+        period = _PERIOD if self._last is None else min(max(now - self._last, 1e-5), _LATE)
+        self._last = now
+        asked = (0.0,) * 6 if command is None else command.wrench
+        wrench = self.guard.tick(place.position, asked, age, period)
+        self._device.set(wrench)
+        self._send(place, now, age)
+        return wrench
+
+    def _listen(self) -> None:
+        while True:
+            try:
+                packet = self._socket.recv(LONGEST + 1)
+            except BlockingIOError:
+                return
+            except ConnectionError:  # nobody listens there yet
+                continue
+            command = unpacked_force(packet)
+            if command is None or command.number > self._number:
+                continue
+            if self._command is None or command.number >= self._command.number:
+                self._command = command
+
+    def _send(self, place: Place, now: float, age: float) -> None:
+        self._number += 1
+        behind = age if age < 1.0 else 0.0
+        if behind:
+            self.behind.append(behind)
+        x, y, z = map(float, place.position)
+        w, i, j, k = map(float, place.orientation)
+        state = DeviceState(self._number, now, (x, y, z), (w, i, j, k), place.flags, behind)
+        try:
+            self._socket.send(packed_state(state))
+        except (BlockingIOError, ConnectionError):  # the next one is newer
+            return
+
+    def close(self) -> None:
+        """Lets the device go."""
+        self._device.close()
+        self._socket.close()
+
+
+class Simulated:
+    """A virtual device as hardware, in real time.
+
+    Args:
+        virtual: the device.
+    """
+
+    limits = Limits(force=10.0)
+
+    def __init__(self, virtual: VirtualDevice) -> None:
+        self.virtual = virtual
+        self._wrench: Sequence[float] = (0.0,) * 6
+        self._due = self._moved = time.perf_counter()
+
+    def read(self) -> Place:
+        """See `Device`."""
+        self._due += _PERIOD
+        now = time.perf_counter()
+        if self._due > now:
+            time.sleep(self._due - now)
+        now = time.perf_counter()
+        if now - self._due > _LATE:  # what was missed is not made up for
+            self._due = self._moved = now
+        self.virtual.move(self._wrench[:3], max(now - self._moved, 1e-6))
+        self._moved = now
+        return Place(self.virtual.position)
+
+    def set(self, wrench: Sequence[float]) -> None:
+        """See `Device`."""
+        self._wrench = wrench
+
+    def close(self) -> None:
+        """See `Device`."""
+
+
+def made(address: str, grip: str, depth: float) -> Device:
+    """The device of an address: `virtual`, or haply://HOST:PORT.
+
+    Raises:
+        DrakeTeleopError: for another one, or if it does not answer.
+    """
+    if address == "virtual":
+        return Simulated(VirtualDevice(tapping(depth), grip))
+    if address.startswith("haply://"):
+        return HaplyDevice(address)
+    raise DrakeTeleopError("is no device", where=address, remedy="virtual, or haply://HOST:PORT")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs until the time is over, Ctrl-C, or the device is gone."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("device", help="virtual, or haply://HOST:PORT")
+    parser.add_argument("station", help="udp://127.0.0.1:PORT")
+    parser.add_argument("--grip", choices=tuple(GRIPS), default="medium", help="of the virtual one")
+    parser.add_argument("--depth", type=float, default=0.08, help="how far its hand goes down [m]")
+    parser.add_argument("--seconds", type=float, default=float("inf"))
+    parser.add_argument("--no-observer", action="store_true")
+    parser.add_argument("--json", type=Path, help="figures, at the end")
+    options = parser.parse_args(arguments)
+    device = made(options.device, options.grip, options.depth)
+    client = Client(device, options.station, observe=not options.no_observer)
+    end, largest = time.perf_counter() + options.seconds, 0.0
+    try:
+        while time.perf_counter() < end:
+            largest = max(largest, float(np.linalg.norm((client.tick() or (0.0,) * 3)[:3])))
+    except KeyboardInterrupt:
+        pass
+    finally:
+        client.close()
+    behind = np.array(client.behind or [0.0])
+    figures = {
+        "behind_p50_ms": float(1e3 * np.median(behind)),
+        "behind_p99_ms": float(1e3 * np.percentile(behind, 99)),
+        "largest_force_n": largest,
+        "energy_j": client.guard.energy,
+        "slowed": client.guard.slowed,
+    }
+    if options.json is not None:
+        options.json.write_text(json.dumps(figures) + "\n")
+    print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except DrakeTeleopError as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,126 @@
+"""The Haply Inverse3, by the websocket of Haply's service on this machine (Inverse Service 3).
+
+Its messages are JSON: `inverse3[0].state.cursor_position` {x, y, z} [m], the grip's
+`state.orientation` {w, x, y, z} and `state.buttons` {a, b, c}, in `wireless_verse_grip` or
+`verse_grip`. Each is answered by a force, `inverse3[0].commands.set_cursor_force.values`; else the
+service sends no next one. Its axes, x to the right, y away from the operator, z up, are turned into
+B. Button a opens the clutch. Written from public clients of the service, and tried with a virtual
+one alone, not with the device.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.live.device_guard import Limits
+from drake_teleop.live.device_packets import CLUTCH_OPEN, DeviceState, Place, believable
+
+_LONGEST, _TIMEOUT = 65536, 0.5  # bytes of a message, s
+_GRIPS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
+_NOWHERE = DeviceState(0, 0.0, (0.0, 0.0, 0.0))
+
+
+class Heard(NamedTuple):
+    """What a message says: which device, and where it is in B."""
+
+    device: str
+    state: DeviceState
+
+
+def read_message(text: Any) -> Heard | None:
+    """What is in a message, None if no device is, or none at a place where it can be. Never raises.
+
+    Args:
+        text: as it came.
+    """
+    if not isinstance(text, (str, bytes)) or len(text) > _LONGEST:
+        return None
+    try:
+        said = json.loads(text)
+        cursor = said["inverse3"][0]
+        place, name = cursor["state"]["cursor_position"], cursor["device_id"]
+        x, y, z = (_number(place[axis]) for axis in "xyz")
+        grip: Any = next((said[kind][0]["state"] for kind in _GRIPS if said.get(kind)), {})
+        turn = grip.get("orientation") or {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
+        w, i, j, k = (_number(turn[axis]) for axis in "wxyz")
+        pressed = (grip.get("buttons") or {}).get("a") is True
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError):
+        return None
+    if not isinstance(name, str):
+        return None
+    state = believable(
+        _NOWHERE._replace(flags=CLUTCH_OPEN if pressed else 0), (-y, x, z, w, -j, i, k, 0.0)
+    )
+    return None if state is None else Heard(name, state)
+
+
+def written_force(device: str, wrench: Sequence[float]) -> str:
+    """The message that displays a force (its first three numbers, in B)."""
+    f_x, f_y, f_z = wrench[:3]
+    values = {"x": f_y, "y": -f_x, "z": f_z}
+    return json.dumps(
+        {"inverse3": [{"device_id": device, "commands": {"set_cursor_force": {"values": values}}}]}
+    )
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
+        raise ValueError(value)
+    return float(value)
+
+
+class HaplyDevice:
+    """An Inverse3 at a service.
+
+    Args:
+        address: haply://HOST:PORT, 10001 if there is none.
+
+    Raises:
+        DrakeTeleopError: if nobody answers there.
+    """
+
+    limits = Limits(force=8.0)  # of 10 N at its peak (D)
+
+    def __init__(self, address: str) -> None:
+        from websockets.sync.client import connect
+
+        try:
+            parts = urlsplit(address)
+            url = f"ws://{parts.hostname or 'localhost'}:{parts.port or 10001}"
+            self._socket = connect(
+                url, max_size=_LONGEST, open_timeout=2, compression=None, proxy=None
+            )
+        except (OSError, TimeoutError, ValueError) as error:
+            raise DrakeTeleopError(
+                f"does not answer ({error})", where=address, remedy="start Haply's service"
+            ) from error
+        self._device = ""
+
+    def read(self) -> Place | None:
+        """See `Device`."""
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            heard = read_message(self._socket.recv(timeout=_TIMEOUT))
+        except TimeoutError:
+            return None
+        except ConnectionClosed as error:
+            raise DrakeTeleopError("the service has gone", where="haply") from error
+        if heard is None:
+            return None
+        self._device = heard.device
+        return Place(heard.state.position, heard.state.orientation, heard.state.flags)
+
+    def set(self, wrench: Sequence[float]) -> None:
+        """See `Device`."""
+        if self._device:
+            self._socket.send(written_force(self._device, wrench))
+
+    def close(self) -> None:
+        """See `Device`."""
+        self.set((0.0,) * 6)
+        self._socket.close()

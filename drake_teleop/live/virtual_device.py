@@ -1,0 +1,84 @@
+"""A haptic device that is none: a mass in a simulated hand, for tests and for trying a link.
+
+    device and hand: m x'' = f - b x' + k (x_hand - x) + d (x_hand' - x')
+
+with f the force that was set at the last tick. Along each axis of B by itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from drake_teleop.operator.operator import GRIPS
+
+_STEPS = 10  # a millisecond
+
+
+class VirtualDevice:
+    """Exactly as passive as its numbers: a light, lively device.
+
+    Attributes:
+        position: [m].
+        velocity: [m/s].
+        energy: that the port has taken from device and hand since the beginning [J]:
+            minus the integral of f . dx.
+
+    Args:
+        hand: where the hand wants it and how fast that moves, at a time [s]: [m], [m/s].
+        grip: of `GRIPS`.
+        mass: of the device [kg].
+        damping: likewise [N s/m].
+    """
+
+    def __init__(
+        self,
+        hand: Callable[[float], tuple[Sequence[float], Sequence[float]]],
+        grip: str = "medium",
+        mass: float = 0.15,
+        damping: float = 0.5,
+    ) -> None:
+        held = GRIPS[grip]
+        self._hand, self._b = hand, damping
+        self._mass, self._k, self._d = mass + held.mass, held.stiffness, held.damping
+        self.position, self.velocity = list(map(float, hand(0.0)[0])), [0.0, 0.0, 0.0]
+        self.energy, self._t = 0.0, 0.0
+
+    def move(self, force: Sequence[float], seconds: float) -> None:
+        """Goes on under a force on the hand that is held."""
+        steps = max(math.ceil(seconds * 1e3 * _STEPS - 1e-9), 1)
+        h = seconds / steps
+        for _ in range(steps):
+            self._t += h
+            at, speed = self._hand(self._t)
+            for i in range(3):
+                x, v = self.position[i], self.velocity[i]
+                pull = force[i] - self._b * v + self._k * (at[i] - x) + self._d * (speed[i] - v)
+                v += h * pull / self._mass
+                self.velocity[i], self.position[i] = v, x + h * v
+                self.energy -= force[i] * h * v
+
+
+def tapping(
+    depth: float, *, hertz: float = 0.5, lift: float = 0.01, hold: float = 0.6
+) -> Callable[[float], tuple[Sequence[float], Sequence[float]]]:
+    """A hand that goes `depth` below z = 0 and `lift` above it, and stays below for a while [m].
+
+    Args:
+        hertz: of going down and up.
+        hold: share of the time below.
+    """
+
+    def hand(t: float) -> tuple[Sequence[float], Sequence[float]]:
+        phase, way = (t * hertz) % 1.0, 0.5 * (1.0 - hold)
+        if phase < way:
+            s, rate = phase / way, 1.0
+        elif phase < way + hold:
+            s, rate = 1.0, 0.0
+        else:
+            s, rate = (1.0 - phase) / way, -1.0
+        smooth, slope = s * s * (3.0 - 2.0 * s), 6.0 * s * (1.0 - s) * rate * hertz / way
+        far = depth + lift
+        return (0.0, 0.0, lift - far * smooth), (0.0, 0.0, -far * slope)
+
+    return hand
