@@ -60,7 +60,7 @@ class DeviceGuard:
         self._force: _Vector = (0.0, 0.0, 0.0)
         self._torque: _Vector = (0.0, 0.0, 0.0)
         self._position: _Vector | None = None
-        self._moved: _Vector = (0.0, 0.0, 0.0)
+        self._speed: _Vector = (0.0, 0.0, 0.0)
 
     def tick(
         self, position: Sequence[float], wrench: Sequence[float], age: float, period: float
@@ -79,12 +79,14 @@ class DeviceGuard:
         given = -_dot(self._force, moved)
         self.energy += given
         self._available = min(self._available + given, _MOST)
+        # As fast as it was, and faster by as much as it has become; for as long as now.
+        speed, before = _times(1.0 / period, moved), self._speed
         coming = (
-            2.0 * moved[0] - self._moved[0],
-            2.0 * moved[1] - self._moved[1],
-            2.0 * moved[2] - self._moved[2],
+            period * (2.0 * speed[0] - before[0]),
+            period * (2.0 * speed[1] - before[1]),
+            period * (2.0 * speed[2] - before[2]),
         )
-        self._position, self._moved = x, moved
+        self._position, self._speed = x, speed
 
         share = self._share(age, period)
         force, torque = _sound(wrench[:3]), _sound(wrench[3:])
@@ -96,7 +98,7 @@ class DeviceGuard:
         if share == 0.0:  # whatever the slew: at 50 ms there is none
             force, torque = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         elif self._observe:
-            force = self._passive(force, coming, period)
+            force = _shortened(self._passive(force, coming, period), limits.force)
         self._force, self._torque = force, torque
         return (*force, *torque)
 
@@ -116,7 +118,7 @@ class DeviceGuard:
             return force
         self.slowed += 1
         along = out / distance
-        most = max(there / distance, -_DAMPER * distance / period)
+        most = max(there / distance, -_DAMPER * math.hypot(*self._speed))
         off = max(along - most, 0.0) / distance
         return (
             force[0] - off * coming[0],

@@ -45,6 +45,7 @@ _FADE, _RETURN, _SLEW = 0.05, 4.0, 150.0
 _HELD, _START, _FROM, _WAY, _TURN, _PATH = 0, 1, 2, 9, 12, 15
 # Of what is displayed: the wrench (6,), a `Fault`, the share of the largest that is allowed.
 _FAULT, _ALLOWED, _DISPLAY = 6, 7, 8
+_WRENCH = float(Fault.WRENCH)
 
 
 @njit(cache=True)
@@ -68,7 +69,7 @@ def _display(wrench, held, period, most, last, now):
     """One period of what is displayed, `now` (8,) after `last`; `most` (2,) [N, N m]."""
     fault = 0.0
     if not sound(wrench):
-        fault = float(Fault.WRENCH)
+        fault = _WRENCH
     wanted = held and fault == 0.0
     change = _RETURN if wanted else -1.0 / _FADE
     allowed = min(max(last[_ALLOWED] + period * change, 0.0), 1.0)

@@ -1,0 +1,225 @@
+"""Is the link to a haptic device fast, safe when it is silent, and passive? With a virtual device.
+
+    python benchmarks/device.py [--seconds 10] [--drive] [--json FILE]
+
+`link_`: a virtual device in a process of its own at 1 kHz over UDP, and here a wall by the same
+handlers as a drive's: time from taking a packet to having sent the force, and at the device how
+late its force is. `silent_`: the force at the device 50 ms after the station falls silent.
+`leaf_` and `wall_`: the device's client with and without its passivity observer in simulated time,
+at the leaf (291 N/m at the hand) and a wall of 6 kN/m, up to five samples late, and as late as was
+measured just now: least energy of the port [J]; how far the resting hand moves to and fro [m].
+`fuzz_`: messages that are none. With --drive the whole station in real time under the device.
+Baselines: the same without the observer; the share of time in which a process waited for a core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from drake_teleop.live.device_guard import DeviceGuard, Limits
+from drake_teleop.live.device_link import DeviceLink
+from drake_teleop.live.device_packets import DeviceState, packed_state, unpacked_state
+from drake_teleop.live.haply import read_message
+from drake_teleop.live.virtual_device import VirtualDevice, tapping
+from drake_teleop.operator.operator import GRIPS
+
+LEAF, WALL = 5100 / 17.5, 6000.0  # N/m at the hand
+_TICK = 1e-3
+
+
+def client(port: int, seconds: float, figures: Path, *more: str) -> subprocess.Popen[bytes]:
+    """A virtual device in a process of its own."""
+    module = "drake_teleop.live.device_client"
+    station = f"udp://127.0.0.1:{port}"
+    line = [sys.executable, "-m", module, "virtual", station, "--seconds", str(seconds)]
+    return subprocess.Popen([*line, "--json", str(figures), *more], stdout=subprocess.DEVNULL)
+
+
+def waited() -> float:
+    """For how long this thread has waited for a core [s]."""
+    return int(Path("/proc/thread-self/schedstat").read_text().split()[1]) * 1e-9
+
+
+def linked(seconds: float) -> tuple[dict[str, float], np.ndarray]:
+    """Figures of the link at 1 kHz, and how late forces were at the device, in ticks."""
+    with tempfile.TemporaryDirectory() as folder:
+        link, told = DeviceLink("udp://127.0.0.1:0"), Path(folder) / "device.json"
+        device = client(link.port, seconds, told, "--depth", "0.01", "--grip", "medium")
+        spent, behind, number = [], [], -1
+        while device.poll() is None:
+            began = time.perf_counter()
+            state = link.poll(began)
+            if state is None or state.number == number:
+                time.sleep(5e-5)
+                continue
+            if number < 0:
+                start, waited_before = began, waited()
+            number = state.number
+            link.send(np.array([0.0, 0.0, max(-WALL * state.position[2], 0.0), 0.0, 0.0, 0.0]))
+            spent.append(time.perf_counter() - began)
+            behind.append(state.behind)
+        lasted = time.perf_counter() - start
+        found = json.loads(told.read_text())
+        percent = 1e3 * np.percentile(spent, [50, 95, 99, 100])
+        names = ("p50", "p95", "p99", "max")
+        figures = {f"link_processing_{n}_ms": float(p) for n, p in zip(names, percent, strict=True)}
+        figures |= {
+            "link_packets_per_s": len(spent) / lasted,
+            "link_lost_share": max(link.lost, 0) / max(number, 1),
+            "link_share_waiting_for_a_core": (waited() - waited_before) / lasted,
+            "link_force_behind_p50_ms": found["behind_p50_ms"],
+            "link_force_behind_p99_ms": found["behind_p99_ms"],
+            "link_energy_j": found["energy_j"],
+            "link_largest_force_n": found["largest_force_n"],
+        }
+        link.close()
+    return figures, np.ceil(np.array(behind[100:]) / _TICK)
+
+
+def silent() -> dict[str, float]:
+    """The largest force of a guard from 50 ms of silence on, whatever was commanded before [N]."""
+    largest, random = 0.0, np.random.default_rng(0)
+    for _ in range(200):
+        guard = DeviceGuard(Limits(37.5))
+        wrench, x = random.normal(0.0, 30.0, 6), np.zeros(3)
+        for k in range(300):
+            x = x + random.normal(0.0, 1e-4, 3)
+            age = _TICK * max(k - 150, 0)
+            force = guard.tick(x, wrench, age, _TICK)
+            if age >= 0.05:
+                largest = max(largest, float(np.abs(force).max()))
+    return {"silent_50_ms_largest_n": largest}
+
+
+def pressed(stiffness: float, grip: str, late: np.ndarray, *, observe: bool) -> tuple[float, float]:
+    """Least energy of the port [J]; how far the hand moves to and fro when it should rest [m].
+
+    Args:
+        stiffness: of the wall [N/m].
+        grip: of the virtual hand.
+        late: by how many ticks a force is late, in a circle.
+        observe: whether the observer is on.
+    """
+    virtual, most = VirtualDevice(tapping(0.02), grip), int(late.max())
+    guard, heights = DeviceGuard(Limits(37.5), observe=observe), [0.01] * (most + 1)
+    least, resting, newest = 0.0, [], 0
+    for k in range(4000):
+        heights.append(virtual.position[2])
+        newest = max(newest, len(heights) - 1 - int(late[k % len(late)]))  # never an older one
+        push = max(-stiffness * heights[newest], 0.0)
+        force = guard.tick(virtual.position, (0.0, 0.0, push, 0.0, 0.0, 0.0), 0.0, _TICK)
+        virtual.move(force[:3], _TICK)
+        least = min(least, virtual.energy)
+        if 0.65 < (0.5 * _TICK * k) % 1.0 < 0.8 and k > 2000:
+            resting.append(virtual.position[2])
+    return least, float(np.ptp(resting))
+
+
+def passive(measured: np.ndarray) -> dict[str, float]:
+    """Energy and rest at leaf and wall, with every grip, with and without the observer."""
+    figures: dict[str, float] = {}
+    delays = {f"{n}_late": np.array([n]) for n in (0, 1, 2, 5)} | {"as_measured": measured}
+    for observe, word in ((True, "observed"), (False, "bare")):
+        for name, late in delays.items():
+            at_leaf = [pressed(LEAF, grip, late, observe=observe) for grip in GRIPS]
+            at_wall = {grip: pressed(WALL, grip, late, observe=observe) for grip in GRIPS}
+            figures[f"leaf_{name}_{word}_least_energy_j"] = min(energy for energy, _ in at_leaf)
+            for grip, (_, moved) in at_wall.items():
+                figures[f"wall_{name}_{word}_{grip}_moves_m"] = moved
+    return figures
+
+
+def fuzzed(count: int = 10_000) -> dict[str, float]:
+    """Values that are not finite among what random packets and texts led to, of each kind."""
+    random, wrong, refused = np.random.default_rng(1), 0, 0
+    good = packed_state(DeviceState(1, 0.0, (0.01, 0.0, 0.0)))
+    place = {"cursor_position": {"x": 0.1, "y": 0.2, "z": 0.3}}
+    said = json.dumps({"inverse3": [{"device_id": "a", "state": place}]})
+    link = DeviceLink("udp://127.0.0.1:0")
+    for k in range(count):
+        packet = bytearray(good)
+        for i in random.integers(0, len(packet), random.integers(1, 40)):
+            packet[i] = random.integers(256)
+        cut = bytes(packet[: random.integers(len(packet))] if k % 10 == 0 else packet)
+        link._take(cut, "peer", 1e-3 * k)
+        led = link.lead(1e-3 * k)
+        wrong += not all(np.isfinite(value) for value in led.values())
+        state = unpacked_state(cut)
+        refused += state is None
+        text = list(said)
+        for i in random.integers(0, len(text), random.integers(1, 8)):
+            text[i] = chr(random.integers(1, 300))
+        heard = read_message("".join(text))
+        wrong += heard is not None and not np.isfinite([*heard.state.position]).all()
+    link.close()
+    return {"fuzz_messages": 2.0 * count, "fuzz_not_finite": wrong, "fuzz_packets_refused": refused}
+
+
+def driven(seconds: float) -> dict[str, float]:
+    """The whole station under the device, in real time, without a page."""
+    from drake_teleop.identified_load import identified_load
+    from drake_teleop.live.external_master import with_device
+    from drake_teleop.live.live import Live
+    from drake_teleop.live.session import live_scenario
+    from drake_teleop.scenario import LoadScenario
+
+    scenario = live_scenario(with_device(LoadScenario("contact_transition")))
+    load, clock = identified_load(scenario), time.perf_counter
+    link = DeviceLink("udp://127.0.0.1:0")
+    live = Live(scenario, load, None, lambda rows: None, clock(), link)
+    with tempfile.TemporaryDirectory() as folder:
+        told = Path(folder) / "device.json"
+        device = client(link.port, seconds + 2.0, told, "--depth", "0.075", "--grip", "medium")
+        while live.still or link.silent(clock()):  # until it has begun
+            live.tick(clock)
+            time.sleep(1e-3)
+        live.join(1, clock())
+        end, lost, late = clock() + seconds, live.pace.given_up, []
+        while clock() < end:
+            if live.pace.wait(clock()) <= 0:
+                late.append(-live.pace.wait(clock()))
+            live.tick(clock)
+            time.sleep(live.wait(clock()))
+        figures = link.figures(clock())
+        device.wait()
+        found = json.loads(told.read_text())
+        lost = live.pace.given_up - lost
+        live.close()
+    return {
+        "drive_factor": 1.0 - lost / seconds,
+        "drive_slice_late_p99_ms": 1e3 * float(np.percentile(late, 99)),
+        "drive_packets_late_p99_ms": figures["late_p99_ms"],
+        "drive_force_behind_p50_ms": found["behind_p50_ms"],
+        "drive_force_behind_p99_ms": found["behind_p99_ms"],
+        "drive_energy_j": found["energy_j"],
+        "drive_largest_force_n": found["largest_force_n"],
+    }
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--drive", action="store_true", help="the whole station too")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    figures, late = linked(options.seconds)
+    figures |= silent() | passive(late) | fuzzed()
+    if options.drive:
+        figures |= driven(options.seconds)
+    for name, value in figures.items():
+        print(f"{name:44} {value:.4g}")
+    if options.json is not None:
+        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

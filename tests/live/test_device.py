@@ -1,0 +1,279 @@
+"""A haptic device as the hand: packets, silence, limits, passivity; what a session makes of it."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.live.device import DrivenBy
+from drake_teleop.live.device_client import Client
+from drake_teleop.live.device_guard import DeviceGuard, Limits
+from drake_teleop.live.device_link import DeviceLink
+from drake_teleop.live.device_packets import (
+    CLUTCH_OPEN,
+    DeviceState,
+    ForceCommand,
+    Place,
+    packed_force,
+    packed_state,
+    unpacked_force,
+    unpacked_state,
+)
+from drake_teleop.live.external_master import with_device
+from drake_teleop.live.haply import read_message, written_force
+from drake_teleop.live.inputs import RANGES, Inputs
+from drake_teleop.live.live import Live
+from drake_teleop.live.session import Session, read_drive, repeat
+from drake_teleop.live.virtual_device import VirtualDevice, tapping
+from drake_teleop.pages.progress import silent
+from drake_teleop.result import SimulationResult
+
+MS = 1e-3
+
+
+class Sender:
+    """A device that sends what it is told to."""
+
+    def __init__(self, port):
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect(("127.0.0.1", port))
+        self._socket.settimeout(1.0)
+
+    def send(self, number, position=(0.0, 0.0, 0.0), **more):
+        self._socket.send(packed_state(DeviceState(number, MS * number, position, **more)))
+
+    def raw(self, packet):
+        self._socket.send(packet)
+
+    def force(self):
+        return unpacked_force(self._socket.recv(1000))
+
+
+@pytest.fixture
+def link():
+    made = DeviceLink("udp://127.0.0.1:0")
+    yield made
+    made.close()
+
+
+def test_packets_are_as_the_header_says():
+    text = resources.files("drake_teleop.live").joinpath("drake_teleop_device.h").read_text()
+    sizes = [int(size) for size in re.findall(r"device: (\d+) bytes", text)]
+    state = DeviceState(7, 1.5, (0.1, -0.2, 0.3), (0.0, 0.6, 0.8, 0.0), CLUTCH_OPEN, 0.004)
+    command = ForceCommand(7, 1.5, (1.0, 2.0, 3.0, 0.1, 0.2, 0.3))
+    assert [len(packed_state(state)), len(packed_force(command))] == sizes
+    assert unpacked_state(packed_state(state)) == state
+    assert unpacked_force(packed_force(command)) == command
+    assert packed_state(state)[24:32] == np.array([0.1], "<f8").tobytes()  # after 4 + 4 + 8 + 8
+
+
+def test_messages_that_are_none_change_nothing_but_a_counter(link):
+    random, good = np.random.default_rng(0), packed_state(DeviceState(1, 0.0, (0.01, 0.0, 0.0)))
+    said = json.dumps(
+        {"inverse3": [{"device_id": "a", "state": {"cursor_position": {"x": 1, "y": 2, "z": 3}}}]}
+    )
+    odd = [b"", b"DTD1", good[:-1], good + b"x", b"DTD2" + good[4:], b"DTF1" + good[4:]]
+    for place in range(16, 88, 8):
+        for value in (np.nan, np.inf, -np.inf, 1e308, 1e30):
+            odd.append(good[:place] + np.array([value], "<f8").tobytes() + good[place + 8 :])
+    for places, values in zip(
+        random.integers(0, 88, (500, 6)), random.integers(0, 256, (500, 6)), strict=True
+    ):
+        packet = bytearray(good)
+        for place, value in zip(places, values, strict=True):
+            packet[place] = value
+        odd.append(bytes(packet))
+    sender = Sender(link.port)
+    for k, packet in enumerate(odd):
+        sender.raw(packet)
+        if k % 40 == 0:
+            led = link.lead(1e-4 * k)
+            assert all(np.isfinite(value) for value in led.values())
+            assert np.isfinite(Inputs().changed(led).pose(np.zeros(3))[0] if led["held"] else 0.0)
+    assert link.refused > 40
+    assert read_message(said).state.position == (-2.0, 1.0, 3.0)
+    texts = ["", "[]", "{}", "null", "[" * 9000, '{"inverse3":[]}', said[:-1], "1e999", 7, None]
+    texts += [said.replace(*pair) for pair in (("1,", "NaN,"), ("2", '"2"'), ("3}", "1e400}"))]
+    for text in texts:
+        assert read_message(text) is None
+    for places, values in zip(
+        random.integers(0, len(said), (500, 3)), random.integers(32, 127, (500, 3)), strict=True
+    ):
+        letters = list(said)
+        for place, value in zip(places, values, strict=True):
+            letters[place] = chr(value)
+        heard = read_message("".join(letters))
+        assert heard is None or np.isfinite(heard.state.position).all()
+
+
+def test_a_force_goes_to_haply_as_its_place_came():
+    said = json.loads(written_force("a", (1.0, 2.0, 3.0)))
+    device = {"device_id": "a", "state": {"cursor_position": {"x": 2, "y": -1, "z": 3}}}
+    assert said["inverse3"][0]["commands"]["set_cursor_force"]["values"] == {
+        "x": 2.0, "y": -1.0, "z": 3.0,
+    }  # fmt: skip
+    assert read_message(json.dumps({"inverse3": [device]})).state.position == (1.0, 2.0, 3.0)
+
+
+def test_one_device_leads_until_it_is_silent_and_late_packets_do_not(link):
+    one, other = Sender(link.port), Sender(link.port)
+    one.send(1, (0.1, 0.0, 0.0))
+    assert link.lead(0.0) == {"held": 1, "clutch": 0} | dict.fromkeys(
+        ("x", "y", "z", "rx", "ry", "rz"), 0.0
+    )
+    one.send(4, (0.11, 0.0, 0.0))
+    one.send(3, (0.2, 0.0, 0.0))
+    one.send(4, (0.2, 0.0, 0.0))
+    other.send(9, (0.3, 0.0, 0.0))
+    led = link.lead(0.049)
+    assert led["x"] == pytest.approx(1000.0)
+    assert (link.lost, link.refused) == (1, 1)
+    link.send(np.arange(6.0))
+    assert one.force() == ForceCommand(4, 0.004, (0.0, 1.0, 2.0, 3.0, 4.0, 5.0))
+    assert link.lead(0.0991) == {"held": 0, "clutch": 0}
+    assert "silent" in link.text()
+    other.send(1, (0.1, 0.02, 0.0))
+    assert link.lead(0.2)["clutch"] == 0
+    other.send(2, (0.1, 0.02, 0.0))
+    led = link.lead(0.2401)
+    assert led["y"] == pytest.approx(2000.0)
+    other.send(3, (0.1, 0.02, 0.0))
+    assert "clutch" not in link.lead(0.2801)
+    other.send(4, (0.1, 0.02, 0.0), flags=CLUTCH_OPEN)
+    assert link.lead(0.29)["clutch"] == 0
+
+
+def test_whatever_is_commanded_a_hand_gets_no_more_than_the_limits_and_nothing_in_silence():
+    guard, last = DeviceGuard(Limits(5.0, 0.1, slew=1000.0, torque_slew=10.0)), np.zeros(6)
+    for k in range(300):
+        wrench = (np.nan,) * 6 if k % 50 == 7 else (40.0, -30.0, 0.0, 1.0, 0.0, 0.0)
+        age = MS * max(k - 150, 0) if k < 250 else 0.0
+        now = np.array(guard.tick((0.0, 0.0, 0.0), wrench, age, MS))
+        if k == 120:  # a tick was late, and the next one comes at once
+            moves = guard.tick((0.0, 0.0, -0.02), wrench, age, 0.1)
+            moves = guard.tick((0.0, 0.0, 0.02), wrench, age, 1e-5)
+            assert np.linalg.norm(moves[:3]) <= 5.0 + 1e-12
+            assert np.linalg.norm(guard.tick((0.0, 0.0, 0.0), wrench, age, MS)[:3]) <= 5.0 + 1e-12
+        assert np.linalg.norm(now[:3]) <= 5.0 + 1e-12
+        assert np.linalg.norm(now[3:]) <= 0.1 + 1e-12
+        if k == 149:
+            assert np.linalg.norm(now[:3]) == pytest.approx(5.0)
+        if age < 0.05:
+            assert np.linalg.norm((now - last)[:3]) <= 1.0 + 1e-9
+        else:
+            assert not now.any()
+        if 0 <= k - 250 < 50:  # it comes back by 100 N/s
+            assert np.linalg.norm(now[:3]) <= 0.1 * (k - 249) + 1e-9
+        last = now
+
+
+def pressed(stiffness, grip, delay, *, observe):
+    """A hand taps on a wall once; the least energy of the port, and the speed when it rests."""
+    virtual = VirtualDevice(tapping(0.02, hertz=1.0), grip)
+    guard, heights = DeviceGuard(Limits(37.5), observe=observe), [virtual.position[2]] * delay
+    energy, speed = [], []
+    for k in range(950):
+        heights.append(virtual.position[2])
+        push = max(-stiffness * heights[-1 - delay], 0.0)
+        force = guard.tick(virtual.position, (0.0, 0.0, push, 0.0, 0.0, 0.0), 0.0, MS)
+        virtual.move(force[:3], MS)
+        energy.append(virtual.energy)
+        if 600 < k < 750:
+            speed.append(abs(virtual.velocity[2]))
+    assert guard.energy == pytest.approx(energy[-1], abs=1e-4 if observe else 1.0)
+    return min(energy), max(speed)
+
+
+def test_a_leaf_gives_out_no_energy_even_five_samples_late():
+    assert pressed(291.0, "light", 5, observe=True)[0] >= -1e-6
+    assert pressed(291.0, "light", 5, observe=False)[0] < -1e-3
+
+
+def test_a_stiff_wall_comes_to_rest():
+    assert pressed(6000.0, "medium", 3, observe=True)[1] < 0.05
+    assert pressed(6000.0, "medium", 3, observe=False)[1] > 0.3
+
+
+class Still:
+    """A device that rests, and notes what is set."""
+
+    limits = Limits(10.0)
+
+    def __init__(self):
+        self.was_set = []
+
+    def read(self):
+        return Place((0.0, 0.0, 0.0))
+
+    def set(self, wrench):
+        self.was_set.append(wrench)
+
+    def close(self):
+        self.set((0.0,) * 6)
+
+
+def test_a_client_displays_what_the_station_says_and_nothing_when_it_is_silent(link):
+    device = Still()
+    client = Client(device, f"udp://127.0.0.1:{link.port}")
+    for k in range(200):
+        now = MS * k
+        client.tick(lambda now=now: now)
+        if k < 100:
+            link.lead(now)
+            link.send(np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]))
+    force = [wrench[2] for wrench in device.was_set]
+    assert force[99] == pytest.approx(4.0)
+    assert max(np.abs(force[151:])) == 0.0
+    assert 1 / 1.1 < 1000 * client.behind[50] < 1.1
+    client.close()
+
+
+@pytest.mark.parametrize("address", ["udp://192.0.2.1:9", "tcp://127.0.0.1:9", "udp://127.0.0.1"])
+def test_a_device_elsewhere_or_of_another_kind_is_one_error(address):
+    with pytest.raises(DrakeTeleopError, match=re.escape(address)):
+        DrivenBy(address)
+
+
+def test_a_device_drives_without_a_page_and_lets_go_when_it_is_silent(scenario, load, link):
+    live = Live(with_device(scenario), load, None, lambda rows: None, 0.0, link)
+    sender, seen = Sender(link.port), []
+    for k in range(95):
+        if k < 60:
+            sender.send(k + 1, (0.0, 0.0, -1e-4 * k))
+        live.tick(lambda now=2 * MS * k: now)
+        seen.append(live._session.inputs)
+    assert seen[10].clutch == 0  # the hand's place is taken anew first
+    assert (seen[50].held, seen[50].clutch, seen[50].z) == (1, 1, -10 * 50)
+    assert (seen[-1].held, seen[-1].clutch) == (0, 0)
+    assert "silent" in live.frame()["device"]
+    for _ in range(60):
+        assert np.isfinite(sender.force().wrench).all()
+
+
+@pytest.mark.slow
+def test_a_drive_by_a_device_is_repeated_to_the_same_bytes(scenario, load, tmp_path):
+    setup = with_device(scenario)
+    session = Session(setup, load, log=tmp_path / "log.parquet", record=tmp_path, device=True)
+    felt = []
+    for k in range(128):
+        down = {"z": -20 * k, "rx": k, "held": k < 100, "clutch": k < 100}
+        session.apply(session.inputs.changed(down))
+        session.advance(2)
+        felt.append(np.linalg.norm(session.force()[:3]))
+    session.close()
+    log = SimulationResult.read_parquet(tmp_path / "log.parquet")
+    drive = read_drive(tmp_path)
+    again = repeat(drive, silent(""))
+    assert all(np.array_equal(log[name], again[name], equal_nan=True) for name in ("t", *log))
+    assert max(felt) > 0.3
+    assert max(felt[80:101]) > 0.3
+    assert felt[127] == 0.0  # 54 ms after the hand has let go
+    steps = np.diff(log["pose_command"][:, 6])
+    assert np.abs(steps).max() < 1.2e-4 * setup.kinematic_scaling.translation_scale
+    assert set(RANGES) == set(vars(drive.changes[0][1]))
