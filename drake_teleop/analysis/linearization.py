@@ -650,7 +650,8 @@ def _smooth(scenario: Scenario) -> Scenario:
 
 
 def _check_contact(diagram: Diagram) -> None:
-    if beyond := GetBlock(diagram, "wrist_sensor").beyond:
+    sensor = GetBlock(diagram, "wrist_sensor")
+    if beyond := sensor.beyond or sensor.moves:
         raise DrakeTeleopError(
             f"these surroundings cannot be linearised: {beyond}",
             where="environment",

@@ -9,11 +9,13 @@ along the normal, regularised Coulomb friction across it); a test ties it to the
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Box, GeometryId, ProximityProperties, SceneGraphInspector, Sphere
+from pydrake.geometry import Box, GeometryId, Obb, ProximityProperties, SceneGraphInspector, Sphere
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CalcContactFrictionFromSurfaceProperties, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, PrismaticJoint, RigidBody
 from pydrake.systems.framework import Context
@@ -24,61 +26,95 @@ from drake_teleop.vectors import apply, dot, nine, three, transposed
 
 Array = NDArray[np.float64]
 
-#: Columns of the table of pairs: stiffness; static and dynamic friction.
-STIFFNESS, FRICTION = 22, slice(24, 26)
+#: Columns of the table of pairs: stiffness; static and dynamic friction; which body it moves with.
+STIFFNESS, FRICTION, BODY = 22, slice(24, 26), 27
 #: Their number.
-WIDTH = 27
+WIDTH = 28
 _STIFFNESS, _DISSIPATION = "point_contact_stiffness", "hunt_crossley_dissipation"
 _NO_SLIP = 1e-14  # m/s, as in Drake: a point at rest has a direction
+
+
+class Pairs(NamedTuple):
+    """What may touch.
+
+    Attributes:
+        known: (k, 28), for the kernel. Of each pair of a sphere of the tool and a box: 0-2 centre
+            of the sphere in S [m], 3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest, or
+            of the box in its body if that moves, 16-18 half the box's edges, 19-21 direction in W
+            in which it moves as a leaf (zero if it does not), 22 stiffness k [N/m], 23 dissipation
+            d [s/m], 24 and 25 static and dynamic friction, 26 slip at which it is complete [m/s],
+            27 the row of its body in a `JointTable`, or -1.
+        watched: (l, 28), of the others: spheres and boxes around them. They do not touch as long
+            as these do not; see `indentation`.
+        unknown: of the first of the others, why it is one.
+    """
+
+    known: Array
+    watched: Array
+    unknown: str
 
 
 def ContactPairs(
     plant: MultibodyPlant,
     inspector: SceneGraphInspector,
-    tool: BodyIndex,
+    tool: Mapping[GeometryId, RigidTransform],
     environment: Iterable[ModelInstanceIndex],
     slip: float,
-) -> Array:
-    """The pairs of a sphere of the tool and a box of the environment, as a table for the kernel.
+    moving: Sequence[BodyIndex] = (),
+) -> Pairs:
+    """The pairs of a shape of the tool and one of the environment.
 
     Args:
-        plant: finalized; the environment has one degree of freedom at most, prismatic, 0 by
-            default.
+        plant: finalized; a leaf of the environment is at 0 by default.
         inspector: of the scene graph, with the shapes and their compliance.
-        tool: its body.
+        tool: its shapes, and where their bodies are in S.
         environment: what it may touch.
         slip: at which friction is complete [m/s]; the plant's stiction tolerance.
-
-    Returns:
-        (pairs, 27): 0-2 centre of the sphere in the tool's frame [m], 3 its radius, 4-12 R_WBox by
-        rows and 13-15 p_WBox at rest, 16-18 half the box's edges, 19-21 direction in W in which it
-        moves (zero if it does not), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25 static
-        and dynamic friction, 26 slip at which it is complete [m/s].
+        moving: the bodies of a `JointTable`, row by row.
 
     Raises:
-        DrakeTeleopError: for other shapes, or where Drake chooses the stiffness.
+        DrakeTeleopError: for a shape that no box is around.
     """
     context = plant.CreateDefaultContext()
-    rows = []
+    known, watched, unknown = list[Array](), list[Array](), ""
     touched = (body for instance in environment for body in plant.GetBodyIndices(instance))
     for body in map(plant.get_body, touched):
-        X_WBody = plant.EvalBodyPoseInWorld(context, body)
-        for box in plant.GetCollisionGeometriesForBody(body):
-            for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
-                sphere, edges = _sphere_and_box(inspector, ball, box)
-                X_WBox = X_WBody @ inspector.GetPoseInFrame(box)
-                row = [
-                    inspector.GetPoseInFrame(ball).translation(),
-                    [sphere.radius()],
-                    X_WBox.rotation().matrix().ravel(),
-                    X_WBox.translation(),
-                    np.array(edges.size()) / 2,
-                    _direction(plant, context, body),
-                    _law(*map(inspector.GetProximityProperties, (ball, box))),
-                    [slip],
-                ]
-                rows.append(np.concatenate(row))
-    return np.array(rows).reshape(len(rows), WIDTH)
+        row = moving.index(body.index()) if body.index() in moving else -1
+        X_Body = plant.EvalBodyPoseInWorld(context, body) if row < 0 else RigidTransform()
+        direction = _direction(plant, context, body)
+        for thing in plant.GetCollisionGeometriesForBody(body):
+            for own, X_SOwn in tool.items():
+                if inspector.CollisionFiltered(own, thing):
+                    continue
+                X_Thing = X_Body @ inspector.GetPoseInFrame(thing)
+                X_SShape, law = X_SOwn @ inspector.GetPoseInFrame(own), [0.0] * 4
+                try:
+                    sphere, edges = _sphere_and_box(inspector, own, thing)
+                    law = _law(*map(inspector.GetProximityProperties, (own, thing)))
+                    radius, half, rows = sphere.radius(), np.array(edges.size()) / 2, known
+                except DrakeTeleopError as beyond:
+                    unknown = unknown or str(beyond)
+                    around, box = _around(inspector, own), _around(inspector, thing)
+                    X_SShape, radius = X_SShape @ around.pose(), np.linalg.norm(around.half_width())
+                    X_Thing, half, rows = X_Thing @ box.pose(), box.half_width(), watched
+                placed = [X_Thing.rotation().matrix().ravel(), X_Thing.translation(), half]
+                numbers = [X_SShape.translation(), [radius], *placed, direction, law, [slip, row]]
+                rows.append(np.concatenate(numbers))
+    return Pairs(
+        np.array(known).reshape(len(known), WIDTH),
+        np.array(watched).reshape(len(watched), WIDTH),
+        unknown,
+    )
+
+
+def _around(inspector: SceneGraphInspector, shape: GeometryId) -> Obb:
+    box = inspector.GetObbInGeometryFrame(shape)
+    if box is None:
+        raise DrakeTeleopError(
+            f"a {type(inspector.GetShape(shape)).__name__} has no end",
+            where=inspector.GetName(shape),
+        )
+    return box
 
 
 def _sphere_and_box(
@@ -132,7 +168,7 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
     """How deep a sphere is in its box [m], below 0 if it is not.
 
     Args:
-        pair: (27,) row of `ContactPairs`.
+        pair: (28,) row of `Pairs`.
         p_WS: (3,) origin of the tool's frame in W [m].
         R_WS: (3, 3) its rotation.
         deflection: of the environment [m].
@@ -193,7 +229,7 @@ def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: 
     """The force on the sphere that is `x` [m] deep in its box.
 
     Args:
-        pair: (27,) row of `ContactPairs`.
+        pair: (28,) row of `Pairs`.
         x: its indentation [m].
         normal: (3,) out of the box.
         velocity: (3,) of the sphere at the point of contact, relative to the box [m/s].

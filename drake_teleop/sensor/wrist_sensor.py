@@ -8,9 +8,11 @@ tool minus what the environment exerts on it (Eqs. 1, 2), and the motion is that
 The plant takes steps of its own, cut only where something drives it. When a step is over the sensor
 looks back: at each instant in it at which it samples, position and velocity are interpolated
 (Hermite), and the accelerations follow from the dynamics under the torque that the motors had. So
-8 kHz need no events, and what is sampled is exact for the state it belongs to. Contact that the
-compiled law does not know (`Contact.beyond`) Drake tells, for the end of a step alone: then each
-sample is an event, and ends one.
+8 kHz need no events, and what is sampled is exact for the state it belongs to. What the compiled
+law does not know of a tool that it knows otherwise (`Contact.watched`) Drake is asked for where it
+comes near, in a plant of its own (`ContactTwin`). Contact that it does not know at all
+(`Contact.beyond`) Drake tells, for the end of a step alone: then each sample is an event, and ends
+one.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import Demultiplexer, RandomSource
 
 from drake_teleop._compiled import njit
+from drake_teleop.environment.moving_bodies import interpolate_bodies
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.regressor import non_contact_wrench_into
@@ -71,10 +74,11 @@ from drake_teleop.slave.arm import (
     forward_kinematics,
     sensor_motion,
 )
+from drake_teleop.slave.contact_twin import ContactTwin
 from drake_teleop.slave.drake_contact import contact_wrench_W
 from drake_teleop.slave.plant import SlavePlant
 from drake_teleop.slave.plant_rates import joined, plant_rates, rates_under
-from drake_teleop.slave.tool_contact import environment_wrench
+from drake_teleop.slave.tool_contact import FAR, WATCHED, environment_wrench, nearness
 from drake_teleop.vectors import apply, cross, minus, nine, put, three, transposed
 
 Array = NDArray[np.float64]
@@ -129,7 +133,7 @@ def _interpolate(h, u, x, xdot, end, end_dot, out):
 @njit(cache=True)
 def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
     """One sample of the state x and what follows from it, into `memory`, see `sample_step`."""
-    arm, phi, _, _ = physics
+    arm, phi, _, _, _, _ = physics
     constants, motion_constants, middle, end, ideal = sensor
     half = x.shape[0] // 2
     n = half - 1
@@ -158,21 +162,21 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
 
 
 @njit(cache=True)
-def remember_step(tail, time, state, sheet):
+def remember_step(tail, time, state, around):
     """Puts a step's end into the queue that `sample_step` works off; see its `memory`."""
-    width = state.shape[0] + 3
+    width = state.shape[0] + 1 + around.shape[0]
     entry = tail[2 + int(tail[1]) * width :][:width]
     entry[0] = time
-    joined(state, sheet, entry[1:])
+    joined(state, around, entry[1:])
     tail[1] += 1.0
 
 
 @njit(cache=True)
-def _postpone(memory, tail, longest, time, state, sheet):
+def _postpone(memory, tail, longest, time, state, around):
     """Puts a step's end into the queue in `memory`, see `sample_step`; whether there was room."""
     if memory[tail + 1] >= longest:
         return False
-    remember_step(memory[tail:], time, state, sheet)
+    remember_step(memory[tail:], time, state, around)
     return True
 
 
@@ -186,20 +190,20 @@ def _torque_at(held, after, torque):
 
 @njit(cache=True)
 def sample_step(
-    physics, sensor, period, time, state, sheet, held, applied_W, noise, memory, until_now,
+    physics, sensor, period, time, state, around, held, applied_W, noise, memory, until_now,
     touching_W, result,
 ):  # fmt: skip
     """Takes the samples that have become due in the steps since the last call.
 
     Args:
         physics: (arm's table, phi of the tool, contact pairs, leaf (4,): mass, stiffness, damping,
-            acceleration by gravity).
+            acceleration by gravity; joints of what else moves, wrenches that are told).
         sensor: (chain's constants, estimator's, where its memory begins, where the tail does,
             ideal).
         period: of the sensor [s].
         time: now [s], the end of a step.
         state: (2 n,) [q; v] now.
-        sheet: (2,) deflection and its rate now.
+        around: [the sheet's deflection and its rate, the plant's state if anything else moves] now.
         held: torque (n,) now, of these steps' motors [N m], and at which rate it changed in them;
             (0,) if it was held.
         applied_W: (6,), see `environment_wrench`.
@@ -214,19 +218,24 @@ def sample_step(
             queue now's end alone].
     """
     n = state.shape[0] // 2
-    size, width, half, tau = BEFORE_JOINTS + n, state.shape[0] + 3, n + 1, np.empty(n)
+    size, half, tau, joints = BEFORE_JOINTS + n, n + 1, np.empty(n), physics[4]
+    extra = around.shape[0] - 2
+    full = 2 * half + extra
+    width = 1 + full
     after = result[size + 1 :]
     put(after, 0, memory, 0, memory.shape[0])
     tail = after[sensor[3] :]
     count, queued = tail[0], int(tail[1])
-    now, now_dot, now_wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
-    between, between_dot, wrench_W = np.empty(2 * half), np.empty(2 * half), np.empty(6)
+    now, now_dot, now_wrench_W = np.empty(full), np.empty(2 * half), np.empty(6)
+    between, between_dot, wrench_W = np.empty(full), np.empty(2 * half), np.empty(6)
     start_dot, end_dot = np.empty(2 * half), now_dot
-    joined(state, sheet, now)
+    joined(state, around, now)
     _torque_at(held, 0.0, tau)
     if until_now:
-        none = physics[2][:0]
-        environment_wrench(physics[0], none, applied_W, state[:n], state[n:], sheet, now_wrench_W)
+        none, sheet, plant = physics[2][:0], around[:2], around[2:]
+        environment_wrench(
+            physics[0], none, joints, applied_W, state[:n], state[n:], sheet, plant, now_wrench_W
+        )
         now_wrench_W += touching_W
         rates_under(physics, now, tau, applied_W, now_wrench_W, now_dot)
     else:
@@ -247,20 +256,23 @@ def sample_step(
         h = until - start[0]
         while (count + _SAME) * period < until:
             u = (count * period - start[0]) / h
-            _interpolate(h, u, start[1:], start_dot, end, end_dot, between)
+            _interpolate(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
+            if extra > 0:
+                at_start, at_end = start[width - extra :], end[2 * half :]
+                interpolate_bodies(joints, h, u, at_start, at_end, between[2 * half :])
             _torque_at(held, count * period - time, tau)
             plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
-            _take(physics, sensor, between, between_dot, wrench_W, noise, after)
+            _take(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
             count += 1.0
     # A step that is all rounding may have ended a little before, and have taken this sample.
     taken = (count - 1.0 + _SAME) * period > time
     put(result, 0, after, size if taken else 0, size)
     result[size] = (count - (2.0 if taken else 1.0)) * period
     if until_now and (count - _SAME) * period < time:
-        _take(physics, sensor, now, now_dot, now_wrench_W, noise, after)
+        _take(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
         count += 1.0
     tail[0], tail[1] = count, 0.0
-    remember_step(tail, time, state, sheet)
+    remember_step(tail, time, state, around)
 
 
 class WristSensor(LeafSystem):
@@ -275,6 +287,7 @@ class WristSensor(LeafSystem):
         - torque_rate: (n,) at which it changes [N m/s] (only with `ramps`)
         - slave_acceleration: vdot of the arm, to see that nothing else moves it
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
+        - plant_state: [q; v] of the whole plant (only if anything else moves)
         - contact_results: the plant's (only with something to touch)
         - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
         - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, of whatever pushes it besides
@@ -316,17 +329,21 @@ class WristSensor(LeafSystem):
         constants, chain = sensor_chain(config, n, period)
         motion_constants, estimator = motion_estimator(motion, config, n, period)
         self._offset = constants[OFFSET]
-        self._physics = slave.physics
+        self._physics, contact = slave.physics, slave.contact
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
             first[WRENCH] += config.offset
         # Contact takes many steps for one torque, and to work off the queue takes longer than them.
-        self._beyond = slave.contact.beyond
-        self._longest = _LONGEST if slave.can_touch and not slave.contact.beyond else 1
-        tail = np.zeros(2 + self._longest * (2 * n + 3))
+        self._beyond = contact.beyond
+        self._longest = _LONGEST if slave.can_touch and not contact.beyond else 1
+        self._around = np.zeros(2 + contact.plant_size)
+        tail = np.zeros(2 + self._longest * (2 * n + 1 + len(self._around)))
         memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
+        self._slave, self._watched = slave, contact.watched
+        self._twin: ContactTwin | None = None
+        self._most_told = 2 * self._longest + int(held / period) + 4
         self._period = period
         self._holds = (held, NOISE_BLOCK * period)
         self._no_noise, self._nothing, self._no_rate = (
@@ -340,13 +357,15 @@ class WristSensor(LeafSystem):
         self._rate = self.DeclareVectorInputPort("torque_rate", n) if ramps else None
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
         self._applied = self.DeclareVectorInputPort("applied_wrench_W", 6)
-        self._sheet = self._contacts = self._noise = None
+        self._sheet = self._contacts = self._noise = self._plant = None
         if slave.sensed_sheet is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
+        if contact.plant_size:
+            self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_size)
         if slave.can_touch:
             contacts = Value[ContactResults]()
             self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
-            self._tool = slave.contact.bodies, slave.contact.shapes
+            self._tool = contact.bodies, contact.shapes
         if not config.ideal:
             self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
         self.DeclareDiscreteState(memory)
@@ -354,7 +373,8 @@ class WristSensor(LeafSystem):
         self._remains = slice(len(first) + 1, None)  # of a step: the memory
         # Not the acceleration: whatever changes in the plant would be passed on twice.
         pushes = (self._torque, self._rate, self._applied)
-        seen = (self._state, *pushes, self._sheet, self._contacts, self._noise)
+        around = (self._sheet, self._plant, self._contacts)
+        seen = (self._state, *pushes, *around, self._noise)
         tickets = {port.ticket() for port in seen if port is not None}
         tickets |= {self.time_ticket(), self.xd_ticket()}
         self._step = self.DeclareVectorOutputPort(
@@ -378,13 +398,19 @@ class WristSensor(LeafSystem):
 
     @property
     def contact_pairs(self) -> Array:
-        """(k, 27) what may touch, see `ContactPairs`, a view."""
+        """(k, 28) what may touch, see `Pairs`, a view."""
         return self._physics[2]
 
     @property
     def beyond(self) -> str:
         """What its own contact law does not know, see `Contact`."""
         return self._beyond
+
+    @property
+    def moves(self) -> str:
+        """What of the surroundings moves besides a leaf, as a sentence, or nothing."""
+        names = ", ".join(self._slave.contact.moving)
+        return f"{names} can move" if names else ""
 
     @property
     def remembered(self) -> NDArray[np.intp]:
@@ -400,7 +426,7 @@ class WristSensor(LeafSystem):
 
     def take_samples(self, context: Context) -> None:
         """Takes the samples before now, for who wants to see the state that results."""
-        sample_step(*self._inputs(context), False, self._nothing, self._result)
+        self._sample(context, False, self._nothing, self._result)
         context.SetDiscreteState(self._result[self._remains])
 
     def bring_up_to_date(self, context: Context) -> None:
@@ -411,17 +437,29 @@ class WristSensor(LeafSystem):
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
         tail, time = memory[self._sensor[3] :], context.get_time()
         tail[0], tail[1] = np.ceil(time / self._period - _SAME), 0.0
-        remember_step(tail, time, self._state.Eval(context), self._sheet_state(context))
+        remember_step(tail, time, self._state.Eval(context), self._surroundings(context))
 
-    def _sheet_state(self, context: Context) -> Array:
-        return self._nothing[:2] if self._sheet is None else self._sheet.Eval(context)
+    def _surroundings(self, context: Context) -> Array:
+        """[Deflection, rate] of the leaf, or [0, 0, the plant's state]."""
+        if self._plant is not None:
+            self._around[2:] = self._plant.Eval(context)
+        return self._around if self._sheet is None else self._sheet.Eval(context)
 
     def _applied_W(self, context: Context) -> Array:
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._nothing
 
+    def _near(self, q: Array, around: Array) -> int:
+        """See `nearness`."""
+        arm, _, pairs, _, joints, _ = self._physics
+        return nearness(arm, pairs, self._watched, joints, q, around[:2], around[2:])
+
     def _touching_W(self, context: Context) -> Array:
         if self._contacts is None:
             return self._nothing
+        if not self._beyond:
+            q = self._state.Eval(context)[: self._n]
+            if self._near(q, self._surroundings(context)) == FAR:
+                return self._nothing
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
     def _touching_So_W(self, context: Context) -> Array:
@@ -439,7 +477,7 @@ class WristSensor(LeafSystem):
             self._period,
             context.get_time(),
             self._state.Eval(context),
-            self._sheet_state(context),
+            self._surroundings(context),
             (
                 self._torque.Eval(context),
                 self._no_rate if self._rate is None else self._rate.Eval(context),
@@ -450,14 +488,46 @@ class WristSensor(LeafSystem):
         )
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
-        touching_W = self._touching_W(context)
-        sample_step(*self._inputs(context), True, touching_W, output.get_mutable_value())
+        self._sample(context, True, self._touching_W(context), output.get_mutable_value())
+
+    def _sample(self, context: Context, until_now: bool, touching_W: Array, result: Array) -> None:
+        """`sample_step`, with Drake's contact at each instant where the tool is watched."""
+        inputs = self._inputs(context)
+        if not (len(self._watched) and self._is_watched(context)):
+            sample_step(*inputs, until_now, touching_W, result)
+            return
+        if self._twin is None:
+            self._twin = ContactTwin(self._slave)
+        own = 2 * self._n + 2
+        size = own + self._slave.contact.plant_size
+        told = np.zeros((1 + self._most_told, 2 + size))
+        physics = (*self._physics[:-1], told)
+        # The state of each wrench that is asked for follows from those before.
+        for k in range(self._most_told):
+            told[0, :2] = k, 0.0
+            sample_step(physics, *inputs[1:], until_now, touching_W, result)
+            if told[0, 1] <= k:
+                return
+            asked = told[0, 2:]
+            told[1 + k, :6] = self._twin.wrench_W(asked[:own], asked[own:])
+
+    def _is_watched(self, context: Context) -> bool:
+        """Whether only Drake knows something near, now or at the end of the last step."""
+        if self._near(self._state.Eval(context)[: self._n], self._surroundings(context)) == WATCHED:
+            return True
+        n, memory = self._n, context.get_discrete_state_vector().value()
+        x = memory[self._sensor[3] + 3 :]
+        around = np.concatenate([x[n : 2 * n + 2 : n + 1], x[2 * n + 2 :][: len(self._around) - 2]])
+        return self._near(x[:n], around) == WATCHED
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._longest > 1 and not self._is_due(context.get_time()):
             memory, time = discrete_state.get_mutable_value(0), context.get_time()
-            state, sheet = self._state.Eval(context), self._sheet_state(context)
-            if _postpone(memory, self._sensor[3], self._longest, time, state, sheet):
+            state, around = self._state.Eval(context), self._surroundings(context)
+            watched = len(self._watched) and self._near(state[: self._n], around) == WATCHED
+            if not watched and _postpone(
+                memory, self._sensor[3], self._longest, time, state, around
+            ):
                 return
         discrete_state.set_value(0, self._step.Eval(context)[self._remains])
 
@@ -471,14 +541,17 @@ class WristSensor(LeafSystem):
 
     def _check(self, context: Context) -> EventStatus:
         n = self._n
-        x, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2)
-        joined(self._state.Eval(context), self._sheet_state(context), x)
+        around = self._surroundings(context)
+        x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
+        joined(self._state.Eval(context), around, x)
         if not np.isfinite(x).all():  # nothing is known; the samples say so
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)
-        if self._beyond:
+        physics = self._physics
+        if self._beyond or (len(self._watched) and self._is_watched(context)):
             applied = applied + self._touching_So_W(context)
-        plant_rates(self._physics, x, torque, applied, np.empty(6), xdot)
+            physics = (*physics[:2], physics[2][:0], *physics[3:])
+        plant_rates(physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
         if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ALIKE * (1.0 + np.abs(vdot).max()):
             raise DrakeTeleopError(
@@ -539,6 +612,8 @@ def AddWristSensor(
             slave.plant.get_state_output_port(slave.sensed_sheet),
             sensor.GetInputPort("sheet_state"),
         )
+    if slave.contact.plant_size:
+        builder.Connect(slave.plant.get_state_output_port(), sensor.GetInputPort("plant_state"))
     if slave.can_touch:
         builder.Connect(
             slave.plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")

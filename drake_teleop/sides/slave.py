@@ -259,7 +259,8 @@ def _add_body(
 
 def _samples_within(scenario: Scenario, slave: SlavePlant) -> int:
     """Of the servo for one event; 1 where nothing but the plant itself can foresee its motion."""
-    if slave.contact.beyond or scenario.joint_control.position_interface is not None:
+    contact, interface = slave.contact, scenario.joint_control.position_interface
+    if contact.beyond or contact.plant_size or interface is not None:
         return 1
     return samples_within(scenario.rates.joint_control_hz, scenario.rates.hand_hz)
 
@@ -273,11 +274,10 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputP
         results = plant.get_contact_results_output_port()
         builder.Connect(results, contact.GetInputPort("contact_results"))
     else:
-        moves = slave.sheet is not None
-        contact = builder.AddNamedSystem(
-            "tool_contact", ToolContact(slave.arm, slave.contact_pairs, moves=moves)
-        )
+        contact = builder.AddNamedSystem("tool_contact", ToolContact(slave.arm, slave.contact))
         builder.Connect(state, contact.GetInputPort("slave_state"))
+        if slave.contact.plant_size:
+            builder.Connect(plant.get_state_output_port(), contact.GetInputPort("plant_state"))
     export(builder, contact, "true_contact_wrench_W")
     if slave.sheet is not None:
         sheet = plant.get_state_output_port(slave.sheet)

@@ -379,7 +379,9 @@ class NumericInverseKinematics(LeafSystem):
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._position = self.DeclareVectorInputPort("joint_position", n)
         self.DeclareDiscreteState(np.append(self._posture, 0.0))  # and of when it is
-        self.DeclareVectorOutputPort("joint_command", n, weak_callback(self._calc_command))
+        self._command = self.DeclareVectorOutputPort(
+            "joint_command", n, weak_callback(self._calc_command)
+        )
         self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
@@ -406,5 +408,5 @@ class NumericInverseKinematics(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         next_state = discrete_state.get_mutable_value(0)
-        self._solve(context, next_state[:-1])
+        next_state[:-1] = self._command.Eval(context)  # which the joint control has asked for too
         next_state[-1] = context.get_time()

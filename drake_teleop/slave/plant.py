@@ -57,6 +57,8 @@ class SlavePlant:
         tip: (3,) p_STip, where the tool makes contact [m].
         contact: with what there is to touch.
         assumptions: what the models do not say.
+        config: what was asked for.
+        environment: what there is to touch, or None.
     """
 
     plant: MultibodyPlant
@@ -69,20 +71,23 @@ class SlavePlant:
     tip: NDArray[np.float64]
     contact: Contact
     assumptions: tuple[str, ...]
+    config: Slave
+    environment: Environment | None
 
     @property
     def contact_pairs(self) -> NDArray[np.float64]:
-        """(k, 27) what may touch by the compiled contact law, see `ContactPairs`."""
+        """(k, 28) what may touch by the compiled contact law, see `Pairs`."""
         return self.contact.pairs
 
     @cached_property
     def physics(self) -> tuple[NDArray[np.float64], ...]:
-        """For `plant_rates`: the arm's table, phi in it, `contact_pairs`, the leaf.
+        """For `plant_rates`: the arm's table, phi in it, pairs, leaf, joints; nothing is told.
 
         A copy, because something may be grasped; the joint control knows nothing of that.
         """
         carried = self.arm.with_load(self.arm.phi_load)
-        return carried.table, carried.load, self.contact_pairs, self.contact.leaf
+        contact = self.contact.pairs, self.contact.leaf, self.contact.joints
+        return carried.table, carried.load, *contact, np.zeros((0, 0))
 
     @property
     def sheet(self) -> ModelInstanceIndex | None:
@@ -205,6 +210,8 @@ def AddSlavePlant(
         _tip(plant, slave, parsed, arm),
         contact,
         (*parsed.assumptions, *assumptions),
+        slave,
+        environment,
     )
 
 

@@ -9,11 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex
 from pydrake.systems.framework import Context
 
 from drake_teleop.environment.environment import Environment, ToolShapes
+from drake_teleop.environment.moving_bodies import JOINT_WIDTH, JointTable
 from drake_teleop.environment.point_contact import WIDTH, ContactPairs
 from drake_teleop.errors import DrakeTeleopError
 
@@ -32,9 +34,12 @@ class Contact(NamedTuple):
     """What may touch the tool, and how it is told.
 
     Attributes:
-        pairs: (k, 27) of `ContactPairs`; none if `beyond` says something.
+        pairs: (k, 28) `Pairs.known`; none if `beyond` says something.
+        watched: (l, 28) `Pairs.watched`: what is left to Drake where it comes near.
+        joints: (m, 21) of `JointTable`, by which the boxes of `pairs` move.
+        plant_size: of the plant's state, if there are joints, or 0.
         beyond: what the compiled contact law does not know, so that Drake's contact results are
-            used; empty if it knows all.
+            used; empty if it knows enough.
         bodies: the tool's, and what is welded to it, as numbers.
         shapes: identifiers of their shapes, as numbers.
         leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] of the leaf, and its acceleration by
@@ -44,6 +49,9 @@ class Contact(NamedTuple):
     """
 
     pairs: NDArray[np.float64]
+    watched: NDArray[np.float64]
+    joints: NDArray[np.float64]
+    plant_size: int
     beyond: str
     bodies: frozenset[int]
     shapes: frozenset[int]
@@ -51,11 +59,17 @@ class Contact(NamedTuple):
     sheet: ModelInstanceIndex | None
     moving: dict[str, BodyIndex]
 
+    @property
+    def law(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pairs and joints, as `environment_wrench` takes them."""
+        return self.pairs, self.joints
+
 
 def no_contact() -> Contact:
     """With nothing to touch."""
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
-    return Contact(np.zeros((0, WIDTH)), "", frozenset(), frozenset(), leaf, None, {})
+    pairs, joints = np.zeros((0, WIDTH)), np.zeros((0, JOINT_WIDTH))
+    return Contact(pairs, pairs, joints, 0, "", frozenset(), frozenset(), leaf, None, {})
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> Touched:
@@ -109,21 +123,32 @@ def ContactWith(
             contact = contact._replace(leaf=np.array([*part.moving_part, gravity]))
     context = plant.CreateDefaultContext()
     _check_masses(plant, context, contact)
-    X_STool = plant.CalcRelativeTransform(context, sensor_frame, plant.get_body(tool).body_frame())
-    if any(own for index, own in shapes.items() if index != tool):
-        return contact._replace(beyond="several bodies of the tool have shapes")
-    if not X_STool.IsNearlyIdentity(_SAME):
-        return contact._replace(beyond="the tool's shapes are not placed from S")
     if beyond := _beyond(environment, contact):
         return contact._replace(beyond=beyond)
-    inspector = scene_graph.model_inspector()
+    joints, order = JointTable(plant, contact.moving.values())
+    from_S = {
+        shape: _X_SBody(plant, context, sensor_frame, index)
+        for index, own in shapes.items()
+        for shape in own
+    }
+    inspector, slip = scene_graph.model_inspector(), environment.slip
     try:
-        pairs = ContactPairs(plant, inspector, tool, touched.instances, environment.slip)
-    except DrakeTeleopError as unknown:
-        return contact._replace(beyond=str(unknown))
-    if not len(pairs):
-        return contact._replace(beyond="nothing has a shape")
-    return contact._replace(pairs=pairs)
+        found = ContactPairs(plant, inspector, from_S, touched.instances, slip, order)
+    except DrakeTeleopError as endless:
+        return contact._replace(beyond=str(endless))
+    known, watched, unknown = found
+    if not len(known):
+        return contact._replace(beyond=unknown or "nothing has a shape")
+    size = plant.num_multibody_states() if len(joints) else 0
+    return contact._replace(pairs=known, watched=watched, joints=joints, plant_size=size)
+
+
+def _X_SBody(
+    plant: MultibodyPlant, context: Context, sensor_frame: Frame, index: BodyIndex
+) -> RigidTransform:
+    frame = plant.get_body(index).body_frame()
+    X_SBody = plant.CalcRelativeTransform(context, sensor_frame, frame)
+    return RigidTransform() if X_SBody.IsNearlyIdentity(_SAME) else X_SBody
 
 
 def _check_masses(plant: MultibodyPlant, context: Context, contact: Contact) -> None:
@@ -143,8 +168,6 @@ def _check_masses(plant: MultibodyPlant, context: Context, contact: Contact) -> 
 def _beyond(environment: Environment, contact: Contact) -> str:
     if environment.hydroelastic:
         return "contacts have areas"
-    if contact.moving:
-        return f"{', '.join(contact.moving)} can move"
     if contact.sheet is not None and len(environment.parts) > 1:
         return "the leaf is not alone"
     return ""

@@ -49,7 +49,9 @@ def pairs_of_a_ball(slot: Slot) -> np.ndarray:
     environment = AddEnvironment(plant, slot).instances
     plant.Finalize()
     TouchAsSlot(plant, scene_graph, slot, tool.index())
-    pairs = ContactPairs(plant, scene_graph.model_inspector(), tool.index(), environment, slot.slip)
+    shapes = dict.fromkeys(plant.GetCollisionGeometriesForBody(tool), RigidTransform())
+    inspector = scene_graph.model_inspector()
+    pairs = ContactPairs(plant, inspector, shapes, environment, slot.slip).known
     return pairs[np.all(pairs[:, :3] == 0.0, axis=1)]
 
 
@@ -173,7 +175,9 @@ def wrench_at(slave, angle: float, shift: float) -> np.ndarray:
     near = slave.plant.GetDefaultPositions(slave.instance)
     q, status = nearest_branch(R_WS.matrix(), p_WS, near, arm.lower, arm.upper)
     assert status == IkStatus.OK
-    environment_wrench(arm.table, slave.contact_pairs, np.zeros(6), q, 0 * q, np.zeros(2), wrench)
+    environment_wrench(
+        arm.table, *slave.contact.law, np.zeros(6), q, 0 * q, np.zeros(2), np.zeros(0), wrench
+    )
     return wrench
 
 

@@ -156,10 +156,11 @@ def test_the_arm_touches_nothing_but_what_hangs_on_its_sensor_does(folder, tmp_p
     path, tool = tmp_path / "arm.urdf", Tool(mass=1.0, shapes=[Ball()])
     text = (folder / "arm.urdf").read_text()
     slave = Slave(model=str(path), sensor_frame="ft", home=HOME, tool=tool)
-    for link, beyond in (("l7", ""), ("hand", "several bodies of the tool have shapes")):
+    for link, watched in (("l7", 0), ("hand", 1)):  # a ball that does not say how stiff it is
         path.write_text(text.replace(f'<link name="{link}">', f'<link name="{link}">{ball}'))
         contact = AddSlavePlant(DiagramBuilder(), slave, SheetSpring()).contact
-        assert (contact.beyond, len(contact.shapes)) == (beyond, 2 if beyond else 1)
+        assert (len(contact.watched), len(contact.shapes)) == (watched, 1 + watched)
+        assert (len(contact.pairs), contact.beyond) == (1, "")
 
 
 def test_model_directives_lead_to_other_files_and_their_packages(folder, tmp_path):

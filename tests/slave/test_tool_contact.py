@@ -13,7 +13,6 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.environment.point_contact import ContactPairs
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
-from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.slave.plant import AddSlavePlant
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.tool_contact import environment_wrench
@@ -52,7 +51,9 @@ def test_it_is_drakes_law(place, most):
         plant.SetPositions(context, slave.sheet, sheet[:1])
         plant.SetVelocities(context, slave.sheet, sheet[1:])
         expected = drakes(plant, context, slave.tool)
-        environment_wrench(slave.arm.table, slave.contact_pairs, np.zeros(6), q, v, sheet, found)
+        environment_wrench(
+            slave.arm.table, *slave.contact.law, np.zeros(6), q, v, sheet, np.zeros(0), found
+        )
         # A stiffness of 2e5 N/m makes 1e-10 N of the rounding of a position.
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
         touching += expected.any()
@@ -76,7 +77,7 @@ def test_a_peg_in_a_slot_is_drakes_law_with_many_pairs_at_once():
         results = plant.get_contact_results_output_port().Eval(context)
         most = max(most, results.num_point_pair_contacts())
         environment_wrench(
-            slave.arm.table, slave.contact_pairs, np.zeros(6), q, v, np.zeros(2), found
+            slave.arm.table, *slave.contact.law, np.zeros(6), q, v, np.zeros(2), np.zeros(0), found
         )
         np.testing.assert_allclose(found, drakes(plant, context, slave.tool), rtol=1e-9, atol=1e-9)
     assert most >= 4
@@ -86,20 +87,27 @@ def test_a_push_is_moved_to_the_worlds_origin():
     slave = AddSlavePlant(DiagramBuilder(), Slave(position=[0.55, 0.0, 0.36]), None)
     push, found = np.array([1.0, -2.0, 3.0, 0.1, 0.2, 0.3]), np.zeros(6)
     q = slave.plant.GetPositions(slave.plant.CreateDefaultContext(), slave.instance)
-    environment_wrench(slave.arm.table, slave.contact_pairs, push, q, 0 * q, np.zeros(2), found)
+    environment_wrench(
+        slave.arm.table, *slave.contact.law, push, q, 0 * q, np.zeros(2), np.zeros(0), found
+    )
     np.testing.assert_array_equal(found[:3], push[:3])
     expected = push[3:] + np.cross([0.55, 0.0, 0.36], push[:3])
     np.testing.assert_allclose(found[3:], expected, atol=1e-12)
 
 
-def test_other_shapes_are_refused():
+def test_other_shapes_are_watched_from_around_them():
+    """A cube's ball about its corners, and a box around a ball; without an end there is none."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
     tool = plant.AddRigidBody("tool", SpatialInertia.SolidSphereWithMass(1.0, 0.01))
     table = plant.AddModelInstance("table")
     body = plant.AddRigidBody("body", table, SpatialInertia.SolidSphereWithMass(1.0, 0.01))
-    friction = CoulombFriction(0.2, 0.2)
-    plant.RegisterCollisionGeometry(tool, RigidTransform(), Box(1, 1, 1), "cube", friction)
+    friction, aside = CoulombFriction(0.2, 0.2), RigidTransform([0.0, 0.3, 0.0])
+    cube = plant.RegisterCollisionGeometry(tool, aside, Box(1, 1, 1), "cube", friction)
     plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(0.1), "ball", friction)
     plant.Finalize()
-    with pytest.raises(DrakeTeleopError, match="spheres on boxes only, not a Box on a Sphere"):
-        ContactPairs(plant, scene_graph.model_inspector(), tool.index(), [table], 1e-4)
+    inspector, from_S = scene_graph.model_inspector(), RigidTransform([0.0, 0.0, 0.2])
+    pairs = ContactPairs(plant, inspector, {cube: from_S}, [table], 1e-4)
+    assert len(pairs.known) == 0
+    assert "spheres on boxes only, not a Box on a Sphere" in pairs.unknown
+    np.testing.assert_allclose(pairs.watched[0, :4], [0.0, 0.3, 0.2, 0.75**0.5])
+    np.testing.assert_allclose(pairs.watched[0, 16:19], 0.1)
