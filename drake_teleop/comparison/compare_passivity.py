@@ -157,6 +157,16 @@ def longest_round_trip(
     return longest
 
 
+def station_base(scenario: str | Path, seed: int) -> Scenario:
+    """The station of a scenario as the comparison has it: its own rates, nothing to touch yet."""
+    return replace(
+        LoadScenario(scenario).without_environment(),
+        simulation__seed=seed,
+        rates=_RATES,
+        contact_detection=None,
+    )
+
+
 def station_run(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
@@ -241,12 +251,7 @@ def _station_study(
     jobs: int,
     stage: Stage,
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, NDArray[np.float64]]]]:
-    base = replace(
-        LoadScenario(scenario).without_environment(),
-        simulation__seed=seed,
-        rates=_RATES,
-        contact_detection=None,
-    )
+    base = station_base(scenario, seed)
     estimate = identified_load(base, stage).estimate
     # The longest runs first, so that no process is left with one at the end.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop._compiled import njit
 from drake_teleop.channel.channel import Channel
 from drake_teleop.comparison.one_dof import ACTUAL, HAND, Figures, Task, figures_of
-from drake_teleop.comparison.station_accounts import start_energy, station_accounts
+from drake_teleop.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.identification import slave_arm
 from drake_teleop.operator.operator import MinimumJerk, OperatorConfig, Sine
@@ -124,10 +124,12 @@ def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.f
     """(N,) that hand and environment have put in, and what the stores held at the start [J].
 
     It never falls below zero if the station is passive between the hand, with the force that is
-    held there, and the slave's actual motion.
+    held there, and the slave's actual motion: that of contact and, with sigma > 0, load.
     """
-    accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]]
-    return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=(1, 2)))
+    accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
+    if any(scenario.force_scaling.scales()[:2]):
+        accounts += load_work(result, scenario)
+    return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
 
 
 def _slave_motion(

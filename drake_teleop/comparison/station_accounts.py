@@ -4,7 +4,8 @@ They are those of one degree of freedom (`drake_teleop.comparison.one_dof`), in 
 translation and rotation apart; in the master's power units, positive inwards [J]. What comes out of
 a passive station never exceeds what its stores held at the start: the hand's account plus any one
 of the others never falls below -E_0 then. The command is no physical port. With sigma > 0 the hand
-feels the load too, which gives back what was put into it: energy that `MOTOR` and `ACTUAL` lack.
+feels the load too, which gives back what was put into it: energy that `MOTOR` and `ACTUAL` lack,
+and `load_work` has.
 
     HAND      -sum f_(k-1) . dx_k           the held wrench, at every period of the channel: exact
     COMMAND    sum w_k . dc_k               what the slave sends, along its command: as exact
@@ -25,11 +26,12 @@ from numpy.typing import NDArray
 from drake_teleop.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import slave_arm
+from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.passivity import methods
 from drake_teleop.passivity.energy import ledger, port_work
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario
-from drake_teleop.slave.arm import inverse_dynamics, jacobian
+from drake_teleop.slave.arm import inverse_dynamics, jacobian, sensor_motion
 from drake_teleop.slave.forward_kinematics import pose_into
 
 Array = NDArray[np.float64]
@@ -82,6 +84,33 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
             so_far = np.interp(t, then, result["ports"][:, first + g])
             accounts[:, place, g] = so_far - so_far[0]
     return accounts
+
+
+def load_work(result: SimulationResult, scenario: Scenario) -> Array:
+    """What weight and inertia of the slave's load have put in along its actual motion, as felt.
+
+    It is to `ACTUAL` as the load is to the contact: where the load is felt (sigma > 0), the two
+    together are the environment. Of the true load, with accelerations from one row to the next.
+
+    Returns:
+        (N, 2) by translation and rotation [J], zero in the first row; never more in all than the
+        load's energy at the start, if both kinematic scales are alike.
+    """
+    arm, t, joints = slave_arm(scenario), result.t, slave_arm(scenario).num_joints
+    q, v = np.split(np.ascontiguousarray(result["slave_state"]), [joints], axis=1)
+    a, poses, motion = np.gradient(v, t, axis=0), np.empty((len(t), 7)), np.empty((len(t), 21))
+    for k in range(len(t)):
+        pose_into(arm.table, q[k], poses[k])
+        sensor_motion(arm.table, q[k], v[k], a[k], motion[k])
+    gripper, rest, _ = scenario.force_scaling.scales()
+    held = scenario.force_scaling.gripper_phi
+    of_gripper = arm.phi_load if held is None else np.asarray(held)
+    felt = gripper * of_gripper + rest * (arm.phi_load - of_gripper)
+    wrench = -non_contact_wrench(motion[:, :3], motion[:, 3:6], motion[:, 6:9], felt)
+    R_WS = motion[:, np.newaxis, 12:].reshape(-1, 1, 3, 3)
+    at_So = (R_WS @ wrench.reshape(-1, 2, 3, 1)).reshape(-1, 6)
+    power = scenario.force_scaling.force_scale / _motion_scale(scenario)
+    return np.asarray(power * port_work(at_So, poses, "mean"))
 
 
 def start_energy(scenario: Scenario) -> Array:

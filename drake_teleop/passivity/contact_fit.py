@@ -45,3 +45,25 @@ def fit(sums, more, way, faster, keep):
     if not damping > 0.0:  # and so the determinant is not 0 below
         return max(sums[3] / sums[0], 0.0), 0.0
     return max(square * sums[3] - sums[1] * sums[4], 0.0) / determinant, damping / determinant
+
+
+@njit(cache=True)
+def steadied(push, size, explained, share, across, mean):
+    """What is shown along a mean direction that friction has tilted.
+
+    A tip that is held sideways by f tilts the mean of its wrench w by f / |w| at most. Where it
+    slips, what there is along the mean changes by f^2 / |w|, though nobody presses otherwise. So a
+    step of up to that which depth and speed do not explain is shown gradually; the rest is at once.
+
+    Args:
+        push: what was shown [N].
+        size: what there is along the mean now, not negative [N].
+        explained: what it should have changed by [N].
+        share: of the rest that is shown now.
+        across: the largest friction of late [N].
+        mean: size of the mean wrench, above 0 [N].
+    """
+    push += explained
+    push += min(share, 1.0) * (size - push)
+    turned = across * min(across / mean, 1.0)
+    return min(max(push, size - turned, 0.0), size + turned)

@@ -16,7 +16,9 @@ m, K, D mass and servo as they are believed, all in the master's power units:
     silent for half a round trip, or 60 ms (20 ms at least). At a contact's onset k is that of the
     last one, so that a bounce does not stiffen the wall. Beyond the wall x_w the target is
     x_w + rho (x_received - x_w), along n. rho is left alone while it would change by less than a
-    tenth: it moves the slave, and friction makes a new k of that.
+    tenth: it moves the slave, and friction makes a new k of that. Friction that lasts tilts n, and
+    where it lets go w_n steps by as much as f^2 / |w|, f the largest across n of about a second.
+    A step up to that which k and b do not explain is shown in 0.6 s, or over 1 mm of way.
 :S4: The command follows the target with bounded acceleration, and m v^2 / 2 <= L_s.
 :S5: Motors that push with the motion, f . v > 0, spend at most what A holds in 4 ms; pressing on
     the wall what was paid since the onset, Q, and c F_u^2 / 2 k that nobody paid. With A at its end
@@ -31,7 +33,7 @@ from __future__ import annotations
 import math
 
 from drake_teleop._compiled import njit
-from drake_teleop.passivity.contact_fit import SUMS, fit
+from drake_teleop.passivity.contact_fit import SUMS, fit, steadied
 from drake_teleop.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -56,6 +58,7 @@ from drake_teleop.passivity.packet import (
     OTHER_ENERGY,
     POSE,
     VELOCITY,
+    WRENCH,
     arrived,
     difference_into,
     dot,
@@ -89,6 +92,7 @@ _SLOW = 0.15  # m/s; an impact's wrench says less of the stiffness
 _SMOOTH = 0.02  # s, of the wall's place and of rho
 _SURE = 0.1  # of rho, by which it is not changed: it moves the slave, which changes k
 _DIRECTION = 3.0  # s, of the contact's direction at least: a tip that sticks and slips turns it
+_TILTED, _RUBBED = 0.6, 1.0  # s, in which friction's step along n is shown; of the largest one
 _SETTLED, _TIMES = 0.5, 10.0  # s and c, of a hand that stays
 _STIFFEST = 1200.0  # N/m, of its k_d
 _FOLLOW = 0.01  # s, of the command's generator
@@ -130,6 +134,8 @@ _WAY, _BEHIND, _LEARNT, _SUMS = *(_places.number() for _ in range(3)), _places.v
 _SILENT, _GAP, _ROUND_TRIP, _PERIOD = (_places.number() for _ in range(4))
 # The contact's wrench; the load's, smoothed.
 _CONTACT, _WEIGHT = _places.vector(6), _places.vector(6)
+# What is shown along n; the last speed into it; the largest friction.
+_PUSH, _BEFORE, _ACROSS = (_places.number() for _ in range(3))
 
 
 @njit(cache=True)
@@ -224,6 +230,10 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     _model(received, heard, T, p, memory, gap)
     put(command, 0, memory, COMMAND.start, 13)
     fill(memory[MODEL], memory[_MODEL_TWIST], contact, packet)
+    if memory[TOUCHED] > 0.0:
+        instead = memory[_PUSH] - along(contact, memory[NORMAL], p)
+        for i in range(6):
+            packet[WRENCH][i] += instead * memory[NORMAL][i]
     put(packet, LOAD.start, weight, 0, 6)
     k, yields = memory[_STIFFNESS], 0.0
     for g in range(2):
@@ -283,26 +293,25 @@ def _shown_at_most(T, p, memory):
 def _learn(touched, dx, wrench, T, p, memory):
     """S3 but for the target: direction, stiffness, damping, share, how deep the slave is."""
     if not touched:
-        memory[TOUCHED] = memory[_SMOOTHED] = 0.0
+        memory[TOUCHED] = memory[_SMOOTHED] = memory[_ACROSS] = 0.0
         return
-    normal, k = memory[NORMAL], memory[_STIFFNESS]
+    normal, k, velocity = memory[NORMAL], memory[_STIFFNESS], memory[VELOCITY_HERE]
     size = find_direction(wrench, memory[_ROUND_TRIP], T, p, memory)
     most = _shown_at_most(T, p, memory)
     inward, rate = -over_way(normal, dx), min(T / _FILTER, 1.0)
-    speed = -over_way(normal, memory[VELOCITY_HERE])
+    speed = -over_way(normal, velocity)
     if memory[_SMOOTHED] == 0.0:
         # From the first sample in contact: on the way to it a part was outside.
-        memory[_SMOOTHED] = memory[_ANCHOR] = size
-        memory[_BEHIND], memory[_FAST] = inward, speed
+        memory[_SMOOTHED] = memory[_ANCHOR] = memory[_PUSH] = size
+        memory[_BEHIND] = inward
+        memory[_FAST] = memory[_BEFORE] = speed
         memory[_WAY] = memory[_LEARNT] = 0.0
         memory[_SHARE] = memory[_GOAL] = most / max(k, most)
     follows = rate * (inward - memory[_BEHIND])
     memory[_BEHIND] += follows - inward
     memory[_WAY] += follows
     memory[_SMOOTHED] += rate * (size - memory[_SMOOTHED])
-    fastest = math.hypot(
-        length(memory[VELOCITY_HERE], 0), length(memory[VELOCITY_HERE], 1) / ARM[1]
-    )
+    fastest = math.hypot(length(velocity, 0), length(velocity, 1) / ARM[1])
     slow, far = fastest < _SLOW, abs(memory[_WAY])
     if far > (_STRETCH if slow else _LONG):
         memory[_LEARNT] = min(memory[_LEARNT] + far, _KNOWN)
@@ -321,6 +330,14 @@ def _learn(touched, dx, wrench, T, p, memory):
             memory[_INSIDE] = deep
         memory[_INSIDE] += inward + rate * (deep - memory[_INSIDE] - inward)
         memory[TOUCHED] = 1.0
+    pushed = memory[PUSHED]
+    mean = max(math.sqrt(along(pushed, pushed, p)), 1e-12)
+    rubs = math.sqrt(max(along(wrench, wrench, p) - size * size, 0.0))
+    memory[_ACROSS] = max(memory[_ACROSS] * (1.0 - min(T / _RUBBED, 1.0)), rubs)
+    explained = memory[_STIFFNESS] * inward + memory[_DAMPER] * (speed - memory[_BEFORE])
+    rate = T / _TILTED + abs(inward) / _LEARN
+    memory[_PUSH] = steadied(memory[_PUSH], size, explained, rate, memory[_ACROSS], mean)
+    memory[_BEFORE] = speed
 
 
 @njit(cache=True)

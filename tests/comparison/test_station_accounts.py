@@ -7,7 +7,7 @@ import pytest
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.comparison.one_dof import ACTUAL, HAND, MOTOR
-from drake_teleop.comparison.station_accounts import start_energy, station_accounts
+from drake_teleop.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import slave_arm, true_load
 from drake_teleop.operator.operator import MinimumJerk
@@ -18,6 +18,7 @@ from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.scenario import LoadScenario, Rates, Scenario, Simulation, replace
 from drake_teleop.signals import SIGNALS
 from drake_teleop.simulation import simulate
+from drake_teleop.slave.arm import jacobian, sensor_motion
 from drake_teleop.slave.forward_kinematics import pose_into
 from drake_teleop.station import MakeTeleopStation
 
@@ -69,6 +70,30 @@ def test_a_torque_at_the_tool_works_along_its_turns_alone():
     assert np.isnan(accounts[:, MOTOR]).all()
 
 
+def test_a_load_gets_back_what_it_gave_in_weight_and_motion():
+    """Of T + U, by mass, m c and inertia about So, as written here; half of it is felt."""
+    t, scenario = np.arange(400) * 1e-3, replace(SCENARIO, force_scaling__sigma=0.5)
+    scenario = replace(scenario, kinematic_scaling=KinematicScalingConfig(2.0, 2.0))
+    arm, rates = slave_arm(scenario), np.arange(1, 7)
+    q = np.array([0.1, -0.4, 0.9, 0.2, 0.7, -0.3]) + 0.1 * np.sin(np.outer(t, 2 * rates))
+    v = 0.2 * rates * np.cos(np.outer(t, 2 * rates))
+    result = SimulationResult(t, {"slave_state": np.hstack([q, v])}, [SIGNALS["slave_state"]])
+    m, mc, (xx, xy, xz, yy, yz, zz) = arm.phi_load[0], arm.phi_load[1:4], arm.phi_load[4:]
+    inertia, energy, x = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), [], np.empty(21)
+    J = np.empty((6, 6))
+    for k in range(len(t)):
+        sensor_motion(arm.table, q[k], v[k], np.zeros(6), x)
+        jacobian(arm.table, q[k], J)
+        R_WS, omega, at_So = x[12:].reshape(3, 3), x[3:6], J[:3] @ v[k]
+        moving = 0.5 * m * at_So @ at_So + 0.5 * omega @ inertia @ omega
+        moving += (R_WS.T @ at_So) @ np.cross(omega, mc)
+        energy.append(moving + 9.81 * (m * x[11] + (R_WS @ mc)[2]))
+    given = load_work(result, scenario)
+    expected = -0.5 * 0.1 / 2.0 * (np.array(energy) - energy[0])
+    np.testing.assert_allclose(given.sum(axis=1), expected, atol=3e-5)
+    assert np.ptp(expected) > 0.02 and np.ptp(given[:, 1]) > 1e-3
+
+
 def test_what_the_stores_hold_at_the_start_is_that_of_both_ends():
     scenario = replace(SCENARIO, passivity=PassivityConfig(method="two_layer"))
     np.testing.assert_allclose(
@@ -85,10 +110,12 @@ def test_a_station_without_a_channel_has_no_accounts():
         station_accounts(less, SCENARIO)
 
 
-def test_the_whole_station_with_ledger_creates_no_energy():
+@pytest.mark.parametrize("sigma", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_the_whole_station_with_ledger_creates_no_energy(sigma):
     """A hand that strikes a leaf over a lossy network, of which the slave hears 50 ms later.
 
-    With `none` hand and leaf get 0.45 J and, by rotation, 0.30 J out of this.
+    With `none` hand and leaf get 0.45 J and, by rotation, 0.30 J out of this. Where the load is
+    felt it is part of what may get no more than was put in.
     """
     strike = MinimumJerk(t_start=0.3, duration=0.25, translation=[0.0, 0.0, -0.08])
     scenario = replace(
@@ -99,11 +126,12 @@ def test_the_whole_station_with_ledger_creates_no_energy():
         passivity=PassivityConfig(method="ledger"),
         sheet_spring__position=[0.55, 0.0, 0.235],
         operator__intent=[strike],
+        force_scaling__sigma=sigma,
     )
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     result = simulate(station, scenario.simulation, progress=False)
     assert np.abs(result["true_contact_wrench_W"][:, 2]).max() > 30.0, "it should have struck"
-    accounts = station_accounts(result, scenario)
-    for place in (ACTUAL, MOTOR):
+    accounts = station_accounts(result, scenario) + sigma * load_work(result, scenario)[:, None]
+    for place in (ACTUAL, MOTOR) if sigma == 0.0 else (ACTUAL,):
         created = accounts[:, HAND] + accounts[:, place] + start_energy(scenario)
         assert (created.min(axis=0) >= -1e-6).all()

@@ -170,6 +170,31 @@ def test_friction_that_changes_its_sign_does_not_soften_the_wall():
     assert 180.0 < packet[CONTACT_STIFFNESS] < 350.0, "too stiff is stable, too soft is not"
 
 
+def test_a_tip_that_slips_once_is_no_step_of_what_is_pressed_and_a_wall_that_gives_is():
+    """On a wall of 200 N/m, 0.1 m below So: 0.5 N that held it sideways let go, then 1 N is gone.
+
+    The mean of force and friction is no normal, so that the slip is a step along it, by 0.3 N.
+    """
+    p, packet, command = parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
+    memory, received = initial_memory("ledger", p, START), np.zeros(PACKET_SIZE)
+    pose, received[POSE] = START.copy(), START
+    hand, felt = Hand(np.zeros(6), 0.0), []
+    for k in range(2600):
+        depth = 2e-2 * min(k / 1000, 1.0)
+        dx = np.array([0.0, 0.0, -2e-5 if k < 1000 else 0.0, 0.0, 0.0, 0.0])
+        pose[6] += dx[2]
+        rubs = 0.125 * 200.0 * depth if k < 2000 else 0.0
+        force = 200.0 * depth - (k >= 2500)
+        wrench = np.array([rubs, 0.0, force, 0.0, 0.1 * rubs, 0.0])
+        received[SEQUENCE] += 1.0
+        slave_step(METHOD, received, True, pose, dx / T, dx, wrench, T, p, memory, command, packet)
+        hand.packet[WRENCH], hand.packet[TRIP] = packet[WRENCH], packet[TRIP]
+        felt.append(hand.step()[2])
+    assert felt[1999] == pytest.approx(4.0, abs=0.05)
+    assert np.ptp(felt[1990:2500]) < 0.05
+    assert felt[2505] == pytest.approx(3.0, abs=0.15)
+
+
 def test_a_contact_is_the_same_whatever_the_scales_are_and_one_against_it_is_another():
     """At the slave 18 N at a lever of 40 mm, in the master's power units at three scales."""
     config = PassivityConfig(method="ledger")

@@ -1,0 +1,166 @@
+"""Does `ledger` hold its promises in the whole station, over what network, leaf, hand and sigma?
+
+`python benchmarks/ledger_in_station.py [--json FILE]` presses on a leaf as `compare-passivity` does
+(`drake_teleop.comparison.delayed_contact`): 4 networks, 2 leaves, 3 grips, sigma 0 and 1, 48 runs,
+each with the station's noisy sensor and its identified load, or with an ideal sensor and the true
+load (`--ideal`). `--network`, `--leaf`, `--grip`, `--sigma` choose some, `--method` another method.
+Of each, in the last second of the hold and at the end:
+
+stable    at rest, within 0.5 mm peak to peak, and turning as little
+felt      what the hand feels of the contact, the load's weight taken away, over the scaled
+          contact force, less 1; the force is along the vertical
+left      how far the slave is from the hand, 2 s after contact
+energy    the least of hand and actual motion, E_act + E_0, contact and load together, by
+          translation and rotation apart
+chatter   standard deviation of the force felt along the vertical
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.channel.channel import Channel
+from drake_teleop.comparison.compare_passivity import station_base
+from drake_teleop.comparison.delayed_contact import LEAVES, delayed_contact, station_figures
+from drake_teleop.comparison.one_dof import ACTUAL, HAND
+from drake_teleop.comparison.station_accounts import load_work, start_energy, station_accounts
+from drake_teleop.identification import true_load
+from drake_teleop.identified_load import identified_load
+from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.scenario import replace
+from drake_teleop.simulation import simulate
+from drake_teleop.station import MakeTeleopStation
+
+NETWORKS = ("lan", "internet", "geostationary", "lunar")
+GRIPS, SIGMAS = ("light", "medium", "firm"), (0.0, 1.0)
+FELT, LEFT, CHATTER = 0.1, 5e-3, 0.05  # 1, m, N
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """One run; see the module."""
+
+    network: str
+    leaf: str
+    grip: str
+    sigma: float
+    stable: bool
+    felt_error: float
+    left_m: float
+    energy_J: tuple[float, float]
+    chatter_N: float
+    hunting_m: float
+    turning_rad: float
+    cpu_s: float
+
+    def missed(self) -> list[str]:
+        """Which of its promises the cell does not keep."""
+        kept = {
+            "stable": self.stable,
+            "felt": abs(self.felt_error) <= FELT,
+            "left": self.left_m <= LEFT,
+            "energy": min(self.energy_J) >= -1e-6,
+            "chatter": self.chatter_N <= CHATTER,
+        }
+        return [name for name, well in kept.items() if not well]
+
+
+def cell(
+    network: str, leaf: str, grip: str, sigma: float, method: str, seed: int, ideal: bool
+) -> Cell:
+    """Runs one."""
+    base = replace(
+        station_base("contact_transition", seed),
+        operator__grip=grip,
+        force_scaling__sigma=sigma,
+        wrist_sensor__ideal=ideal,
+    )
+    estimate = true_load(base) if ideal else identified_load(base, False).estimate
+    passivity = PassivityConfig(method=method)
+    scenario, task = delayed_contact(base, Channel(network=network), passivity, leaf)
+    station = MakeTeleopStation(scenario, load_estimate=estimate)
+    began = time.thread_time()
+    result = simulate(station, scenario.simulation, progress=False)
+    spent = time.thread_time() - began
+    found = station_figures(result, scenario, task)
+    accounts = station_accounts(result, scenario)
+    inside = accounts[:, HAND] + accounts[:, ACTUAL] + start_energy(scenario)
+    if sigma > 0.0:
+        inside += load_work(result, scenario)
+    held = (result.t >= task.release - task.judged) & (result.t < task.release)
+    scale = scenario.force_scaling.force_scale
+    weight = sigma * scale * float(true_load(scenario)[6]) * 9.81
+    contact = scale * float(result["true_contact_wrench_W"][held, 2].mean())
+    felt = float(result["force_to_master"][held, 2].mean()) + weight
+    return Cell(
+        network,
+        leaf,
+        grip,
+        sigma,
+        stable=found.stable,
+        felt_error=felt / contact - 1.0,
+        left_m=abs(found.drift),
+        energy_J=(float(inside[:, 0].min()), float(inside[:, 1].min())),
+        chatter_N=found.chatter,
+        hunting_m=found.hunting,
+        turning_rad=found.turning,
+        cpu_s=spent,
+    )
+
+
+def print_cell(one: Cell) -> None:
+    """A line of the table."""
+    name = f"{one.network}, {one.leaf}, {one.grip}, sigma {one.sigma:g}"
+    print(
+        f"{name:<48}{'yes' if one.stable else 'NO':>4}{100 * one.felt_error:8.1f} %"
+        f"{1e3 * one.left_m:8.2f}{one.energy_J[0]:9.4f}{one.energy_J[1]:9.4f}{one.chatter_N:9.4f}"
+        f"{1e3 * one.hunting_m:9.3f}{np.rad2deg(one.turning_rad):9.3f}{one.cpu_s:7.1f}"
+        f"  {' '.join(one.missed())}",
+        flush=True,
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the cells and prints them; returns 0 if every one keeps every promise."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--network", nargs="+", choices=NETWORKS, default=list(NETWORKS))
+    parser.add_argument("--leaf", nargs="+", choices=list(LEAVES), default=list(LEAVES))
+    parser.add_argument("--grip", nargs="+", choices=GRIPS, default=list(GRIPS))
+    parser.add_argument("--sigma", nargs="+", type=float, default=list(SIGMAS))
+    parser.add_argument("--seed", type=int, default=0, help="of sensor and networks")
+    parser.add_argument("--method", choices=METHODS, default="ledger")
+    parser.add_argument("--ideal", action="store_true", help="an ideal sensor, the true load")
+    asked = parser.parse_args(arguments)
+    print(
+        f"{'':<48}{'rest':>4}{'felt':>10}{'left mm':>8}{'E tr J':>9}{'E rot J':>9}{'chat N':>9}"
+        f"{'hunt mm':>9}{'turn deg':>9}{'CPU s':>7}  missed"
+    )
+    cells = []
+    for case in itertools.product(asked.network, asked.leaf, asked.grip, asked.sigma):
+        cells.append(cell(*case, asked.method, asked.seed, asked.ideal))
+        print_cell(cells[-1])
+    missed = {name: 0 for name in ("stable", "felt", "left", "energy", "chatter")}
+    for one in cells:
+        for name in one.missed():
+            missed[name] += 1
+    counts = ", ".join(f"{name} {len(cells) - n}" for name, n in missed.items())
+    print(f"of {len(cells)}: {counts}")
+    if asked.json:
+        rows = [dataclasses.asdict(one) for one in cells]
+        figures: dict[str, Any] = {"cells": len(cells), "missed": missed, "rows": rows}
+        asked.json.write_text(json.dumps(figures, indent=2) + "\n")
+    return int(any(missed.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
