@@ -35,9 +35,12 @@ for name in drake_teleop.ScenarioNames():
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder), cwd=ROOT)
-    (path,) = folder.glob("*.whl")
+    return built("wheel", ROOT, tmp_path_factory.mktemp("wheel"))
+
+
+def built(target: str, source: Path, folder: Path) -> Path:
+    run(sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder), cwd=source)
+    (path,) = folder.iterdir()
     return path
 
 
@@ -61,6 +64,18 @@ def test_the_wheel_holds_what_the_repository_holds_and_nothing_else(wheel):
     assert "drake_teleop/py.typed" in python
     assert {name for name in held if ".dist-info/" not in name} == python | models
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in held)
+
+
+@pytest.mark.slow
+def test_the_source_distribution_builds_the_same_wheel(wheel, tmp_path):
+    source = built("sdist", ROOT, tmp_path / "sdist")
+    shutil.unpack_archive(source, tmp_path / "source", filter="data")
+    (unpacked,) = (tmp_path / "source").iterdir()
+    again = zipfile.ZipFile(built("wheel", unpacked, tmp_path / "wheel"))
+    ours = zipfile.ZipFile(wheel)
+    assert again.namelist() == ours.namelist()
+    assert all(again.read(name) == ours.read(name) for name in ours.namelist())
+    assert (unpacked / "tests").is_dir() and (unpacked / "docs" / "conf.py").is_file()
 
 
 def relative(folder: Path) -> set[str]:
