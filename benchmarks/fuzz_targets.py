@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import fuzz_mutations as mutations
+import fuzz_robots as robots
 import numpy as np
 import polars as pl
 from fuzz_mutations import Mutation
@@ -541,7 +542,7 @@ def _wrenches(path: Path) -> None:
         readings = [udp.unpacked(part) for part in parts]
     else:
         readings = [read_line(line, k) for k, line in enumerate(content.split(b"\n"))]
-    compensator = Compensator(_LOAD, 1e-3, gamma=2.0, largest=np.full(6, 50.0))
+    compensator = Compensator(robots.LOAD, 1e-3, gamma=2.0, largest=np.full(6, 50.0))
     for k, reading in enumerate(readings):
         out = compensator.step(reading, 1e-3 * k)
         numbers = np.array([out.t, *out.contact, *out.scaled])
@@ -551,13 +552,6 @@ def _wrenches(path: Path) -> None:
         if zero and numbers[1:].any():
             raise AssertionError(f"{out!r}")
     compensator.tare()
-
-
-_LOAD = Identification(
-    phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003])),
-    *(np.zeros(6), 1e-6 * np.eye(16), np.ones(16, bool), 4.0, 0.0, np.full(6, 0.01)),
-    *("batch least squares", 100),
-)
 
 
 # Options.
@@ -575,6 +569,8 @@ _COMMANDS = (
     "detect log.csv --load l.json --statistic cusum",
     "compensate udp://:9000 --load l.json --out udp://:9001 --rate 1000 --range 200 10 --tare "
     "--control 9002 --sigma 0.5 --gamma 2 --predicted --cutoff 20",
+    "compensate netft://10.0.0.1?counts=1e6,1e6 --motion rtde://10.0.0.2 --load l.json "
+    "--out a.mcap --sensor-pose 0 0 0.045 0 0 45",
     "inspect log.csv",
     "sample-log --seed 1",
     "analyze press --direction x",
@@ -652,6 +648,14 @@ TARGETS = (
     ),
     Target("wrenches", ".bin", 1, _reading_packets, mutations.damaged, _wrenches),
     Target("wrenches_lines", ".jsonl", 1, _reading_lines, mutations.text, _wrenches),
+    *(
+        Target(f"wrenches_{name}", ".bin", 0.5, seeds, mutations.damaged, run)
+        for name, seeds, run in (
+            ("netft", robots.records, robots.netft_wrenches),
+            ("rtde", robots.samples, robots.rtde_wrenches),
+            ("ros", robots.messages, robots.ros_wrenches),
+        )
+    ),
     Target("options", ".json", 2, _commands, mutations.arguments, _command_line),
 )
 

@@ -51,6 +51,8 @@ SAID = {
     "urdf-long_package.urdf": "",
     "urdf-unknown_encoding.urdf": "is not XML (unknown encoding: utf-9)",
     "trace_npz-empty_delay.npz": "'delay' of case.npz has 0 numbers in a row",
+    "wrenches_ros-damaged_pose.bin": "",
+    "wrenches_rtde-no_time_between.bin": "",
 }
 """Of each case a part of its error; empty if it is none."""
 

@@ -33,6 +33,7 @@ from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Flag, Part, P
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
 _KEPT_S = 0.5  # of motions and wrenches
+_LEAST_DT, _LATEST, _LARGEST = 1e-4, 1e11, 1e5  # [s], [s], of any unit
 _SPACINGS = 20  # that tell the rate of the motion
 
 
@@ -70,13 +71,13 @@ class Window:
     def take(self, part: Part, now: float) -> list[tuple[float, Array]]:
         """Times and motions (9,) that are known by a sample now."""
         row = self._row(part)
-        if not (math.isfinite(part.t) and np.isfinite(row).all()) or part.flags:
+        if row is None:
             return []
         last = self._last
         step = math.inf if last is None else part.t - last[0]
         if step <= 0.0 and now - self._came <= STALE_S:
             return []  # out of order, or the same
-        if not self._dt and 0.0 < step <= STALE_S:
+        if not self._dt and _LEAST_DT <= step <= STALE_S:
             self._measure(step)
         if self._last is None or not 0.0 < step <= STALE_S:
             self.forget()
@@ -93,12 +94,18 @@ class Window:
             self._next += self._dt
         return found
 
-    def _row(self, part: Part) -> Array:
-        """(12,) R_WS and p_WS, or (6,) as they come."""
+    def _row(self, part: Part) -> Array | None:
+        """(12,) R_WS and p_WS, or (6,) as they come; None of what is no motion."""
+        values = part.values
+        if part.flags or not (abs(part.t) < _LATEST and (np.abs(values) < _LARGEST).all()):
+            return None
         if part.stream == IMU:
-            return part.values
-        R_WF = rotation_matrices(part.values[None, :4], "quaternion_wxyz")[0]
-        return np.concatenate([(R_WF @ self._R_FS).ravel(), part.values[4:] + R_WF @ self._p_FS])
+            return values
+        size = float(np.linalg.norm(values[:4]))
+        if not abs(size - 1.0) < 0.01:
+            return None
+        R_WF = rotation_matrices(values[None, :4] / size, "quaternion_wxyz")[0]
+        return np.concatenate([(R_WF @ self._R_FS).ravel(), values[4:] + R_WF @ self._p_FS])
 
     def _middle(self) -> Array:
         """(9,) specific force, angular velocity and acceleration in the middle of the window."""

@@ -39,60 +39,25 @@ _MOST = 4096  # messages that wait; more are lost, the newest first
 _DEEPEST = 64  # frames from one to another
 
 
-class Ros2Source:
-    """Parts of zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&joints=TOPIC&imu=TOPIC&tf=PARENT,CHILD&...].
+class Messages:
+    """What messages say, in parts.
 
     Args:
-        address: TOPIC is of WrenchStamped; sign -1, the default, is for a sensor that tells what
-            the load exerts on it. With tf=PARENT,CHILD the pose is that of one frame in another,
-            put together of what `/tf` tells: all frames between them have to be in it. `domain` is
-            that of ROS, 0 without.
-        dt: between wrenches [s].
+        sign: of wrenches.
+        frames: parent and child whose pose is told by transforms; empty for none.
 
     Attributes:
-        streams: see `PartSource`.
         joint_names: in the order of the newest joint positions.
-
-    Raises:
-        DrakeTeleopError: if the address cannot be used, or a library is missing.
     """
 
-    def __init__(self, address: str, dt: float) -> None:
-        told = Address(address, PORT, known=("pose", "joints", "imu", "tf", "domain", "sign"))
-        self.dt, self._sign, domain = dt, told.sign(), domain_of(told)
-        topics = {WRENCH: topic_of(told, told.path)}
-        for stream in (POSE, JOINTS, IMU):
-            if (text := told.text_of(stream)) is not None:
-                topics[stream] = topic_of(told, text)
-        self._frames = (told.text_of("tf") or "").split(",")
-        if self._frames != [""]:
-            if len(self._frames) != 2 or not all(self._frames):
-                raise DrakeTeleopError("tf is not PARENT,CHILD", where=address)
-            topics["tf"] = "tf"
-        self.streams = tuple(_STREAMS.get(name, name) for name in topics)
-        needed(address)
-        self._types = types()
+    def __init__(self, sign: float, frames: tuple[str, ...] = ()) -> None:
+        self._sign, self._frames, self._types = sign, frames, types()
         self.joint_names: list[str] = []
         self._links: dict[str, tuple[str, Array]] = {}
         self._counts = dict.fromkeys(KINDS, 0)
-        self._came: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
-        for stream in topics:  # what reads it is made now: the first messages would wait for that
-            self.parts(stream, b"", b"")
+        for name in KINDS:  # what reads them is made now: the first messages would wait for that
+            self.parts(name, b"", b"")
         self._counts = dict.fromkeys(KINDS, 0)
-        self._session = opened(told)
-        for stream, topic in topics.items():
-            self._session.declare_subscriber(key(domain, topic, KINDS[stream]), self._take(stream))
-
-    def read(self, timeout_s: float) -> list[Part] | None:
-        """See `Source`."""
-        found: list[Part] = []
-        try:
-            found += self.parts(*self._came.get(timeout=timeout_s))
-            while len(found) < _MOST:
-                found += self.parts(*self._came.get_nowait())
-        except queue.Empty:
-            pass
-        return found
 
     def parts(self, name: str, message: bytes, attached: bytes) -> list[Part]:
         """What a message says, flagged as damaged if it is none. It never raises.
@@ -118,19 +83,6 @@ class Ros2Source:
         except Exception:
             return [Part(stream, -1, math.nan, np.full(6, math.nan), int(Flag.DAMAGED))]
 
-    def close(self) -> None:
-        """See `Source`."""
-        self._session.close()
-
-    def _take(self, stream: str) -> Callable[[Any], None]:
-        def take(sample: Any) -> None:
-            if self._came.qsize() < _MOST:
-                attached = sample.attachment
-                attached = b"" if attached is None else attached.to_bytes()
-                self._came.put((stream, sample.payload.to_bytes(), attached))
-
-        return take
-
     def _values(self, name: str, data: Any) -> Array:
         if name == WRENCH:
             wrench = data.wrench
@@ -148,6 +100,8 @@ class Ros2Source:
         for child, each in newest.items():
             motion = each.transform
             self._links[child] = each.header.frame_id, _pose(motion.translation, motion.rotation)
+        if not self._frames:
+            return []
         parent, frame = self._frames
         pose, header = np.array([1.0, 0, 0, 0, 0, 0, 0]), None
         for _ in range(_DEEPEST):
@@ -160,6 +114,69 @@ class Ros2Source:
             frame, link = self._links[frame]
             pose = _moved(link, pose)
         return []
+
+
+class Ros2Source:
+    """Parts of zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&joints=TOPIC&imu=TOPIC&tf=PARENT,CHILD&...].
+
+    Args:
+        address: TOPIC is of WrenchStamped; sign -1, the default, is for a sensor that tells what
+            the load exerts on it. With tf=PARENT,CHILD the pose is that of one frame in another,
+            put together of what `/tf` tells: all frames between them have to be in it. `domain` is
+            that of ROS, 0 without.
+        dt: between wrenches [s].
+
+    Attributes:
+        streams: see `PartSource`.
+        messages: what read them.
+
+    Raises:
+        DrakeTeleopError: if the address cannot be used, or a library is missing.
+    """
+
+    def __init__(self, address: str, dt: float) -> None:
+        told = Address(address, PORT, known=("pose", "joints", "imu", "tf", "domain", "sign"))
+        self.dt, sign, domain = dt, told.sign(), domain_of(told)
+        topics = {WRENCH: topic_of(told, told.path)}
+        for stream in (POSE, JOINTS, IMU):
+            if (text := told.text_of(stream)) is not None:
+                topics[stream] = topic_of(told, text)
+        frames: tuple[str, ...] = ()
+        if (text := told.text_of("tf")) is not None:
+            frames, topics["tf"] = tuple(text.split(",")), "tf"
+            if len(frames) != 2 or not all(frames):
+                raise DrakeTeleopError("tf is not PARENT,CHILD", where=address)
+        self.streams = tuple(_STREAMS.get(name, name) for name in topics)
+        needed(address)
+        self.messages = Messages(sign, frames)
+        self._came: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
+        self._session = opened(told)
+        for stream, topic in topics.items():
+            self._session.declare_subscriber(key(domain, topic, KINDS[stream]), self._take(stream))
+
+    def read(self, timeout_s: float) -> list[Part] | None:
+        """See `Source`."""
+        found: list[Part] = []
+        try:
+            found += self.messages.parts(*self._came.get(timeout=timeout_s))
+            while len(found) < _MOST:
+                found += self.messages.parts(*self._came.get_nowait())
+        except queue.Empty:
+            pass
+        return found
+
+    def close(self) -> None:
+        """See `Source`."""
+        self._session.close()
+
+    def _take(self, stream: str) -> Callable[[Any], None]:
+        def take(sample: Any) -> None:
+            if self._came.qsize() < _MOST:
+                attached = sample.attachment
+                attached = b"" if attached is None else attached.to_bytes()
+                self._came.put((stream, sample.payload.to_bytes(), attached))
+
+        return take
 
 
 def _xyz(v: Any) -> tuple[float, float, float]:

@@ -69,18 +69,7 @@ class RtdeSource:
     def read(self, timeout_s: float) -> list[Part] | None:
         """See `Source`."""
         samples, self._first = [*self._first, *self._samples(timeout_s)], []
-        return [part for sample in samples for part in self.parts(sample)]
-
-    def parts(self, sample: tuple[float, ...]) -> list[Part]:
-        """What a sample of `rtde_reader` tells. It never raises."""
-        t, values = sample[0], np.array(sample[1:])
-        number = round(t / self.dt) if abs(t) < 1e12 else -1
-        told = {
-            WRENCH: self._sign * values[:6],
-            POSE: np.array([*exponential(sample[10:13]), *sample[7:10]]),
-            IMU: values[12:15],
-        }
-        return [Part(stream, number, t, each) for stream, each in told.items()]
+        return [part for sample in samples for part in parts_of(sample, self.dt, self._sign)]
 
     def _samples(self, timeout_s: float) -> list[tuple[float, ...]]:
         """Those that have come; starts the child anew if it has ended."""
@@ -119,3 +108,15 @@ class RtdeSource:
     def close(self) -> None:
         """See `Source`."""
         self._end()
+
+
+def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
+    """What a sample of `rtde_reader` tells, see `RtdeSource`. It never raises."""
+    t, values = sample[0], np.array(sample[1:])
+    number = round(t / dt) if abs(t) < 1e12 else -1
+    told = {
+        WRENCH: sign * values[:6],
+        POSE: np.array([*exponential(sample[10:13]), *sample[7:10]]),
+        IMU: values[12:15],
+    }
+    return [Part(stream, number, t, each) for stream, each in told.items()]
