@@ -47,7 +47,7 @@ class Order:
         ),
         *("log_identification", "log_contact", "conventions", "excitation", "sensor_noise"),
         *("networks", "energy", "passivity_methods", "ledger_under_loss", "letting_go"),
-        *("stability_map", "felt_impedance", "z_width", "study"),
+        *("stability_map", "felt_impedance", "z_width", "study", "live_drive"),
     )
 
     def __init__(self, folder: str) -> None:

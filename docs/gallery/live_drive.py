@@ -1,0 +1,38 @@
+"""
+A drive, and the network that changes in contact
+================================================
+
+What `drake-teleop drive` does with a mouse a script does here: the hand goes down onto the leaf and
+presses; at 1.5 s an internet comes between it and the arm, with a method that keeps it passive, and
+nothing steps; at 2.5 s σ goes to 0.5, and half of the tool hangs on the hand.
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import drake_teleop as dt
+from drake_teleop.identified_load import identified_load
+from drake_teleop.live.choices import METHODS, NETWORKS
+from drake_teleop.live.session import Session, live_scenario
+
+scenario = live_scenario(dt.LoadScenario("contact_transition"))
+session = Session(scenario, identified_load(scenario))
+internet = {"network": NETWORKS.index("internet"), "method": METHODS.index("ledger")}
+while session.ms < 3500:
+    t = 1e-3 * session.ms
+    wanted = {"z": round(-7500 * min(t, 1.0))}  # in steps of 10 um
+    wanted |= internet if t >= 1.5 else {}
+    wanted |= {"sigma": 50} if t >= 2.5 else {}
+    session.apply(session.inputs.changed(wanted))
+    session.advance()  # 5 ms
+log = session.log()
+figure, (above, below) = plt.subplots(2, sharex=True, figsize=(7, 5))
+above.plot(log.t, log["force_to_master"][:, 2], label="felt")
+above.set(ylabel="vertical force [N]")
+below.plot(
+    log.t, 1e3 * np.diff(log["pose_command"][:, 6], append=np.nan), label="step of the command"
+)
+below.set(xlabel="t [s]", ylabel="step in 1 ms [mm]")
+for axes in (above, below):
+    axes.axvline(1.5, ls=":")
+    axes.legend()
