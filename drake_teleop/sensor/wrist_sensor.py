@@ -78,7 +78,7 @@ from drake_teleop.slave.contact_twin import ContactTwin
 from drake_teleop.slave.drake_contact import contact_wrench_W
 from drake_teleop.slave.plant import SlavePlant
 from drake_teleop.slave.plant_rates import joined, plant_rates, rates_under
-from drake_teleop.slave.tool_contact import FAR, WATCHED, environment_wrench, nearness
+from drake_teleop.slave.tool_contact import FAR, TOUCHING, WATCHED, environment_wrench, nearness
 from drake_teleop.vectors import apply, cross, minus, nine, put, three, transposed
 
 Array = NDArray[np.float64]
@@ -426,7 +426,7 @@ class WristSensor(LeafSystem):
 
     def take_samples(self, context: Context) -> None:
         """Takes the samples before now, for who wants to see the state that results."""
-        self._sample(context, False, self._nothing, self._result)
+        self._sample(context, self._near(context), False, self._nothing, self._result)
         context.SetDiscreteState(self._result[self._remains])
 
     def bring_up_to_date(self, context: Context) -> None:
@@ -448,18 +448,18 @@ class WristSensor(LeafSystem):
     def _applied_W(self, context: Context) -> Array:
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._nothing
 
-    def _near(self, q: Array, around: Array) -> int:
+    def _near(self, context: Context) -> int:
         """See `nearness`."""
+        if self._contacts is None:
+            return FAR
+        if self._beyond:
+            return TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
+        q, around = self._state.Eval(context)[: self._n], self._surroundings(context)
         return nearness(arm, pairs, self._watched, joints, q, around[:2], around[2:])
 
     def _touching_W(self, context: Context) -> Array:
-        if self._contacts is None:
-            return self._nothing
-        if not self._beyond:
-            q = self._state.Eval(context)[: self._n]
-            if self._near(q, self._surroundings(context)) == FAR:
-                return self._nothing
+        assert self._contacts is not None
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
     def _touching_So_W(self, context: Context) -> Array:
@@ -488,12 +488,16 @@ class WristSensor(LeafSystem):
         )
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
-        self._sample(context, True, self._touching_W(context), output.get_mutable_value())
+        near = self._near(context)
+        touching_W = self._nothing if near == FAR else self._touching_W(context)
+        self._sample(context, near, True, touching_W, output.get_mutable_value())
 
-    def _sample(self, context: Context, until_now: bool, touching_W: Array, result: Array) -> None:
-        """`sample_step`, with Drake's contact at each instant where the tool is watched."""
+    def _sample(
+        self, context: Context, near: int, until_now: bool, touching_W: Array, result: Array
+    ) -> None:
+        """`sample_step`, with Drake's contact at each instant if the tool is watched."""
         inputs = self._inputs(context)
-        if not (len(self._watched) and self._is_watched(context)):
+        if near != WATCHED:
             sample_step(*inputs, until_now, touching_W, result)
             return
         if self._twin is None:
@@ -511,24 +515,14 @@ class WristSensor(LeafSystem):
             asked = told[0, 2:]
             told[1 + k, :6] = self._twin.wrench_W(asked[:own], asked[own:])
 
-    def _is_watched(self, context: Context) -> bool:
-        """Whether only Drake knows something near, now or at the end of the last step."""
-        if self._near(self._state.Eval(context)[: self._n], self._surroundings(context)) == WATCHED:
-            return True
-        n, memory = self._n, context.get_discrete_state_vector().value()
-        x = memory[self._sensor[3] + 3 :]
-        around = np.concatenate([x[n : 2 * n + 2 : n + 1], x[2 * n + 2 :][: len(self._around) - 2]])
-        return self._near(x[:n], around) == WATCHED
-
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._longest > 1 and not self._is_due(context.get_time()):
-            memory, time = discrete_state.get_mutable_value(0), context.get_time()
-            state, around = self._state.Eval(context), self._surroundings(context)
-            watched = len(self._watched) and self._near(state[: self._n], around) == WATCHED
-            if not watched and _postpone(
-                memory, self._sensor[3], self._longest, time, state, around
-            ):
-                return
+            watched = len(self._watched) > 0 and self._near(context) == WATCHED
+            if not watched:
+                memory, time = discrete_state.get_mutable_value(0), context.get_time()
+                state, around = self._state.Eval(context), self._surroundings(context)
+                if _postpone(memory, self._sensor[3], self._longest, time, state, around):
+                    return
         discrete_state.set_value(0, self._step.Eval(context)[self._remains])
 
     def _is_due(self, time: float) -> bool:
@@ -548,7 +542,7 @@ class WristSensor(LeafSystem):
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)
         physics = self._physics
-        if self._beyond or (len(self._watched) and self._is_watched(context)):
+        if self._beyond or self._near(context) == WATCHED:
             applied = applied + self._touching_So_W(context)
             physics = (*physics[:2], physics[2][:0], *physics[3:])
         plant_rates(physics, x, torque, applied, np.empty(6), xdot)

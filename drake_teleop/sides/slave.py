@@ -285,8 +285,8 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputP
         if slave.sensed_sheet is not None:
             builder.Connect(sheet, contact.GetInputPort("sheet_state"))
     for name, body in slave.contact.moving.items():
-        pose = builder.AddNamedSystem(POSE_OF + name, MovingPose(body))
-        builder.Connect(plant.get_body_poses_output_port(), pose.GetInputPort("body_poses"))
+        pose = builder.AddNamedSystem(POSE_OF + name, MovingPose(plant, body))
+        builder.Connect(plant.get_state_output_port(), pose.GetInputPort("plant_state"))
         export(builder, pose, **{POSE_OF + name: "pose"})
 
 

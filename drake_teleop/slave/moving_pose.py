@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis
-from pydrake.common.value import Value
 from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
     Joint,
@@ -16,6 +16,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop.environment.moving_bodies import POSE_AND_TWIST, JointTable, bodies_into
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 
 
@@ -43,23 +44,24 @@ class MovingPose(LeafSystem):
 
         name: MovingPose
         input_ports:
-        - body_poses: of all bodies, the plant's
+        - plant_state: [q; v] of the whole plant
         output_ports:
         - pose: (7,) [qw, qx, qy, qz, px, py, pz] in W [1, m]
 
     Args:
+        plant: finalized.
         body: whose pose.
     """
 
     __slots__ = ONE_DICT
 
-    def __init__(self, body: BodyIndex) -> None:
+    def __init__(self, plant: MultibodyPlant, body: BodyIndex) -> None:
         super().__init__()
-        self._body = int(body)
-        self._poses = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
+        self._joints, order = JointTable(plant, [body])
+        self._bodies = np.empty((len(order), POSE_AND_TWIST))
+        self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
         self.DeclareVectorOutputPort("pose", 7, weak_callback(self._calc))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        X_WBody = self._poses.Eval(context)[self._body]
-        turn = X_WBody.rotation().ToQuaternion().wxyz()
-        output.SetFromVector(np.concatenate([turn, X_WBody.translation()]))
+        bodies_into(self._joints, self._state.Eval(context), self._bodies)
+        output.SetFromVector(self._bodies[-1, :7])  # which hangs on those before it

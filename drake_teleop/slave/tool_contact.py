@@ -16,7 +16,7 @@ from drake_teleop.vectors import add_into, cross, minus, plus, put, three
 
 #: Of the tool: nothing touches it, what the compiled law knows may, what it does not know may.
 FAR, TOUCHING, WATCHED = range(3)
-_WATCHED_FROM = 0.02  # m, farther than anything moves in a step
+_WATCHED_FROM = 0.02  # m, farther than anything moves between two looks
 _ROUNDING = 1e-9  # m
 
 

@@ -35,7 +35,13 @@ from drake_teleop.slave.scene import Scene
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.tool import Ball, Tool
 from drake_teleop.slave.tool import Block as ToolBox
-from drake_teleop.slave.tool_contact import environment_wrench
+from drake_teleop.slave.tool_contact import (
+    FAR,
+    TOUCHING,
+    WATCHED,
+    environment_wrench,
+    nearness,
+)
 from drake_teleop.station import GetBlock, MakeTeleopStation
 
 SOFT_PAD = """
@@ -232,6 +238,22 @@ def test_what_the_law_does_not_know_drake_tells_between_the_steps():
     law, drake = (log["measured_wrench_S"] for log in logs)
     assert np.abs(law[:, 0]).max() > 1.0
     np.testing.assert_allclose(drake, law, atol=1e-9)
+
+
+def test_how_near_the_tool_is():
+    """A box that only Drake knows counts from 2 cm on; the ball in front of it as it touches."""
+    shapes = [Ball(0.012, [0.0, 0.0, 0.188]), ToolBox([0.004] * 3, [0.0, 0.0, 0.1])]
+    slave = Slave(position=[0.5, 0.0, 0.45], tool=Tool(mass=1.0, shapes=shapes))
+    wall = Wall(position=[0.5, 0.0, 0.0])
+    built, found = AddSlavePlant(DiagramBuilder(), slave, wall), []
+    pairs, joints = built.contact.law
+    for height in (0.2499, 0.2501, 0.326, 0.327):
+        rows = [pairs.copy(), built.contact.watched.copy()]
+        for row in rows:
+            row[:, 15] += height
+        nothing = np.zeros(2)
+        found.append(nearness(built.arm.table, *rows, joints, built.start, nothing, nothing))
+    assert found == [FAR, TOUCHING, TOUCHING, WATCHED]  # the box's ball has 3.5 mm
 
 
 @pytest.mark.slow
