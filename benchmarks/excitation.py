@@ -64,7 +64,7 @@ def speed(robot: Robot, row: tuple[str, float, float, float], seeds: int) -> dic
     task = task_of(robot, criterion, period)
     values: dict[str, list[float]] = {"soon": [], "later": []}
     for seed in range(seeds):
-        found = design(task, seed=seed, seconds=later)
+        found = design(Problem(task), seed=seed, seconds=later)
         for name, seconds in (("soon", soon), ("later", later)):
             trajectory, _ = best_checked(robot, [it for it in found if it.seconds <= seconds])
             values[name].append(criteria_of(robot, trajectory)[criterion])

@@ -709,7 +709,14 @@ def scaling_study(
 @click.option(
     "--period", type=option.Number(0.5, 600), default=6.0, show_default=True, metavar="SECONDS"
 )
-@click.option("--harmonics", type=option.Whole(2, 20), default=5, show_default=True)
+@click.option(
+    "--harmonics", type=option.Whole(2, 20), help="Of each joint.  [default: 5, with --until 3]"
+)
+@click.option(
+    "--until",
+    metavar="TOLERANCE",
+    help='The shortest motion instead that reaches, say, "mass 0.5 %, com 0.5 mm, inertia 5 %".',
+)
 @click.option(
     "--time",
     "seconds",
@@ -729,7 +736,8 @@ def excite(
     payload: float | None,
     criterion: str,
     period: float,
-    harmonics: int,
+    harmonics: int | None,
+    until: str | None,
     seconds: float | None,
     seed: int,
     out: Path,
@@ -754,6 +762,7 @@ def excite(
         criterion=criterion,
         period=period,
         harmonics=harmonics,
+        until=until,
         seconds=seconds,
         seed=seed,
         quiet=quiet,

@@ -14,7 +14,8 @@ summary.json        the figures; it and all above but session.json are the same 
 `summary.json` holds the criterion that was minimised and the value of every criterion (what each
 is: `excitation/criteria.py`), the use of every limit as checked by Drake at 1 kHz, the predicted
 standard deviation of each parameter of the heaviest load after one period, from the noise of the
-sensor (`excitation/prediction.py`), and what was assumed.
+sensor (`excitation/prediction.py`), and what was assumed. With `until` also that, and how much of
+each tolerance is `reached` in the share `reliable` of the records.
 Nothing is written if no trajectory respects all limits.
 """
 
@@ -32,7 +33,9 @@ from drake_teleop.excitation.check import RATE
 from drake_teleop.excitation.excite import Excitation, excite, sensor_motion
 from drake_teleop.excitation.motion_film import write_motion_film
 from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
+from drake_teleop.excitation.shortest import RELIABLE, shortest
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.tolerance import read_tolerance
 from drake_teleop.pages.progress import show_progress
 from drake_teleop.pages.style import BLACK, BLUE, COLOURS, GREY, Picture, house_style
 from drake_teleop.scenario import LoadScenario
@@ -63,9 +66,10 @@ def excite_command(
     package_paths: tuple[Path, ...] = (),
     acceleration: tuple[float, ...] = (),
     payload: float | None = None,
+    until: str | None = None,
     criterion: str = "kappa_w10",
     period: float = 6.0,
-    harmonics: int = 5,
+    harmonics: int | None = None,
     seconds: float | None = None,
     seed: int = 0,
     quiet: bool = False,
@@ -79,7 +83,10 @@ def excite_command(
         model: another arm that moves instead, with the scenario's sensor; and then
         sensor_frame: the frame or link at which it measures, needed with `model`.
         package_paths, acceleration, payload: see `RobotFromModel`.
-        criterion, period, harmonics, seconds, seed: see `excite`.
+        until: a tolerance, see `read_tolerance`: then the shortest motion that reaches it, see
+            `shortest`, whatever criterion, period and seconds are.
+        criterion, period, harmonics, seconds, seed: see `excite`; by default 5 harmonics, 3 with
+            `until`.
         quiet: no progress bars and no tables.
         progress: False for no progress bars alone.
 
@@ -89,6 +96,7 @@ def excite_command(
     Raises:
         DrakeTeleopError: if the input cannot be used, or nothing respects all limits.
     """
+    tolerance = None if until is None else read_tolerance(until)
     setup = LoadScenario(scenario)
     make_folder(out)  # before the work: a bad path costs no time
     with show_progress(progress and not quiet) as stage:
@@ -114,16 +122,31 @@ def excite_command(
                 payload=payload,
             )
         opened(1.0)
-        found = excite(
-            robot,
-            criterion=criterion,
-            period=period,
-            harmonics=harmonics,
-            seed=seed,
-            seconds=seconds,
-            progress=stage,
-        )
-    summary = summarise(found) | {"seed": seed}
+        reached = {}
+        if tolerance is None:
+            found = excite(
+                robot,
+                criterion=criterion,
+                period=period,
+                harmonics=5 if harmonics is None else harmonics,
+                seed=seed,
+                seconds=seconds,
+                progress=stage,
+            )
+        else:
+            told = stage("Shorten the motion")
+            result = shortest(
+                robot,
+                tolerance,
+                harmonics=3 if harmonics is None else harmonics,
+                seed=seed,
+                progress=lambda done, best: told(done, f"{best:.3g} s" if best < np.inf else ""),
+            )
+            told(1.0)
+            found = result.excitation
+            shares = dict(zip(tolerance.entries, result.reached.tolist(), strict=True))
+            reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE}
+    summary = summarise(found) | reached | {"seed": seed}
     session = {"design_s": found.seconds}
     with output_folder(out):
         write_table(out / "trajectory.csv", table(found))
@@ -247,6 +270,13 @@ def _print(summary: dict[str, Any], out: Path) -> None:
         deviations.add_row(name.replace("[", r"\["), f"{value:.2g}")
     for part in (values, uses, deviations):
         console.print(part)
+    if "until" in summary:
+        console.print(
+            f"{summary['period_s']:.3g} s reach {summary['until']}"
+            f" in {summary['reliable']:.0%} of the records, by the sensor's noise alone",
+            highlight=False,
+            markup=False,
+        )
     for words in summary["assumed"]:
         console.print(f"assumed: {words}", highlight=False, markup=False)
     console.print(

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.excitation.problem import Evaluation, Problem, Task
+from drake_teleop.excitation.problem import Evaluation, Problem
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.one_thread import one_blas_thread
 
@@ -59,7 +59,7 @@ class Iterate:
 
 
 def design(
-    task: Task,
+    problem: Problem,
     *,
     seed: int,
     starts: int = 4,
@@ -69,7 +69,7 @@ def design(
     """Minimises the criterion within the limits.
 
     Args:
-        task: what to design.
+        problem: what to design.
         seed: of the candidates. With `seconds` left out, the result is a function of the arguments.
         starts: how many candidates are followed.
         seconds: thread CPU time; instead of `starts`, as many as fit.
@@ -78,7 +78,7 @@ def design(
     Returns:
         The feasible iterates as they were found; none if there were none.
     """
-    search = _Search(Problem(task), starts, seconds, progress)
+    search = _Search(problem, starts, seconds, progress)
     with one_blas_thread(), suppress(_TimeIsUpError):
         for candidate in search.candidates(np.random.default_rng(seed)):
             if seconds is None and search.start == starts:

@@ -21,7 +21,7 @@ from drake_teleop.excitation.limits import (
     sensor_vectors,
 )
 from drake_teleop.excitation.prediction import predicted_deviations
-from drake_teleop.excitation.problem import Task
+from drake_teleop.excitation.problem import Problem, Task
 from drake_teleop.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.pages.progress import Stage, show_progress
@@ -96,7 +96,7 @@ def excite(
         def designing(done: float, best: float) -> None:
             told(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
 
-        found = design(task, seed=seed, starts=starts, seconds=seconds, progress=designing)
+        found = design(Problem(task), seed=seed, starts=starts, seconds=seconds, progress=designing)
         designing(1.0, min((iterate.value for iterate in found), default=np.inf))
         trajectory, uses = best_checked(robot, found, checking)
     best = accumulate((iterate.value for iterate in found), min)

@@ -77,7 +77,14 @@ def sensor_noise(
 def predicted_deviations(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """(16,) standard deviations of offsets and phi after the motion.
+    """(16,) standard deviations of offsets and phi after the motion; as `predicted_covariance`."""
+    return np.sqrt(np.diag(predicted_covariance(s, omega, alpha, step, noise, phi)))
+
+
+def predicted_covariance(
+    s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
+) -> Array:
+    """(16, 16) covariance of offsets and phi after the motion.
 
     Args:
         s, omega, alpha: (T, 3) samples of the motion, in S.
@@ -103,9 +110,14 @@ def predicted_deviations(
         influence[:, 9:] = _backwards(of_alpha, through_alpha, step)
     # An increment of a walk is in all that comes after it.
     later = np.cumsum(influence[::-1], axis=0)
-    of_white = np.einsum("tci,c->i", influence**2, noise.white) / step
-    of_walk = np.einsum("tci,c->i", later**2, noise.walk) * step
-    return np.sqrt(of_white + of_walk)
+    of_white = _products(influence, noise.white) / step
+    return of_white + _products(later, noise.walk) * step
+
+
+def _products(influence: Array, variances: Array) -> Array:
+    """(16, 16) sum over samples and channels of influence influence^T times the variance."""
+    rows = (influence * np.sqrt(variances)[:, np.newaxis]).reshape(-1, influence.shape[2])
+    return rows.T @ rows
 
 
 def _correction(filter_: SteadyState, period: float) -> tuple[Array, Array]:

@@ -40,7 +40,6 @@ DEFAULT = "mass 0.5 %, com 0.5 mm, inertia 5 %"
 _WRONG = Flag.DAMAGED | Flag.NOT_FINITE | Flag.OUT_OF_RANGE | Flag.SATURATED | Flag.GAP
 _IDLE_S = 0.05
 _ANY_HZ = 1000.0  # readings are kept with their times: their rate is asked by the compensator alone
-_AGREE = 2  # looks in a row
 
 
 class Recorder:
@@ -131,7 +130,7 @@ def calibrate(
     def seen(result: Look) -> bool:
         looks.append(result)
         show(result)
-        return len(looks) >= _AGREE and all(each.known.all() for each in looks[-_AGREE:])
+        return bool(result.known.all())
 
     over = False
     with ThreadPoolExecutor(1) as beside, suppress(KeyboardInterrupt):
@@ -142,17 +141,19 @@ def calibrate(
                     after = max(FIRST_S, GROWS * recorder.seconds)
                     recorder.write(path)
                     options = {"cutoff_hz": cutoff_hz, "delay": delay}
-                    pending = beside.submit(look, path, tolerance, **options)  # type: ignore[arg-type]
+                    before = looks[-1] if looks else None
+                    pending = beside.submit(look, path, tolerance, before, **options)  # type: ignore[arg-type]
                 if pending is not None and (not source.live or pending.done()):
                     over, pending = seen(pending.result()), None
                     if over:
                         break
             over = over or recorder.seconds >= seconds
     if pending is not None:
-        over = seen(pending.result())
-    if not looks or not over or not looks[-1].known.all():
+        seen(pending.result())
+    if not looks or not looks[-1].known.all():
         recorder.write(path)
-        seen(look(path, tolerance, cutoff_hz=cutoff_hz, delay=delay))
+        before = looks[-1] if looks else None
+        seen(look(path, tolerance, before, cutoff_hz=cutoff_hz, delay=delay))
     return looks, recorder
 
 

@@ -2,10 +2,11 @@
 
 What has been recorded is identified as `identify` does, again and again, each time the record has
 grown by `GROWS`. A number is known when the half-width of its interval of `SURE` is within its
-tolerance; the 95 % interval that is shown is then half of it or less. To look often and to stop at
-the first good news makes intervals too narrow; therefore the level is far above 95 %, the variance
-has to be known itself (`FEWEST_DEGREES`), and two looks in a row have to agree. Nothing is known
-while something speaks against the record: suspected errors, another load from some time on, poses.
+tolerance, two looks in a row; the 95 % interval that is shown is then half of it or about. To look
+often and to stop at the first good news makes intervals too narrow; therefore the level is far
+above 95 %, two looks have to agree, and the variance be known itself (`FEWEST_DEGREES`). Nothing is
+known while something speaks against the record: suspected errors, another load from some time on,
+poses at rest.
 
 **What is missing.** The information of the recorded motion, G = sum of [E V]^T W [E V] over the
 samples that are independent behind the low-pass, and that of each of six motions from the present
@@ -32,7 +33,7 @@ from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.alignment import low_passed
 from drake_teleop.logs.read.reading import read_log
 
-SURE = 0.999
+SURE = 0.9998
 """Level of the interval that has to be within the tolerance."""
 GROWS = 1.12
 """By how much longer the record is at the next look."""
@@ -64,7 +65,8 @@ class Look:
         found: what was identified; None if nothing could be.
         why: nothing could be; else "".
         half: (k,) half-widths of the 95 % intervals of the asked numbers over their tolerances.
-        known: (k,) whether each is known.
+        sure: (k,) whether the wider interval of each is within its tolerance.
+        known: (k,) whether that is so in the look before, too.
         doubts: what speaks against the record; nothing is known then.
         advice: the motion that tells most of what is not known; "" if all is.
     """
@@ -73,17 +75,26 @@ class Look:
     found: IdentifiedLog | None
     why: str
     half: Array
+    sure: NDArray[np.bool_]
     known: NDArray[np.bool_]
     doubts: tuple[str, ...]
     advice: str
 
 
-def look(path: Path, tolerance: Tolerance, *, cutoff_hz: float | None, delay: str | float) -> Look:
+def look(
+    path: Path,
+    tolerance: Tolerance,
+    before: Look | None,
+    *,
+    cutoff_hz: float | None,
+    delay: str | float,
+) -> Look:
     """Identifies the record so far, as `identify` would.
 
     Args:
         path: the record, a canonical log.
         tolerance: what is asked.
+        before: the look before this one.
         cutoff_hz, delay: as of `identify_log`.
     """
     count, found, why = len(tolerance.entries), None, ""
@@ -91,24 +102,25 @@ def look(path: Path, tolerance: Tolerance, *, cutoff_hz: float | None, delay: st
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
     except DrakeTeleopError as error:
         why = str(error)
-    half, known = np.full(count, np.inf), np.zeros(count, bool)
+    half, sure = np.full(count, np.inf), np.zeros(count, bool)
     doubts: tuple[str, ...] = ()
     phi, noise, log = _GUESS, _NOISE, None
     if found is not None:
         load, log = found.identification, found.log
-        half, sure, degrees = half_widths(found, tolerance)
+        half, wider, degrees = half_widths(found, tolerance)
         doubts = doubts_of(found)
-        known = (sure <= 1.0) & (degrees >= FEWEST_DEGREES) & (not doubts)
+        sure = (wider <= 1.0) & (degrees >= FEWEST_DEGREES) & (not doubts)
         if load.mass > 0.0:
             phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _NOISE)
-    if log is not None and known.all():
-        return Look(float(log.t[-1]), found, why, half, known, doubts, "")
+    known = sure & (before is not None and before.sure)
+    if log is not None and sure.all():
+        return Look(float(log.t[-1]), found, why, half, sure, known, doubts, "")
     try:
         log = log or low_passed(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
     except DrakeTeleopError:  # hardly anything yet
-        return Look(0.0, found, why, half, known, doubts, _MOTIONS[0][0].format(axis="x"))
+        return Look(0.0, found, why, half, sure, known, doubts, _MOTIONS[0][0].format(axis="x"))
     advice = missing_motion(log.motion, log.dt, cutoff_hz, errors_of(tolerance, phi), noise)
-    return Look(float(log.t[-1]), found, why, half, known, doubts, advice)
+    return Look(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
 
 
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:

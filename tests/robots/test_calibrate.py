@@ -63,11 +63,9 @@ class Stream:
 def test_it_stops_when_two_looks_know_and_says_what_identify_says(tmp_path: Path) -> None:
     path = tmp_path / "log.parquet"
     looks, recorder = calibrate(Stream(recorded(20.0, [0, 1, 2])), path, ASKED)
-    assert recorder.seconds < 8.0 and [each.known.all() for each in looks[-3:]] == [
-        False,
-        True,
-        True,
-    ]
+    assert recorder.seconds < 8.0
+    assert [at.sure.all() for at in looks[-3:]] == [False, True, True]
+    assert [at.known.all() for at in looks[-3:]] == [False, False, True]
     last = looks[-1]
     assert last.found is not None and last.advice == "" and all(at.advice for at in looks[:-2])
     again = identify_log(path).identification
@@ -80,12 +78,12 @@ def test_it_stops_when_two_looks_know_and_says_what_identify_says(tmp_path: Path
 def looked_at(values: np.ndarray, until: str, path: Path) -> Look:
     log = Log(DT * np.arange(len(values)), *np.split(values, [6, 9, 12], axis=1))
     write_log(log, path)
-    return look(path, read_tolerance(until), cutoff_hz=30.0, delay="auto")
+    return look(path, read_tolerance(until), None, cutoff_hz=30.0, delay="auto")
 
 
 def test_about_one_axis_the_inertia_about_the_others_stays_unknown(tmp_path: Path) -> None:
     at = looked_at(recorded(4.0, [1]), "mass 5 %, inertia 20 %", tmp_path / "log.parquet")
-    known = dict(zip(read_tolerance("mass 5 %, inertia 20 %").entries, at.known, strict=True))
+    known = dict(zip(read_tolerance("mass 5 %, inertia 20 %").entries, at.sure, strict=True))
     assert known["mass"] and known["inertia xy"]
     assert not any(known[f"inertia {axes}"] for axes in ("xx", "xz", "zz"))
     assert "about y" not in at.advice
@@ -95,7 +93,7 @@ def test_about_one_axis_the_inertia_about_the_others_stays_unknown(tmp_path: Pat
 def test_of_two_loads_none_is_known(tmp_path: Path) -> None:
     both = np.concatenate([recorded(3.0, [0, 1, 2]), recorded(3.0, [0, 1, 2], phi=1.5 * PHI)])
     at = looked_at(both, "mass 1000 %", tmp_path / "log.parquet")
-    assert at.half < 1.0 and not at.known.any() and "the load changes at t = 3" in at.doubts[0]
+    assert at.half < 1.0 and not at.sure.any() and "the load changes at t = 3" in at.doubts[0]
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

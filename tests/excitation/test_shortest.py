@@ -1,0 +1,69 @@
+"""The shortest motion that makes a load known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.excitation.criteria import Criterion
+from drake_teleop.excitation.problem import Task
+from drake_teleop.excitation.robot import Robot, RobotFromScenario
+from drake_teleop.excitation.shortest import ShortestProblem, reliable_factor, shortest
+from drake_teleop.load.tolerance import errors_of, read_tolerance
+from drake_teleop.scenario import LoadScenario
+
+ASKED = read_tolerance("mass 0.1 %, com 0.1 mm, inertia 1 %")
+
+
+@pytest.fixture(scope="module")
+def slave() -> Robot:
+    return RobotFromScenario(LoadScenario("identification"))
+
+
+def problem_of(slave: Robot) -> ShortestProblem:
+    criterion = Criterion("A16", slave.scales)
+    task = Task(slave.arm.table, slave.limits, criterion, slave.home, 1.0, 3)
+    return ShortestProblem(task, errors_of(ASKED, slave.limits.phi), slave, None)
+
+
+def test_ten_numbers_at_once_need_more_than_one() -> None:
+    assert reliable_factor(1) == pytest.approx(1.96, abs=0.001)
+    assert pytest.approx(0.95, abs=1e-3) == (1 - 2 * 0.0025573) ** 10
+    assert reliable_factor(10) == pytest.approx(2.7996, abs=1e-3)
+
+
+def test_gradients_are_differences(slave: Robot) -> None:
+    problem, rng = problem_of(slave), np.random.default_rng(0)
+    x = problem.candidate(rng, near_home=True)
+    x[-1] = np.log(1.2)
+    at = problem.evaluate(x, 2.0, 100.0)
+    for step in (1e-6 * rng.normal(size=len(x)), np.append(np.zeros(len(x) - 1), 1e-6)):
+        up, down = (problem.evaluate(x + sign * step, 2.0, 100.0) for sign in (1, -1))
+        differences = [up.log_criterion - down.log_criterion, *(up.uses - down.uses)]
+        np.testing.assert_allclose(differences, 2 * at.gradients @ step, rtol=1e-4, atol=1e-11)
+
+
+def test_what_is_asked_is_the_deviation_over_the_period(slave: Robot) -> None:
+    """Of the samples of the grid, all of which white noise of the sensor's density falls on."""
+    problem = problem_of(slave)
+    x = problem.candidate(np.random.default_rng(1), near_home=True)
+    x[-1] = np.log(2.0)
+    at = problem.evaluate(x, 200.0, 100.0)
+    motion = tuple(problem._vectors.copy())
+    worst = problem.deviations(motion, 2.0).max()
+    assert np.exp(2 * (at.uses[0] - 1)) == pytest.approx(worst, rel=0.01)
+    assert problem.deviations(motion, 8.0).max() == pytest.approx(worst / 2, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_it_reaches_what_is_asked_within_all_limits(slave: Robot) -> None:
+    found = shortest(slave, read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %"), starts=1)
+    assert 0.2 < found.excitation.trajectory.period < 1.0
+    assert 0.8 < found.reached.max() <= 1.0
+    assert all(use.share <= 1.0 for use in found.excitation.uses)
+
+
+def test_what_is_out_of_reach_is_said(slave: Robot) -> None:
+    with pytest.raises(DrakeTeleopError, match="no motion within the limits"):
+        shortest(slave, read_tolerance("inertia 0.00001 %"), starts=1)
