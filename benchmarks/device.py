@@ -8,7 +8,8 @@ late its force is. `silent_`: the force at the device 50 ms after the station fa
 `leaf_` and `wall_`: the device's client with and without its passivity observer in simulated time,
 at the leaf (291 N/m at the hand) and a wall of 6 kN/m, up to five samples late, and as late as was
 measured just now: least energy of the port [J]; how far the resting hand moves to and fro [m].
-`fuzz_`: messages that are none. With --drive the whole station in real time under the device.
+`station_wall_`: likewise with the whole station between, in simulated time. `fuzz_`: messages that
+are none. With --drive the whole station in real time under the device.
 Baselines: the same without the observer; the share of time in which a process waited for a core.
 """
 
@@ -24,12 +25,18 @@ from pathlib import Path
 
 import numpy as np
 
+from drake_teleop.environment.wall import Wall
+from drake_teleop.identified_load import identified_load
 from drake_teleop.live.device_guard import DeviceGuard, Limits
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, packed_state, unpacked_state
+from drake_teleop.live.external_master import with_device
 from drake_teleop.live.haply import read_message
+from drake_teleop.live.live import Live
+from drake_teleop.live.session import Session, live_scenario
 from drake_teleop.live.virtual_device import VirtualDevice, tapping
 from drake_teleop.operator.operator import GRIPS
+from drake_teleop.scenario import LoadScenario, replace
 
 LEAF, WALL = 5100 / 17.5, 6000.0  # N/m at the hand
 _TICK = 1e-3
@@ -53,9 +60,11 @@ def linked(seconds: float) -> tuple[dict[str, float], np.ndarray]:
     with tempfile.TemporaryDirectory() as folder:
         link, told = DeviceLink("udp://127.0.0.1:0"), Path(folder) / "device.json"
         device = client(link.port, seconds, told, "--depth", "0.01", "--grip", "medium")
-        spent, behind, number = [], [], -1
+        spent: list[tuple[float, float]] = []
+        behind: list[float] = []
+        number = -1
         while device.poll() is None:
-            began = time.perf_counter()
+            began, cpu = time.perf_counter(), time.thread_time()
             state = link.poll(began)
             if state is None or state.number == number:
                 time.sleep(5e-5)
@@ -64,13 +73,15 @@ def linked(seconds: float) -> tuple[dict[str, float], np.ndarray]:
                 start, waited_before = began, waited()
             number = state.number
             link.send(np.array([0.0, 0.0, max(-WALL * state.position[2], 0.0), 0.0, 0.0, 0.0]))
-            spent.append(time.perf_counter() - began)
+            spent.append((time.perf_counter() - began, time.thread_time() - cpu))
             behind.append(state.behind)
         lasted = time.perf_counter() - start
         found = json.loads(told.read_text())
-        percent = 1e3 * np.percentile(spent, [50, 95, 99, 100])
-        names = ("p50", "p95", "p99", "max")
-        figures = {f"link_processing_{n}_ms": float(p) for n, p in zip(names, percent, strict=True)}
+        figures = {
+            f"link_processing_{kind}{name}_ms": 1e3 * float(np.percentile(times, part))
+            for kind, times in zip(("", "cpu_"), np.transpose(spent), strict=True)
+            for name, part in (("p50", 50), ("p95", 95), ("p99", 99), ("max", 100))
+        }
         figures |= {
             "link_packets_per_s": len(spent) / lasted,
             "link_lost_share": max(link.lost, 0) / max(number, 1),
@@ -137,6 +148,38 @@ def passive(measured: np.ndarray) -> dict[str, float]:
     return figures
 
 
+def in_station(grip: str, *, observe: bool) -> tuple[float, float]:
+    """As `pressed`, with the whole station in simulated time: slices of 2 ms, a force 2 ms late.
+
+    The wall and the tool's ball make 6 kN/m at the hand, if the arm were rigid.
+    """
+    ball, scale = 4e5, 1 / 17.5
+    scenario = live_scenario(with_device(LoadScenario("contact_transition")))
+    felt = WALL / (scale * scenario.kinematic_scaling.translation_scale)
+    wall = Wall(position=[0.55, 0.0, 0.247], stiffness=1 / (1 / felt - 1 / ball))
+    scenario = replace(
+        scenario, sheet_spring=None, environment=[wall], force_scaling__sigma=1.0,
+        force_scaling__force_scale=scale,
+    )  # fmt: skip
+    session = Session(scenario, None, device=True)
+    virtual = VirtualDevice(tapping(0.02), grip)
+    guard, start = DeviceGuard(Limits(37.5), observe=observe), virtual.position[2]
+    wrench, least, resting = np.zeros(6), 0.0, []
+    for k in range(800):
+        place = {"z": 1e5 * (virtual.position[2] - start), "held": 1, "clutch": 1}
+        session.apply(session.inputs.changed(place))
+        session.advance(2)
+        session.news()
+        for _ in range(2):
+            force = guard.tick(virtual.position, tuple(wrench), 2e-3, _TICK)
+            virtual.move(force[:3], _TICK)
+            least = min(least, virtual.energy)
+        wrench = session.force()
+        if k > 700:
+            resting.append(virtual.position[2])
+    return least, float(np.ptp(resting))
+
+
 def fuzzed(count: int = 10_000) -> dict[str, float]:
     """Values that are not finite among what random packets and texts led to, of each kind."""
     random, wrong, refused = np.random.default_rng(1), 0, 0
@@ -165,12 +208,6 @@ def fuzzed(count: int = 10_000) -> dict[str, float]:
 
 def driven(seconds: float) -> dict[str, float]:
     """The whole station under the device, in real time, without a page."""
-    from drake_teleop.identified_load import identified_load
-    from drake_teleop.live.external_master import with_device
-    from drake_teleop.live.live import Live
-    from drake_teleop.live.session import live_scenario
-    from drake_teleop.scenario import LoadScenario
-
     scenario = live_scenario(with_device(LoadScenario("contact_transition")))
     load, clock = identified_load(scenario), time.perf_counter
     link = DeviceLink("udp://127.0.0.1:0")
@@ -213,6 +250,11 @@ def main() -> None:
     options = parser.parse_args()
     figures, late = linked(options.seconds)
     figures |= silent() | passive(late) | fuzzed()
+    for grip in GRIPS:
+        for observe, word in ((True, "observed"), (False, "bare")):
+            least, moved = in_station(grip, observe=observe)
+            figures[f"station_wall_{word}_{grip}_least_energy_j"] = least
+            figures[f"station_wall_{word}_{grip}_moves_m"] = moved
     if options.drive:
         figures |= driven(options.seconds)
     for name, value in figures.items():

@@ -10,6 +10,7 @@ one alone, not with the device.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -88,12 +89,19 @@ class HaplyDevice:
     def __init__(self, address: str) -> None:
         from websockets.sync.client import connect
 
+        self._open = contextlib.ExitStack()
         try:
             parts = urlsplit(address)
             url = f"ws://{parts.hostname or 'localhost'}:{parts.port or 10001}"
-            self._socket = connect(
-                url, max_size=_LONGEST, open_timeout=2, compression=None, proxy=None
+            opened = connect(
+                url,
+                max_size=_LONGEST,
+                open_timeout=2,
+                close_timeout=1,
+                compression=None,
+                proxy=None,
             )
+            self._socket = self._open.enter_context(opened)
         except (OSError, TimeoutError, ValueError) as error:
             raise DrakeTeleopError(
                 f"does not answer ({error})", where=address, remedy="start Haply's service"
@@ -117,10 +125,12 @@ class HaplyDevice:
 
     def set(self, wrench: Sequence[float]) -> None:
         """See `Device`."""
-        if self._device:
-            self._socket.send(written_force(self._device, wrench))
+        from websockets.exceptions import ConnectionClosed
+
+        with contextlib.suppress(ConnectionClosed):  # `read` says so
+            self._socket.send(written_force(self._device, wrench) if self._device else "{}")
 
     def close(self) -> None:
         """See `Device`."""
         self.set((0.0,) * 6)
-        self._socket.close()
+        self._open.close()

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import re
 import socket
+import threading
 from importlib import resources
 
 import numpy as np
 import pytest
+from websockets.sync.server import serve
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.live.device import DrivenBy
@@ -26,7 +28,7 @@ from drake_teleop.live.device_packets import (
     unpacked_state,
 )
 from drake_teleop.live.external_master import with_device
-from drake_teleop.live.haply import read_message, written_force
+from drake_teleop.live.haply import HaplyDevice, read_message, written_force
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.session import Session, read_drive, repeat
@@ -232,6 +234,37 @@ def test_a_client_displays_what_the_station_says_and_nothing_when_it_is_silent(l
     assert max(np.abs(force[151:])) == 0.0
     assert 1 / 1.1 < 1000 * client.behind[50] < 1.1
     client.close()
+
+
+def test_an_inverse3_at_a_service_that_wants_an_answer_before_it_says_more():
+    heard = []
+
+    def service(connection):
+        cursor = {"device_id": "b7", "state": {"cursor_position": {"x": 0.1, "y": 0.2, "z": 0.3}}}
+        grip = {"state": {"orientation": {"w": 0, "x": 1, "y": 0, "z": 0}, "buttons": {"a": True}}}
+        for message in ("oh", {"inverse3": [cursor]}, {"inverse3": [cursor], "verse_grip": [grip]}):
+            connection.send(json.dumps(message))
+            heard.append(json.loads(connection.recv()))
+
+    with serve(service, "127.0.0.1", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        device = HaplyDevice(f"haply://127.0.0.1:{server.socket.getsockname()[1]}")
+        places = []
+        for k in range(3):
+            places.append(device.read())
+            device.set((float(k), 0.0, 0.0, 0.0, 0.0, 0.0))
+        with pytest.raises(DrakeTeleopError, match="gone"):
+            device.read()
+        device.close()
+        server.shutdown()
+    assert places == [
+        None,
+        Place((-0.2, 0.1, 0.3)),
+        Place((-0.2, 0.1, 0.3), (0.0, 0.0, 1.0, 0.0), CLUTCH_OPEN),
+    ]
+    values = [said["inverse3"][0]["commands"]["set_cursor_force"]["values"] for said in heard[1:]]
+    assert values == [{"x": 0.0, "y": -1.0, "z": 0.0}, {"x": 0.0, "y": -2.0, "z": 0.0}]
+    assert heard[0] == {}
 
 
 @pytest.mark.parametrize("address", ["udp://192.0.2.1:9", "tcp://127.0.0.1:9", "udp://127.0.0.1"])

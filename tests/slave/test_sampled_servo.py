@@ -3,19 +3,22 @@
 import numpy as np
 import pytest
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_teleop.environment.wall import Wall
+from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.simulation import simulate
 from drake_teleop.slave.joint_control import (
     JointControl,
     JointControlConfig,
     joint_control_torque,
     servo_numbers,
 )
-from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.plant import AddSlavePlant, start_pose
 from drake_teleop.slave.sampled_servo import SampledServo, samples_within, torque_line
 from drake_teleop.slave.slave_config import Slave
+from drake_teleop.station import MakeTeleopStation
 
 CONFIG = JointControlConfig()
 
@@ -55,6 +58,40 @@ def test_samples_inside_a_step_move_the_arm_as_events_do(wall, share):
     rate = np.abs(moved(1, 2e3, wall) - honest).max()
     assert rate > 5e-5  # rad, of five times the rate
     assert np.abs(moved(5, 1e4, wall) - honest).max() < share * rate
+
+
+class Elsewhere(LeafSystem):
+    """A master that wants the tool 2 mm to the side."""
+
+    def __init__(self, start):
+        super().__init__()
+        self.DeclareVectorInputPort("wrench_command", 6)
+        pose = start + np.array([0, 0, 0, 0, 0, 0.002, 0])
+        self.DeclareVectorOutputPort(
+            "pose_command", 7, lambda context, output: output.SetFromVector(pose)
+        )
+
+
+def test_the_sensor_looks_into_steps_in_which_the_torque_changes():
+    scenario = replace(
+        LoadScenario("free_motion_force"),
+        rates__joint_control_hz=1e4,
+        rates__log_hz=2e3,
+        rates__sensor_hz=7e3,  # so that the sample of a row was taken within a step
+        wrist_sensor__ideal=True,
+        force_scaling__sigma=1.0,
+        simulation__settle=0.0,
+        simulation__duration=0.01,
+    )
+    logs = []
+    for step in (1e-3, 1.25e-4):
+        simulation = replace(scenario, simulation__max_step=step, simulation__accuracy=1e-8)
+        master = Elsewhere(start_pose(scenario.slave))
+        station = MakeTeleopStation(simulation, master=master)
+        logs.append(simulate(station, simulation.simulation, progress=False))
+    measured = [log["measured_wrench_S"][:, :3] for log in logs]
+    assert np.abs(np.diff(measured[1], axis=0)).max() > 0.5  # N, from row to row
+    np.testing.assert_allclose(*measured, rtol=0.0, atol=1e-5)
 
 
 def test_one_sample_is_the_controller_itself_to_the_last_bit():
