@@ -60,7 +60,6 @@ def _message(name: str, k: int) -> bytes:
     data = {
         WRENCH: lambda: (kinds["Wrench"](vector, kinds["Vector3"](*_WRENCH[3:])),),
         POSE: lambda: (kinds["Pose"](kinds["Point"](0.4, 0.1, 0.3), turn),),
-        "joints": lambda: (["a", "b"], np.zeros(2), np.zeros(2), np.zeros(2)),
         IMU: lambda: (turn, nine, vector, nine, vector, nine),
     }
     if name == "tf":

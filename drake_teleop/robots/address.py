@@ -15,17 +15,20 @@ class Address:
         text: the address.
         port: if it says none.
         known: the names that it may have.
+        host: if it says none.
 
     Raises:
         DrakeTeleopError: without a host, or with another name or port.
     """
 
-    def __init__(self, text: str, port: int, known: tuple[str, ...]) -> None:
+    def __init__(
+        self, text: str, port: int | None, known: tuple[str, ...], *, host: str = ""
+    ) -> None:
         self.text = text
         try:
             parts = urlsplit(text)
             said = dict(parse_qsl(parts.query, keep_blank_values=True, strict_parsing=False))
-            self.host, self.port = parts.hostname or "", parts.port or port
+            self.host, self.port = parts.hostname or host, parts.port or port
         except ValueError as error:
             raise DrakeTeleopError(str(error), where=text) from error
         if not self.host:

@@ -12,15 +12,18 @@ from drake_teleop.robots.lines import LineSink, LineSource
 from drake_teleop.robots.replay_log import LogSource
 from drake_teleop.robots.streams import PartSource, Sink, Source
 from drake_teleop.robots.table import TableSink
-from drake_teleop.robots.udp import UdpSink, UdpSource
+from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
-_SOURCES = "udp://:PORT, rtde://HOST, netft://HOST, zenoh://HOST/TOPIC, - for stdin, or replay:LOG"
+_SOURCES = (
+    "udp://:PORT, posed://:PORT, rtde://HOST, netft://HOST, zenoh://HOST/TOPIC, - for stdin, or"
+    " replay:LOG"
+)
 _SINKS = (
     "udp://HOST:PORT, zenoh://HOST/TOPIC, foxglove://[HOST][:PORT], -, or a .csv, .parquet or"
     " .mcap file"
 )
 _REPLAY = "replay:"
-_OF_PARTS = ("rtde", "netft", "zenoh")
+_OF_PARTS = ("posed", "rtde", "netft", "zenoh")
 
 
 def source_of(
@@ -34,7 +37,7 @@ def source_of(
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
 ) -> Source:
-    """The source at an address: udp, rtde, netft, zenoh, - for stdin, or replay:LOG.
+    """The source at an address: udp, posed, rtde, netft, zenoh, - for stdin, or replay:LOG.
 
     Args:
         address: see the sources; docs/robot.md lists them.
@@ -107,6 +110,8 @@ def _period(rate_hz: float | None, address: str) -> float:
 
 def _of_parts(address: str, rate_hz: float | None) -> PartSource:
     kind = _kind(address)
+    if kind == "posed":
+        return PosedSource(address, _period(rate_hz, address))
     if kind == "rtde":
         from drake_teleop.robots.rtde import RtdeSource
 

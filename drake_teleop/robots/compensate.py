@@ -150,6 +150,8 @@ def compensate_command(
     late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
     say(f"late by {1e3 * late:.1f} ms")
     say(f"stale after {1e3 * STALE_S:.0f} ms; what cannot be trusted is zero")
+    if largest is None:
+        say("no --range: nothing says how large a wrench can be, and what is saturated is not seen")
     try:
         counts = run(readings, compensator, wrenches, control=asked, tare=tare, say=say)
         say(", ".join(f"{name} {count}" for name, count in counts.items()))

@@ -1,4 +1,4 @@
-/* The packets of `drake-teleop compensate udp://...`. Little-endian, IEEE 754, no padding.
+/* The packets of `drake-teleop compensate udp://...` and `posed://...`. Little-endian, IEEE 754, no padding.
  *
  * Frame S of the sensor, SI: N, N m, m/s^2, rad/s, rad/s^2. Sign: what the sensor exerts on the load;
  * most sensors report the opposite. Specific force is acceleration minus gravity, of the origin of S:
@@ -22,6 +22,18 @@ typedef struct { /* to drake-teleop: 144 bytes */
   double wrench[6]; /* force, torque */
   double specific_force[3], angular_velocity[3], angular_acceleration[3];
 } dt_reading;
+
+/* posed://: the pose of any frame on the wrist, in a frame whose z is upwards. The wrench is turned
+ * round unless the address says ?sign=1. */
+typedef struct { /* to drake-teleop: 128 bytes */
+  char magic[4]; /* "DTP1" */
+  uint32_t flags; /* DT_SATURATED or 0 */
+  uint64_t number;
+  double t;
+  double wrench[6];
+  double quaternion[4]; /* w x y z */
+  double position[3]; /* m */
+} dt_posed;
 
 typedef struct { /* from drake-teleop: 120 bytes */
   char magic[4]; /* "DTC1" */

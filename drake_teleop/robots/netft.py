@@ -150,24 +150,32 @@ class NetFtSource:
 def _page(told: Address) -> list[float]:
     """Counts of 1 N and of 1 N m, and the rate [Hz], as the box says them."""
     from http.client import HTTPConnection, HTTPException
-    from xml.etree import ElementTree
 
     remedy = "or say them: netft://HOST?counts=FORCE,TORQUE&rate=HZ"
     where = f"http://{told.host}/netftapi2.xml"
     connection = HTTPConnection(told.host, timeout=_PAGE_S)
     try:
         connection.request("GET", "/netftapi2.xml")
-        answer = connection.getresponse().read(_PAGE_BYTES)
-        root = ElementTree.fromstring(answer)
-        text = {each.tag: (each.text or "").strip() for each in root.iter()}
-        counts = [float(text[f"cfgcp{kind}"]) / _UNITS[text[f"scfg{kind}u"]] for kind in ("f", "t")]
-        values = [*counts, float(text["comrdtrate"])]
-    except (OSError, HTTPException, ElementTree.ParseError, ValueError, KeyError) as error:
+        return page_of(connection.getresponse().read(_PAGE_BYTES))
+    except (OSError, HTTPException, SyntaxError, ValueError, KeyError) as error:
         raise DrakeTeleopError(
             f"counts, units and rate cannot be read ({error!r})", where=where, remedy=remedy
         ) from error
     finally:
         connection.close()
+
+
+def page_of(content: bytes) -> list[float]:
+    """Counts of 1 N and of 1 N m, and the rate [Hz], as netftapi2.xml says them.
+
+    Raises:
+        SyntaxError, KeyError, ValueError: if it does not.
+    """
+    from xml.etree import ElementTree
+
+    text = {each.tag: (each.text or "").strip() for each in ElementTree.fromstring(content).iter()}
+    counts = [float(text[f"cfgcp{kind}"]) / _UNITS[text[f"scfg{kind}u"]] for kind in ("f", "t")]
+    values = [*counts, float(text["comrdtrate"])]
     if not all(0.0 < value < 1e12 for value in values):
-        raise DrakeTeleopError("counts and rate are no positive numbers", where=where)
+        raise ValueError("they are no positive numbers")
     return values

@@ -24,14 +24,13 @@ from drake_teleop.robots.ros2 import (
     topic_of,
     types,
 )
-from drake_teleop.robots.streams import IMU, JOINTS, POSE, WRENCH, Flag, Part
+from drake_teleop.robots.streams import IMU, POSE, WRENCH, Flag, Part
 
 _TF = "tf2_msgs/msg/TFMessage"
 KINDS = {
     WRENCH: WRENCH_STAMPED,
     "tf": _TF,
     POSE: "geometry_msgs/msg/PoseStamped",
-    JOINTS: "sensor_msgs/msg/JointState",
     IMU: "sensor_msgs/msg/Imu",
 }
 _STREAMS = {"tf": POSE}
@@ -45,14 +44,10 @@ class Messages:
     Args:
         sign: of wrenches.
         frames: parent and child whose pose is told by transforms; empty for none.
-
-    Attributes:
-        joint_names: in the order of the newest joint positions.
     """
 
     def __init__(self, sign: float, frames: tuple[str, ...] = ()) -> None:
         self._sign, self._frames, self._types = sign, frames, types()
-        self.joint_names: list[str] = []
         self._links: dict[str, tuple[str, Array]] = {}
         self._counts = dict.fromkeys(KINDS, 0)
         for name in KINDS:  # what reads them is made now: the first messages would wait for that
@@ -89,9 +84,6 @@ class Messages:
             return self._sign * np.array([*_xyz(wrench.force), *_xyz(wrench.torque)])
         if name == POSE:
             return _pose(data.pose.position, data.pose.orientation)
-        if name == JOINTS:
-            self.joint_names = list(data.name)
-            return np.array(data.position, float)
         return np.array([*_xyz(data.linear_acceleration), *_xyz(data.angular_velocity)])
 
     def _posed(self, data: Any) -> list[tuple[Any, Array]]:
@@ -117,7 +109,7 @@ class Messages:
 
 
 class Ros2Source:
-    """Parts of zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&joints=TOPIC&imu=TOPIC&tf=PARENT,CHILD&...].
+    """Parts of zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&imu=TOPIC&tf=PARENT,CHILD&...].
 
     Args:
         address: TOPIC is of WrenchStamped; sign -1, the default, is for a sensor that tells what
@@ -135,10 +127,10 @@ class Ros2Source:
     """
 
     def __init__(self, address: str, dt: float) -> None:
-        told = Address(address, PORT, known=("pose", "joints", "imu", "tf", "domain", "sign"))
+        told = Address(address, PORT, known=("pose", "imu", "tf", "domain", "sign"))
         self.dt, sign, domain = dt, told.sign(), domain_of(told)
         topics = {WRENCH: topic_of(told, told.path)}
-        for stream in (POSE, JOINTS, IMU):
+        for stream in (POSE, IMU):
             if (text := told.text_of(stream)) is not None:
                 topics[stream] = topic_of(told, text)
         frames: tuple[str, ...] = ()

@@ -22,7 +22,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.quaternions import exponential
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.rtde_reader import SAMPLE
-from drake_teleop.robots.streams import IMU, POSE, WRENCH, Part
+from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part
 
 PORT = 30004
 _FIRST_S = 3.0  # to wait for the robot at the start
@@ -41,7 +41,7 @@ class RtdeSource:
         DrakeTeleopError: if the address cannot be used, ur_rtde is missing, or no robot answers.
     """
 
-    streams: tuple[str, ...] = (WRENCH, POSE, IMU)
+    streams: tuple[str, ...] = (WRENCH, POSE, ACCELERATION)
 
     def __init__(self, address: str) -> None:
         told = Address(address, PORT, known=("sign",))
@@ -117,6 +117,6 @@ def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
     told = {
         WRENCH: sign * values[:6],
         POSE: np.array([*exponential(sample[10:13]), *sample[7:10]]),
-        IMU: values[12:15],
+        ACCELERATION: values[12:15],
     }
     return [Part(stream, number, t, each) for stream, each in told.items()]

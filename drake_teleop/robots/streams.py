@@ -51,9 +51,9 @@ class Part(NamedTuple):
     """What one stream of several told, on its own clock; readings are made of them.
 
     Args:
-        stream: one of `WRENCH`, `POSE`, `JOINTS`, `IMU`, whose values are the wrench of S (6), the
-            pose X_WF of a frame on the wrist (7), positions of joints (n), or specific force and
-            angular velocity of S (6) or the first of them alone (3).
+        stream: one of `WRENCH`, `POSE`, `IMU`, `ACCELERATION`, whose values are the wrench of S
+            (6), the pose X_WF of a frame on the wrist (7), specific force and angular velocity of
+            S (6), or what an accelerometer somewhere on the wrist says (3), which nobody reads yet.
         number: of the stream, one more each time.
         t: of the stream [s].
     """
@@ -65,7 +65,7 @@ class Part(NamedTuple):
     flags: int = 0
 
 
-WRENCH, POSE, JOINTS, IMU = "wrench", "pose", "joints", "imu"
+WRENCH, POSE, IMU, ACCELERATION = "wrench", "pose", "imu", "acceleration"
 
 
 class Compensated(NamedTuple):

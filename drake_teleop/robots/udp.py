@@ -1,7 +1,8 @@
 """Readings and wrenches in UDP packets of a fixed layout, as `drake_teleop_udp.h` has it in C.
 
 Little-endian, without padding. In: "DTW1", flags (of `Flag`, SATURATED alone is read), number,
-time [s], 15 numbers. Out: "DTC1", flags, number, time [s], contact (6), scaled (6).
+time [s], 15 numbers; or "DTP1", the same, wrench (6), pose (w x y z, position). Out: "DTC1",
+flags, number, time [s], contact (6), scaled (6).
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.robots.streams import DAMAGED, Compensated, Flag, Reading
+from drake_teleop.robots import streams
+from drake_teleop.robots.address import Address
+from drake_teleop.robots.streams import DAMAGED, Compensated, Flag, Part, Reading
 
 THIS_MACHINE = "127.0.0.1"
 READING = struct.Struct("<4sIQd15d")
+POSED = struct.Struct("<4sIQd13d")
 WRENCH = struct.Struct("<4sIQd12d")
-_IN, _OUT = b"DTW1", b"DTC1"
+_IN, _POSED, _OUT = b"DTW1", b"DTP1", b"DTC1"
 _HEAD = struct.Struct("<4sIQd")
 _MOST = 256  # packets at once
 
@@ -35,6 +39,22 @@ def unpacked(packet: bytes) -> Reading:
     _, flags, number, t = _HEAD.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 15, _HEAD.size).astype(np.float64)
     return Reading(number, t, values, flags & Flag.SATURATED)
+
+
+def packed_parts(wrench: Part, pose: Part) -> bytes:
+    """The packet of a wrench and a pose of the same instant."""
+    head = _POSED, wrench.flags, wrench.number, wrench.t
+    return POSED.pack(*head, *wrench.values, *pose.values)
+
+
+def unpacked_parts(packet: bytes) -> list[Part]:
+    """Wrench and pose in a packet, a damaged wrench if it is none. It never raises."""
+    if len(packet) != POSED.size or packet[:4] != _POSED:
+        return [Part(streams.WRENCH, -1, np.nan, np.full(6, np.nan), int(Flag.DAMAGED))]
+    _, flags, number, t = _HEAD.unpack_from(packet)
+    values = np.frombuffer(packet, "<f8", 13, _HEAD.size).astype(np.float64)
+    wrench = Part(streams.WRENCH, number, t, values[:6], flags & Flag.SATURATED)
+    return [wrench, Part(streams.POSE, number, t, values[6:])]
 
 
 def packed_wrench(out: Compensated) -> bytes:
@@ -87,23 +107,21 @@ def listening(host: str, port: int) -> socket.socket:
     return receiver
 
 
-class UdpSource:
-    """Readings that are sent to a port. Only this machine can, unless HOST says otherwise."""
-
-    live = True
+class _Receiver:
+    """Packets that are sent to a port. Only this machine can, unless HOST says otherwise."""
 
     def __init__(self, address: str, dt: float) -> None:
         self.dt = dt
         self._socket = listening(*endpoint(address))
         self.port = self._socket.getsockname()[1]
 
-    def read(self, timeout_s: float) -> list[Reading] | None:
-        """See `Source`."""
-        found: list[Reading] = []
+    def packets(self, timeout_s: float) -> list[bytes]:
+        """Those that have come."""
+        found: list[bytes] = []
         self._socket.settimeout(timeout_s)
         try:
             while len(found) < _MOST:
-                found.append(unpacked(self._socket.recv(READING.size + 1)))
+                found.append(self._socket.recv(READING.size + 1))
                 self._socket.settimeout(0.0)
         except (TimeoutError, BlockingIOError):
             pass
@@ -112,6 +130,37 @@ class UdpSource:
     def close(self) -> None:
         """See `Source`."""
         self._socket.close()
+
+
+class UdpSource(_Receiver):
+    """Readings of udp://[HOST]:PORT."""
+
+    live = True
+
+    def read(self, timeout_s: float) -> list[Reading] | None:
+        """See `Source`."""
+        return [unpacked(packet) for packet in self.packets(timeout_s)]
+
+
+class PosedSource(_Receiver):
+    """Wrenches and poses of posed://[HOST]:PORT[?sign=-1].
+
+    Args:
+        address: sign -1, the default, is for a sensor that tells what the load exerts on it.
+        dt: between packets [s].
+    """
+
+    streams: tuple[str, ...] = (streams.WRENCH, streams.POSE)
+
+    def __init__(self, address: str, dt: float) -> None:
+        self._sign = Address(address, None, known=("sign",), host=THIS_MACHINE).sign()
+        super().__init__(address, dt)
+
+    def read(self, timeout_s: float) -> list[Part] | None:
+        """See `PartSource`."""
+        parts = [part for packet in self.packets(timeout_s) for part in unpacked_parts(packet)]
+        signs = {streams.WRENCH: self._sign}
+        return [part._replace(values=signs.get(part.stream, 1.0) * part.values) for part in parts]
 
 
 class UdpSink:

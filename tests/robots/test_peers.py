@@ -24,13 +24,23 @@ from peer import HASH
 from test_compensator import PHI, load
 from websockets.sync.client import connect
 
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.addresses import sink_of
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.netft import NetFtSource
+from drake_teleop.robots.netft import NetFtSource, page_of
 from drake_teleop.robots.ros2_source import Ros2Source
 from drake_teleop.robots.rtde import RtdeSource
-from drake_teleop.robots.streams import IMU, POSE, WRENCH, Compensated, Flag, Part, Reading, Source
+from drake_teleop.robots.streams import (
+    ACCELERATION,
+    POSE,
+    WRENCH,
+    Compensated,
+    Flag,
+    Part,
+    Reading,
+    Source,
+)
 
 PEER = Path(__file__).with_name("peer.py")
 AT_REST = np.array([0.0, 0.0, 9.81, *np.zeros(6)])
@@ -128,7 +138,11 @@ def test_rtde() -> None:
     assert not {50000 + number for number in LOST} & {row.number for row in seen}
     poses = [part.values for part in seen.parts if part.stream == POSE]
     np.testing.assert_allclose(poses[0], [np.cos(0.5), 0, 0, np.sin(0.5), 0.4, 0.1, 0.3])
-    assert next(part.values.tolist() for part in seen.parts if part.stream == IMU) == [0, 0, 9.81]
+    assert next(part.values.tolist() for part in seen.parts if part.stream == ACCELERATION) == [
+        0,
+        0,
+        9.81,
+    ]
 
 
 def test_ros_2() -> None:
@@ -189,3 +203,27 @@ def test_foxglove_and_mcap(tmp_path: Path) -> None:
     wrench = json.loads(messages[2].data)
     assert wrench["contact"]["tau_z"] == 5.0 and wrench["scaled"]["f_y"] == -1.0
     assert wrench["number"] == 2 and wrench["flags"] == ["stale"]
+
+
+@pytest.mark.parametrize(("real_hz", "named"), [(500.0, True), (1004.0, False)])
+def test_a_box_at_another_rate_is_named_and_does_not_seem_late(real_hz: float, named: bool) -> None:
+    source = NetFtSource("netft://127.0.0.1?counts=1,1&rate=1000&sign=1")
+    compensator, flags = Compensator(load(), source.dt), []
+    for k in range(round(2.5 * real_hz)):
+        now = k / real_hz
+        part = source.part(struct.pack(">III6i", k, k, 0, *range(6)), now)
+        values = np.concatenate([part.values, AT_REST])
+        flags.append(compensator.step(Reading(part.number, part.t, values, part.flags), now).flags)
+    source.close()
+    assert set(flags[-200:]) == {Flag.WRONG_RATE if named else 0}
+
+
+def test_a_box_is_asked_for_its_counts_units_and_rate() -> None:
+    page = """<netft><cfgcpf>4448</cfgcpf><cfgcpt>1000000</cfgcpt><scfgfu>lbf</scfgfu>
+        <scfgtu>N-mm</scfgtu><comrdtrate>500</comrdtrate></netft>"""
+    assert page_of(page.encode()) == pytest.approx([4448 / 4.4482216, 1e9, 500.0])
+    for bad in (b"", b"<a/>", page.encode().replace(b"500", b"0"), page.encode()[:60]):
+        with pytest.raises((ValueError, KeyError, SyntaxError)):
+            page_of(bad)
+    with pytest.raises(DrakeTeleopError, match="or say them: netft://HOST"):
+        NetFtSource("netft://127.0.0.9")

@@ -20,7 +20,7 @@ from drake_teleop.robots.addresses import sink_of, source_of
 from drake_teleop.robots.compensate import Control, run
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.lines import LineSource, read_line, written_line
-from drake_teleop.robots.streams import DAMAGED, Compensated, Flag, Reading
+from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Compensated, Flag, Part, Reading
 
 HEADER = Path(udp.__file__).with_name("drake_teleop_udp.h").read_text()
 
@@ -56,7 +56,7 @@ def test_the_header_says_the_same() -> None:
             sum(int((re.findall(r"\d+", x) or [1])[0]) for x in n.split(",")) for _, n in fields
         ]
         lengths.append(sum(sizes[kind] * n for (kind, _), n in zip(fields, counts, strict=True)))
-    assert lengths == [udp.READING.size, udp.WRENCH.size]
+    assert lengths == [udp.READING.size, udp.POSED.size, udp.WRENCH.size]
     bits = {name: int(value) for name, value in re.findall(r"DT_(\w+) = (\d+)", HEADER)}
     assert bits == {str(flag.name): flag.value for flag in Flag}
 
@@ -114,6 +114,22 @@ def test_from_socket_to_socket_on_this_machine_alone() -> None:
     sink.close()
 
 
+def test_wrench_and_pose_in_a_packet() -> None:
+    wrench = Part(WRENCH, 4, 0.5, np.arange(6.0), int(Flag.SATURATED))
+    pose = Part(POSE, 4, 0.5, np.array([1.0, 0, 0, 0, 0.4, 0.1, 0.3]))
+    source = udp.PosedSource("posed://:0", DT)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for packet in (udp.packed_parts(wrench, pose), b"x" * udp.POSED.size, b"DTP1"):
+            sender.sendto(packet, ("127.0.0.1", source.port))
+    assert source._socket.getsockname()[0] == "127.0.0.1"
+    found = source.read(5.0)
+    source.close()
+    assert found is not None and [part[:3] for part in found[:2]] == [wrench[:3], pose[:3]]
+    np.testing.assert_array_equal(found[0].values, -wrench.values)
+    np.testing.assert_array_equal(found[1].values, pose.values)
+    assert [part.flags for part in found] == [Flag.SATURATED, 0, Flag.DAMAGED, Flag.DAMAGED]
+
+
 def test_lines_from_a_pipe_to_a_table(tmp_path: Path) -> None:
     out, into = os.pipe()
     lines = b"\n".join(map(line_of, readings(30, touched=5.0)))
@@ -165,7 +181,10 @@ def test_the_control_port_tares_and_says_so() -> None:
     assert said[0].startswith(b"refused: there are not 0.5 s") and said[1].startswith(b"unknown")
 
 
-@pytest.mark.parametrize("address", ["udp://:x", "udp://:70000", "udp://a", "tcp://:1", "log.csv"])
+@pytest.mark.parametrize(
+    "address",
+    ["udp://:x", "udp://:70000", "udp://a", "tcp://:1", "log.csv", "netft://", "rtde://a?x=1"],
+)
 def test_an_address_that_is_none(address: str) -> None:
     with pytest.raises(DrakeTeleopError):
         source_of(address, load(), rate_hz=500.0)
