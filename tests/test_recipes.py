@@ -9,7 +9,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from drake_teleop.identification import true_load
+from drake_teleop.scenario import LoadScenario
+from drake_teleop.simulation import simulate
+from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.station import MakeTeleopStation
 
 ROOT = Path(__file__).parents[1]
 RECIPES = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -62,6 +69,23 @@ def run(copy: Path, script: str) -> None:
 
 def test_there_is_a_recipe_for_each_kind_of_part():
     assert len(blocks("python")) == len(blocks("diff")) == 3
+
+
+def test_an_arm_a_device_and_a_wall_are_ten_lines(tmp_path):
+    """With them `run` has all it wants."""
+    (text,) = re.findall(r"^```yaml\n(slave:.*?)^```$", RECIPES, re.M | re.S)
+    assert len(text.splitlines()) <= 10
+    shutil.copy(ROOT / "models" / "leader_arm.urdf", tmp_path / "arm.urdf")
+    (tmp_path / "mine.yaml").write_text(text)
+    scenario = LoadScenario(tmp_path / "mine.yaml")
+    station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
+    scenario.simulation.settle, scenario.simulation.duration = 0.0, 0.02
+    result = simulate(station, scenario.simulation, progress=False)
+    slave = NominalSlave(scenario.slave)
+    assert slave.arm.joint_names[0] == "yaw" and slave.arm.phi_load[0] == pytest.approx(0.1)
+    assert scenario.master.device(0.0, 0.0).mass_matrix(np.zeros(6))[0, 0] == pytest.approx(0.12)
+    assert result["true_contact_wrench_W"].shape == (21, 6)
+    assert np.abs(result["measured_wrench_S"][:, :3]).max() > 0.5
 
 
 @pytest.mark.slow
