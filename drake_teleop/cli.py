@@ -375,6 +375,7 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
     help="Of the sensor: at its ends there is no wrench, and none that goes out is above it.",
 )
 @click.option("--predicted", is_flag=True, help="Extrapolate over the low-pass's lag.")
+@click.option("--watch", is_flag=True, help="Flag contact, and another load than the known one.")
 @click.option("--tare", is_flag=True, help="Set the offsets at the start, untouched and at rest.")
 @click.option(
     "--control",
@@ -396,6 +397,7 @@ def compensate(
     sensor_pose: tuple[float, ...] | None,
     largest: tuple[float, float] | None,
     predicted: bool,
+    watch: bool,
     tare: bool,
     control: int | None,
     real_time: bool,
@@ -423,6 +425,7 @@ def compensate(
         sensor_pose=sensor_pose,
         largest=largest,
         predicted=predicted,
+        watch=watch,
         tare=tare,
         control=control,
         real_time=real_time,

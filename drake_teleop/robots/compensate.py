@@ -18,6 +18,7 @@ from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
 from drake_teleop.robots.lines import names_of
 from drake_teleop.robots.streams import Compensated, Sink, Source
 from drake_teleop.robots.udp import THIS_MACHINE, listening
+from drake_teleop.robots.watch import Watch
 
 _IDLE_S = 0.01  # between wrenches of zero while nothing comes
 
@@ -99,6 +100,7 @@ def compensate_command(
     largest: tuple[float, float] | None = None,
     predicted: bool = False,
     tare: bool = False,
+    watch: bool = False,
     control: int | None = None,
     real_time: bool = False,
     cutoff_hz: float | None = 30.0,
@@ -114,6 +116,7 @@ def compensate_command(
         sigma, gamma, cutoff_hz, predicted: see `Compensator`.
         largest: the sensor's range [N], [N m].
         tare: at the start.
+        watch: for contact and another load, see `drake_teleop.robots.watch`.
         control: port of `Control`.
 
     Raises:
@@ -140,6 +143,7 @@ def compensate_command(
         wait=getattr(readings, "wait", 0),
         predicted=predicted,
         largest=limits,
+        watch=Watch(found, readings.dt, cutoff_hz) if watch else None,
     )
     wrenches = sink_of(sink)
     asked = None if control is None else Control(control)

@@ -27,6 +27,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.robots.streams import ONLY_SAID, VALUES, Compensated, Flag, Reading
+from drake_teleop.robots.watch import Watch
 
 STALE_S = 0.05
 """Age above which there is no wrench [s]."""
@@ -58,6 +59,7 @@ class Compensator:
             source; what comes out is late by as many.
         predicted: extrapolate over wait and low-pass.
         largest: (6,) the sensor's range [N, N m].
+        watch: says of each good reading whether something is touched, or it is another load.
         tare_limit: how far offsets may drift [N], [N m].
 
     Attributes:
@@ -77,13 +79,14 @@ class Compensator:
         wait: int = 0,
         predicted: bool = False,
         largest: Array | None = None,
+        watch: Watch | None = None,
         tare_limit: tuple[float, float] = (5.0, 0.25),
     ) -> None:
         self._phi, self._nothing = usable_phi(load)[0], np.zeros(10)
         self._scales, self._dt = (float(sigma), float(sigma), float(gamma)), dt
         self.offsets = load.offsets.copy()
         self.lag_s = wait * dt + filter_lag(dt, cutoff_hz)
-        self._filter = None
+        self._filter, self._watch = None, watch
         if cutoff_hz is not None and cutoff_hz < 0.5 / dt:
             self._filter = low_pass_coefficients(dt, cutoff_hz, self.lag_s if predicted else 0.0)
         self._range = np.full(6, np.inf) if largest is None else np.asarray(largest, float)
@@ -114,6 +117,8 @@ class Compensator:
         wrench = self._filtered(self._eliminated(reading.values))
         if wrong:
             return self._zero(flags)
+        if self._watch is not None:
+            flags |= self._watch.flags(reading.values)
         return self._limited(reading, wrench, flags)
 
     def idle(self, now: float) -> Compensated | None:
@@ -140,6 +145,8 @@ class Compensator:
                 " something is touched, or it is another load"
             )
         self.offsets = self.offsets + step
+        if self._watch is not None:
+            self._watch.restart(self.offsets)
         self.rested = 0
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 

@@ -10,7 +10,8 @@
 enum {
   DT_SATURATED = 1, DT_DAMAGED = 2, DT_NOT_FINITE = 4, DT_OUT_OF_RANGE = 8, DT_REORDERED = 16,
   DT_STALE = 32, DT_CLOCK_JUMP = 64, DT_RESTART = 128, DT_GAP = 256,
-  DT_WRONG_RATE = 512, DT_CLIPPED = 1024 /* with these two the wrench is no zero */
+  DT_WRONG_RATE = 512, DT_CLIPPED = 1024, /* with these and all below the wrench is no zero */
+  DT_IN_CONTACT = 2048, DT_OTHER_LOAD = 4096
 };
 
 #pragma pack(push, 1)

@@ -32,9 +32,11 @@ class Flag(IntFlag):
     GAP = 256  #: a straight line stands in for what a log does not have
     WRONG_RATE = 512  #: the rate is not the stated one; the wrench is no zero for that
     CLIPPED = 1024  #: limited to the sensor's range; likewise
+    IN_CONTACT = 2048  #: the known load does not explain the wrench; likewise
+    OTHER_LOAD = 4096  #: another load hangs there; likewise
 
 
-ONLY_SAID = Flag.WRONG_RATE | Flag.CLIPPED
+ONLY_SAID = Flag.WRONG_RATE | Flag.CLIPPED | Flag.IN_CONTACT | Flag.OTHER_LOAD
 """Flags whose wrench is not zero."""
 
 
