@@ -37,7 +37,7 @@ class Environment(ABC):
     """Something to touch: a dataclass that derives from this, of which a scenario may have several.
 
     Its bodies may stand still or move, and have any shape that Drake knows. The wrist sensor's own
-    contact law is the faster one; it knows boxes that stand still, and a `moving_part` by itself.
+    contact law is the faster one; it knows boxes that stand or move, and a `moving_part` by itself.
     """
 
     @property

@@ -1,8 +1,8 @@
 """Contact as Drake computes it, for what the wrist sensor's own law does not know.
 
-Meshes, cylinders, boxes on boxes, pressures over an area, bodies that move. Drake tells the forces
-of the state that the plant is in, so the plant stops at each of the sensor's samples: the wrench is
-as exact as by the compiled law, and takes longer to simulate.
+Meshes, cylinders, boxes on boxes, pressures over an area. Drake tells the forces of the state that
+the plant is in, so the plant stops at each of the sensor's samples: the wrench is as exact as by
+the compiled law, and takes longer to simulate.
 """
 
 from __future__ import annotations
