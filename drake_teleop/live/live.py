@@ -33,6 +33,7 @@ Show = Callable[[dict[str, np.ndarray]], None]
 
 #: Frames for the page [s].
 FRAME = 1 / 60
+_SHORTEST = 0.6 * FRAME  # between two of them
 # How long it goes on when nobody drives [s]; slices in a row before messages are listened to.
 _ALONE, _IN_A_ROW = 0.25, 4
 _LONGEST_MS = 36_000_000
@@ -74,7 +75,7 @@ class Live:
         self._drives, self._paused, self._stopped = 0, False, ""
         self._alone_since = now
         self.pace = Pace(1e-3 * self._slice_ms, now)
-        self._frame_due = now
+        self._frame_due, self._framed, self._heeded = now, now, False
         self._begin(now)
 
     def _begin(self, now: float) -> None:
@@ -194,9 +195,12 @@ class Live:
         if self._driver is None and not self._asleep and now - self._alone_since >= _ALONE:
             self._asleep = True
             self._try(self._session.keep)
-        if now < self._frame_due:
+        # What the driver has just done is shown at once; frames then go along with what he does.
+        heeded = self._heeded and now >= self._framed + _SHORTEST
+        if now < self._frame_due and not heeded:
             return None
-        self._frame_due = max(self._frame_due + FRAME, now - FRAME)
+        self._frame_due = now + 1.5 * FRAME if heeded else max(self._frame_due + FRAME, now - FRAME)
+        self._framed, self._heeded = now, False
         return self.frame()
 
     def _listen(self, now: float) -> None:
@@ -217,6 +221,7 @@ class Live:
 
     def _slice(self, now: float) -> None:
         by_device = {} if self._link is None else self._link.lead(now)
+        self._heeded |= self._wanted.target != self._session.inputs.target
         try:
             self._session.apply(self._wanted.changed(by_device))
         except DrakeTeleopError as error:

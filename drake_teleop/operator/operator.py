@@ -244,6 +244,24 @@ def _wanted_into(packed, start, moving, memory, time, pose, twist):
 
 
 @njit(cache=True)
+def _unit_pose_into(pose, twist, out):
+    """Writes the pose (7,) with a quaternion of length 1; whether it is one and all is finite."""
+    square, rest = 0.0, 0.0
+    for k in range(4):
+        square += pose[k] * pose[k]
+    for k in range(7):
+        rest += pose[k] - pose[k]  # not a number unless it is finite
+    for k in range(6):
+        rest += twist[k] - twist[k]
+    if not (rest == 0.0 and 0.0 < square < math.inf):
+        return False
+    size = math.sqrt(square)
+    for k in range(7):
+        out[k] = pose[k] / size if k < 4 else pose[k]
+    return True
+
+
+@njit(cache=True)
 def _wrench_now(
     packed, start, moving, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench
 ):  # fmt: skip
@@ -344,7 +362,8 @@ class Operator(LeafSystem):
         # Segments, the pose that they are relative to, and how that moves.
         self._intent = (pack_intent(config.intent), np.array(start, dtype=float), np.zeros(6))
         self._wanted, self._wanted_twist = np.empty(7), np.empty(6)
-        self._no_memory = np.empty(0)
+        self._no_memory, self._no_segments = np.empty(0), self._intent[0][:0]
+        self._intended = np.empty(7)
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
         self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
@@ -419,18 +438,16 @@ class Operator(LeafSystem):
         """What the plan is added to: segments, the pose they are relative to, its twist."""
         if not self._intended_pose.HasValue(context):
             return self._intent
-        segments, _, still = self._intent
         pose = self._intended_pose.Eval(context)
         known = self._intended_twist.HasValue(context)
-        twist = self._intended_twist.Eval(context) if known else still
-        size = math.sqrt(pose[:4] @ pose[:4])
-        if not (np.isfinite(pose).all() and np.isfinite(twist).all() and size > 0.0):
+        twist = self._intended_twist.Eval(context) if known else self._intent[2]
+        if not _unit_pose_into(pose, twist, self._intended):
             raise DrakeTeleopError(
                 f"what the operator wants at {context.get_time():g} s is no finite pose or twist",
                 where="intended_pose",
                 remedy="give X_BE [qw qx qy qz px py pz] in m, and [v; omega] in m/s, rad/s",
             )
-        return segments[:0], np.concatenate([pose[:4] / size, pose[4:]]), twist
+        return self._no_segments, self._intended, twist
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         _wrench_now(

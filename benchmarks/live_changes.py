@@ -1,0 +1,140 @@
+"""Does a station that is driven take a step when network and method change under a pressing tool?
+
+    python benchmarks/live_changes.py [--methods A,B] [--networks A,B] [--json FILE]
+
+The hand of `contact_transition` (firm grip, JR3) presses on the leaf, over no network and without a
+method. Then a method over a network, and back: by how much the slave's command jumps, how far the arm
+goes away from there afterwards, and by how much what the hand feels rises above what it was. Between
+them it taps at 1 Hz: CPU time of each slice of 5 ms, and real-time factor.
+Baseline: the same tapping after the way back, over no network and without a method.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.identification import slave_arm
+from drake_teleop.identified_load import IdentifiedLoad, identified_load
+from drake_teleop.live.choices import NAMES, chosen, filled_after
+from drake_teleop.live.inputs import SLICE_MS
+from drake_teleop.live.session import Session, live_scenario
+from drake_teleop.scenario import LoadScenario, Scenario
+from drake_teleop.slave.arm import forward_kinematics
+
+PRESSING, AFTER, TAPPING = -8500, 1.0, 1.0  # 10 um, s, s
+
+
+class Driven:
+    """A drive whose log is kept, slice by slice."""
+
+    def __init__(self, scenario: Scenario, load: IdentifiedLoad) -> None:
+        self.scenario, self.load = scenario, load
+        self.session = Session(scenario, load)
+        self.inputs, self._arm = self.session.inputs, slave_arm(scenario)
+        self.rows: list[dict[str, np.ndarray]] = []
+        self.cpu: list[float] = []
+
+    def go(self, seconds: float, tap: bool = False, **changes: int) -> None:
+        """Goes on for so long, with changed inputs."""
+        self.inputs, self.rows, self.cpu = self.inputs.changed(changes), [], []
+        end = self.session.ms + round(1e3 * seconds)
+        while self.session.ms < end:
+            if tap:
+                down = 0.5 - 0.5 * np.cos(2e-3 * np.pi * (end - self.session.ms))
+                self.inputs = self.inputs.changed({"z": round(PRESSING * (1.0 - down))})
+            start = time.thread_time()
+            self.session.apply(self.inputs)
+            self.session.advance()
+            self.cpu.append(time.thread_time() - start)
+            self.rows.append(self.session.news())
+
+    def signal(self, name: str, instead: str = "") -> np.ndarray:
+        return np.concatenate([rows[name if name in rows else instead] for rows in self.rows])
+
+    def tool(self) -> np.ndarray:
+        """(n, 3) the sensor's origin in W [m]."""
+        R_WS, places = np.empty((3, 3)), []
+        for q in self.signal("slave_state")[:, : self._arm.num_joints]:
+            places.append(np.empty(3))
+            forward_kinematics(self._arm.table, q, R_WS, places[-1])
+        return np.array(places)
+
+    def change(self, seconds: float, **changes: int) -> dict[str, float]:
+        """Figures of a change in contact: what was there before it, and what afterwards."""
+        self.go(0.01)
+        was = (
+            self.signal("pose_received", "pose_command")[-1, 4:],
+            self.tool()[-1],
+            np.linalg.norm(self.signal("force_to_master")[-1, :3]),
+        )
+        self.go(seconds, **changes)
+        felt = np.linalg.norm(self.signal("force_to_master")[:, :3], axis=1)
+        command = self.signal("pose_received", "pose_command")[:, 4:]
+        return {
+            "felt_before_N": float(was[2]),
+            "command_jumps_mm": 1e3 * float(np.linalg.norm(command[0] - was[0])),
+            "arm_moves_mm": 1e3 * float(np.linalg.norm(self.tool() - was[1], axis=1).max()),
+            "felt_rises_N": float(felt.max() - was[2]),
+            "felt_falls_N": float(was[2] - felt.min()),
+            "felt_steps_N": float(np.abs(np.diff(np.append(was[2], felt))).max()),
+        }
+
+
+def measured(driven: Driven, network: int, method: int) -> dict[str, float]:
+    """Figures of one network and method."""
+    still = driven.inputs.changed({"network": network, "method": method})
+    fills = filled_after(chosen(driven.scenario, driven.load, still))
+    figures = driven.change(fills + AFTER, network=network, method=method)
+    figures |= tapping(driven)
+    driven.go(1.0, z=PRESSING)
+    back = driven.change(1.5, network=0, method=0)
+    figures |= {f"back.{name}": value for name, value in back.items()}
+    return figures | {f"none.{name}": value for name, value in tapping(driven).items()}
+
+
+def tapping(driven: Driven) -> dict[str, float]:
+    """What slices take while the tool taps."""
+    driven.go(TAPPING, tap=True)
+    cpu = 1e3 * np.array(driven.cpu)
+    return {
+        "slice_cpu_p50_ms": float(np.median(cpu)),
+        "slice_cpu_p99_ms": float(np.percentile(cpu, 99)),
+        "real_time_factor": SLICE_MS * len(cpu) / cpu.sum(),
+    }
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    networks = [name for name in NAMES["network"][1:] if name != "custom"]
+    parser.add_argument("--methods", default=",".join(NAMES["method"]))
+    parser.add_argument("--networks", default=",".join(networks))
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    options = parser.parse_args()
+    figures: dict[str, Any] = {}
+    scenario = live_scenario(LoadScenario("contact_transition"))
+    load = identified_load(scenario)
+    for method in options.methods.split(","):
+        for network in options.networks.split(","):
+            driven = Driven(scenario, load)
+            driven.go(1.0, z=PRESSING)
+            pair = NAMES["network"].index(network), NAMES["method"].index(method)
+            row = measured(driven, *pair)
+            figures |= {f"{method}.{network}.{name}": round(x, 4) for name, x in row.items()}
+            print(
+                f"{method:13} {network:14}",
+                *(f"{name} {x:.3g}" for name, x in row.items()),
+                flush=True,
+            )
+            if options.json is not None:
+                options.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
