@@ -488,7 +488,8 @@ def _drives(_: Path) -> list[bytes]:
 _MESSAGES = (
     {"set": {"x": 10, "y": -20.5, "rz": 3, "sigma": 50, "force_scale": 5714, "held": 1}},
     {"pause": True, "slow": 5, "set": {"clutch": 0}},
-    {"drive": True, "reset": True},
+    {"drive": True, "reset": True, "scene": "slot"},
+    {"set": {"network": 7, "delay": 500, "method": 2, "sensor": 1, "object": 1, "grip": 0}},
 )
 
 

@@ -34,6 +34,8 @@ Show = Callable[[dict[str, np.ndarray]], None]
 #: Frames for the page [s].
 FRAME = 1 / 60
 _SHORTEST = 0.6 * FRAME  # between two of them
+#: The contact force at the hand from which a gamepad vibrates [N].
+TOUCH = 0.12
 # How long it goes on when nobody drives [s]; slices in a row before messages are listened to.
 _ALONE, _IN_A_ROW = 0.25, 4
 _LONGEST_MS = 36_000_000
@@ -92,8 +94,9 @@ class Live:
         if self._link is not None:
             self._link.begin_anew(now)
         self._cockpit, self._stopped, self._asleep = Cockpit(self._scenario), "", False
-        self._refusal = ""
+        self._refusal, self._pressed = "", False
         self._wanted = self._session.inputs
+        self._led = self._wanted.target
         self._frame: dict[str, Any] = {}
         self.pace.start(now)
 
@@ -119,6 +122,7 @@ class Live:
             "ranges": RANGES,
             "names": NAMES,
             "object": self._scenario.force_scaling.gripper_phi is not None,
+            "touch": TOUCH,
             "known": self._load is not None,
             "noise": self._load is not None and self._load.noise_floor is not None,
             "scale": scaling.translation_scale,
@@ -195,7 +199,7 @@ class Live:
         if self._driver is None and not self._asleep and now - self._alone_since >= _ALONE:
             self._asleep = True
             self._try(self._session.keep)
-        # What the driver has just done is shown at once; frames then go along with what he does.
+        # What the driver has just done or touched is shown at once; frames then go along with it.
         heeded = self._heeded and now >= self._framed + _SHORTEST
         if now < self._frame_due and not heeded:
             return None
@@ -221,7 +225,8 @@ class Live:
 
     def _slice(self, now: float) -> None:
         by_device = {} if self._link is None else self._link.lead(now)
-        self._heeded |= self._wanted.target != self._session.inputs.target
+        self._heeded |= self._wanted.target != self._led
+        self._led = self._wanted.target
         try:
             self._session.apply(self._wanted.changed(by_device))
         except DrakeTeleopError as error:
@@ -234,6 +239,9 @@ class Live:
                 self._wanted = self._wanted.changed(kept)
         if not self._stopped:
             self._try(lambda: self._session.advance(self._slice_ms))
+            pressed = self._session.pressed() > TOUCH
+            self._heeded |= pressed and not self._pressed
+            self._pressed = pressed
         if self._link is not None and not self._stopped:
             self._link.send(self._session.force())
         if self._session.ms >= _LONGEST_MS:

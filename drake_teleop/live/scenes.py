@@ -8,9 +8,9 @@ from drake_teleop.scenario import LoadScenario, Scenario, replace
 
 #: Scene -> a shipped scenario; "own" is what the drive was begun with.
 _SHIPPED = {
-    "leaf": "contact_transition",
+    "leaf": "touch",
     "slot": "peg_in_slot",
-    "wall": "contact_transition",
+    "wall": "touch",
     "block": "push_block",
 }
 SCENES = ("own", *_SHIPPED)

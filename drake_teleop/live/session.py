@@ -279,6 +279,14 @@ class Session:
             self._earlier.clear()
         return found
 
+    def pressed(self) -> float:
+        """The calculated contact force of the log's last row, at the hand [N]; 0 if unknown."""
+        part, sink = self._now.columns.get("contact_wrench_S"), self._now.sink
+        if part is None or not sink.num_samples():
+            return 0.0
+        force = sink.data()[part.start : part.start + 3, -1]
+        return self.inputs.scales["force_scale"] * math.sqrt(float(force @ force))
+
     def stylus(self) -> Inputs:
         """The inputs of a hand that takes hold of the stylus where it is, without pulling."""
         return self.inputs.held_at(self._now.value("pose_master"), self._start)

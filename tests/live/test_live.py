@@ -106,6 +106,55 @@ def test_one_drives_and_others_watch_until_they_ask(scenario, load, clock):
     assert (frame["drive"], frame["inputs"]["x"]) == (2, 0) and frame["t"] < 0.02
 
 
+def test_a_station_that_there_is_not_is_refused_and_the_drive_goes_on(
+    scenario, load, clock, monkeypatch
+):
+    live = make(scenario, load, clock)
+    live.join(1, clock())
+
+    def no_such(*_):
+        raise DrakeTeleopError("there is no such station")
+
+    monkeypatch.setattr("drake_teleop.live.session.chosen", no_such)
+    live.hear(1, '{"set": {"network": 3, "x": 100}}', clock())
+    frame = pass_time(live, clock, 0.03)[-1]
+    assert (frame["state"], frame["inputs"]["network"], frame["inputs"]["x"]) == ("running", 0, 100)
+    assert frame["words"] == ["there is no such station"]
+
+
+def test_another_scene_is_another_drive_and_its_record_another_folder(
+    scenario, load, clock, tmp_path
+):
+    live = make(scenario, load, clock, tmp_path / "drive")
+    (tmp_path / "drive-2").mkdir()
+    live.join(1, clock())
+    pass_time(live, clock, 0.03)
+    live.hear(1, '{"scene": "wall"}', clock())
+    frame = pass_time(live, clock, 0.05)[-1]  # time stands still until its load is known
+    assert (frame["state"], frame["scene"], live.asked) == ("preparing", "wall", "wall")
+    live.change(scenario, load, lambda rows: None, clock())
+    frame = pass_time(live, clock, 0.03)[-1]
+    assert (frame["state"], frame["scene"], frame["drive"]) == ("running", "wall", 2)
+    assert frame["record"] == str(tmp_path / "drive-3")
+    assert read_drive(tmp_path / "drive").changes[-1][0] > 0
+    live.close()
+
+
+def test_what_is_done_is_shown_at_once(scenario, load, clock):
+    """Not with the next of 60 frames a second; and no more of them follow from that."""
+    live = make(scenario, load, clock)
+    live.join(1, clock())
+    pass_time(live, clock, 0.1)
+    live.hear(1, '{"set": {"x": 100}}', clock())
+    start = clock.now
+    frame = None
+    while frame is None or frame["inputs"]["x"] != 100:
+        frame = live.tick(clock)
+        clock.now += 1e-3
+    assert clock.now - start < 0.013
+    assert len(pass_time(live, clock, 0.2)) <= 13
+
+
 def test_what_stops_a_drive_is_said_and_a_reset_begins_again(scenario, load, clock, monkeypatch):
     live = make(scenario, load, clock)
     live.join(1, clock())
@@ -150,7 +199,21 @@ def nonsense(rng: np.random.Generator) -> object:
     if kind == 3:
         return "[" * int(rng.integers(1, LONGEST + 9))
     wild = ["NaN", "Infinity", "-1e308", "1e999", "9" * 400, "null", "true", '"7"', "[1]", "{}"]
-    names = ["x", "rz", "sigma", "force_scale", "held", "clutch", "__class__", "ms", ""]
+    names = [
+        "x",
+        "rz",
+        "sigma",
+        "force_scale",
+        "held",
+        "clutch",
+        "network",
+        "method",
+        "sensor",
+        "object",
+        "__class__",
+        "ms",
+        "",
+    ]
     values = ", ".join(f'"{rng.choice(names)}": {rng.choice(wild)}' for _ in range(3))
     other = rng.choice(["slow", "pause", "reset", "drive", "set"])
     return f'{{"set": {{{values}}}, "{other}": {rng.choice(wild)}}}'
@@ -165,8 +228,10 @@ def test_ten_thousand_messages_of_nonsense_leave_every_number_finite(scenario, l
         live.hear(1, nonsense(rng), clock())
         if k % 1000 == 0:
             live.hear(1, '{"pause": false, "slow": 1}', clock())
+            live.asked = ""  # so is another scene
             live._session.apply(live._wanted)
             live._session.advance()
+    live.asked = ""
     frame = live.frame()
     assert live.refused > 3000
     assert frame["state"] == "running" and math.isfinite(sum(frame["inputs"].values()))
@@ -181,6 +246,8 @@ def test_ten_thousand_messages_of_nonsense_leave_every_number_finite(scenario, l
         ('{"set": {"x": 1, "y": NaN, "z": true, "rx": "1"}}', {"set": {"x": 1}}),
         ('{"slow": 1e9, "pause": 1}', {"slow": 20.0}),
         ('{"drive": true, "reset": 1}', {"drive": True}),
+        ('{"scene": "leaf", "pause": true}', {"scene": "leaf", "pause": True}),
+        ('{"scene": "../leaf"}', None),
         ("[]", None),
         ("{}", None),
         (b'{"reset": true}', None),

@@ -119,6 +119,15 @@ def test_the_page_drives(browser):
     browser.until("effects.length > 2 && frame.contact")
     assert 0.0 < browser.run("effects[0].strongMagnitude") <= 1.0
 
+    # Another network and an object, while it presses; then the socket is lost for a moment.
+    browser.run("at('network').value = 2; at('network').dispatchEvent(new Event('change'))")
+    browser.run("at('object').click()")
+    browser.until("frame.inputs.network === 2 && frame.inputs.object === 1 && frame.contact")
+    you = browser.run("socket.close(); hello.you")
+    browser.until(
+        f"hello.you > {you} && drives && target && frame.inputs.held === 1 && frame.inputs.network === 2"
+    )
+
     browser.call(
         "Emulation.setDeviceMetricsOverride",
         width=400, height=800, deviceScaleFactor=1, mobile=True,
