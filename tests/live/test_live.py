@@ -199,21 +199,8 @@ def nonsense(rng: np.random.Generator) -> object:
     if kind == 3:
         return "[" * int(rng.integers(1, LONGEST + 9))
     wild = ["NaN", "Infinity", "-1e308", "1e999", "9" * 400, "null", "true", '"7"', "[1]", "{}"]
-    names = [
-        "x",
-        "rz",
-        "sigma",
-        "force_scale",
-        "held",
-        "clutch",
-        "network",
-        "method",
-        "sensor",
-        "object",
-        "__class__",
-        "ms",
-        "",
-    ]
+    names = ["x", "rz", "sigma", "force_scale", "held", "clutch", "__class__", "ms", ""]
+    names += ["network", "method", "sensor", "object"]
     values = ", ".join(f'"{rng.choice(names)}": {rng.choice(wild)}' for _ in range(3))
     other = rng.choice(["slow", "pause", "reset", "drive", "set"])
     return f'{{"set": {{{values}}}, "{other}": {rng.choice(wild)}}}'
