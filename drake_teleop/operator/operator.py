@@ -35,7 +35,7 @@ from drake_teleop.operator.task import Insert, Movement, Press, Reach, Task, Tou
 from drake_teleop.quantities import choice, plain, quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, rotate
 from drake_teleop.slave.arm import ArmModel, forward_kinematics
-from drake_teleop.vectors import put
+from drake_teleop.vectors import put, unit_pose_into
 
 _FORCE_LIMIT = 60.0  # N, what a hand can exert on a stylus and still control, E
 _TORQUE_LIMIT = 2.0  # N m, E
@@ -244,24 +244,6 @@ def _wanted_into(packed, start, moving, memory, time, pose, twist):
 
 
 @njit(cache=True)
-def _unit_pose_into(pose, twist, out):
-    """Writes the pose (7,) with a quaternion of length 1; whether it is one and all is finite."""
-    square, rest = 0.0, 0.0
-    for k in range(4):
-        square += pose[k] * pose[k]
-    for k in range(7):
-        rest += pose[k] - pose[k]  # not a number unless it is finite
-    for k in range(6):
-        rest += twist[k] - twist[k]
-    if not (rest == 0.0 and 0.0 < square < math.inf):
-        return False
-    size = math.sqrt(square)
-    for k in range(7):
-        out[k] = pose[k] / size if k < 4 else pose[k]
-    return True
-
-
-@njit(cache=True)
 def _wrench_now(
     packed, start, moving, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench
 ):  # fmt: skip
@@ -441,7 +423,7 @@ class Operator(LeafSystem):
         pose = self._intended_pose.Eval(context)
         known = self._intended_twist.HasValue(context)
         twist = self._intended_twist.Eval(context) if known else self._intent[2]
-        if not _unit_pose_into(pose, twist, self._intended):
+        if not unit_pose_into(pose, twist, self._intended):
             raise DrakeTeleopError(
                 f"what the operator wants at {context.get_time():g} s is no finite pose or twist",
                 where="intended_pose",
