@@ -149,21 +149,3 @@ def cross_matrix(a: NDArray[np.float64]) -> NDArray[np.float64]:
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         matrix[..., k, j], matrix[..., j, k] = a[..., i], -a[..., i]
     return matrix
-
-
-@njit(cache=True)
-def unit_pose_into(pose, twist, out):
-    """Writes a pose (7,) with a quaternion of length 1; whether it is one, and all is finite."""
-    square, rest = 0.0, 0.0
-    for k in range(4):
-        square += pose[k] * pose[k]
-    for k in range(7):
-        rest += pose[k] - pose[k]  # not a number unless it is finite
-    for k in range(6):
-        rest += twist[k] - twist[k]
-    if not (rest == 0.0 and 0.0 < square < math.inf):
-        return False
-    size = math.sqrt(square)
-    for k in range(7):
-        out[k] = pose[k] / size if k < 4 else pose[k]
-    return True

@@ -29,13 +29,14 @@ from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.operator import decision
 from drake_teleop.operator import perception as feeling
 from drake_teleop.operator.decision import Training
+from drake_teleop.operator.intended import unit_pose_into
 from drake_teleop.operator.minimum_jerk import add_plan_into
 from drake_teleop.operator.perception import Perception, perceive_into
 from drake_teleop.operator.task import Insert, Movement, Press, Reach, Task, Touch
 from drake_teleop.quantities import choice, plain, quantity
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply, rotate
 from drake_teleop.slave.arm import ArmModel, forward_kinematics
-from drake_teleop.vectors import put, unit_pose_into
+from drake_teleop.vectors import put
 
 _FORCE_LIMIT = 60.0  # N, what a hand can exert on a stylus and still control, E
 _TORQUE_LIMIT = 2.0  # N m, E
