@@ -1,0 +1,249 @@
+"""How soon does the page show what a driver does, and when does a gamepad vibrate?
+
+    python benchmarks/live_page.py [--trials 20] [--seconds 60] [--json FILE]
+
+In headless Chromium, drawing off (without a graphics card it takes longer than all else): from the
+browser's time stamp of a pointer's move of 20 pixels, of a key, and from the moment that a stick is
+pushed, until the tool has moved by 0.2 mm in the page's scene. A key and a stick lead the hand at
+0.1 m/s, so that a part of it is the way. From the slice in which the contact force at the hand gets
+beyond 0.5 N, until `playEffect` of a gamepad that is a spy. Then, without a browser and in virtual
+time, fast free motion up and down: in how many frames a gamepad would vibrate, by the contact force
+and by the measured one. No baseline: the figures are times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import numpy as np
+from websockets.sync.client import ClientConnection, connect
+
+from drake_teleop.identified_load import identified_load
+from drake_teleop.live.live import TOUCH, Live
+from drake_teleop.live.server import LiveDrive, drive
+from drake_teleop.live.session import live_scenario
+from drake_teleop.scenario import LoadScenario
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+OPTIONS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--enable-unsafe-swiftshader",
+)  # fmt: skip
+SPY = """window.effects = []; window.axes = [0, 0, 0, 0];
+navigator.getGamepads = () => [{connected: true, id: "spy", axes, buttons: [],
+  vibrationActuator: {playEffect: () => {
+    effects.push(performance.timeOrigin + performance.now()); return Promise.resolve(); }}}];
+addEventListener("DOMContentLoaded", () => {
+  MeshCat.Viewer.prototype.render = () => {};
+  const handle = MeshCat.Viewer.prototype.handle_command;
+  MeshCat.Viewer.prototype.handle_command = function (command) {
+    handle.call(this, command);
+    if (command.type !== "set_transform" || !/tool$/.test(command.path)) return;
+    window.place = [12, 13, 14].map((k) => command.matrix[k]);
+    if (window.wait && Math.hypot(...place.map((p, k) => p - wait.place[k])) > 2e-4) {
+      wait.done(performance.now() - wait.since);
+      window.wait = null;
+    }
+  };
+});
+for (const name of ["pointermove", "keydown"])
+  addEventListener(name, (event) => {
+    if (window.wait && !wait.since) wait.since = event.timeStamp; }, true);
+window.moved = () => new Promise((done) => {
+  window.wait = {done, place: [...place], since: 0}; });"""
+
+
+class Page:
+    """A page, through the browser's own debugging socket."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket, self._numbers = socket, itertools.count()
+
+    def send(self, method: str, **params: Any) -> int:
+        number = next(self._numbers)
+        self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
+        return number
+
+    def answer(self, number: int) -> Any:
+        while True:
+            message = json.loads(self._socket.recv(60.0))
+            if message.get("id") == number:
+                return message["result"].get("result", {}).get("value")
+
+    def begin(self, script: str) -> int:
+        return self.send(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
+
+    def run(self, script: str) -> Any:
+        return self.answer(self.begin(script))
+
+    def mouse(self, kind: str, x: int) -> None:
+        self.answer(
+            self.send(
+                "Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=300, button="left",
+                buttons=int(kind != "Released"), clickCount=1,
+            )
+        )  # fmt: skip
+
+
+def latencies(page: Page, trials: int) -> dict[str, list[float]]:
+    """Times from what is done until the tool has moved [ms], by what is done."""
+    found: dict[str, list[float]] = {"pointer": [], "key": [], "stick": []}
+    for trial in range(trials):
+        for kind, times in found.items():
+            page.run("Object.assign(target, {x: 0, y: 0, z: 0}); 1")
+            time.sleep(1.5)
+            if kind == "pointer":
+                page.mouse("Pressed", 300)
+            waiting = page.begin("moved()")
+            sign = 1 - 2 * (trial % 2)
+            if kind == "pointer":
+                page.mouse("Moved", 300 + 20 * sign)
+            elif kind == "key":
+                code = "KeyE" if sign > 0 else "KeyQ"
+                page.send("Input.dispatchKeyEvent", type="keyDown", code=code, key=code[-1])
+            else:
+                page.send("Runtime.evaluate", expression=STICK.replace("SIGN", str(sign)))
+            times.append(page.answer(waiting))
+            page.mouse("Released", 300)
+            page.send("Input.dispatchKeyEvent", type="keyUp", code="KeyE", key="E")
+            page.send("Input.dispatchKeyEvent", type="keyUp", code="KeyQ", key="Q")
+            page.run("axes[0] = 0; 1")
+    return found
+
+
+STICK = "axes[0] = SIGN; wait.since = performance.now()"
+
+
+def vibration(page: Page, driven: LiveDrive, trials: int) -> list[float]:
+    """From the slice with a contact of 0.5 N to the gamepad's effect [ms]."""
+    session, found, touched = driven._live._session, [], []
+    advance = session.advance
+
+    def watched(ms: int) -> None:
+        start = time.time()
+        advance(ms)
+        if not touched and session.pressed() > 0.5:
+            touched.append(start)
+
+    session.advance = watched  # type: ignore[method-assign]
+    for _ in range(trials):
+        page.run("Object.assign(target, {x: 0, y: 0, z: 0}); 1")
+        time.sleep(1.5)
+        touched.clear()
+        page.run("effects.length = 0; target.z = -9000; 1")
+        time.sleep(1.5)
+        effects = page.run("effects")
+        if touched and effects:
+            found.append(effects[0] - 1e3 * touched[0])
+    return found
+
+
+def in_the_browser(trials: int) -> dict[str, float]:
+    """Figures of a page in headless Chromium."""
+    driven = drive("touch")
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        process = subprocess.Popen(
+            [CHROMIUM or "", *OPTIONS, f"--user-data-dir={folder}"],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            assert process.stderr is not None
+            said = next(line for line in process.stderr if "DevTools listening" in line)
+            port = said.rpartition(":")[2].partition("/")[0]
+            tabs = json.load(urlopen(f"http://127.0.0.1:{port}/json"))
+            address = next(tab["webSocketDebuggerUrl"] for tab in tabs if tab["type"] == "page")
+            with connect(address, max_size=None, origin=None) as socket:
+                page = Page(socket)
+                for domain in ("Runtime", "Page"):
+                    page.answer(page.send(f"{domain}.enable"))
+                page.answer(page.send("Page.addScriptToEvaluateOnNewDocument", source=SPY))
+                page.answer(page.send("Page.navigate", url=driven.url))
+                while not page.run("!!(window.place && typeof target !== 'undefined' && target)"):
+                    time.sleep(0.1)
+                figures = {}
+                for kind, times in (
+                    *latencies(page, trials).items(),
+                    ("vibration", vibration(page, driven, trials)),
+                ):
+                    p50, p95 = np.percentile(times, [50, 95])
+                    figures |= {f"{kind}_p50_ms": float(p50), f"{kind}_p95_ms": float(p95)}
+                figures["real_time_factor"] = page.run("frame.factor")
+                return figures
+        finally:
+            process.kill()
+            process.communicate()
+            driven.stop()
+
+
+class Clock:
+    """Time that passes only when it is told to."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def free_motion(seconds: float) -> dict[str, float]:
+    """In how many frames of fast free motion a gamepad would vibrate; in virtual time."""
+    scenario = live_scenario(LoadScenario("touch"))
+    clock, seen, fastest = Clock(), [], 0.0
+
+    def show(rows: dict[str, np.ndarray]) -> None:
+        nonlocal fastest
+        size = np.linalg.norm(rows["specific_force_S"], axis=1)
+        fastest = max(fastest, float(np.abs(size - 9.81).max()))
+
+    live = Live(scenario, identified_load(scenario), None, show, clock())
+    live.join(1, clock())
+    while clock.now < seconds + 2.0:
+        share = min(clock.now, 2.0) / 2.0
+        z = share * (4000.0 + 9000.0 * np.sin(2 * np.pi * 2.63 * clock.now))
+        live.hear(1, json.dumps({"set": {"z": z, "x": 600.0 * np.sin(3.0 * clock.now)}}), clock())
+        frame = live.tick(clock)
+        if frame is not None and clock.now > 2.0:
+            seen.append([frame["f"][1][1], frame["f"][0][1]])
+        clock.now += max(live.wait(clock.now), 1e-4)
+    forces = np.array(seen)
+    return {
+        "free_s": seconds,
+        "free_peak_acceleration": fastest,
+        "free_contact_force_max_N": float(forces[:, 0].max()),
+        "free_vibrates_by_contact": float((forces[:, 0] >= TOUCH).mean()),
+        "free_vibrates_by_measured": float((forces[:, 1] >= TOUCH).mean()),
+    }
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--trials", type=int, default=20)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    options = parser.parse_args()
+    figures = free_motion(options.seconds) if options.seconds else {}
+    if CHROMIUM is None:
+        print("there is no Chromium here")
+    elif options.trials:
+        figures |= in_the_browser(options.trials)
+    for name, value in figures.items():
+        print(f"{name:28} {value:.4g}")
+    if options.json is not None:
+        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
