@@ -192,6 +192,9 @@ ERRORS = {
     "MJCF without its other file": ("xml", "<mujoco><include file='x.xml'/></mujoco>",
                                     "Failed to load <include> file"),
     "SDF of two models": ("sdf", sdf("</model><model name='n'>"), "cannot be read as a robot"),
+    "SDF that includes a bad inertia": (
+        "sdf", sdf("<link name='x'/><include><uri>{bad}</uri></include>"),
+        "arm.sdf: cannot be read as a robot .*other.urdf.*angle inequality"),
     "SDF of the future": ("sdf", sdf("", "99"), "Unable to convert from SDF version 99"),
     "SDF without an axis": ("sdf", sdf(sdf_joint("revolute", "")), "axis must be specified for"),
     "SDF of a gearbox": ("sdf", sdf(sdf_joint("gearbox")), "gearbox. not supported"),
@@ -235,7 +238,7 @@ def test_what_cannot_be_is_one_error(tmp_path, case):
     suffix, text, expected = ERRORS[case]
     path, other = tmp_path / f"arm.{suffix}", tmp_path / "other.urdf"
     tool = Tool(mass=1.0)
-    if suffix == "dmd.yaml":
+    if suffix in ("dmd.yaml", "sdf"):
         text = text.replace("{good}", other.as_uri()).replace("{bad}", other.as_uri())
         other.write_text(ERRORS["no triangle"][1] if "bad" in case else arm())
     if "without a tool" in case:
