@@ -2,14 +2,15 @@
 what does it cost?
 
 `python benchmarks/inverse_kinematics.py [--poses 100000] [--json FILE]` takes the RX90, one with a
-sliding joint, and of the `bench` extra's robot descriptions a Panda, an xArm 7, a UR5 and a Kinova
-Jaco. For each arm:
+sliding joint, one of five joints, one of eight, and of the `bench` extra's robot descriptions a
+Panda, an xArm 7, a UR5 and a Kinova Jaco. For each arm:
 
 * `find_posture` for poses of random joint positions within the limits, from the middle of the
   limits: how many are met, the largest error, the time; the status of those that are not;
 * `follow_pose` along a motion of all joints at 2 kHz, from its last answer: errors, the largest
   speed as part of its limit, the time of a call. Baselines along the same motion: Drake's
-  `DoDifferentialInverseKinematics`, and a step of damped least squares in numpy;
+  `DoDifferentialInverseKinematics`, a step as of Pinocchio's examples, and one of damped least
+  squares in numpy;
 * of three, a tool that turns to and fro through a singularity of the wrist, or aside of it.
 
 And on the RX90, next to the closed form: the largest difference in a joint, and what the closed
@@ -37,7 +38,15 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.slave.arm import ArmModel, forward_kinematics, jacobian
+from drake_teleop.slave.arm import (
+    PHI,
+    ROTATION,
+    SLIDES,
+    TRANSLATION,
+    ArmModel,
+    forward_kinematics,
+    jacobian,
+)
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.inverse_kinematics import IkStatus, InverseKinematics, solve_pose_command
 from drake_teleop.slave.models import ParseModel
@@ -73,6 +82,22 @@ _ON_A_RAIL = (
     ("revolute", "0 0 0.2", "0 1 0", -2.0, 2.0, 5.0),
     ("revolute", "0 0 0.1", "0 0 1", -3.1, 3.1, 5.0),
 )
+#: Five as of small arms, of which a pose that all reach asks for one of the six; and eight.
+_MADE = {
+    "on a rail": _ON_A_RAIL,
+    "five joints": (
+        ("revolute", "0 0 0.1", "0 0 1", -2.0, 2.0, 3.0),
+        ("revolute", "0 0 0.05", "0 1 0", -1.8, 1.8, 3.0),
+        ("revolute", "0 0 0.25", "0 1 0", -2.0, 2.0, 3.0),
+        ("revolute", "0 0 0.25", "0 1 0", -1.7, 1.7, 5.0),
+        ("revolute", "0 0 0.1", "0 0 1", -2.8, 2.8, 5.0),
+    ),
+    "eight joints": (
+        *_ON_A_RAIL[:4],
+        ("revolute", "0 0 0.2", "0 0 1", -2.8, 2.8, 3.0),
+        *_ON_A_RAIL[4:],
+    ),
+}
 
 
 def described() -> Path | None:
@@ -92,13 +117,17 @@ def arms(models: Path | None) -> dict[str, tuple[ArmModel, MultibodyPlant, Frame
     finalize(plant)
     found["rx90"] = ArmModelFromPlant(plant, instance), plant, plant.GetFrameByName("sensor")
     with tempfile.TemporaryDirectory() as folder:
-        joints = [
-            _JOINT.format(k=k, i=k - 1, kind=kind, xyz=xyz, axis=axis, low=low, high=high, speed=v)
-            for k, (kind, xyz, axis, low, high, v) in enumerate(_ON_A_RAIL, start=1)
-        ]
-        path = Path(folder) / "on_a_rail.urdf"
-        path.write_text(f'<robot name="on_a_rail"><link name="l0"/>{"".join(joints)}</robot>')
-        files = {"on a rail": (path, "l7")}
+        files = {}
+        for name, chain in _MADE.items():
+            joints = [
+                _JOINT.format(
+                    k=k, i=k - 1, kind=kind, xyz=xyz, axis=axis, low=low, high=high, speed=v
+                )
+                for k, (kind, xyz, axis, low, high, v) in enumerate(chain, start=1)
+            ]
+            path = Path(folder) / f"{name.replace(' ', '_')}.urdf"
+            path.write_text(f'<robot name="made"><link name="l0"/>{"".join(joints)}</robot>')
+            files[name] = path, f"l{len(chain)}"
         if models is not None:
             files |= {name: (models / file, frame) for name, (file, frame) in DESCRIBED.items()}
         for name, (path, frame) in files.items():
@@ -225,6 +254,35 @@ class DampedLeastSquares:
         self.q = self.q + self.J.T @ np.linalg.solve(self.J @ self.J.T + 1e-6 * np.eye(6), e)
 
 
+class PinocchiosFollower:
+    """One step of the loop that Pinocchio's examples close, with its frames and its logarithm."""
+
+    def __init__(self, arm: ArmModel, q: Array) -> None:
+        import pinocchio as pin
+
+        self.pin, self.model, self.q, last = pin, pin.Model(), q.copy(), 0
+        for row in range(arm.num_joints + 1):
+            R = arm.table[row, ROTATION:TRANSLATION].reshape(3, 3)
+            X = pin.SE3(R, arm.table[row, TRANSLATION:PHI])
+            if row < arm.num_joints:
+                slides = arm.table[row, SLIDES] != 0.0
+                kind = pin.JointModelPZ() if slides else pin.JointModelRZ()
+                last = self.model.addJoint(last, kind, X, f"j{row}")
+        self.frame = self.model.addFrame(pin.Frame("S", last, 0, X, pin.FrameType.OP_FRAME))
+        self.data = self.model.createData()
+
+    def __call__(self, pose: Array) -> None:
+        pin, model, data = self.pin, self.model, self.data
+        wanted = pin.SE3(pin.Quaternion(pose[0], pose[1], pose[2], pose[3]), pose[4:])
+        pin.framesForwardKinematics(model, data, self.q)
+        off = data.oMf[self.frame].actInv(wanted)
+        J = pin.computeFrameJacobian(model, data, self.q, self.frame)
+        J = -pin.Jlog6(off.inverse()) @ J
+        error = pin.log6(off).vector
+        v = -J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(6), error)
+        self.q = pin.integrate(model, self.q, v)
+
+
 def followed(arm: ArmModel, follower: Any, motion: Array) -> dict[str, float]:
     """Along joint positions (N, n) whose poses are the commands."""
     poses = [pose_of(arm, q) for q in motion]
@@ -320,10 +378,13 @@ def main() -> None:
     parser.add_argument(
         "--models", type=Path, default=described(), help="example-robot-data/robots"
     )
+    parser.add_argument("--arms", help="some of them, by name with commas between")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     figures: dict[str, Any] = {}
     for name, (arm, plant, frame) in arms(options.models).items():
+        if options.arms and name not in options.arms.split(","):
+            continue
         motion = wavy(arm, 4000)
         start = motion[0]
         found = figures[name] = {
@@ -331,6 +392,7 @@ def main() -> None:
             "random": random_poses(arm, options.poses),
             "follow": followed(arm, Follower(arm, start), motion),
             "follow_drake": followed(arm, DrakesFollower(arm, plant, frame, start), motion[:1000]),
+            "follow_pinocchio": followed(arm, PinocchiosFollower(arm, start), motion[:1000]),
             "follow_numpy": followed(arm, DampedLeastSquares(arm, start), motion[:1000]),
         }
         for aside in ASIDE if name in BENT else ():
