@@ -25,7 +25,7 @@ from drake_teleop.robots.rtde_reader import SAMPLE
 from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part
 
 PORT = 30004
-_FIRST_S = 3.0  # to wait for the robot at the start
+_FIRST_S = 10.0  # to wait for the robot at the start
 _AGAIN_S = 0.2  # from one start of the child to the next
 _FIRST = 5  # samples that tell the rate
 _BLOCK = 65536
