@@ -40,6 +40,7 @@ KEYWORDS = {
     "robot": {
         "the-load-in-the-robot-s-format": "Franka, UR, URScript, payload",
         "the-wrench-without-the-tool-live": "compensate, gravity compensation",
+        "beside-a-robot": "UR RTDE, ATI NetFT, OnRobot, ROS 2 rmw_zenoh, Franka",
     },
     "sensor": {"the-presets": "ATI, JR3, Bota, Robotiq, OnRobot, sensor noise"},
     "station": {

@@ -75,8 +75,12 @@ def run(
                 say(f"t = {out.t:.3f} s: {name}")
             counts[name] += 1
 
+    def waited() -> float:
+        left = compensator.left(time.monotonic())
+        return min(left, _IDLE_S) if left > 0.0 else _IDLE_S
+
     with suppress(KeyboardInterrupt):
-        while (readings := source.read(_IDLE_S)) is not None:
+        while (readings := source.read(waited())) is not None:
             if source.live and (stale := compensator.idle(time.monotonic())) and not readings:
                 put(stale)
             for reading in readings:

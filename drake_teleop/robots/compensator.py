@@ -127,6 +127,10 @@ class Compensator:
             return None
         return self._zero(Flag.STALE)
 
+    def left(self, now: float) -> float:
+        """How long the last reading is not stale yet [s]."""
+        return max(0.0, self._now + STALE_S - now)
+
     def tare(self) -> str:
         """Sets the offsets; what it did, or why it did not: "refused: ..."."""
         if self.rested < len(self._rest):

@@ -148,6 +148,8 @@ def test_nothing_for_a_while_is_zero_and_then_it_settles_anew() -> None:
         compensator.step(reading, reading.t)
     last = 19 * DT
     assert compensator.idle(last + 0.9 * STALE_S) is None
+    assert compensator.left(last + 0.9 * STALE_S) == pytest.approx(0.1 * STALE_S)
+    assert compensator.left(last + 1.1 * STALE_S) == 0.0
     stale = compensator.idle(last + 1.1 * STALE_S)
     assert stale is not None and stale.flags == Flag.STALE and not stale.contact.any()
     again = readings(1200, touched=-4.0)[1000]  # two seconds later, another contact
