@@ -48,6 +48,7 @@ class Record:
 
     t: dict[str, Array]
     values: dict[str, dict[str, Array]]
+    seed: int
     fields: dict[str, dict[str, dict[str, Any]]] = field(default_factory=dict)
     top: dict[str, Any] = field(default_factory=dict)
 
@@ -93,6 +94,7 @@ def make(
             "pose": {"orientation": _wxyz(R), "position": p + 5e-5 * noise[1]},
             "imu": {"specific_force": s, "angular_velocity": omega, "angular_acceleration": alpha},
         },
+        seed,
     )
 
 
@@ -156,6 +158,20 @@ def _xyzw(record: Record) -> None:
 
 def _tcp(record: Record) -> None:
     record.values["pose"]["position"] += _matrices(record) @ [0.0, 0.0, 0.15]
+
+
+def _direction(record: Record) -> Array:
+    """(3,) of length 1, of the record's seed."""
+    x = np.random.default_rng([record.seed, 11]).normal(size=3)
+    return np.asarray(x / np.linalg.norm(x))
+
+
+def _off(record: Record) -> None:
+    record.values["pose"]["position"] += _matrices(record) @ (0.02 * _direction(record))
+
+
+def _tilted(record: Record) -> None:
+    _turned(Rotation.from_rotvec(np.radians(10.0) * _direction(record)).as_matrix())(record)
 
 
 def _slow_clock(stream: str) -> Callable[[Record], None]:
@@ -244,6 +260,10 @@ KINDS: dict[str, Mistake] = {
         ("wrench.frame", "rotation_in_sensor"),
     ),
     "TCP 150 mm": Mistake(_tcp, POSED, ("pose frame",), ("pose.position_in_sensor",)),
+    "shift 20 mm": Mistake(_off, POSED, ("pose frame",), ("pose.position_in_sensor",)),
+    "turn 10 deg": Mistake(
+        _tilted, POSED, ("mounting", "pose frame"), ("wrench.frame", "rotation_in_sensor")
+    ),
     "clock of the pose 1 %": Mistake(_slow_clock("pose"), POSED, ("clock",), (".time.scale",)),
     "clock of the IMU 1 %": Mistake(_slow_clock("imu"), SENSED, ("clock",), (".time.scale",)),
     "alpha in deg": Mistake(

@@ -53,7 +53,10 @@ def clock_rate(
     now, best = spectra(0.0), 0.0
     least = start = now.fit().cost
     for _ in range(_STEPS):
-        trial = best + _step(now)
+        step, gain = _step(now)
+        trial = best + step
+        if gain < _BELIEVED and best == 0.0:
+            return 0.0
         if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _FARTHEST:
             break
         now = spectra(trial)
@@ -70,8 +73,8 @@ def at_rate(poses: Poses, rate: float, grid: Grid, delay: float) -> Poses:
     return Poses(middle + (poses.t - middle) / (1.0 + rate), poses.position, poses.quaternion)
 
 
-def _step(spectra: Spectra) -> float:
-    """Of the rate."""
+def _step(spectra: Spectra) -> tuple[float, float]:
+    """Of the rate, and by how much twice the logarithm of the likelihood should grow."""
     fit, grid = spectra.fit(), spectra.grid
     change = np.gradient(spectra.zeta, grid.dt, axis=0)
     away = (grid.t - 0.5 * (grid.t[0] + grid.t[-1]))[:, None]
@@ -89,4 +92,6 @@ def _step(spectra: Spectra) -> float:
         rest = G[16:, 16:] - G[16:, :16] @ np.linalg.pinv(G[:16, :16], 1e-12, True) @ G[:16, 16:]
         gram += rest[:2, :2]
         right += rest[:2, 2]
-    return float(np.linalg.lstsq(gram, right, rcond=1e-12)[0][0])
+    inverse = np.linalg.pinv(gram, 1e-12, True)
+    step = float(inverse[0] @ right)
+    return step, 2.0 * step**2 / float(inverse[0, 0] + 1e-300)
