@@ -57,7 +57,8 @@ At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
     at rest what is measured too; k_h = 2.5 kN/m, h_m is the largest |w - w_n n| of about a second,
     tau thirty round trips, but 0.6 s at least. Both means are so slow because what they pass on of
     the slave's friction, a round trip late, moves the hand, and that turns the friction round: with
-    0.8 s and ten round trips the tip stuck and slipped on for good over 100 ms.
+    0.8 s and ten round trips the tip stuck and slipped on for good over 100 ms. Of w_n, what
+    friction alone explains is shown gradually, see S3.
 :M3: The wall is remembered, so that fast taps are felt: while nothing else is heard,
     u_n = -k_c (x_m - x_w)_n. It is dropped when the slave was so deep in it that it should
     have met 1 N, 1 to 3 mm, and met nothing: a hard wall that has gone stops the hand before 3 mm;
