@@ -45,6 +45,8 @@ EXPLAINED = {
     ("__init__.py", "import_module"),
     # A child of this package's own code, with a host's name as its argument.
     ("robots/rtde.py", "subprocess"),
+    # Likewise, with the addresses of a device and of this process.
+    ("live/device.py", "subprocess"),
 }  # fmt: skip
 LISTENS = re.compile(
     r"\bMeshcat\(.*|\bClient\(|LocalCluster\(|\bsocket\b|\bhttp\.|socketserver|asyncio"
@@ -62,6 +64,9 @@ LISTENING = {
     ("robots/udp.py", "socket"),
     # Connected to the box that was named, which alone is heard; and its page, read once.
     ("robots/netft.py", "socket"),
+    # Connected to the drive, which alone is heard; a class of its own.
+    ("live/device_client.py", "socket"),
+    ("live/device_client.py", "Client("),
     ("robots/netft.py", "http."),
 }
 """All that can listen; tests look at the sockets of both."""
@@ -78,6 +83,8 @@ WRITING = {
     ("slave/meshes.py", ".write_text"),
     # A line for each change of a drive's inputs, which is to outlive the process.
     ("live/session.py", 'open("w'),
+    # Figures, where --json says.
+    ("live/device_client.py", ".write_text"),
     # A mark of one byte more.
     ("studies/store.py", 'open("ab'),
     # Functions of the package that write by `writing.py`.
