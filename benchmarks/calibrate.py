@@ -64,10 +64,16 @@ def hand(rng: np.random.Generator, t: Array) -> Motion:
     start = np.clip((t - 0.5) / 0.5, 0.0, 1.0)[:, None]
     start = start**2 * (3.0 - 2.0 * start)
     omega = rng.uniform(1.0, 3.0) / np.sqrt(3.0) * waves[:, :3] * start
-    dt = t[1] - t[0]
-    up = np.empty((len(t), 3))
+    up = turned(omega, t[1] - t[0])
+    s = 9.81 * up + rng.uniform(0.5, 2.0) * waves[:, 3:] * start
+    return s, omega, np.gradient(omega, t[1] - t[0], axis=0)
+
+
+def turned(omega: Array, dt: float) -> Array:
+    """(N, 3) the vertical in S, which is z at first."""
+    up = np.empty_like(omega)
     up[0] = [0.0, 0.0, 1.0]
-    for k in range(1, len(t)):  # gravity in S turns by -omega
+    for k in range(1, len(omega)):  # gravity in S turns by -omega
         w = 0.5 * (omega[k] + omega[k - 1]) * dt
         angle = float(np.linalg.norm(w))
         e = w / angle if angle > 0.0 else w
@@ -75,8 +81,7 @@ def hand(rng: np.random.Generator, t: Array) -> Motion:
         up[k] = (
             u * np.cos(angle) - np.cross(e, u) * np.sin(angle) + e * (e @ u) * (1 - np.cos(angle))
         )
-    s = 9.81 * up + rng.uniform(0.5, 2.0) * waves[:, 3:] * start
-    return s, omega, np.gradient(omega, dt, axis=0)
+    return up
 
 
 def excited(t: Array) -> Motion:
@@ -104,6 +109,11 @@ class Stream:
         self.dt = float(t[1] - t[0])
         self._t, self._values, self._at = t, values, 0
 
+    @property
+    def recorded(self) -> tuple[Array, Array]:
+        """(N,) times and (N, 15) values of all readings."""
+        return self._t, self._values
+
     def read(self, timeout_s: float) -> list[Reading] | None:
         """See `Source`."""
         start, self._at = self._at, min(self._at + 64, len(self._t))
@@ -115,15 +125,18 @@ class Stream:
         """See `Source`."""
 
 
-def stream_of(rng: np.random.Generator, phi: Array, t: Array, motion: Motion) -> Stream:
-    """What sensors say of it."""
+def stream_of(
+    rng: np.random.Generator, phi: Array, t: Array, motion: Motion, late: int | None = None
+) -> Stream:
+    """What sensors say of it; the motion is `late` samples late, or 0 to 4."""
     a = rng.choice(COLOURS)
     white = rng.normal(size=(len(t) + 500, 6)) * np.sqrt(1.0 - a * a)
     noise = lfilter([1.0], [1.0, -a], white, axis=0)[500:] * NOISE
     wrench = (
         non_contact_wrench(*motion, phi) + rng.normal(size=6) * np.repeat([5.0, 0.3], 3) + noise
     )
-    late = int(rng.integers(0, 5))
+    drawn = int(rng.integers(0, 5))
+    late = drawn if late is None else late
     moved = np.hstack(motion)
     moved = np.concatenate([np.repeat(moved[:1], late, axis=0), moved[: len(moved) - late]])
     return Stream(t, np.hstack([wrench, moved + MOTION_NOISE * rng.normal(size=moved.shape)]))

@@ -45,8 +45,17 @@ RELIABLE = 0.95
 """Share of the records in which all asked numbers are to be within their tolerances at once."""
 # Periods that are tried first and last [s].
 _SHORTEST, _LONGEST = 0.2, 20.0
-# Rounds of the search, and by how much more than needed is asked when one fell short.
-_ROUNDS, _MORE = 4, 1.01
+# Rounds of the search at most, how many of them are to reach what is asked, and by how much more
+# than needed is asked when one fell short.
+_ROUNDS, _REACH, _MORE = 10, 3, 1.005
+# Rounds that find nothing, after which there is nothing.
+_LOST = 3
+# What misses by more is no place to begin from; then the search looks everywhere, with so many
+# times as many starts.
+_NEAR = 1.5
+_EVERYWHERE = 2
+# Between the seeds of rounds: each has candidates of its own.
+_OTHER = 2**33
 # Later rounds look around what was found: share of the coefficients, and of the period.
 _AROUND, _PERIODS = 0.2, 1.3
 # The maximum over the asked numbers is sharper than that over eigenvalues: they are ten.
@@ -72,7 +81,7 @@ def shortest(
     *,
     harmonics: int = 3,
     seed: int = 0,
-    starts: int = 5,
+    starts: int = 4,
     progress: Callable[[float, float], None] = lambda done, best: None,
 ) -> Shortest:
     """Designs and checks the shortest motion that reaches a tolerance.
@@ -81,7 +90,8 @@ def shortest(
         robot: the arm.
         tolerance: of its heaviest load.
         harmonics: N of Eq. (9).
-        seed, starts, progress: see `design`.
+        seed, progress: see `design`.
+        starts: of `design`, for searches around what was found; twice that where nothing was yet.
 
     Raises:
         DrakeTeleopError: if nothing within the limits reaches it in `_LONGEST` seconds.
@@ -98,22 +108,32 @@ def shortest(
     )
     worst, around = np.inf, None
     best: Shortest | None = None
+    reaching, lost = 0, 0
     for k in range(_ROUNDS):
         problem = ShortestProblem(task, errors * factor[:, np.newaxis], robot, around)
-        found = design(problem, seed=seed, starts=starts, progress=progress)
+        many = _EVERYWHERE * starts if around is None else starts
+        found = design(problem, seed=seed + _OTHER * k, starts=many, progress=progress)
         found = [each for each in found if each.value <= _LONGEST]
         if not found:
-            break
+            if (lost := lost + 1) == _LOST:
+                break
+            around = None
+            continue
         trajectory, uses = best_checked(robot, found)
         motion = sensor_motion(robot, trajectory)
         covariance = predicted_covariance(*motion, 1 / RATE, robot.noise, robot.limits.phi)
         reached = deviations_of(errors, covariance)
         worst = float(reached.max())
-        around = problem.best
+        around = problem.best if worst < _NEAR else None
         if worst <= 1.0 and (best is None or trajectory.period < best.excitation.trajectory.period):
             best = Shortest(_excitation(robot, trajectory, covariance, uses, found), reached)
+        reaching += worst <= 1.0
+        if reaching == _REACH:
+            break
         seen = problem.deviations(motion, trajectory.period)
-        factor = factor * (reached / seen) * (_MORE if worst > 1.0 and k > 0 else 1.0)
+        now = factor * (reached / seen)
+        # Not less than before, where a round fell short: else it might go to and fro.
+        factor = _MORE * np.maximum(now, factor) if worst > 1.0 and k > 0 else now
     if best is not None:
         return best
     raise DrakeTeleopError(

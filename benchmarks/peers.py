@@ -1,0 +1,347 @@
+"""Ours against what others do, on the same logs: what is left of the wrench, and is the load true?
+
+`python benchmarks/peers.py [--json FILE] [--loads 30] [--ntnu DIR] [--bota PYTHON]`, in 10 s each:
+
+* ours: `identify` of one motion of `excite` for the shipped arm, noise, offsets and delay as in
+  calibrate.py; `known` by the rule of `calibrate` where all of it is asked
+  ("mass 0.5 %, com 0.5 mm, inertia 5 %");
+* least squares: mass, centre of mass, inertia and offsets by plain least squares of the same log,
+  low-passed, no delay, N and N m alike, as scripts do it; intervals of white noise;
+* kth: 20 poses at rest for as long together, mass, centre of mass and offsets by plain least
+  squares, as force_torque_tools and ft_tools_ros2 do it; no inertia;
+* static: the same without offsets, as aiofranka's payload.py does it from joint torques, after a
+  tare in free air: their offsets are taken away with an error of 0.2 N and 0.01 N m;
+* vendor: gravity alone, of the true mass and centre of mass, typed in, and a tare at the start.
+
+Held out is another motion of the same load, with offsets of its own, a tare, and 30 Hz. With
+--bota, the Python of an environment that has bota-payload-utils and numpy, its estimator is given
+five loads' motions (a hand's, 15 s each), paced by the clock. With --ntnu, the load of NTNU's 24
+poses and what it leaves of the two records in motion, without its mean.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from calibrate import HZ, NOISE, Motion, Stream, excited, hand, load_of, stream_of, turned
+from numpy.typing import NDArray
+
+from drake_teleop.load.batch.methods import identify_batch
+from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench, regressor
+from drake_teleop.load.tolerance import read_tolerance, sizes_of, values_of
+from drake_teleop.logs.processing import identify_log, usable_phi
+from drake_teleop.logs.read.alignment import low_pass, undelayed
+from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.logs.read.delay import delay_of
+from drake_teleop.logs.read.reading import read_log
+from drake_teleop.robots.calibration import look
+
+Array = NDArray[np.float64]
+
+ASKED = read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %")
+SECONDS, POSES = 10.0, 20
+WORDS = ("mass_%", "com_mm", "inertia_%", "physical", "left_N", "left_N_m")
+PEERS = ("ours", "least squares", "kth", "static", "vendor")
+
+
+class Found(NamedTuple):
+    """A load by one of the peers; (16,) intervals' ends, or None where none is stated."""
+
+    phi: Array
+    low: Array | None = None
+    high: Array | None = None
+
+
+def log_of(stream: Stream) -> Log:
+    """What a stream would record."""
+    t, values = stream.recorded
+    return Log(t, *np.split(values, [6, 9, 12], axis=1))
+
+
+def ours(log: Log, path: Path) -> Found:
+    """`identify`."""
+    write_log(log, path)
+    load = identify_log(path).identification
+    return Found(load.phi, *intervals(load))
+
+
+def least_squares(log: Log) -> Found:
+    """Plain, with the covariance of white noise."""
+    wrench, *motion = (low_pass(x, log.dt, 30.0) for x in (log.wrench, *log.motion))
+    V = regressor(*motion)
+    rows = np.concatenate([np.tile(np.eye(6), (len(V), 1, 1)), V], axis=2).reshape(-1, 16)
+    theta, squares, *_ = np.linalg.lstsq(rows, wrench.ravel(), rcond=None)
+    deviations = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows)) * squares[0] / len(rows))
+    return Found(theta[6:], theta - 1.96 * deviations, theta + 1.96 * deviations)
+
+
+def static(rng: np.random.Generator, phi: Array, *, offsets: bool) -> Found:
+    """From poses at rest: first moments and, or not, offsets."""
+    up = rng.normal(size=(POSES, 3))
+    s = 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
+    still = np.zeros_like(s)
+    noise = NOISE * rng.normal(size=(POSES, 6)) / np.sqrt(SECONDS * HZ / POSES)
+    left = rng.normal(size=6) * (np.repeat([5.0, 0.3], 3) if offsets else [0.2] * 3 + [0.01] * 3)
+    wrench = non_contact_wrench(s, still, still, phi) + left + noise
+    rows = regressor(s, still, still)[:, :, :4]
+    if offsets:
+        rows = np.concatenate([rows, np.tile(np.eye(6), (POSES, 1, 1))], axis=2)
+    theta = np.linalg.lstsq(rows.reshape(6 * POSES, -1), wrench.ravel(), rcond=None)[0]
+    return Found(np.concatenate([theta[:4], np.zeros(6)]))
+
+
+def held_out(log: Log, phi: Array, up: Array | None = None) -> tuple[float, float]:
+    """Rms of |f| and |tau| that a load leaves after a tare over the record, at 30 Hz.
+
+    With the vertical in S (N, 3), of its weight alone.
+    """
+    s, omega, alpha = log.motion
+    if up is not None:
+        s, omega, alpha = 9.81 * up, still_of(log), still_of(log)
+    left = low_pass(log.wrench - non_contact_wrench(s, omega, alpha, phi), log.dt, 30.0)
+    left = left - left.mean(axis=0)
+    f, tau = (float(np.sqrt((x**2).sum(axis=1).mean())) for x in (left[:, :3], left[:, 3:]))
+    return f, tau
+
+
+def simulated(loads: int, folder: Path) -> dict[str, Any]:
+    """Figures of the simulated arm."""
+    t = np.arange(round(SECONDS * HZ)) / HZ
+    motion = excited(t)
+    rows: dict[str, list[list[float]]] = {name: [] for name in PEERS}
+    covered: dict[str, list[Array]] = {"ours": [], "least squares": []}
+    false = 0
+    for k in range(loads):
+        rng = np.random.default_rng([k, 99])
+        phi = load_of(rng)
+        log, path = log_of(stream_of(rng, phi, t, motion, late=2)), folder / "log.parquet"
+        fresh: Motion = hand(rng, t)
+        other = log_of(stream_of(rng, phi, t, fresh, late=0))
+        up = turned(fresh[1], t[1])
+        found = {
+            "ours": ours(log, path),
+            "least squares": least_squares(log),
+            "kth": static(rng, phi, offsets=True),
+            "static": static(rng, phi, offsets=False),
+            "vendor": Found(np.concatenate([phi[:4], np.zeros(6)])),
+        }
+        at = look(path, ASKED, None, cutoff_hz=30.0, delay="auto")
+        for name, each in found.items():
+            error = np.abs(values_of(ASKED, each.phi) - values_of(ASKED, phi))
+            relative = error / sizes_of(ASKED, phi) * np.repeat([0.5, 0.5, 5.0], [1, 3, 6])
+            if name == "ours":
+                false += int((at.sure & (relative > np.repeat([0.5, 0.5, 5.0], [1, 3, 6]))).sum())
+            if each.low is not None and each.high is not None:
+                held = (each.low[6:] <= phi) & (phi <= each.high[6:])
+                covered[name].append(held)
+            left = held_out(other, each.phi, up if name == "vendor" else None)
+            physical = float(is_physically_consistent(each.phi))
+            rows[name].append(
+                [relative[0], relative[1:4].max(), relative[4:].max(), physical, *left]
+            )
+    figures: dict[str, Any] = {"ours.false_known": false}
+    for name in PEERS:
+        medians, mean = np.median(rows[name], axis=0), np.mean(rows[name], axis=0)
+        for i, word in enumerate(WORDS):
+            figures[f"{name}.{word}"] = float(mean[i] if word == "physical" else medians[i])
+    for name, held in covered.items():
+        figures[f"{name}.coverage_95"] = float(np.mean(held))
+    return figures
+
+
+# Run by another Python: config, and t and rows as .npy; in the sensor's convention, by the clock.
+_BOTA = """
+import sys, time
+import numpy as np
+from bota_payload_utils import BotaPayloadEstimator
+estimator = BotaPayloadEstimator(sys.argv[1])
+t, rows = np.load(sys.argv[2]), np.load(sys.argv[3])
+estimator.start_payload_estimation()
+start = time.monotonic()
+for when, row in zip(t, rows):
+    while (now := time.monotonic() - start) < when:
+        time.sleep(2e-4)
+    estimator.update(now, row)
+    if not estimator.is_estimator_running():
+        break
+print("STOPPED", when, int(estimator.is_estimation_successful()))
+"""
+
+
+def bota(python: Path, loads: int, folder: Path) -> dict[str, Any]:
+    """Figures of bota-payload-utils' estimator; thresholds and covariances are our guesses."""
+    t = np.arange(round(15.0 * HZ)) / HZ
+    stops, errors, physical = [], [], []
+    for k in range(loads):
+        rng = np.random.default_rng([k, 4])
+        phi = load_of(rng)
+        _, values = stream_of(rng, phi, t, hand(rng, t), late=0).recorded
+        rows = np.ascontiguousarray(np.hstack([-values[:, :6], values[:, 6:12]]))
+        np.save(folder / "t.npy", t)
+        np.save(folder / "rows.npy", rows)
+        result = folder / f"bota{k}.json"
+        axes = (*"xyz", "Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
+        variances = {
+            "force": 0.03,
+            "torque": 7e-5,
+            "linear_acc": 2.5e-3,
+            "angular_vel": 4e-6,
+            "angular_acc": 0.04,
+            "wrench_bias": 1e-6,
+        }
+        entries = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+        config = {
+            "min_time": 3.0,
+            "max_time": 14.5,
+            "estimation_covariance_convergence_threshold": {
+                "mass": 1e-2,
+                "com": 1e-3,
+                "inertia": 1e-3,
+                "wrench_bias": 1e-1,
+            },
+            "measurement_noise_covariance": {
+                name: dict.fromkeys(axes, variance) for name, variance in variances.items()
+            },
+            "output_bias_estimate": True,
+            "output_config_file_name": str(result),
+            "prior_payload_properties": {
+                "mass": 1.0,
+                "com": {"x": 0.0, "y": 0.0, "z": 0.05},
+                "inertia": dict(zip(entries, (0.01, 0.0, 0.0, 0.01, 0.0, 0.01), strict=True)),
+            },
+        }
+        (folder / "config.json").write_text(json.dumps({"payload_estimator_config": config}))
+        files = [str(folder / name) for name in ("config.json", "t.npy", "rows.npy")]
+        said = subprocess.run(
+            [str(python), "-c", _BOTA, *files], capture_output=True, text=True, check=True
+        ).stdout
+        words = said[said.index("STOPPED") :].split()
+        if words[2] != "1":
+            continue
+        stops.append(float(words[1]))
+        load = json.loads(result.read_text())["payload_compensator_config"]["payload_properties"]
+        com = np.array([load["com"][a] for a in "xyz"])
+        about = np.array([load["inertia"][name] for name in entries])
+        I = about[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3)  # noqa: E741
+        m, c, true = mass_com_inertia(phi)
+        moments = np.linalg.eigvalsh(I)
+        physical.append(moments[0] > 0.0 and 2.0 * moments[2] <= moments.sum())
+        errors.append(
+            [
+                100.0 * abs(load["mass"] / m - 1.0),
+                1e3 * np.abs(com - c).max(),
+                100.0 * np.abs(I - true).max() / (np.trace(true) / 3.0),
+            ]
+        )
+    figures: dict[str, Any] = {"bota.loads": loads, "bota.called_converged": len(stops)}
+    if stops:
+        medians = np.median(errors, axis=0)
+        false = (np.array(errors) > [0.5, 0.5, 5.0]).any(axis=1).sum()
+        figures |= {
+            "bota.converged_but_wrong": int(false),
+            "bota.median_s": float(np.median(stops)),
+            **{f"bota.{word}": float(x) for word, x in zip(WORDS, medians, strict=False)},
+            "bota.physical": float(np.mean(physical)),
+        }
+    return figures
+
+
+def ntnu(records: Path, folder: Path) -> dict[str, Any]:
+    """What the load of NTNU's 24 poses leaves of its two records in motion, without the mean."""
+    figures = {}
+    poses = np.genfromtxt(records / "0-calibration_fts-accel.csv", delimiter=",", names=True)
+    wrench = -np.column_stack([poses[name] for name in ("fx", "fy", "fz", "tx", "ty", "tz")])
+    gravity = np.column_stack([poses[name] for name in ("gx", "gy", "gz")])
+    still = np.zeros_like(gravity)
+    rows = np.concatenate(
+        [regressor(-gravity, still, still)[:, :, :4], np.tile(np.eye(6), (len(poses), 1, 1))],
+        axis=2,
+    )
+    theta = np.linalg.lstsq(rows.reshape(-1, 10), wrench.ravel(), rcond=None)[0]
+    fit = identify_batch(wrench, -gravity, still, still, shared_noise=True).identification
+    by_peer = {"ours": usable_phi(fit)[0], "kth": np.concatenate([theta[:4], np.zeros(6)])}
+    for record in ("1-baseline", "2-vibrations"):
+        log = read_log(described(records, record, folder))
+        late = undelayed(log, delay_of(log, 30.0, "auto", by_peer["ours"])[0])
+        for name, phi in by_peer.items():
+            # Others do not know of a delay, nor of more than gravity.
+            of = late if name == "ours" else log
+            motion = of.motion if name == "ours" else (-of.gravity, still_of(of), still_of(of))
+            left = low_pass(of.wrench - non_contact_wrench(*motion, phi), of.dt, 30.0)[:, :3]
+            left = left - left.mean(axis=0)
+            figures[f"{name}.{record}.left_N"] = float(np.sqrt((left**2).sum(axis=1).mean()))
+        figures[f"{record}.weight_N"] = 9.82085 * float(by_peer["kth"][0])
+    return figures
+
+
+def still_of(log: Log) -> Array:
+    """(N, 3) zeros."""
+    return np.zeros((len(log), 3))
+
+
+def described(records: Path, record: str, folder: Path) -> Path:
+    """The description of a record, as of docs/logs.md."""
+    time = {"column": "t", "unit": "us"}
+    files = {name: str(records / f"{record}_{name}.csv") for name in ("wrench", "accel")}
+    document = {
+        "gravity": 9.82085,
+        "wrench": {
+            "file": files["wrench"],
+            "time": time,
+            "force": {"columns": ["fx", "fy", "fz"], "unit": "N"},
+            "torque": {"columns": ["tx", "ty", "tz"], "unit": "N m"},
+            "sign": -1,
+        },
+        "imu": {
+            "file": files["accel"],
+            "time": time,
+            "specific_force": {
+                "columns": ["ax", "ay", "az"],
+                "unit": "g",
+                "bias": [-0.0037, 0.0088, 0.0771],
+            },
+            "frame": [[0, -1, 0], [0, 0, 1], [-1, 0, 0]],
+        },
+        "pose": {
+            "file": str(records / f"{record}_orientations.csv"),
+            "time": time,
+            "orientation": {
+                "columns": [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)],
+                "form": "matrix",
+            },
+        },
+    }
+    path = folder / f"{record}.yaml"
+    path.write_text(json.dumps(document))
+    return path
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--loads", type=int, default=30)
+    parser.add_argument("--ntnu", type=Path, help="folder of the records of NTNU")
+    parser.add_argument("--bota", type=Path, help="a Python that has bota-payload-utils and numpy")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        figures = simulated(options.loads, Path(folder)) if options.loads else {}
+        if options.ntnu is not None:
+            figures |= ntnu(options.ntnu, Path(folder))
+        if options.bota is not None:
+            figures |= bota(options.bota, 5, Path(folder))
+    for name, value in figures.items():
+        print(f"{name:32} {value:.4g}")
+    if options.json is not None:
+        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
