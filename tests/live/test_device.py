@@ -229,6 +229,9 @@ def test_a_client_displays_what_the_station_says_and_nothing_when_it_is_silent(l
         if k < 100:
             link.lead(now)
             link.send(np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]))
+        if k == 120:  # of a client that was here before
+            late = packed_force(ForceCommand(10**6, now, (0.0, 9.0, 9.0, 0.0, 0.0, 0.0)))
+            link._socket.sendto(late, link._peer)
     force = [wrench[2] for wrench in device.was_set]
     assert force[99] == pytest.approx(4.0)
     assert max(np.abs(force[151:])) == 0.0

@@ -51,7 +51,7 @@ def moved(samples, hz, wall=None):
 @pytest.mark.parametrize(
     # The second pushes the tool, which is 3 mm in it, with 60 N.
     ("wall", "share"),
-    [(None, 0.03), (Wall(position=[0.55, 0.0, 0.253], stiffness=2e4), 0.045)],
+    [(None, 0.018), (Wall(position=[0.55, 0.0, 0.253], stiffness=2e4), 0.045)],
 )
 def test_samples_inside_a_step_move_the_arm_as_events_do(wall, share):
     honest = moved(1, 1e4, wall)
