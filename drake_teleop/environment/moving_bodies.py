@@ -18,10 +18,12 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
     Joint,
+    JointIndex,
     PrismaticJoint,
     QuaternionFloatingJoint,
     RevoluteJoint,
 )
+from pydrake.systems.framework import Context
 
 from drake_teleop._compiled import njit
 from drake_teleop.quaternions import conjugate, multiply, normalized, rotate
@@ -37,7 +39,7 @@ JOINT_WIDTH = 21
 POSE_AND_TWIST = 13
 
 
-def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[BodyIndex]]:
+def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[int]]:
     """By which joints bodies hang on the world.
 
     Args:
@@ -48,33 +50,39 @@ def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Arra
         table: (m, 21), parents first: 0 row of the parent, or -1 if it is anchored; 1 the kind; 2
             and 3 where its positions and velocities begin in the plant's state [q; v]; 4-6 its
             axis; 7-13 and 14-20 X_PF, or X_WF, and X_MB, a quaternion and a place each.
-        order: the body of each row; besides `bodies` those on which they hang.
+        order: the body of each row, as a number; besides `bodies` those on which they hang.
     """
-    joints = {
-        joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
-    }
-    context, order, rows = plant.CreateDefaultContext(), list[BodyIndex](), list[Array]()
-
-    def add(body: BodyIndex) -> None:
-        joint = joints[body]
-        parent = joint.parent_body()
-        if plant.IsAnchored(parent):
-            row, X_PF = -1, joint.frame_on_parent().CalcPoseInWorld(context)
-        else:
-            if parent.index() not in order:
-                add(parent.index())
-            row = order.index(parent.index())
-            X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
-        X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
-        kind, axis = _kind(joint)
-        places = joint.position_start(), plant.num_positions() + joint.velocity_start()
-        order.append(body)
-        rows.append(np.array([row, kind, *places, *axis, *_numbers(X_PF), *_numbers(X_MB)]))
-
+    # Numbers alone: a joint that is held would hold the plant, and that the joint.
+    above: dict[int, tuple[int, int]] = {}
+    anchored: set[int] = set()
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        child, parent = int(joint.child_body().index()), int(joint.parent_body().index())
+        above[child] = int(index), parent
+        if plant.IsAnchored(joint.parent_body()):
+            anchored.add(parent)
+    order: list[int] = []
     for body in bodies:
-        if body not in order:
-            add(body)
+        chain, number = [], int(body)
+        while number not in order and number not in anchored:
+            chain.append(number)
+            number = above[number][1]
+        order += reversed(chain)
+    context, rows = plant.CreateDefaultContext(), []
+    for number in order:
+        index, parent = above[number]
+        row = order.index(parent) if parent in order else -1
+        rows.append(_row(plant, context, plant.get_joint(JointIndex(index)), row))
     return np.array(rows).reshape(len(rows), JOINT_WIDTH), order
+
+
+def _row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) -> Array:
+    F = joint.frame_on_parent()
+    X_PF = F.CalcPoseInWorld(context) if row < 0 else F.GetFixedPoseInBodyFrame()
+    X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+    kind, axis = _kind(joint)
+    places = joint.position_start(), plant.num_positions() + joint.velocity_start()
+    return np.array([row, kind, *places, *axis, *_numbers(X_PF), *_numbers(X_MB)])
 
 
 def _kind(joint: Joint) -> tuple[int, Array]:

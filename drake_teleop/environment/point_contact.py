@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import Box, GeometryId, Obb, ProximityProperties, SceneGraphInspector, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CalcContactFrictionFromSurfaceProperties, MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, PrismaticJoint, RigidBody
+from pydrake.multibody.tree import ModelInstanceIndex, PrismaticJoint, RigidBody
 from pydrake.systems.framework import Context
 
 from drake_teleop._compiled import njit
@@ -60,7 +60,7 @@ def ContactPairs(
     tool: Mapping[GeometryId, RigidTransform],
     environment: Iterable[ModelInstanceIndex],
     slip: float,
-    moving: Sequence[BodyIndex] = (),
+    moving: Sequence[int] = (),
 ) -> Pairs:
     """The pairs of a shape of the tool and one of the environment.
 
@@ -76,10 +76,12 @@ def ContactPairs(
         DrakeTeleopError: for a shape that no box is around.
     """
     context = plant.CreateDefaultContext()
-    known, watched, unknown = list[Array](), list[Array](), ""
+    known: list[Array] = []
+    watched: list[Array] = []
+    unknown = ""
     touched = (body for instance in environment for body in plant.GetBodyIndices(instance))
     for body in map(plant.get_body, touched):
-        row = moving.index(body.index()) if body.index() in moving else -1
+        row = moving.index(int(body.index())) if int(body.index()) in moving else -1
         X_Body = plant.EvalBodyPoseInWorld(context, body) if row < 0 else RigidTransform()
         direction = _direction(plant, context, body)
         for thing in plant.GetCollisionGeometriesForBody(body):

@@ -341,7 +341,13 @@ class WristSensor(LeafSystem):
         memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
-        self._slave, self._watched = slave, contact.watched
+        # Neither plant nor indices in it, which would hold the Diagram that holds this.
+        self._watched, self._moving, self._plant_size = (
+            contact.watched,
+            tuple(contact.moving),
+            contact.plant_size,
+        )
+        self._twins = slave.config, slave.environment, slave.start
         self._twin: ContactTwin | None = None
         self._most_told = 2 * self._longest + int(held / period) + 4
         self._period = period
@@ -409,7 +415,7 @@ class WristSensor(LeafSystem):
     @property
     def moves(self) -> str:
         """What of the surroundings moves besides a leaf, as a sentence, or nothing."""
-        names = ", ".join(self._slave.contact.moving)
+        names = ", ".join(self._moving)
         return f"{names} can move" if names else ""
 
     @property
@@ -501,9 +507,9 @@ class WristSensor(LeafSystem):
             sample_step(*inputs, until_now, touching_W, result)
             return
         if self._twin is None:
-            self._twin = ContactTwin(self._slave)
+            self._twin = ContactTwin(*self._twins)
         own = 2 * self._n + 2
-        size = own + self._slave.contact.plant_size
+        size = own + self._plant_size
         told = np.zeros((1 + self._most_told, 2 + size))
         physics = (*self._physics[:-1], told)
         # The state of each wrench that is asked for follows from those before.

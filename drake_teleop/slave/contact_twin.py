@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.environment.environment import Environment
 from drake_teleop.slave.drake_contact import contact_wrench_W
-from drake_teleop.slave.plant import AddSlavePlant, SlavePlant
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
 
 Array = NDArray[np.float64]
 
@@ -18,12 +20,14 @@ class ContactTwin:
     The simulated plant is in one state; the wrist sensor wants contact at instants between.
 
     Args:
-        slave: which.
+        config: which slave.
+        environment: what there is to touch.
+        q_start: (n,) joint positions [rad].
     """
 
-    def __init__(self, slave: SlavePlant) -> None:
+    def __init__(self, config: Slave, environment: Environment | None, q_start: Array) -> None:
         builder = DiagramBuilder()
-        self._slave = AddSlavePlant(builder, slave.config, slave.environment, slave.start)
+        self._slave = AddSlavePlant(builder, config, environment, q_start)
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self._context = self._slave.plant.GetMyMutableContextFromRoot(self._root)

@@ -125,7 +125,9 @@ def ContactWith(
     _check_masses(plant, context, contact)
     if beyond := _beyond(environment, contact):
         return contact._replace(beyond=beyond)
-    joints, order = JointTable(plant, contact.moving.values())
+    joints, order = contact.joints, list[int]()
+    if contact.moving:
+        joints, order = JointTable(plant, contact.moving.values())
     from_S = {
         shape: _X_SBody(plant, context, sensor_frame, index)
         for index, own in shapes.items()
