@@ -14,11 +14,13 @@ RUNS = {
     ),
     "adversary_methods": "benchmarks/adversary.py --runs 900 --json FILE",
     "analysis": "benchmarks/analysis.py --json FILE",
+    "calibrate": "benchmarks/calibrate.py --json FILE",
     "calls": "benchmarks/calls.py --json FILE",
     "compensate": "benchmarks/compensate.py --json FILE",
     "contact_detection": "benchmarks/contact_detection.py --json FILE",
     "domain": "benchmarks/domain.py --json FILE",
     "errors_in_variables": "benchmarks/errors_in_variables.py --json FILE",
+    "foreign_analysis": "benchmarks/foreign_analysis.py --json FILE",
     "frequency_response": "benchmarks/frequency_response.py --json FILE",
     "identification": "benchmarks/identification.py --json FILE",
     "intervals": "benchmarks/intervals.py --json FILE",
@@ -26,6 +28,7 @@ RUNS = {
     "live": "benchmarks/live.py --json FILE",
     "load_change": "benchmarks/load_change.py --json FILE",
     "mujoco_wrench": "benchmarks/mujoco_wrench.py --json FILE",
+    "peers": "benchmarks/peers.py --json FILE",
     "planted_mistakes": "benchmarks/planted_mistakes.py --json FILE",
     "pose_noise": "benchmarks/pose_noise.py --runs 24 --no-present --json FILE",
     "realistic_sensor": "benchmarks/realistic_sensor.py --json FILE",
@@ -230,6 +233,26 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         lambda f: 100 * f["total"]["named"][0] / f["total"]["named"][1],
         *("%", 95.0),
     ),
+    Claim(
+        *(LOGS, "Mass of ten seconds of motion, as peers would do it: ours"),
+        *("simulated arm, median of 30 loads", "logs.md", "peers"),
+        *(lambda f: f["ours.mass_%"], "%", 0.0, 0.1),
+    ),
+    Claim(
+        *(LOGS, "plain least squares of the same log"),
+        *("the same; the bound is ours", "logs.md", "peers"),
+        *(lambda f: f["least squares.mass_%"] / f["ours.mass_%"], "times ours", 1.0),
+    ),
+    Claim(
+        *(LOGS, "static poses for as long, as force_torque_tools does it"),
+        *("the same", "logs.md", "peers"),
+        *(lambda f: f["kth.mass_%"] / f["ours.mass_%"], "times ours", 1.0),
+    ),
+    Claim(
+        *(LOGS, "torque that those poses leave in fast motion"),
+        *("held-out motion, 30 Hz", "logs.md", "peers"),
+        *(lambda f: f["kth.left_N_m"] / f["ours.left_N_m"], "times ours", 1.0),
+    ),
     # Contact
     Claim(
         *(CONTACT, "Contacts of 0.2 to 1 N are noticed in fast free motion"),
@@ -311,6 +334,12 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
             * 1e3
         ),
         *("ms", 0.0, 1.0),
+    ),
+    Claim(
+        *(ANALYSIS, "The one-axis model is the Diagram on other arms and devices, but for"),
+        *("Panda and omega.6, UR5 and Touch, RX90; to 20 Hz", "analysis.md", "foreign_analysis"),
+        lambda f: max(max(station["from the sampled axis, %"].values()) for station in f.values()),
+        *("%", 0.0, 1.0),
     ),
     # Stations of one's own
     Claim(
@@ -398,6 +427,22 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(LIVE, "and takes of a core"),
         *("the same", "robot.md", "compensate"),
         *(lambda f: 100 * f["ours.1000_Hz.core"], "%", 0.0, 25.0),
+    ),
+    Claim(
+        *(LIVE, "`calibrate` calls a number known that is wrong"),
+        *("100 loads by hand, and by `excite`'s motion; right gains", "robot.md", "calibrate"),
+        *(lambda f: f["hand.wrong_at_the_end"] + f["excite.wrong_at_the_end"], "", 0.0, 0.0),
+    ),
+    Claim(
+        *(LIVE, "its 95 % intervals hold at the moment it stops, at least"),
+        *("each number, the same loads", "robot.md", "calibrate"),
+        lambda f: 100 * min(f["hand.coverage_least"], f["excite.coverage_least"]),
+        *("%", 90.0, 98.0),
+    ),
+    Claim(
+        *(LIVE, "mass and centre of mass are known after, in the middle"),
+        *("by hand, 0.5 % and 0.5 mm", "robot.md", "calibrate"),
+        *(lambda f: f["hand.median_s"], "s", 0.0, 5.0),
     ),
     Claim(
         *(LIVE, "A drive is as fast as the clock"),

@@ -363,7 +363,7 @@ def drakes_errors_said(path: Path, said: _Said = _ROBOT) -> Iterator[None]:
         raise
     # SystemExit: a condition of Drake's; LookupError: of the containers of C++.
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
-        reason = str(error).replace("<literal-string>", "").replace(str(path), path.name)
+        reason = str(error).replace("<literal-string>", "").replace(f"{path.parent}/", "")
         raise DrakeTeleopError(
             f"cannot be read as a {said[0]} ({reason.strip()})",
             where=str(path),

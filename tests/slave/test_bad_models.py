@@ -200,7 +200,8 @@ ERRORS = {
     "SDF of a gearbox": ("sdf", sdf(sdf_joint("gearbox")), "gearbox. not supported"),
     "SDF of a fixed arm": ("sdf", sdf(sdf_joint("fixed")),
                            "sensor_frame: no moving joint between the world and l6"),
-    "directives that are none": ("dmd.yaml", "directives: [{add_modell: {}}]", "add_modell"),
+    "directives that are none": ("dmd.yaml", "directives: [{add_modell: {}}]",
+                                 "arm.dmd.yaml:1:14: YAML"),
     "directives with a field too many": ("dmd.yaml", "directives: [{add_model: {name: a, file: "
                                          "file:///a.urdf, color: red}}]", "color"),
     "directives to nothing": ("dmd.yaml", adding("file:///none/a.urdf"), "does not exist"),
