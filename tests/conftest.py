@@ -8,6 +8,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -66,6 +67,15 @@ def nothing_listens_to_other_machines() -> Iterator[None]:
     over.set()
     watch.join()
     assert not found
+
+
+@pytest.fixture
+def meshcat() -> Iterator[Any]:
+    """One that is unmade here: by the garbage collection of another thread it ends the process."""
+    from pydrake.geometry import Meshcat, MeshcatParams  # not before OPENBLAS_NUM_THREADS is set
+
+    yield Meshcat(MeshcatParams(host="localhost"))
+    gc.collect()
 
 
 @pytest.hookimpl(trylast=True)  # what is not run shall not count

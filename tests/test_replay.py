@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.geometry import Meshcat
 
 from drake_teleop import film, replay
 from drake_teleop.errors import DrakeTeleopError
@@ -34,11 +34,6 @@ def scenario() -> Scenario:
 def result(scenario) -> SimulationResult:
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     return simulate(station, scenario.simulation)
-
-
-@pytest.fixture
-def meshcat() -> Meshcat:
-    return Meshcat(MeshcatParams(host="localhost"))
 
 
 @pytest.fixture

@@ -119,8 +119,8 @@ def test_a_trajectory_has_no_other_fields(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("[" * 2000, "nested too deeply"),
-        ('{"phi": ' * 2000, "nested too deeply"),
+        ("[" * 200_000, "nested too deeply"),
+        ('{"phi": ' * 200_000, "nested too deeply"),
         ('{"phi": 1, "phi": 2}', ":phi: stands there twice"),
         ("", "is not JSON (line 1"),
         ("\xff", "is no text in UTF-8"),

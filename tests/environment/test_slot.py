@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydrake.geometry import Meshcat, MeshcatParams, Sphere
+from pydrake.geometry import Sphere
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
@@ -243,9 +243,9 @@ def test_contact_only_takes_energy_from_the_tool(inserted):
     assert work[-1] < -0.02
 
 
-def test_the_replay_shows_the_slot_where_it_is_and_the_peg_in_it(inserted):
+def test_the_replay_shows_the_slot_where_it_is_and_the_peg_in_it(inserted, meshcat):
     scenario, result = inserted
-    scene = ReplayScene(Meshcat(MeshcatParams(host="localhost")), scenario, result)
+    scene = ReplayScene(meshcat, scenario, result)
     scene.show(0.0, result, len(result.t) - 1)
     slot = scene.plant.GetBodyByName("slot").EvalPoseInWorld(scene.context)
     np.testing.assert_allclose(slot.translation(), scenario.slot.position)

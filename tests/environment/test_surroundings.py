@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.yaml import yaml_load
-from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.framework import DiagramBuilder
@@ -279,7 +278,7 @@ def test_a_block_that_is_pushed_over_its_table_resists_by_friction():
     assert "contact_by" not in summary
 
 
-def test_the_film_shows_what_moved_where_it_was(tmp_path):
+def test_the_film_shows_what_moved_where_it_was(tmp_path, meshcat):
     """A block that is turned, and a door that is open, from their poses alone."""
     hinge = '<joint name="hinge" type="revolute">'
     text = (models_dir() / "door.sdf").read_text()
@@ -303,7 +302,7 @@ def test_the_film_shows_what_moved_where_it_was(tmp_path):
         "measured_wrench_S": np.zeros((1, 6)),
         "load_estimate": np.zeros((1, 16)),
     }
-    scene = ReplayScene(Meshcat(MeshcatParams(host="localhost")), scenario, still | poses)
+    scene = ReplayScene(meshcat, scenario, still | poses)
     scene.show(0.0, still | poses, 0)
     for name, pose in poses.items():
         body = scene.plant.GetBodyByName(name.removeprefix("pose_of_"))
