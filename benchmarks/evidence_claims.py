@@ -245,7 +245,7 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
     ),
     Claim(
         *(LOGS, "static poses for as long, as force_torque_tools does it"),
-        *("the same", "logs.md", "peers"),
+        *("the same; at rest no inertia is in the way, and none is told", "logs.md", "peers"),
         *(lambda f: f["kth.mass_%"] / f["ours.mass_%"], "times ours", 1.0),
     ),
     Claim(
