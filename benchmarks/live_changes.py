@@ -21,7 +21,8 @@ import numpy as np
 
 from drake_teleop.identification import slave_arm
 from drake_teleop.identified_load import IdentifiedLoad, identified_load
-from drake_teleop.live.choices import NAMES, chosen, filled_after
+from drake_teleop.live.choice_names import NAMES
+from drake_teleop.live.choices import chosen, filled_after
 from drake_teleop.live.inputs import SLICE_MS
 from drake_teleop.live.session import Session, live_scenario
 from drake_teleop.scenario import LoadScenario, Scenario

@@ -12,7 +12,7 @@ import numpy as np
 
 import drake_teleop as dt
 from drake_teleop.identified_load import identified_load
-from drake_teleop.live.choices import METHODS, NETWORKS
+from drake_teleop.live.choice_names import METHODS, NETWORKS
 from drake_teleop.live.session import Session, live_scenario
 
 scenario = live_scenario(dt.LoadScenario("contact_transition"))

@@ -7,16 +7,16 @@ goes on where the present one is (`drake_teleop.live.handing_on`).
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.channel.channel import Channel
-from drake_teleop.channel.network import PRESETS as NETWORK_PRESETS
 from drake_teleop.channel.network import longest_delay
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.identified_load import IdentifiedLoad
+from drake_teleop.live.choice_names import NETWORKS, OWN, SENSORS
+from drake_teleop.live.inputs import Inputs
 from drake_teleop.operator.operator import GRIPS
 from drake_teleop.passivity.methods import METHODS
 from drake_teleop.passivity.safe_state import RESUME
@@ -25,33 +25,13 @@ from drake_teleop.sensor.presets import PRESETS as SENSOR_PRESETS
 from drake_teleop.slave.payload import Payload
 from drake_teleop.slave.plant import NominalSlave
 
-if TYPE_CHECKING:
-    from drake_teleop.live.inputs import Inputs
-
 Array = NDArray[np.float64]
 
-_OWN = "as in the scenario"
-NETWORKS = (_OWN, *NETWORK_PRESETS, "custom")
-SENSORS = (_OWN, *SENSOR_PRESETS)
-#: What each number of a choice means.
-NAMES = {"network": NETWORKS, "method": METHODS, "grip": tuple(GRIPS), "sensor": SENSORS}
 #: What is grasped, if the scenario's tool holds nothing.
 OBJECT = Payload(mass=0.8)
 #: In which the hand goes over to what it feels of another station [s].
 BLEND = 0.25
 _TENTH_OF_MS, _PERCENT, _PER_MILLE = 1e-4, 1e-2, 1e-3
-
-
-def first_choices(scenario: Scenario) -> dict[str, int]:
-    """The choices that leave a scenario as it is."""
-    return {
-        "network": 0,
-        "method": METHODS.index(scenario.passivity.method),
-        "grip": list(GRIPS).index(scenario.operator.grip),
-        "object": int(scenario.slave.payload.mass > 0.0),
-        "detection": int(scenario.contact_detection is not None),
-        "sensor": 0,
-    }
 
 
 def chosen(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
@@ -71,7 +51,7 @@ def chosen(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> S
             distribution="gamma",
             loss=_PER_MILLE * inputs.loss,
         )
-    elif name != _OWN:
+    elif name != OWN:
         changes["channel"] = Channel(network=name)
     if inputs.sensor:
         changes["wrist_sensor"] = SENSOR_PRESETS[SENSORS[inputs.sensor]]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.live.choices import NETWORKS, SENSORS, first_choices
+from drake_teleop.live.choice_names import NETWORKS, SENSORS, first_choices
 from drake_teleop.operator.operator import GRIPS
 from drake_teleop.passivity.methods import METHODS
 from drake_teleop.quaternions import exponential, logarithm

@@ -17,7 +17,7 @@ from pydrake.math import RollPitchYaw
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identified_load import IdentifiedLoad
-from drake_teleop.live.choices import NAMES
+from drake_teleop.live.choice_names import NAMES
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.external_master import TICK_MS

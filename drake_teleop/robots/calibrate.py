@@ -29,9 +29,9 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.tolerance import Tolerance, read_tolerance
 from drake_teleop.logs.commands import identify_command
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.robots.addresses import source_of
 from drake_teleop.robots.calibration import FIRST_S, GROWS, Look, look
 from drake_teleop.robots.compensator import JUMP_S
+from drake_teleop.robots.sources_and_sinks import source_of
 from drake_teleop.robots.streams import VALUES, Flag, Reading, Source
 from drake_teleop.writing import make_folder, write_json, write_picture
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.identification import Identification
-from drake_teleop.robots.addresses import sink_of, source_of
 from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
 from drake_teleop.robots.lines import names_of
+from drake_teleop.robots.sources_and_sinks import sink_of, source_of
 from drake_teleop.robots.streams import Compensated, Sink, Source
 from drake_teleop.robots.udp import THIS_MACHINE, listening
 from drake_teleop.robots.watch import Watch

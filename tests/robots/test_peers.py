@@ -26,11 +26,11 @@ from websockets.sync.client import connect
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.addresses import sink_of
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import NetFtSource, page_of
 from drake_teleop.robots.ros2_source import Ros2Source
 from drake_teleop.robots.rtde import RtdeSource
+from drake_teleop.robots.sources_and_sinks import sink_of
 from drake_teleop.robots.streams import (
     ACCELERATION,
     POSE,

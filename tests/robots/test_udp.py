@@ -16,10 +16,10 @@ from test_compensator import DT, load, readings
 
 import drake_teleop.robots.udp as udp
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.robots.addresses import sink_of, source_of
 from drake_teleop.robots.compensate import Control, run
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.lines import LineSource, read_line, written_line
+from drake_teleop.robots.sources_and_sinks import sink_of, source_of
 from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Compensated, Flag, Part, Reading
 
 HEADER = Path(udp.__file__).with_name("drake_teleop_udp.h").read_text()
