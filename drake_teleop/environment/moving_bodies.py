@@ -47,10 +47,10 @@ def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Arra
         bodies: that are not anchored.
 
     Returns:
-        table: (m, 21), parents first: 0 row of the parent, or -1 if it is anchored; 1 the kind; 2
-            and 3 where its positions and velocities begin in the plant's state [q; v]; 4-6 its
-            axis; 7-13 and 14-20 X_PF, or X_WF, and X_MB, a quaternion and a place each.
-        order: the body of each row, as a number; besides `bodies` those on which they hang.
+        (m, 21) table, parents first: 0 row of the parent, or -1 if it is anchored; 1 the kind; 2
+        and 3 where its positions and velocities begin in the plant's state [q; v]; 4-6 its axis;
+        7-13 and 14-20 X_PF, or X_WF, and X_MB, a quaternion and a place each. And the body of each
+        row, as a number; besides `bodies` those on which they hang.
     """
     # Numbers alone: a joint that is held would hold the plant, and that the joint.
     above: dict[int, tuple[int, int]] = {}
