@@ -7,6 +7,7 @@ Imports count wherever they stand, but for those that only type checkers follow.
 from __future__ import annotations
 
 import ast
+import subprocess
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -21,6 +22,12 @@ LARGEST_ROOM = 0.15
 LONGEST_FILE = 450
 REASON = "(long: "
 """In the first line of a longer file, before why it is one file nevertheless."""
+
+TOP = {
+    *(".ci", ".github", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE"),
+    *("README.md", "pyproject.toml"),
+    *("benchmarks", "docs", "drake_teleop", "models", "notebooks", "tests"),
+}
 
 Sources = dict[str, str]
 """Text of each module, by its name below the package, such as "load.batch.methods"."""
@@ -131,6 +138,14 @@ def test_load_logs_and_passivity_do_without_drake(house: Sources) -> None:
 
 def test_no_room_is_too_large(house: Sources) -> None:
     assert large_rooms(house) == []
+
+
+def test_the_top_folder_holds_what_it_should() -> None:
+    tracked = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=PACKAGE.parent, capture_output=True, text=True
+    )
+    top = {name.split("/")[0] for name in tracked.stdout.split("\0") if name}
+    assert top <= TOP, "a stray file was committed (in no clone, git names none)"
 
 
 def test_long_files_say_why(house: Sources) -> None:
