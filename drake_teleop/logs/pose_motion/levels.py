@@ -12,6 +12,7 @@ the lowest frequencies, where such noise is largest and gravity turns, count as 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,23 +42,31 @@ class Levels:
         """White within each group."""
         return cls(of.sizes, of.group, np.ones((of.count, 6)))
 
-    def power(self, sums: Array, taken: Array | float = 0.0) -> Array:
+    def power(self, sums: Array, taken: Array | None = None) -> Array:
         """(bands, 6) mean power of a number.
 
         Args:
             sums: (bands, 6) of the power of the residual's numbers.
             taken: (bands, 6) numbers that parameters took, of twice `sizes`.
         """
-        numbers = np.broadcast_to(self.sizes[:, None], sums.shape)
-        left = self.grouped(numbers - 0.5 * taken)
-        left = np.maximum(left, _LEAST_LEFT * self.grouped(numbers))
+        left = self._numbers
+        if taken is not None:
+            left = np.maximum(left - 0.5 * self.grouped(taken), _LEAST_LEFT * left)
         level = self.grouped(sums / self.shape) / left
         return np.asarray(level[self.group] * self.shape)
 
     def grouped(self, x: Array) -> Array:
         """(groups, ...) sums of (bands, ...)."""
-        starts = np.flatnonzero(np.diff(self.group, prepend=-1))
-        return np.asarray(np.add.reduceat(x, starts, axis=0))
+        return np.asarray(np.add.reduceat(x, self._starts, axis=0))
+
+    @cached_property
+    def _starts(self) -> NDArray[np.intp]:
+        return np.flatnonzero(np.diff(self.group, prepend=-1))
+
+    @cached_property
+    def _numbers(self) -> Array:
+        """(groups, 1) half as many as each group has."""
+        return self.grouped(self.sizes)[:, None]
 
     def costs(self, power: Array) -> Array:
         """(6,) minus the log likelihood of each channel with these powers, but for a constant."""

@@ -335,12 +335,12 @@ def _sums(record: _Record, state: State) -> Array:
 
 
 def _residual_covariances(
-    record: _Record, state: State, sums: Array, taken: Array | float = 0.0
+    record: _Record, state: State, sums: Array, taken: Array | None = None
 ) -> Array:
     """(bands, 6, 6) R_b of a number, from the residual's powers and what the fit took of them."""
     levels, sizes = record.levels, record.levels.sizes[:, None]
     P = _residual_powers(record.Q, state) / sizes[..., None]
-    own = np.diagonal(P, axis1=1, axis2=2) * (sizes - 0.5 * taken)
+    own = np.diagonal(P, axis1=1, axis2=2) * (sizes if taken is None else sizes - 0.5 * taken)
     least = np.maximum(
         _LEAST_SHARE * levels.power(sums, taken), least_power(record.Z, levels.sizes)
     )
