@@ -161,13 +161,16 @@ class LogOnDisk:
         the same rows, or has none to write.
         """
         part = self._read()
-        part.write_part(self._folder, self._rows)
+        self._write(part)
         self._sink.Clear()
         self._rows += len(part.t)
 
     def keep(self) -> None:
         """Writes them, and keeps them: the next `take` writes the same part with more rows."""
-        self._read().write_part(self._folder, self._rows)
+        self._write(self._read())
+
+    def _write(self, part: SimulationResult) -> None:
+        part.write_part(self._folder, self._rows)
 
     def _read(self) -> SimulationResult:
         return self._form(read_log(self._simulator, self._start))

@@ -85,11 +85,11 @@ class Inputs:
     def changed(self, values: Mapping[str, Any]) -> Inputs:
         """With other values, each brought into its range; what is no finite number is left out."""
         changes = {}
-        for name, (low, high) in RANGES.items():
-            value = values.get(name)
+        for name in values.keys() & RANGES.keys():
+            value, (low, high) = values[name], RANGES[name]
             if isinstance(value, (int, float)) and abs(value) < 1e15:
                 changes[name] = round(min(max(value, low), high))
-        return dataclasses.replace(self, **changes)
+        return dataclasses.replace(self, **changes) if changes else self
 
     @property
     def target(self) -> tuple[int, ...]:

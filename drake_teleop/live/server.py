@@ -46,6 +46,8 @@ from drake_teleop.writing import make_folder
 
 _HOST = "127.0.0.1"
 _MOST_CLIENTS = 8
+# Turns of the loop from a socket that can be read to what has been said: one wakes its reader.
+_STEPS_OF_A_MESSAGE = 3
 _BEHIND = 2**18  # bytes that wait for a slow page, before it misses frames
 
 
@@ -164,12 +166,22 @@ class LiveDrive:
                         if c.transport.get_write_buffer_size() < _BEHIND
                     ]
                     broadcast(ready, json.dumps({"frame": frame}))
-                # As asyncio waits in whole milliseconds, the last one is not slept through.
-                rest = self._live.wait(time.perf_counter())
-                await asyncio.sleep(max(rest - 1e-3, 0.0))
+                await self._sleep()
         finally:
             gc.enable()
             gc.unfreeze()
+
+    async def _sleep(self) -> None:
+        """Until there is something to do; then messages that have come are listened to.
+
+        As asyncio waits in whole milliseconds, the last one is slept through without it.
+        """
+        rest = self._live.wait(time.perf_counter()) - 1e-3
+        if rest > 0:
+            await asyncio.sleep(rest)
+        time.sleep(self._live.wait(time.perf_counter()))
+        for _ in range(_STEPS_OF_A_MESSAGE):
+            await asyncio.sleep(0)
 
     async def _change_scene(self) -> None:
         """Identifies the load beside the loop, which may take a while; all else is Meshcat's."""

@@ -27,12 +27,13 @@ from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
 from drake_teleop.live.handing_on import hand_on
 from drake_teleop.live.inputs import INPUTS, SLICE_MS, Inputs, header, read_inputs, row
+from drake_teleop.live.log_beside import LogBeside
 from drake_teleop.pages.progress import Progress
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.scenario_reference import commented
 from drake_teleop.signals import LOG, SIGNALS, signal_of
-from drake_teleop.simulation import LogOnDisk, MakeSimulator, advance, columns, read_log
+from drake_teleop.simulation import MakeSimulator, advance, columns, read_log
 from drake_teleop.station import GetBlock, MakeTeleopStation
 from drake_teleop.writing import make_folder, naming, write_text
 
@@ -41,15 +42,19 @@ _PART_ROWS = 1000
 # Of a change of scales [s]. A slider that is moved changes them 60 times a second, and each ramp
 # begins slowly: with longer ones nothing would happen until it rests.
 _RAMP = 0.05
+# The shortest step that error control may ask for [s]: a slice in contact has time for no more.
+# A third-order step follows vibrations up to 1.7 / step = 1.1 kHz without exciting them; the ball
+# on a leaf vibrates at up to 700 Hz.
+_SHORTEST_STEP = 2.5e-4
 _LOAD, _SCENARIO = "load.npz", "scenario.yaml"
 # Where this is, the hand's place in the inputs is that of a device.
 _DEVICE = "device.txt"
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
-    """A scenario as it is driven: without intent, task and settling time, with steps of 125 us.
+    """A scenario as it is driven: without intent, task and settling time.
 
-    Steps of one length take the same time wherever the tool is.
+    Its steps are controlled, see `_Station`.
     """
     return replace(
         scenario,
@@ -58,8 +63,7 @@ def live_scenario(scenario: Scenario) -> Scenario:
         simulation__settle=0.0,
         simulation__end_with_task=False,
         simulation__on_fault="continue",
-        simulation__integrator="runge_kutta2",
-        simulation__max_step=min(scenario.simulation.max_step, 1.25e-4),
+        simulation__integrator="runge_kutta3",
     )
 
 
@@ -108,6 +112,10 @@ class _Station:
         )
         seeded = dataclasses.replace(scenario.simulation, seed=scenario.simulation.seed + number)
         self.simulator = MakeSimulator(self.station, seeded)
+        integrator = self.simulator.get_mutable_integrator()
+        if scenario.simulation.integrator == "runge_kutta3":  # the one with error control
+            integrator.set_requested_minimum_step_size(_SHORTEST_STEP)
+            integrator.set_throw_on_minimum_step_size_violation(False)
         self.context = self.simulator.get_mutable_context()
         self.sink = self.station.GetSubsystemByName(LOG).FindMutableLog(self.context)
         self.columns = columns(self.station)
@@ -195,9 +203,9 @@ class Session:
         self._record = None
         if record is not None:
             self._record = _Record(record, scenario, load, self.inputs, device=device)
-        self._on_disk = None
+        self._on_disk: LogBeside | None = None
         if log is not None:
-            self._on_disk = LogOnDisk(log, self._now.simulator, 0.0, with_all_signals)
+            self._on_disk = LogBeside(log, self._now.simulator, 0.0, with_all_signals)
         self._earlier: list[SimulationResult] = []
         self._now.simulator.Initialize()
 
@@ -301,6 +309,7 @@ class Session:
             self._record.write(self.ms, self.inputs)
         if self._on_disk is not None:
             self._on_disk.keep()
+            self._on_disk.finish()
 
     def _rows(self) -> SimulationResult:
         return with_all_signals(read_log(self._now.simulator, 0.0))
