@@ -10,7 +10,7 @@ along the normal, regularised Coulomb friction across it); a test ties it to the
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,14 @@ from pydrake.systems.framework import Context
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.vectors import apply, dot, nine, three, transposed
+from drake_teleop.vectors import apply, dot, minus, nine, plus, rows, three, times, transposed
 
 Array = NDArray[np.float64]
 
 #: Columns of the table of pairs: stiffness; static and dynamic friction; which body it moves with.
 STIFFNESS, FRICTION, BODY = 22, slice(24, 26), 27
-#: Their number.
-WIDTH = 28
+#: Their number, and that of pairs that are watched.
+WIDTH, WATCHED_WIDTH = 28, 40
 _STIFFNESS, _DISSIPATION = "point_contact_stiffness", "hunt_crossley_dissipation"
 _NO_SLIP = 1e-14  # m/s, as in Drake: a point at rest has a direction
 
@@ -44,8 +44,9 @@ class Pairs(NamedTuple):
             in which it moves as a leaf (zero if it does not), 22 stiffness k [N/m], 23 dissipation
             d [s/m], 24 and 25 static and dynamic friction, 26 slip at which it is complete [m/s],
             27 the row of its body in a `JointTable`, or -1.
-        watched: (l, 28), of the others: spheres and boxes around them. They do not touch as long
-            as these do not; see `indentation`.
+        watched: (l, 40), of the others: boxes around both. They do not touch as long as these do
+            not, see `apart`. As above, with 0-2 the middle of the tool's box, 3 unused; 28-36
+            R_SBox of that by rows, 37-39 half its edges.
         unknown: of the first of the others, why it is one.
     """
 
@@ -89,23 +90,31 @@ def ContactPairs(
                 if inspector.CollisionFiltered(own, thing):
                     continue
                 X_Thing = X_Body @ inspector.GetPoseInFrame(thing)
-                X_SShape, law = X_SOwn @ inspector.GetPoseInFrame(own), [0.0] * 4
+                X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)
                 try:
                     sphere, edges = _sphere_and_box(inspector, own, thing)
                     law = _law(*map(inspector.GetProximityProperties, (own, thing)))
-                    radius, half, rows = sphere.radius(), np.array(edges.size()) / 2, known
+                    half = np.array(edges.size()) / 2
+                    place = [X_SShape.translation(), [sphere.radius()]]
+                    known.append(_row(place, X_Thing, half, [direction, law, [slip, row]]))
                 except DrakeTeleopError as beyond:
                     unknown = unknown or str(beyond)
                     around, box = _around(inspector, own), _around(inspector, thing)
-                    X_SShape, radius = X_SShape @ around.pose(), np.linalg.norm(around.half_width())
-                    X_Thing, half, rows = X_Thing @ box.pose(), box.half_width(), watched
-                placed = [X_Thing.rotation().matrix().ravel(), X_Thing.translation(), half]
-                numbers = [X_SShape.translation(), [radius], *placed, direction, law, [slip, row]]
-                rows.append(np.concatenate(numbers))
+                    X_SBox, X_Thing = X_SShape @ around.pose(), X_Thing @ box.pose()
+                    place = [X_SBox.translation(), [0.0]]
+                    turned = [X_SBox.rotation().matrix().ravel(), around.half_width()]
+                    last = [direction, [0.0] * 4, [slip, row], *turned]
+                    watched.append(_row(place, X_Thing, box.half_width(), last))
     return Pairs(
         np.array(known).reshape(len(known), WIDTH),
-        np.array(watched).reshape(len(watched), WIDTH),
+        np.array(watched).reshape(len(watched), WATCHED_WIDTH),
         unknown,
+    )
+
+
+def _row(first: list[Any], X_Thing: RigidTransform, half: Array, last: list[Any]) -> Array:
+    return np.concatenate(
+        [*first, X_Thing.rotation().matrix().ravel(), X_Thing.translation(), half, *last]
     )
 
 
@@ -213,6 +222,37 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
         origin = pair[13 + i] + deflection * pair[19 + i] + w[i]
         normal[3 + i] = origin - inwards * normal[i]
     return radius - distance
+
+
+@njit(cache=True)
+def apart(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float) -> float:
+    """How far two boxes are apart at least [m], below 0 if they may touch.
+
+    The largest gap along the edges of either (Gottschalk 1996, without the cross products).
+
+    Args:
+        pair: (40,) row of `Pairs.watched`, for the tool's box.
+        box: (28,) the same row with the other box where it is.
+        p_WS, R_WS: of the tool's frame in W.
+        deflection: of the environment [m].
+    """
+    R, between = rows(R_WS), minus(three(p_WS, 0), three(box, 13))
+    between = plus(between, apply(R, three(pair, 0)))
+    between = minus(between, times(deflection, three(box, 19)))
+    edges, halves, largest = np.empty((6, 3)), np.empty(6), -np.inf
+    for i in range(3):
+        k = WIDTH + i  # columns of a rotation: directions of edges
+        edge = apply(R, (pair[k], pair[k + 3], pair[k + 6]))
+        edges[i, 0], edges[i, 1], edges[i, 2] = edge
+        edges[3 + i, 0], edges[3 + i, 1], edges[3 + i, 2] = box[4 + i], box[7 + i], box[10 + i]
+        halves[i], halves[3 + i] = pair[WIDTH + 9 + i], box[16 + i]
+    for i in range(6):
+        axis = three(edges[i], 0)
+        gap = abs(dot(between, axis))
+        for j in range(6):
+            gap -= halves[j] * abs(dot(three(edges[j], 0), axis))
+        largest = max(largest, gap)
+    return largest
 
 
 @njit(cache=True)

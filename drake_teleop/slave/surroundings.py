@@ -16,7 +16,7 @@ from pydrake.systems.framework import Context
 
 from drake_teleop.environment.environment import Environment, ToolShapes
 from drake_teleop.environment.moving_bodies import JOINT_WIDTH, JointTable
-from drake_teleop.environment.point_contact import WIDTH, ContactPairs
+from drake_teleop.environment.point_contact import WATCHED_WIDTH, WIDTH, ContactPairs
 from drake_teleop.errors import DrakeTeleopError
 
 _SAME = 1e-12  # of frames: rounding
@@ -35,7 +35,7 @@ class Contact(NamedTuple):
 
     Attributes:
         pairs: (k, 28) `Pairs.known`; none if `beyond` says something.
-        watched: (l, 28) `Pairs.watched`: what is left to Drake where it comes near.
+        watched: (l, 40) `Pairs.watched`: what is left to Drake where it comes near.
         joints: (m, 21) of `JointTable`, by which the boxes of `pairs` move.
         plant_size: of the plant's state, if there are joints, or 0.
         beyond: what the compiled contact law does not know, so that Drake's contact results are
@@ -69,7 +69,8 @@ def no_contact() -> Contact:
     """With nothing to touch."""
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
     pairs, joints = np.zeros((0, WIDTH)), np.zeros((0, JOINT_WIDTH))
-    return Contact(pairs, pairs, joints, 0, "", frozenset(), frozenset(), leaf, None, {})
+    watched = np.zeros((0, WATCHED_WIDTH))
+    return Contact(pairs, watched, joints, 0, "", frozenset(), frozenset(), leaf, None, {})
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> Touched:

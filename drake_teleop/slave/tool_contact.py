@@ -7,7 +7,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop._compiled import njit
 from drake_teleop.environment.moving_bodies import POSE_AND_TWIST, bodies_into
-from drake_teleop.environment.point_contact import BODY, WIDTH, contact_force, indentation
+from drake_teleop.environment.point_contact import BODY, WIDTH, apart, contact_force, indentation
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.quaternions import rotate
 from drake_teleop.slave.arm import ArmModel, forward_kinematics, jacobian
@@ -89,7 +89,7 @@ def nearness(arm, pairs, watched, joints, q, sheet, state):
 
     Args:
         arm, pairs, joints, q, sheet, state: as above.
-        watched: (l, 28) `Pairs.watched`.
+        watched: (l, 40) `Pairs.watched`.
     """
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)
@@ -100,8 +100,7 @@ def nearness(arm, pairs, watched, joints, q, sheet, state):
             _place(pair, bodies, placed)
         else:
             put(placed, 0, pair, 0, WIDTH)
-        placed[3] += _WATCHED_FROM
-        if indentation(placed, p_WS, R_WS, sheet[0], normal) > 0.0:
+        if apart(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_FROM:
             return WATCHED
     for pair in pairs:
         box = _place(pair, bodies, placed) if pair[BODY] >= 0.0 else pair

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pydrake.geometry import Box, Sphere
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.environment.point_contact import ContactPairs
+from drake_teleop.environment.point_contact import ContactPairs, apart
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.slot import Slot
 from drake_teleop.slave.plant import AddSlavePlant
@@ -96,18 +96,56 @@ def test_a_push_is_moved_to_the_worlds_origin():
 
 
 def test_other_shapes_are_watched_from_around_them():
-    """A cube's ball about its corners, and a box around a ball; without an end there is none."""
+    """A brick turned about z, and a box around a ball; without an end there is none."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
     tool = plant.AddRigidBody("tool", SpatialInertia.SolidSphereWithMass(1.0, 0.01))
     table = plant.AddModelInstance("table")
     body = plant.AddRigidBody("body", table, SpatialInertia.SolidSphereWithMass(1.0, 0.01))
     friction, aside = CoulombFriction(0.2, 0.2), RigidTransform([0.0, 0.3, 0.0])
-    cube = plant.RegisterCollisionGeometry(tool, aside, Box(1, 1, 1), "cube", friction)
+    cube = plant.RegisterCollisionGeometry(tool, aside, Box(1, 2, 4), "cube", friction)
     plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(0.1), "ball", friction)
     plant.Finalize()
     inspector, from_S = scene_graph.model_inspector(), RigidTransform([0.0, 0.0, 0.2])
     pairs = ContactPairs(plant, inspector, {cube: from_S}, [table], 1e-4)
     assert len(pairs.known) == 0
     assert "spheres on boxes only, not a Box on a Sphere" in pairs.unknown
-    np.testing.assert_allclose(pairs.watched[0, :4], [0.0, 0.3, 0.2, 0.75**0.5])
+    np.testing.assert_allclose(pairs.watched[0, :3], [0.0, 0.3, 0.2])
     np.testing.assert_allclose(pairs.watched[0, 16:19], 0.1)
+    np.testing.assert_allclose(np.sort(pairs.watched[0, 37:]), [0.5, 1.0, 2.0])
+
+
+def test_boxes_that_are_apart_do_not_touch():
+    """Never farther than Drake says, and as far where a face is the nearest."""
+    random, half = np.random.default_rng(3), np.array([[0.02, 0.05, 0.1], [0.08, 0.03, 0.04]])
+    plant, _ = AddMultibodyPlantSceneGraph(builder := DiagramBuilder(), 0.0)
+    bodies = [
+        plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1)) for name in "ab"
+    ]
+    friction = CoulombFriction(0.2, 0.2)
+    X_SOwn = RigidTransform(RollPitchYaw(0.3, -0.5, 0.2), [0.03, -0.02, 0.1])
+    shapes = [
+        plant.RegisterCollisionGeometry(body, X, Box(*(2 * edges)), "box", friction)
+        for body, X, edges in zip(bodies, (X_SOwn, RigidTransform()), half, strict=True)
+    ]
+    plant.Finalize()
+    root = builder.Build().CreateDefaultContext()
+    context = plant.GetMyMutableContextFromRoot(root)
+    query = plant.get_geometry_query_input_port()
+    facing = 0
+    for _ in range(200):
+        X_WS, X_WBox = (
+            RigidTransform(RollPitchYaw(*random.uniform(-3, 3, 3)), random.uniform(-0.2, 0.2, 3))
+            for _ in bodies
+        )
+        leaf, deflection = random.normal(size=3), 0.02
+        for body, X in zip(bodies, (X_WS, X_WBox), strict=True):
+            plant.SetFreeBodyPose(context, body, X)
+        moved = RigidTransform(X_WBox.rotation(), X_WBox.translation() - deflection * leaf)
+        rest = [moved.rotation().matrix().ravel(), moved.translation(), half[1], leaf, np.zeros(6)]
+        own = [X_SOwn.rotation().matrix().ravel(), half[0]]
+        pair = np.concatenate([X_SOwn.translation(), [0.0], *rest, *own])
+        found = apart(pair, pair[:28], X_WS.translation(), X_WS.rotation().matrix(), deflection)
+        told = query.Eval(context).ComputeSignedDistancePairClosestPoints(*shapes).distance
+        assert found <= max(told, 0.0) + 1e-6
+        facing += found > 0.0 and found > told - 1e-6
+    assert facing > 20
