@@ -86,11 +86,22 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
     """
     store = Store(out / "runs.parquet")
     make_folder(store.folder)
+    with claimed(out, identity):
+        yield store
+
+
+@contextmanager
+def claimed(out: Path, identity: dict[str, Any]) -> Iterator[None]:
+    """Keeps a folder, which is there, for this process and for what `identity` says it holds.
+
+    Raises:
+        DrakeTeleopError: if the folder holds something else, or is in use.
+    """
     handle = os.open(out, os.O_RDONLY)
     try:
         _lock(handle, out)
         _check_identity(out, identity)
-        yield store
+        yield
     finally:
         os.close(handle)
 

@@ -1,0 +1,150 @@
+"""A participant's way through an experiment: its order, what it learns, and what a kill leaves."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.experiment.design import (
+    ApparentMass,
+    Condition,
+    ContactDetection,
+    Experiment,
+    LoadExperiment,
+    PegInSlot,
+)
+from drake_teleop.experiment.procedure import Felt, Procedure, trials_of
+from drake_teleop.experiment.psychometrics import correct_probability
+from drake_teleop.experiment.store import Store, open_results
+
+SMALL = Experiment(
+    tasks=[ContactDetection(trials=6, practice=2), ApparentMass(trials=5), PegInSlot(trials=2)],
+    conditions=[
+        Condition(name="a"),
+        Condition(name="b", sigma=1.0),
+        Condition(name="c", gamma=2.0),
+    ],
+)
+
+
+def go_through(procedure: Procedure, rng, threshold: float, most: int = 10_000) -> None:
+    """A participant whose answers come from the level; or until a number of trials is done."""
+    while procedure.phase != "end" and procedure.number < most:
+        if procedure.phase == "interval":
+            felt = Felt(procedure.shown, force_N=5.0, done=True, time_s=1.0)
+            procedure.finished(felt)
+        elif procedure.phase == "gap":
+            procedure.second()
+        elif procedure.phase == "answer":
+            p = correct_probability(procedure.level, threshold, 1.5, 0.0)
+            signal = procedure.trial.signal
+            procedure.answer(signal if rng.random() < p else 3 - signal, 0.5)
+        else:
+            procedure.go()
+
+
+def test_order_is_drawn_for_each_participant_and_each_round_has_every_condition_once():
+    one, other = trials_of(SMALL, 1), trials_of(SMALL, 2)
+    assert one == trials_of(SMALL, 1) != other
+    counted = [t.condition for t in one if t.task == 0 and not t.practice]
+    assert all(sorted(counted[k : k + 3]) == [0, 1, 2] for k in range(0, 18, 3))
+    orders = {tuple(dict.fromkeys(t.task for t in trials_of(SMALL, n))) for n in range(30)}
+    assert len(orders) == 6
+    signals = [t.signal for n in range(30) for t in trials_of(SMALL, n) if t.task == 0]
+    assert {t.signal for t in one if t.task == 2} == {0}
+    assert 0.4 < np.mean(np.array(signals) == 1) < 0.6
+
+
+def test_a_participant_goes_on_where_it_stopped_with_the_same_levels(tmp_path):
+    """A kill is a new process, which has nothing but the folder; an unfinished trial is lost."""
+    whole, cut = Store(tmp_path / "whole"), Store(tmp_path / "cut")
+    go_through(Procedure(SMALL, 3, whole), np.random.default_rng(1), 2.0)
+    rng = np.random.default_rng(1)
+    first = Procedure(SMALL, 3, cut)
+    go_through(first, rng, 2.0, most=17)
+    first.go()
+    first.finished(Felt(first.shown))
+    again = Procedure(SMALL, 3, cut)
+    assert (again.phase, again.number) == ("consent", 17)
+    go_through(again, rng, 2.0)
+    assert cut.path(3).read_bytes() == whole.path(3).read_bytes()
+    assert len(cut.rows(3)) == len(trials_of(SMALL, 3))
+
+
+def test_practice_does_not_count_and_what_touched_nothing_is_done_again(tmp_path):
+    procedure = Procedure(SMALL, 1, Store(tmp_path))
+    before = procedure.number
+    procedure.go(), procedure.go(), procedure.go()
+    assert procedure.phase == "interval"
+    procedure.answer(1, 0.1)  # nobody was asked
+    procedure.finished(Felt(valid=False))
+    assert (procedure.phase, procedure.again, procedure.number) == ("ready", True, before)
+    go_through(procedure, np.random.default_rng(0), 2.0)
+    counted = [row for row in Store(tmp_path).rows(1) if not row.practice]
+    assert len(counted) == 3 * (6 + 5 + 2)
+
+
+def test_what_is_shown_of_a_trial_is_the_same_for_all_conditions(tmp_path):
+    """Blind: with each condition in place of every other, the page is told the same."""
+
+    def told(names: list[int]) -> list[dict]:
+        conditions = [SMALL.conditions[k] for k in names]
+        other = dataclasses.replace(SMALL, conditions=conditions)
+        procedure = Procedure(other, 1, Store(tmp_path / str(names)))
+        seen = []
+        while procedure.phase != "end" and procedure.number < 12:
+            seen.append(procedure.view())
+            if procedure.phase == "interval":
+                procedure.finished(Felt(procedure.shown))
+            elif procedure.phase == "gap":
+                procedure.second()
+            elif procedure.phase == "answer":
+                procedure.answer(procedure.trial.signal, 0.5)
+            else:
+                procedure.go()
+        return seen
+
+    assert told([0, 1, 2]) == told([2, 0, 1])
+    assert not {"condition", "level", "signal"} & set(told([0, 1, 2])[0])
+
+
+def test_a_folder_is_one_experiments_and_a_damaged_file_is_named(tmp_path):
+    with open_results(tmp_path, SMALL) as store:
+        with pytest.raises(DrakeTeleopError, match="another process"):
+            open_results(tmp_path, SMALL).__enter__()
+        go_through(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0, most=3)
+        assert store.table().shape == (3, 12)
+        text = store.path(1).read_text()
+        for damaged in (text[:-30], text.replace("\n1,", "\n7,"), "trial\nx"):
+            store.path(1).write_text(damaged)
+            with pytest.raises(DrakeTeleopError, match=r"01\.csv"):
+                store.rows(1)
+    with pytest.raises(DrakeTeleopError, match="another study"):
+        open_results(tmp_path, dataclasses.replace(SMALL, seed=1)).__enter__()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("tasks: []", "tasks: there is none"),
+        ("tasks: [!PegInSlot {scenario: touch}]\nconditions: [{name: a}]", "nothing of a slot"),
+        ("tasks: [!Juggling {}]\nconditions: [{name: a}]", "Juggling"),
+        ("tasks: [!ApparentMass {low: 0.1, high: 0.1}]\nconditions: [{name: a}]", "no range"),
+        ("tasks: [!ApparentMass {}]\nconditions: [{name: a}, {name: a}]", "its own name"),
+        ("tasks: [!ApparentMass {}]\nconditions: [{name: a, sigma: 1, eta: 0.5}]", "eta"),
+        ("tasks: [!ApparentMass {}]\nconditions: [{name: a, network: moon}]", "moon"),
+    ],
+)
+def test_a_bad_file_is_refused_with_its_field(tmp_path, text, said):
+    (tmp_path / "e.yaml").write_text(text)
+    with pytest.raises(DrakeTeleopError, match=rf"e\.yaml.*{said}|{said}.*e\.yaml"):
+        LoadExperiment(tmp_path / "e.yaml")
+
+
+def test_the_shipped_experiment_is_complete():
+    experiment, scenarios = LoadExperiment("contact_and_mass")
+    assert len(scenarios) == len(experiment.tasks) == 3
+    assert "without your name" in experiment.consent
