@@ -93,7 +93,7 @@ class SimulatedParticipant:
     noise: float = quantity(0.06, "N", 1e-4, 100.0, "standard deviation at rest, at the hand")
     weber: float = quantity(0.1, "1", 0.0, 1.0, "and as a share of the response")
     lapse: float = quantity(0.02, "1", 0.0, 0.5, "share of the answers that are guessed")
-    reach: float = quantity(0.073, "m", 1e-3, 0.3, "how far down it goes to touch, at the hand")
+    reach: float = quantity(0.088, "m", 1e-3, 0.3, "how far down it goes to touch, at the hand")
     sway: float = quantity(0.03, "m", 1e-3, 0.1, "to and fro at 1 Hz, to judge a mass")
 
 
