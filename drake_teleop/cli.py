@@ -94,15 +94,45 @@ def run(
     metavar="ADDRESS",
     help="A haptic device is the hand: udp://127.0.0.1:PORT or haply://localhost:10001.",
 )
+@click.option("--study", metavar="FILE", help="A blind experiment, in place of SCENARIO.")
+@click.option(
+    "--results",
+    type=option.PATH,
+    default=Path("out/experiment"),
+    show_default=True,
+    metavar="DIR",
+    help="Of --study: the same folder goes on where it stopped.",
+)
+@click.option(
+    "--simulated",
+    type=option.Whole(0, 9999),
+    default=0,
+    help="Of --study: so many simulated participants, without a page.",
+)
 def drive(
-    scenario: str, record: Path | None, port: int, no_browser: bool, device: str | None
+    scenario: str,
+    record: Path | None,
+    port: int,
+    no_browser: bool,
+    device: str | None,
+    study: str | None,
+    results: Path,
+    simulated: int,
 ) -> None:
     """Drive a station live in the browser.
 
     SCENARIO is the name of a shipped one or a YAML file; its operator gives the grip alone. One
     page, on this machine: the hand by mouse, keys, touch or gamepad, which vibrates in contact;
     forces, sigma, gamma and eta while you press. `run --inputs DIR` repeats what was recorded.
+    With --study, a shipped experiment or a YAML file, simulated participants do an experiment.
     """
+    if study is not None:
+        from drake_teleop.experiment.command import experiment_command
+
+        if not simulated:
+            raise click.UsageError("--study needs --simulated")
+        experiment_command(study, results, simulated=simulated)
+        return
     from drake_teleop.live.server import drive_command
 
     drive_command(scenario, record=record, port=port, browser=not no_browser, device=device)

@@ -1,0 +1,52 @@
+"""The table of an experiment, of participants whose threshold is known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from test_procedure import SMALL, go_through
+
+from drake_teleop.experiment.command import whose_turn
+from drake_teleop.experiment.design import Condition, ContactDetection, Experiment
+from drake_teleop.experiment.procedure import Procedure, trials_of
+from drake_teleop.experiment.results import results, write_results
+from drake_teleop.experiment.store import Store
+
+CONTACT = "threshold of contact [N at the tool]"
+
+
+def test_thresholds_come_back_through_order_store_and_table(tmp_path):
+    experiment = Experiment(tasks=[ContactDetection(trials=40)], conditions=[Condition(name="a")])
+    store, rng = Store(tmp_path), np.random.default_rng(2)
+    for number in range(1, 6):
+        go_through(Procedure(experiment, number, store), rng, 2.0)
+    found = [r for r in results(experiment, store) if r.quantity == CONTACT]
+    each = [r for r in found if r.participant]
+    assert len(each) == 5 and {r.trials for r in each} == {40}
+    assert sum(r.low <= 2.0 <= r.high for r in each) >= 4
+    for over in (r for r in found if not r.participant):
+        assert over.low < 2.0 < over.high < 2.0 * over.low
+
+
+def test_the_folder_has_table_trials_and_picture(tmp_path):
+    store = Store(tmp_path)
+    assert write_results(SMALL, store).is_empty()
+    go_through(Procedure(SMALL, 4, store), np.random.default_rng(0), 2.0)
+    table = write_results(SMALL, store)
+    assert {p.name for p in tmp_path.glob("*.*")} == {"results.csv", "results.png", "trials.csv"}
+    share = table.filter(quantity="share of trials done", condition="a").row(0, named=True)
+    # Wilson's interval of 2 of 2: z^2 / (n + z^2) from 1 down.
+    assert share["low"] == pytest.approx(2.0 / (2.0 + 1.959964**2)) and share["high"] == 1.0
+    time = table.filter(quantity="time to the floor [s]", condition="a").row(0, named=True)
+    assert math.isclose(time["value"], 1.0)
+
+
+def test_whose_turn_it_is(tmp_path):
+    store, trials = Store(tmp_path), len(trials_of(SMALL, 1))
+    assert whose_turn(store, trials) == 1
+    go_through(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0)
+    assert whose_turn(store, trials) == 2
+    go_through(Procedure(SMALL, 2, store), np.random.default_rng(0), 2.0, most=5)
+    assert (whose_turn(store, trials), whose_turn(store, trials, 7)) == (2, 7)
