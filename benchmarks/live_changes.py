@@ -93,7 +93,7 @@ def measured(driven: Driven, network: int, method: int) -> dict[str, float]:
     fills = filled_after(chosen(driven.scenario, driven.load, still))
     figures = driven.change(fills + AFTER, network=network, method=method)
     figures |= tapping(driven)
-    driven.go(0.8, z=PRESSING)
+    driven.go(0.8 + fills, z=PRESSING)  # at rest, with nothing on its way
     back = driven.change(0.8, network=0, method=0)
     return figures | {f"back.{name}": value for name, value in back.items()}
 

@@ -175,6 +175,7 @@ def in_the_browser(trials: int) -> dict[str, float]:
                 page = Page(socket)
                 for domain in ("Runtime", "Page"):
                     page.answer(page.send(f"{domain}.enable"))
+                page.answer(page.send("Emulation.setFocusEmulationEnabled", enabled=True))
                 page.answer(page.send("Page.addScriptToEvaluateOnNewDocument", source=SPY))
                 page.answer(page.send("Page.navigate", url=driven.url))
                 while not page.run("!!(window.place && typeof target !== 'undefined' && target)"):
