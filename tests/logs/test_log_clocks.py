@@ -242,3 +242,10 @@ def test_what_is_invented_in_a_gap_is_not_used(tmp_path: Path) -> None:
     assert not free.touched.any()
     assert len(free.log) == len(free.contact) == len(free.causal.contact) == len(free.scaled)
     assert np.abs(free.contact).max() < 0.05
+
+
+def test_dates_have_no_unit() -> None:
+    stamps = np.array(["2026-03-01T12:00:00.000", "2026-03-01T12:00:00.002"], "datetime64[ms]")
+    table = Table(Path("x.csv"), {"t": stamps, "f": np.zeros(2)})
+    with pytest.raises(DrakeTeleopError, match=r"here\.unit.*no unit; leave it out"):
+        read_clock(Time(column="t", unit="ms"), table, ["f"], "here")

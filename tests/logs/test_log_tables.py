@@ -93,3 +93,53 @@ def test_a_panic_in_polars_is_one_line_and_ctrl_c_is_none(
     assert "\n" not in str(found.value)
     if raised is DrakeTeleopError:
         assert "x.csv: cannot be read: " in str(found.value)
+
+
+LAB = "t,f\n0.5,1.25\n1.5,-2.0\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        LAB.replace(",", ";").replace(".", ","),  # as a spreadsheet on the continent
+        LAB.replace(",", "\t"),
+        "# recorder 3, 500 Hz\n\n" + LAB,
+        "# " + LAB.replace(",", " "),  # numpy.savetxt
+        '"t";"f, in N"\n0,5;1,25\n1,5;-2,0\n'.replace("f, in N", "f"),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_csv_of_other_programs(tmp_path: Path, text: str, encoding: str) -> None:
+    path = tmp_path / "x.csv"
+    path.write_bytes(text.encode(encoding))
+    found = read_table(path).numbers(["t", "f"], 2, "here")
+    assert found.tolist() == [[0.5, 1.25], [1.5, -2.0]]
+
+
+def test_a_comma_between_whole_numbers_separates(tmp_path: Path) -> None:
+    table = read_table(write(tmp_path / "x.csv", "1,2\n3,4\n"), header=False)
+    assert table.numbers(["0", "1"], 2, "here").tolist() == [[1.0, 2.0], [3.0, 4.0]]
+
+
+def test_rows_after_comments_are_counted_from_the_file_s_first(tmp_path: Path) -> None:
+    table = read_table(write(tmp_path / "x.csv", "# a\n# b\nt,f\n0,1\n1,oops\n"))
+    with pytest.raises(DrakeTeleopError, match="'oops' in row 5"):
+        table.raw("f", "here")
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        ["2026-03-01T12:00:00.25", "2026-03-01T12:00:00.5"],
+        ["2026-03-01 12:00:00.25Z", "2026-03-01 12:00:00.5Z"],
+        ["12:00:00.25", "12:00:00.5"],
+    ],
+)
+def test_dates_and_times_of_day_are_seconds(tmp_path: Path, stamps: list[str]) -> None:
+    text = "t,f\n" + "".join(f"{stamp},1\n" for stamp in stamps)
+    t = read_table(write(tmp_path / "x.csv", text)).single("t", "here")
+    assert t[1] - t[0] == pytest.approx(0.25, abs=1e-6)
+    assert t[0] % 86400 == pytest.approx(43200.25, abs=1e-6)
+    pl.DataFrame({"t": stamps}).write_csv(tmp_path / "y.csv")
+    pl.read_csv(tmp_path / "y.csv", try_parse_dates=True).write_parquet(tmp_path / "y.parquet")
+    assert read_table(tmp_path / "y.parquet").single("t", "here").tolist() == t.tolist()

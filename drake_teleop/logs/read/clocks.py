@@ -75,6 +75,12 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     stamps = table.raw(time.column, f"{where}.column")
     if stamps.shape[1] != 1 or not np.isfinite(stamps).any():
         table.numbers([time.column], 1, f"{where}.column")
+    if time.unit != "s" and table.columns[str(time.column)].dtype.kind in "mM":
+        raise DrakeTeleopError(
+            "the column holds dates or times of day, which have no unit",
+            where=f"{where}.unit",
+            remedy="leave it out",
+        )
     t = stamps[:, 0] * UNITS[time.unit]
     rows = np.flatnonzero(np.isfinite(t))
     notes = []

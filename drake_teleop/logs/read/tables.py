@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError, reading
+from drake_teleop.logs.read.csv_text import read_csv
 
 if TYPE_CHECKING:
     import polars as pl
@@ -201,7 +202,8 @@ class Table:
         return DrakeTeleopError(
             f"{cell!r} in row {row + self.first_row} is not a number",
             where=f"{self.path}:{name}",
-            remedy="correct the cell or delete the row",
+            remedy="correct the cell or delete the row"
+            + (", if it holds units: the log description has them" if row == 0 else ""),
         )
 
 
@@ -239,11 +241,10 @@ def _read_frame(path: Path, header: bool) -> Table:
         lazy = _ParquetColumns(path, dict(zip(_stripped(names), names, strict=True)))
         small = len(names) * pl.scan_parquet(path).select(pl.len()).collect().item() <= _LARGE
         return Table(path, dict(lazy) if small else lazy)
-    frame = pl.read_csv(path, has_header=header, infer_schema_length=None)
+    frame, first_row = read_csv(path, header)
     names = [name if header else str(i) for i, name in enumerate(frame.columns)]
     found = [_frame_column(series) for series in frame.get_columns()]
-    columns = dict(zip(_stripped(names), found, strict=True))
-    return Table(path, columns, first_row=2 if header else 1)
+    return Table(path, dict(zip(_stripped(names), found, strict=True)), first_row)
 
 
 def _stripped(names: list[str]) -> list[str]:
@@ -270,6 +271,10 @@ class _ParquetColumns(UserDict[str, Any]):
 def _frame_column(series: pl.Series) -> NDArray:
     import polars as pl
 
+    if series.dtype == pl.Time:
+        series = series.cast(pl.Duration("ns"))
+    if series.dtype in (pl.Datetime, pl.Duration):
+        return series.to_numpy()
     # Floats keep their empty cells as NaN, which is reported with its row later on.
     return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
 
@@ -289,6 +294,9 @@ def _as_numbers(
 ) -> NDArray[np.float64]:
     if column.dtype.kind in "fiu":
         return column.astype(float, copy=False)
+    if column.dtype.kind in "mM":  # seconds, since 1970 or midnight
+        count = column.astype(f"{column.dtype.kind}8[ns]").astype(np.int64)
+        return np.where(np.isnat(column), np.nan, count * 1e-9)
     if column.dtype.kind == "c" and len(column):  # float() would drop half of it
         raise bad(0, column[0])
     numbers = np.empty(len(column))

@@ -1,0 +1,101 @@
+"""CSV files as recorders and spreadsheets write them: which separator, decimal sign, header.
+
+======================================== =========================================================
+in the file                              taken as
+======================================== =========================================================
+`;`, tab, or single spaces               the separator, where a line has no other; with the first
+                                         two a number may have a decimal comma
+lines before the header that begin       comments, but for one right before the numbers that has
+with `#`                                 as many names: the header, as `numpy.savetxt` writes it
+UTF-16 with its mark, UTF-8 with one     text, as spreadsheets save it
+dates and times of ISO 8601              numpy's datetime64 (a time of day: timedelta64)
+======================================== =========================================================
+"""
+
+from __future__ import annotations
+
+import codecs
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import polars as pl
+
+_LOOKED_AT = 2**16  # bytes that tell all this
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_QUOTED = re.compile('"[^"]*"')
+_DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
+
+
+def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
+    """The table in a CSV file, and the number of its first data row as a reader counts.
+
+    Args:
+        path: the file.
+        header: whether there are names.
+
+    Raises:
+        Exception: whatever polars says of what is no such file.
+    """
+    import polars as pl
+
+    with path.open("rb") as file:
+        head = file.read(_LOOKED_AT)
+    source: Path | bytes = path
+    if head.startswith(_UTF_16):
+        source = path.read_text("utf-16").encode()
+        head = source[:_LOOKED_AT]
+    lines = head.decode("utf-8", "replace").lstrip("\ufeff").splitlines()
+    before = _comments(lines)
+    rest = lines[before:]
+    separator = _separator(rest[0]) if rest else ","
+    names = _names_in_comment(lines[:before], rest, separator) if header else None
+    header = header and names is None
+    frame = pl.read_csv(
+        source,
+        has_header=header,
+        separator=separator,
+        decimal_comma=separator in ";\t" and _decimal_commas(rest, separator),
+        skip_lines=before,
+        infer_schema_length=None,
+        try_parse_dates=True,
+    )
+    if names is not None:
+        frame.columns = names
+    return frame, before + (2 if header else 1)
+
+
+def _comments(lines: list[str]) -> int:
+    """How many lines stand before the table."""
+    table = (i for i, line in enumerate(lines) if line.strip() and not line.startswith("#"))
+    return next(table, 0)
+
+
+def _separator(line: str) -> str:
+    bare = _QUOTED.sub("", line).strip()
+    if ";" in bare or "\t" in bare:
+        return ";" if ";" in bare else "\t"
+    return " " if "," not in bare and " " in bare and "  " not in bare else ","
+
+
+def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
+    """Of the last comment, if numbers follow it, one for each name."""
+    told = [line for line in comments if line.startswith("#")]
+    if not told or not all(_is_number(cell) for cell in rest[0].split(separator)):
+        return None
+    names = [name.strip() for name in told[-1].lstrip("# ").split(separator)]
+    alike = len(names) == len(rest[0].split(separator)) and len(set(names)) == len(names)
+    return names if alike else None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _decimal_commas(lines: list[str], separator: str) -> bool:
+    return any(_DECIMAL_COMMA.fullmatch(cell) for line in lines for cell in line.split(separator))
