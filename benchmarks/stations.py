@@ -3,7 +3,8 @@
 For each cell: the ideal sensor's force against the plant's reaction port; the mass that `identify`
 finds, and what elimination leaves of the peak inertial force; what the hand feels of the device and
 of sigma times the load, against (device + sigma k m_t), from forces and accelerations at 1.3 Hz;
-CPU time over the station's own bare plant, alone and with what it touches; simulated over CPU time.
+the largest force of contact, without which a wall shows nothing; CPU time over the station's own
+bare plant, alone and with what it touches; simulated over CPU time.
 
     python benchmarks/stations.py [--arms A,...] [--devices D,...] [--models DIR] [--json FILE]
 
@@ -36,12 +37,13 @@ from drake_teleop.reproduction.speed import MakeBarePlant, MakeMovingStation
 from drake_teleop.resources import models_dir
 from drake_teleop.run import run_scenario, summarise
 from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.slave.arm import forward_kinematics
 from drake_teleop.slave.plant import NominalSlave
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.tool import Ball, Tool
 
 _SIGMA, _PUSHED = 0.5, 1.3  # Hz
-_GAP = 0.072  # m, from the tip at the start to the leaf
+_DEEP = 0.005  # m, so far below the leaf is the tip's lower turn, as in Fig. 8
 _BEFORE = np.array([0.068, 0.0, -0.05])  # m, from the tip at the start to the block's foot
 _SCENARIOS = {
     "free motion": "free_motion_force",
@@ -89,7 +91,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     rows = []
-    columns = "port N", "mass %", "left %", "felt %", "cost", "with all", "rtf"
+    columns = "port N", "mass %", "left %", "felt %", "contact N", "cost", "with all", "rtf"
     print(f"{'arm':6s} {'device':20s} {'surroundings':12s}", *(f"{name:>10s}" for name in columns))
     for arm, device in product(arguments.arms.split(","), arguments.devices.split(",")):
         for surroundings, scenario in _scenarios(arm, device, arguments.models).items():
@@ -117,7 +119,10 @@ def _slave(arm: str, models: Path | None) -> Slave:
 
 
 def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario]:
-    """The tool moves as in the paper; a small device less, by a larger kinematic scale."""
+    """The tool moves as in the paper; a small device less, by a larger kinematic scale.
+
+    One hand leads each device less or farther: the leaf lies where the tip then comes down to.
+    """
     scenarios, slave = {}, _slave(arm, models)
     own = 1.0 if arm == "rx90" else 0.5
     for what, name in _SCENARIOS.items():
@@ -130,14 +135,11 @@ def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario
             for move in scenario.operator.intent
         ]
         tip = NominalSlave(slave).start_tip
-        if scenario.sheet_spring is not None and arm != "rx90":
-            below = (tip - [0.0, 0.0, own * _GAP]).tolist()
-            scenario = replace(scenario, sheet_spring__position=below)
         blocks = [
             dataclasses.replace(block, position=(tip + _BEFORE).tolist())
             for block in scenario.environment
         ]
-        scenarios[what] = replace(
+        changed = replace(
             scenario,
             slave=slave,
             environment=blocks,
@@ -145,12 +147,28 @@ def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario
             operator__intent=intent,
             kinematic_scaling__translation_scale=1 / share,
         )
+        if scenario.sheet_spring is not None and (arm, device) != ("rx90", PHANTOM):
+            leaf = _lowest(changed)
+            leaf[2] += own * _DEEP
+            changed = replace(changed, sheet_spring__position=leaf.tolist())
+        scenarios[what] = changed
     return scenarios
+
+
+def _lowest(scenario: Scenario) -> np.ndarray:
+    """Where the tip comes down to with nothing there [m, in W]."""
+    run = run_scenario(replace(scenario, sheet_spring=None), progress=False)
+    slave, tips, R_WS, p_WS = NominalSlave(scenario.slave), [], np.empty((3, 3)), np.empty(3)
+    for q in run.result["joint_position"]:
+        forward_kinematics(slave.arm.table, q, R_WS, p_WS)
+        tips.append(p_WS + R_WS @ slave.tip)
+    return min(tips, key=lambda tip: tip[2])
 
 
 def figures(scenario: Scenario, free: bool) -> dict[str, float | None]:
     """The row of one station; `felt` in free motion only."""
-    summary = summarise(run_scenario(scenario, progress=False))
+    run = run_scenario(scenario, progress=False)
+    summary = summarise(run)
     inertial = summary["peak_measured_force_N"]
     left = summary["residual_force_max_N"] if free else None
     makes = {
@@ -164,10 +182,15 @@ def figures(scenario: Scenario, free: bool) -> dict[str, float | None]:
         "mass_error_percent": summary["mass_error_percent"],
         "left_percent": None if left is None else 100 * left / inertial,
         "felt_error_percent": _felt_error(scenario) if free else None,
+        "contact_N": None if free else _hardest(run.result["true_contact_wrench_W"]),
         "cost_over_bare": seconds["whole"] / seconds["bare"],
         "cost_over_plant": seconds["whole"] / seconds["plant"],
         "real_time_factor": 1 / seconds["whole"],
     }
+
+
+def _hardest(contact_W: np.ndarray) -> float:
+    return float(np.linalg.norm(contact_W[:, :3], axis=1).max())
 
 
 def _felt_error(scenario: Scenario) -> float:
