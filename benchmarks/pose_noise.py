@@ -20,6 +20,7 @@ import argparse
 import json
 import time
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -154,14 +155,18 @@ def kinematics(q: Array, v: Array, vdot: Array) -> tuple[Array, Array, Array, Ar
     return R, p, omega, alpha, a
 
 
+@lru_cache(maxsize=12)
+def moved(motion: str, path: int, wrench_rate: float, rate: float) -> tuple[Array, ...]:
+    """Times of wrench and poses, and `kinematics` at both, one after the other."""
+    t, t_pose = np.arange(0.0, 60.0, 1 / wrench_rate), np.arange(0.0013, 60.0, 1 / rate)
+    both = np.concatenate([t, t_pose])
+    return t, t_pose, *kinematics(*MOTIONS[motion](np.random.default_rng([path, 7]), both))
+
+
 def record(case: Case, motion: str, seed: int) -> tuple[Array, Array, Poses]:
     """Times, wrench and poses of one record; 6 trajectories."""
     rng = np.random.default_rng([seed, len(motion)])
-    path = np.random.default_rng([seed % 6, 7])
-    t = np.arange(0.0, 60.0, 1 / case.wrench_rate)
-    t_pose = np.arange(0.0013, 60.0, 1 / case.rate)
-    both = np.concatenate([t, t_pose])
-    R, p, omega, alpha, a = kinematics(*MOTIONS[motion](path, both))
+    t, t_pose, R, p, omega, alpha, a = moved(motion, seed % 6, case.wrench_rate, case.rate)
     n = len(t)
     in_S = [np.einsum("nji,nj->ni", R[:n], x[:n]) for x in (a - GRAVITY_W, omega, alpha)]
     wrench = non_contact_wrench(*in_S, PHI)
@@ -297,8 +302,8 @@ def main() -> None:
                     ),
                     flush=True,
                 )
-    if arguments.json:
-        arguments.json.write_text(json.dumps(report, indent=2) + "\n")
+                if arguments.json:  # after each line: the whole takes long
+                    arguments.json.write_text(json.dumps(report, indent=2) + "\n")
 
 
 if __name__ == "__main__":
