@@ -48,7 +48,7 @@ def fit(sums, more, way, faster, keep):
 
 
 @njit(cache=True)
-def steadied(push, size, explained, share, across, mean):
+def steadied(push, size, explained, share, turned):
     """What is shown along a mean direction that friction has tilted.
 
     A tip that is held sideways by f tilts the mean of its wrench w by f / |w| at most. Where it
@@ -60,10 +60,24 @@ def steadied(push, size, explained, share, across, mean):
         size: what there is along the mean now, not negative [N].
         explained: what it should have changed by [N].
         share: of the rest that is shown now.
-        across: the largest friction of late [N].
-        mean: size of the mean wrench, above 0 [N].
+        turned: f^2 / |w|, of the largest friction of late [N].
     """
     push += explained
     push += min(share, 1.0) * (size - push)
-    turned = across * min(across / mean, 1.0)
     return min(max(push, size - turned, 0.0), size + turned)
+
+
+@njit(cache=True)
+def slipped(more, most, turned):
+    """What of a stretch's change of force friction explains, and so no stiffness.
+
+    A tip that slips changes the force where there is hardly any way. What a stiffness from 0 to a
+    certain one does not explain is friction's, up to what that can do.
+
+    Args:
+        more: change of the force [N].
+        most: what the stiffest would have changed it by, with the sign of the way [N].
+        turned: as in `steadied` [N].
+    """
+    rest = more - min(max(more, min(most, 0.0)), max(most, 0.0))
+    return min(max(rest, -turned), turned)

@@ -1,4 +1,4 @@
-"""Energy ledgers at the slave's actual motion, and motors that are held to them.
+"""Energy ledgers at the slave's actual motion, and motors that are held to them. (long: one law)
 
 With the hand's held wrench f, the contact's wrench w and the slave's *actual* motion x_s, hand and
 contact have put in E_act = -sum f_(k-1) . dx_m + integral w . dx_s. The hand's ledger L_m counts
@@ -54,11 +54,12 @@ At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
 
         h' = -k_h v_m + (w - w_n n - h) / tau,    |h| <= h_m u_n / w_n,
 
-    at rest what is measured too; k_h = 2.5 kN/m, h_m is the largest |w - w_n n| of about a second,
-    tau thirty round trips, but 0.6 s at least. Both means are so slow because what they pass on of
-    the slave's friction, a round trip late, moves the hand, and that turns the friction round: with
-    0.8 s and ten round trips the tip stuck and slipped on for good over 100 ms. Of w_n, what
-    friction alone explains is shown gradually, see S3.
+    at rest what is measured too; k_h = 2.5 kN/m, h_m is the largest |w - w_n n| of about a second
+    or of tau, tau thirty round trips, but 0.6 s at least: friction that fades while the hand rests
+    lets it move, and a round trip later the tip slips. Both means are so slow because what they
+    pass on of the slave's friction, a round trip late, moves the hand, and that turns the friction
+    round: with 0.8 s and ten round trips the tip stuck and slipped on for good over 100 ms. Of w_n,
+    what friction alone explains is shown gradually, see S3.
 :M3: The wall is remembered, so that fast taps are felt: while nothing else is heard,
     u_n = -k_c (x_m - x_w)_n. It is dropped when the slave was so deep in it that it should
     have met 1 N, 1 to 3 mm, and met nothing: a hard wall that has gone stops the hand before 3 mm;
@@ -68,7 +69,10 @@ At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
 :M5: u may spend a share of L_m; what was shortened comes back in 20 ms. With L_m at its end there
     is a force only at steps in which the hand is seen to move against it, likewise for M6: a
     reversal is seen late, by a step of the encoder at least, and nothing could pay for it.
-:M6: Drag on the hand until both reserves are full, and on one that was pushed, while it is fast.
+:M6: Drag on the hand, from where a reserve is below 0.3 of itself (in contact: L_m below R_m) until
+    both are full; what was sent counts as there. A wall that goes keeps what was put into it, and
+    is to be felt no longer than the news takes. Drag, too, on a hand that was pushed since it last
+    rested, while it is fast.
 :M7: What L_m has beyond its reserve R_m (in contact R_m + 0.7 R_s) is sent.
 
 Translation and rotation are two groups with a ledger each; what is touched is one for both. Where
@@ -157,7 +161,7 @@ _OVER = 1.1  # of k_c: a wall that is taken for too stiff is stable, for too sof
 _STIFFEST, _SOFTEST = 2500.0, 50.0  # N/m that are predicted with at most; that make a wall
 _LEAD = 2.0  # steps, by which the hand is led: half a step in theory, but velocity is filtered
 _ONSET = 0.3  # s, in which o fades
-_FORGET = 1.0  # s, of the largest friction
+_FORGET = 1.0  # s, of the largest friction, at least: h goes over to what is measured, not to 0
 _PATIENCE = 30.0  # round trips, in which friction at the hand goes over to what is measured
 _PREDICTED = 3.0  # N, beyond twice the wrench: more is no prediction
 _REMEMBERED = 10.0  # N, the most that a remembered wall pushes with
@@ -172,6 +176,9 @@ _DRAIN = 50.0  # 1/s, share of the ledger that the wrench may spend
 _RETURN = 0.02  # s, in which a shortened wrench comes back
 _START = 5.0  # m/s^2, by which a hand may be faster at the next step
 _FADING = 0.02  # m/s, below it drag fades
+_RESTED = 0.1  # s at rest, after which nothing is braked for what was given before
+# Of a reserve: without contact drag begins below the one, and ends at the other, but for rounding.
+_LOW, _FULL = 1.0 - PASSED, 1.0 - 1e-9
 _BRAKE, _BRAKED = 0.5, 0.1  # N and m/s: what was pushed is braked with so much, down to this speed
 
 # Memory as at the head of `ledger_slave`: filtered velocity, whether something is touched, what it
@@ -185,6 +192,7 @@ _WALL, _DEPTH, _MISSED = _places.number(), _places.number(), _places.number()
 _RUBBING, _FRICTION = _places.vector(6), _places.vector(2)
 # What the force gave since it last came to rest; share of the wrench that is withheld.
 _GIVEN, _WITHHELD = _places.vector(2), _places.vector(2)
+_CHARGING = _places.vector(2)  # whether drag earns what a reserve lacks
 # The newest packet; whether the wrench still goes over, after some were missing or what is touched
 # has changed; the last wrench, before it was paid for.
 _NEWEST, _MISSING, _LAST = _places.number(), _places.vector(2), _places.vector(6)
@@ -266,14 +274,14 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         _approach(g, T, p, memory, wrench)
         limit(wrench, g, limits[g])
         _afford(g, dx, T, p, memory, wrench)
-        _drag(g, received, dx, T, p, memory, wrench)
-        limit(wrench, g, limits[g])
         level = p[HAND_RESERVE][g]
         if memory[TOUCHED] > 0.0:
             level += PASSED * p[RESERVE][g]
         surplus = max(memory[LEDGER][g] - level, 0.0)
         memory[SENT][g] += surplus
         memory[LEDGER][g] -= surplus
+        _drag(g, received, dx, T, p, memory, wrench)
+        limit(wrench, g, limits[g])
         packet[ENERGY][g], packet[LEVEL][g] = memory[SENT][g], memory[LEDGER][g]
     put(memory, HELD.start, wrench, 0, 6)
     fill(pose, velocity, wrench, packet)
@@ -362,7 +370,8 @@ def _rub(g, T, size, pressed, shown, received, dx, p, memory):
         total += part * part
         rubbing[i] += share * (part - rubbing[i])
         rubbing[i] -= spring * (dx[i] - way * metric * normal[i])
-    most[g] = max(most[g] * (1.0 - min(T / _FORGET, 1.0)), math.sqrt(total))
+    forgets = min(T / max(_FORGET, _PATIENCE * received[TRIP]), 1.0)
+    most[g] = max(most[g] * (1.0 - forgets), math.sqrt(total))
     limit(rubbing, g, pressed * most[g])
 
 
@@ -418,11 +427,19 @@ def _earning(g, dx, T, p, memory):
 @njit(cache=True)
 def _drag(g, received, dx, T, p, memory, wrench):
     """M6: adds drag."""
-    velocity, drag = memory[VELOCITY_HERE], 0.0
-    speed, touched = length(velocity, g), memory[TOUCHED] > 0.0
-    poor = received[LEVEL][g] < p[RESERVE][g] and not touched
-    if memory[LEDGER][g] < p[HAND_RESERVE][g] or poor:
+    velocity, drag, charging = memory[VELOCITY_HERE], 0.0, memory[_CHARGING]
+    speed, own = length(velocity, g), memory[LEDGER][g] / p[HAND_RESERVE][g]
+    # What has been sent counts as there: to hear of it takes a round trip.
+    least = min(own, (received[LEVEL][g] + memory[SENT][g]) / p[RESERVE][g])
+    touched = memory[TOUCHED] > 0.0
+    if (touched and own < _FULL) or (not touched and least < _LOW):
+        charging[g] = 1.0
+    elif touched or least >= _FULL:
+        charging[g] = 0.0
+    if charging[g] > 0.0:
         drag = p[DRAG][g]
+    if speed < _FADING * ARM[g]:
+        memory[_GIVEN][g] *= 1.0 - min(T / _RESTED, 1.0)
     if memory[_GIVEN][g] > 0.0 and speed > _BRAKED * ARM[g]:
         drag = max(drag, _BRAKE * LEVER[g])
     drag *= _earning(g, dx, T, p, memory)

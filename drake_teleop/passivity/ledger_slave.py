@@ -1,4 +1,4 @@
-"""The slave's end of the method `ledger`, see `drake_teleop.passivity.ledger`.
+"""The slave's end of `ledger`, see `drake_teleop.passivity.ledger`. (long: one end's steps)
 
 At each step, w the contact's wrench, l what is felt of the load, x and v the slave's actual motion,
 m, K, D mass and servo as they are believed, all in the master's power units:
@@ -19,6 +19,7 @@ m, K, D mass and servo as they are believed, all in the master's power units:
     tenth: it moves the slave, and friction makes a new k of that. Friction that lasts tilts n, and
     where it lets go w_n steps by as much as f^2 / |w|, f the largest across n of about a second.
     A step up to that which k and b do not explain is shown in 0.6 s, or over 1 mm of way.
+    It is no stiffness either: of a stretch's change of force what neither 0 nor 2 k explains.
 :S4: The command follows the target with bounded acceleration, and m v^2 / 2 <= L_s.
 :S5: Motors that push with the motion, f . v > 0, spend at most what A holds in 4 ms; pressing on
     the wall what was paid since the onset, Q, and c F_u^2 / 2 k that nobody paid. With A at its end
@@ -33,7 +34,7 @@ from __future__ import annotations
 import math
 
 from drake_teleop._compiled import njit
-from drake_teleop.passivity.contact_fit import SUMS, fit, steadied
+from drake_teleop.passivity.contact_fit import SUMS, fit, slipped, steadied
 from drake_teleop.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -239,7 +240,8 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for g in range(2):
         size = length(memory[NORMAL], g)
         yields += size * size / (_STIFF * p[STIFFNESS][g])
-        packet[ENERGY][g], packet[LEVEL][g] = memory[SENT][g], memory[LEDGER][g]
+        packet[ENERGY][g] = memory[SENT][g]
+        packet[LEVEL][g] = memory[LEDGER][g] - memory[RECEIVED][g]
     packet[CONTACT_DAMPING], packet[TRIP] = memory[_DAMPER], memory[_ROUND_TRIP]
     packet[CONTACT_STIFFNESS] = memory[_SHARE] * k / (1.0 + k * yields)
 
@@ -297,7 +299,7 @@ def _learn(touched, dx, wrench, T, p, memory):
         return
     normal, k, velocity = memory[NORMAL], memory[_STIFFNESS], memory[VELOCITY_HERE]
     size = find_direction(wrench, memory[_ROUND_TRIP], T, p, memory)
-    most = _shown_at_most(T, p, memory)
+    most, turned = _shown_at_most(T, p, memory), _turns(wrench, size, T, p, memory)
     inward, rate = -over_way(normal, dx), min(T / _FILTER, 1.0)
     speed = -over_way(normal, velocity)
     if memory[_SMOOTHED] == 0.0:
@@ -316,8 +318,11 @@ def _learn(touched, dx, wrench, T, p, memory):
     if far > (_STRETCH if slow else _LONG):
         memory[_LEARNT] = min(memory[_LEARNT] + far, _KNOWN)
         keep = max(1.0 - far / max(memory[_LEARNT], _LEARN), 0.0) if slow else 0.5
-        more = memory[_SMOOTHED] - memory[_ANCHOR]
-        k, damper = fit(memory[_SUMS], more, memory[_WAY], speed - memory[_FAST], keep)
+        faster = speed - memory[_FAST]
+        more = memory[_SMOOTHED] - memory[_ANCHOR] - memory[_DAMPER] * faster
+        more -= slipped(more, max(2.0 * k, _SHOWN) * memory[_WAY], turned)
+        more += memory[_DAMPER] * faster
+        k, damper = fit(memory[_SUMS], more, memory[_WAY], faster, keep)
         memory[_STIFFNESS], memory[_DAMPER] = k, damper
         memory[_WAY], memory[_ANCHOR], memory[_FAST] = 0.0, memory[_SMOOTHED], speed
     if k > 1.0:  # N/m: something is known
@@ -330,14 +335,20 @@ def _learn(touched, dx, wrench, T, p, memory):
             memory[_INSIDE] = deep
         memory[_INSIDE] += inward + rate * (deep - memory[_INSIDE] - inward)
         memory[TOUCHED] = 1.0
+    explained = memory[_STIFFNESS] * inward + memory[_DAMPER] * (speed - memory[_BEFORE])
+    rate = T / _TILTED + abs(inward) / _LEARN
+    memory[_PUSH] = steadied(memory[_PUSH], size, explained, rate, turned)
+    memory[_BEFORE] = speed
+
+
+@njit(cache=True)
+def _turns(wrench, size, T, p, memory):
+    """f^2 / |w| of S3: what friction that lets go changes the wrench along n by at most [N]."""
     pushed = memory[PUSHED]
     mean = max(math.sqrt(along(pushed, pushed, p)), 1e-12)
     rubs = math.sqrt(max(along(wrench, wrench, p) - size * size, 0.0))
     memory[_ACROSS] = max(memory[_ACROSS] * (1.0 - min(T / _RUBBED, 1.0)), rubs)
-    explained = memory[_STIFFNESS] * inward + memory[_DAMPER] * (speed - memory[_BEFORE])
-    rate = T / _TILTED + abs(inward) / _LEARN
-    memory[_PUSH] = steadied(memory[_PUSH], size, explained, rate, memory[_ACROSS], mean)
-    memory[_BEFORE] = speed
+    return memory[_ACROSS] * min(memory[_ACROSS] / mean, 1.0)
 
 
 @njit(cache=True)

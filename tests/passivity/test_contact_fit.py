@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.passivity.contact_fit import SUMS, fit
+from drake_teleop.passivity.contact_fit import SUMS, fit, slipped
 
 
 def found(stiffness, damping, way, faster, keep=0.8):
@@ -39,3 +39,13 @@ def test_what_cannot_be_told_apart_is_a_spring_and_the_past_is_forgotten():
 
 def test_neither_is_negative():
     assert fit(np.zeros(SUMS), -1.0, 1e-3, 0.1, 0.5) == (0.0, pytest.approx(0.0, abs=1e-9))
+
+
+def test_a_slip_is_no_stiffness_and_a_stop_that_is_struck_is_one():
+    """Of what a way of 0.2 mm changes: up to 0.12 N are a spring's, 0.4 N at most friction's."""
+    for sign in (1.0, -1.0):
+        assert sign * slipped(sign * 0.1, sign * 0.12, 0.4) == 0.0
+        assert sign * slipped(sign * 0.4, sign * 0.12, 0.4) == pytest.approx(0.28)
+        assert sign * slipped(-sign * 0.1, sign * 0.12, 0.4) == pytest.approx(-0.1)
+        assert sign * slipped(sign * 2.0, sign * 0.12, 0.4) == pytest.approx(0.4)
+        assert slipped(sign * 2.0, sign * 0.12, 0.0) == 0.0

@@ -98,6 +98,19 @@ def test_friction_is_of_the_hands_own_motion_and_at_rest_what_is_measured():
     np.testing.assert_allclose(hand.rest(400), np.zeros(6), atol=1e-9)
 
 
+def test_friction_does_not_fade_under_a_hand_that_rests():
+    """Over 600 ms what the slave measures now is less than what holds the hand."""
+    hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
+    hand.packet[TRIP] = 0.6
+    hand.rest(1500)
+    hand.packet[WRENCH][1] = -0.6
+    for _ in range(20):
+        held = hand.step([0.0, 5e-5, 0.0, 0.0, 0.0, 0.0])[1]
+    hand.packet[WRENCH][1] = -0.3
+    assert held == pytest.approx(-0.6, rel=0.1)
+    assert hand.rest(1500)[1] == pytest.approx(held, rel=0.2)
+
+
 def test_a_tip_that_sticks_and_slips_does_not_drive_the_hand():
     """Three times a second to and fro on what is touched, as before a stiff leaf over `internet`.
 
