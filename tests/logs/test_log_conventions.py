@@ -314,20 +314,28 @@ def test_for_comparisons_a_log_is_thinned_to_means_whatever_tells_its_time(
         assert log.wrench[0, 0] == pytest.approx(0.004)
 
 
-@pytest.mark.parametrize(("left", "refused"), [(0.45, False), (0.55, True)])
+@pytest.mark.parametrize(
+    ("left", "moves", "refused"),
+    [
+        (0.45, 1.0, ""),
+        (0.55, 1.0, "55 % of the wrench's variance are left"),
+        (0.55, 0.1, "hardly moves or turns"),  # no reason to doubt the axes
+    ],
+)
 def test_a_load_that_explains_less_than_half_is_refused_if_there_is_a_reason(
-    monkeypatch: pytest.MonkeyPatch, left: float, refused: bool
+    monkeypatch: pytest.MonkeyPatch, left: float, moves: float, refused: str
 ) -> None:
     rng = np.random.default_rng(0)
     wrench, still = rng.normal(size=(200, 6)), np.tile([0.0, 0.0, 9.8], (200, 1))
-    log = Log(np.arange(200) * 0.01, wrench, still, 0 * still, 0 * still)
+    moving = still + moves * rng.normal(size=(200, 3))
+    log = Log(np.arange(200) * 0.01, wrench, moving, 0 * still, 0 * still)
     reason = Finding("axes", "two axes of the wrench are exchanged")
     monkeypatch.setattr(conventions, "check_log", lambda path: SimpleNamespace(findings=(reason,)))
     load: Any = SimpleNamespace(mass=1.0, identifiable=np.ones(16, bool))
     # Of a residual that is this share of the wrench's standard deviation everywhere.
     predicted = (1 - np.sqrt(left)) * wrench
     if refused:
-        with pytest.raises(DrakeTeleopError, match="55 % of the wrench's variance are left"):
+        with pytest.raises(DrakeTeleopError, match=refused):
             conventions.question_fit(Path("log"), log, load, predicted, 0.0)
     else:
         assert conventions.question_fit(Path("log"), log, load, predicted, 0.0) == (reason,)

@@ -35,6 +35,8 @@ from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 
+_STILL = 0.3, 0.1
+"""Specific force [m/s^2] and angular velocity [rad/s], rms, below which nothing is said of axes."""
 NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
 
 
@@ -104,6 +106,8 @@ def question_fit(
         return tuple(found)
     negative = load.mass < 0 and bool(load.identifiable[6])
     worthless = negative or unexplained > 0.5 or any(f.name == "units" for f in found)
+    if worthless and not log.static:
+        _check_moves(log)
     if found and worthless:
         what = f"the fitted mass is {load.mass:.4g} kg"
         if not negative:
@@ -117,6 +121,19 @@ def question_fit(
             remedy="set `sign: -1` in the log description (or remove it if it is there)",
         )
     return tuple(found)
+
+
+def _check_moves(log: Log) -> None:
+    """Refuses a record at rest: any unit, axis and sign explains it as badly as any other."""
+    s, omega = (np.linalg.norm(x.std(axis=0)) for x in (log.specific_force, log.angular_velocity))
+    if s < _STILL[0] and omega < _STILL[1]:
+        seconds = log.t[-1] - log.t[0]
+        raise DrakeTeleopError(
+            f"in {seconds:.2g} s the sensor hardly moves or turns ({s:.2g} m/s^2, {omega:.2g} rad/s"
+            " rms): a load cannot be told from offsets",
+            where=log.source,
+            remedy="record 10 s of brisk turns about all axes, as `drake-teleop excite` designs",
+        )
 
 
 def _doubted(path: Path, log: Log) -> bool:
