@@ -90,4 +90,11 @@ assert abs(felt[1.0][free].mean() + 0.76 * 9.81) < 0.5
 wall = runs[0.0]["true_contact_wrench_W"][held, 2].mean()
 assert wall > 4.0 and abs(felt[0.0][held].mean() / wall - 1) < 0.02
 """,
+    "06_drive": """
+assert same and np.array_equal(np.diff(log.t) > 0.0, np.ones(len(log.t) - 1, bool))
+assert felt[300:800].max() > 1.5 and felt[1100:1550].max() < 0.1 < felt[2300]
+changed = slice(2395, None)  # to the internet and a method
+assert np.abs(np.diff(felt[changed])).max() < 0.02
+assert np.linalg.norm(np.diff(log["pose_received"][2398:2403, 4:], axis=0), axis=1).max() < 1e-4
+""",
 }
