@@ -33,6 +33,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import Tolerance, read_tolerance, sizes_of, values_of
 from drake_teleop.robots.calibrate import calibrate
 from drake_teleop.robots.calibration import Look
+from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import Reading
 
 Array = NDArray[np.float64]
@@ -163,7 +164,7 @@ def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
         rng = np.random.default_rng([k, len(name)])
         phi = load_of(rng)
         stream = stream_of(rng, phi, t, motion or hand(rng, t))
-        looks, _ = calibrate(stream, folder / "log.parquet", tolerance)
+        looks = calibrate(stream, Recorder(), folder / "log.parquet", tolerance)
         for at in looks:
             if at.found is not None:
                 wrong = np.array(judged(at, tolerance, phi)["error"]) > 1.0

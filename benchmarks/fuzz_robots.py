@@ -16,6 +16,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD, NetFtSource
+from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.ros2 import attachment, types
 from drake_teleop.robots.ros2_source import KINDS, Messages
 from drake_teleop.robots.rtde import parts_of
@@ -94,7 +95,7 @@ def netft_wrenches(path: Path) -> None:
             yield Part(IMU, k, DT * k, still)
             yield source.part(packet, DT * k)
 
-    _checked(Assembly(_Told(WRENCH), _Told(IMU)), parts())
+    _checked(Assembly(Parts(_Told(WRENCH), _Told(IMU))), parts())
     source._socket.close()
 
 
@@ -102,7 +103,7 @@ def rtde_wrenches(path: Path) -> None:
     """Samples of RTDE."""
     whole = [each for each in _pieces(path.read_bytes(), SAMPLE.size) if len(each) == SAMPLE.size]
     parts = (part for each in whole for part in parts_of(SAMPLE.unpack(each), DT, -1.0))
-    _checked(Assembly(_Told(WRENCH, POSE)), parts)
+    _checked(Assembly(Parts(_Told(WRENCH, POSE))), parts)
 
 
 _SIZES = {name: len(_message(name, 0)) for name in KINDS}
@@ -116,7 +117,7 @@ def ros_wrenches(path: Path) -> None:
         for name, size in _SIZES.items():
             message, content = content[:size], content[size:]
             parts += _MESSAGES.parts(name, message[:-_SENT], message[-_SENT:])
-    _checked(Assembly(_Told(WRENCH, POSE)), iter(parts))
+    _checked(Assembly(Parts(_Told(WRENCH, POSE))), iter(parts))
 
 
 def _pieces(content: bytes, size: int) -> list[bytes]:

@@ -384,25 +384,10 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
 )
 @click.option(
     "--rate",
+    "rate_hz",
     type=option.Number(0, 1e5, min_open=True),
     metavar="HZ",
     help="Of the wrenches; a log, a UR and a NetBox tell their own.",
-)
-@click.option("--motion", metavar="SOURCE", help="Who tells the motion, if SOURCE does not.")
-@click.option(
-    "--sensor-pose",
-    nargs=6,
-    type=option.Number(-1e3, 1e3),
-    metavar="X Y Z ROLL PITCH YAW",
-    help="Of the sensor in the frame whose poses come [m, deg].",
-)
-@click.option(
-    "--range",
-    "largest",
-    type=option.Number(0, 1e5, min_open=True),
-    nargs=2,
-    metavar="N NM",
-    help="Of the sensor: at its ends there is no wrench, and none that goes out is above it.",
 )
 @click.option("--predicted", is_flag=True, help="Extrapolate over the low-pass's lag.")
 @click.option("--watch", is_flag=True, help="Flag contact, and another load than the known one.")
@@ -413,27 +398,8 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
     metavar="PORT",
     help="Of 127.0.0.1, for the word `tare` by UDP.",
 )
-@click.option("--real-time", is_flag=True, help="Replay a log in its own time.")
-@option.cutoff
-@option.delay
-def compensate(
-    source: str,
-    load: Path,
-    sink: str,
-    sigma: float,
-    gamma: float,
-    rate: float | None,
-    motion: str | None,
-    sensor_pose: tuple[float, ...] | None,
-    largest: tuple[float, float] | None,
-    predicted: bool,
-    watch: bool,
-    tare: bool,
-    control: int | None,
-    real_time: bool,
-    cutoff_hz: float,
-    delay: float | str,
-) -> None:
+@option.stream
+def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     """Take the load out of a live wrench.
 
     SOURCE is udp://[HOST]:PORT, rtde://HOST, netft://HOST, zenoh://HOST/TOPIC, - for lines of JSON
@@ -444,24 +410,7 @@ def compensate(
     """
     from drake_teleop.robots.compensate import compensate_command
 
-    compensate_command(
-        source,
-        load,
-        sink,
-        sigma=sigma,
-        gamma=gamma,
-        rate_hz=rate,
-        motion=motion,
-        sensor_pose=sensor_pose,
-        largest=largest,
-        predicted=predicted,
-        watch=watch,
-        tare=tare,
-        control=control,
-        real_time=real_time,
-        cutoff_hz=cutoff_hz,
-        delay=delay,
-    )
+    compensate_command(source, load, sink, **options)
 
 
 @cli.command()
@@ -474,36 +423,16 @@ def compensate(
     help="What is to be known, and how well; what is left out is not asked.",
 )
 @click.option(
-    "--range",
-    "largest",
-    type=option.Number(0, 1e5, min_open=True),
-    nargs=2,
-    metavar="N NM",
-    help="Of the sensor: readings at its ends are left out.",
-)
-@click.option(
     "--seconds",
     type=option.Number(1, 36000),
     default=120.0,
     show_default=True,
     help="Of the record, at most.",
 )
-@click.option("--real-time", is_flag=True, help="Replay a log in its own time.")
+@option.stream
 @option.out("calibrate")
-@option.cutoff
-@option.delay
 @option.quiet
-def calibrate(
-    source: str,
-    until: str,
-    largest: tuple[float, float] | None,
-    seconds: float,
-    real_time: bool,
-    out: Path,
-    cutoff_hz: float,
-    delay: float | str,
-    quiet: bool,
-) -> int:
+def calibrate(source: str, out: Path, **options: Any) -> int:
     """Identify a load from a live stream, guided.
 
     SOURCE is as for `compensate`. Move the tool by hand or by the motion of `excite`, and touch
@@ -512,17 +441,7 @@ def calibrate(
     """
     from drake_teleop.robots.calibrate import calibrate_command
 
-    summary = calibrate_command(
-        source,
-        out,
-        until=until,
-        largest=largest,
-        seconds=seconds,
-        real_time=real_time,
-        cutoff_hz=cutoff_hz,
-        delay=delay,
-        quiet=quiet,
-    )
+    summary = calibrate_command(source, out, **options)
     return 0 if summary["all_known"] else 1
 
 

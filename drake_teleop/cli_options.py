@@ -156,6 +156,34 @@ delay = click.option(
     help="Motion behind the wrench, in seconds, or estimated.",
 )
 
+
+def stream(command: Callable[..., Any]) -> Callable[..., Any]:
+    """What all that read a live SOURCE take."""
+    for option in (
+        delay,
+        cutoff,
+        click.option("--real-time", is_flag=True, help="Replay a log in its own time."),
+        click.option(
+            "--range",
+            "largest",
+            type=Number(0, 1e5, min_open=True),
+            nargs=2,
+            metavar="N NM",
+            help="Of the sensor: what is at its ends is not used, and nothing above it goes out.",
+        ),
+        click.option(
+            "--sensor-pose",
+            nargs=6,
+            type=Number(-1e3, 1e3),
+            metavar="X Y Z ROLL PITCH YAW",
+            help="Of the sensor in the frame whose poses come [m, deg].",
+        ),
+        click.option("--motion", metavar="SOURCE", help="Who tells the motion, if not SOURCE."),
+    ):
+        command = option(command)
+    return command
+
+
 gripper = click.option(
     "--gripper",
     type=PATH,

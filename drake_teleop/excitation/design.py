@@ -3,7 +3,8 @@
 From random candidates, the best first: L-BFGS with the limits as penalties brings each near, then
 SLSQP with one smooth-maximum constraint for each kind of limit; both with the analytic gradients
 of `problem.py`. The best iterates that respect all limits on the optimiser's grid are kept, since
-SLSQP often ends on one that does not. Nothing here is a verdict: `check.py` is.
+SLSQP often ends on one that does not. A problem may bound a descent, where SLSQP would go too far
+and not come back; it is repeated from its end then. Nothing here is a verdict: `check.py` is.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ _TOLERANCE = 1e-5
 # A start is given up without a feasible iterate after so many evaluations, and after the first
 # stage of SLSQP if it is not within this factor of the best.
 _PATIENCE, _PROMISING = 250, 1.08
+# Where the problem bounds how far a descent goes, it is repeated while it is worth so much.
+_WORTH = 0.995
 
 
 @dataclass(frozen=True)
@@ -142,23 +145,35 @@ class _Search:
             options = {"maxiter": iterations}
             stage = (of_criterion, of_maxima, weight)
             x = self._minimize(self._penalised, x, stage, "L-BFGS-B", jac=True, options=options).x
-        for k, (*sharpness, iterations) in enumerate(_DESCENT):
-            if k > 0 and self._best_of_start > _PROMISING * self._best:
+        step_by_step = self._problem.bounds(x) is not None
+        for k, stage_of in enumerate(_DESCENT):
+            hopeless = self._best_of_start > _PROMISING * self._best
+            if k > 0 and hopeless and not step_by_step:
                 return
-            x = self._minimize(
-                lambda x, *sharpness: self._at(x, *sharpness).log_criterion,
-                x,
-                tuple(sharpness),
-                "SLSQP",
-                jac=lambda x, *sharpness: self._at(x, *sharpness).gradients[0],
-                constraints={
-                    "type": "ineq",
-                    "fun": lambda x, *sharpness: MARGIN - self._at(x, *sharpness).uses,
-                    "jac": lambda x, *sharpness: -self._at(x, *sharpness).gradients[1:],
-                    "args": tuple(sharpness),
-                },
-                options={"maxiter": iterations, "ftol": _TOLERANCE},
-            ).x
+            x = self._descended(x, *stage_of)
+        before = float("inf")
+        while step_by_step and self._best_of_start < _WORTH * before:
+            before = self._best_of_start
+            x = self._descended(x, *_DESCENT[-1])
+
+    def _descended(self, x: Array, of_criterion: float, of_maxima: float, iterations: int) -> Array:
+        """Where SLSQP ends."""
+        found: Array = self._minimize(
+            lambda x, *sharpness: self._at(x, *sharpness).log_criterion,
+            x,
+            (of_criterion, of_maxima),
+            "SLSQP",
+            jac=lambda x, *sharpness: self._at(x, *sharpness).gradients[0],
+            bounds=self._problem.bounds(x),
+            constraints={
+                "type": "ineq",
+                "fun": lambda x, *sharpness: MARGIN - self._at(x, *sharpness).uses,
+                "jac": lambda x, *sharpness: -self._at(x, *sharpness).gradients[1:],
+                "args": (of_criterion, of_maxima),
+            },
+            options={"maxiter": iterations, "ftol": _TOLERANCE},
+        ).x
+        return found
 
     def _penalised(
         self, x: Array, of_criterion: float, of_maxima: float, weight: float

@@ -20,6 +20,8 @@ from drake_teleop.excitation.limits import (
 from drake_teleop.load.trajectory import FourierTrajectory
 
 Array = NDArray[np.float64]
+Bounds = list[tuple[float | None, float | None]]
+"""Of each unknown, least and largest; None: none."""
 
 # Samples of a period for each harmonic.
 _SAMPLES = 24
@@ -102,6 +104,10 @@ class Problem:
         if not near_home:
             q0 = limits.q_middle + 0.6 * limits.q_half * rng.uniform(-1, 1, len(size))
         return np.concatenate([q0, spread * rng.standard_normal(len(spread))])
+
+    def bounds(self, x: Array) -> Bounds | None:
+        """Within which a descent from x stays; None: anywhere."""
+        return None
 
     def evaluate(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
         """Criterion and limits at x; sharpness of the criterion and of the smooth maxima."""

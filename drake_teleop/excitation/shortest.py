@@ -34,7 +34,7 @@ from drake_teleop.excitation.limits import (
     sensor_vectors,
 )
 from drake_teleop.excitation.prediction import predicted_covariance
-from drake_teleop.excitation.problem import Evaluation, Problem, Task
+from drake_teleop.excitation.problem import Bounds, Evaluation, Problem, Task
 from drake_teleop.excitation.robot import Robot
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.regressor import regressor
@@ -43,17 +43,20 @@ from drake_teleop.load.trajectory import FourierTrajectory
 
 RELIABLE = 0.95
 """Share of the records in which all asked numbers are to be within their tolerances at once."""
-# Periods that are tried first and last [s].
-_SHORTEST, _LONGEST = 0.2, 20.0
-# Rounds of the search at most, how many of them are to reach what is asked, and by how much more
-# than needed is asked when one fell short.
-_ROUNDS, _REACH, _MORE = 10, 3, 1.005
+# The longest period [s]; the highest harmonic of the shortest [Hz]: half of what the low-pass of
+# `identify` lets through, and more than most joint control follows.
+_LONGEST, _FASTEST = 20.0, 15.0
+# Of log T, in one descent: SLSQP, which sees straight lines, would go to nothing, and not return.
+_STEP = 0.15
+# Rounds of the search at most; how many that reach what is asked may come without one that is
+# shorter by this share; and by how much more than needed is asked when one fell short.
+_ROUNDS, _IN_VAIN, _SHORTER, _MORE = 20, 3, 0.995, 1.005
 # Rounds that find nothing, after which there is nothing.
 _LOST = 3
 # What misses by more is no place to begin from; then the search looks everywhere, with so many
 # times as many starts.
 _NEAR = 1.5
-_EVERYWHERE = 2
+_EVERYWHERE = 10
 # Between the seeds of rounds: each has candidates of its own.
 _OTHER = 2**33
 # Later rounds look around what was found: share of the coefficients, and of the period.
@@ -91,7 +94,7 @@ def shortest(
         tolerance: of its heaviest load.
         harmonics: N of Eq. (9).
         seed, progress: see `design`.
-        starts: of `design`, for searches around what was found; twice that where nothing was yet.
+        starts: of `design`, for searches around what was found; ten times that where nothing was.
 
     Raises:
         DrakeTeleopError: if nothing within the limits reaches it in `_LONGEST` seconds.
@@ -108,10 +111,11 @@ def shortest(
     )
     worst, around = np.inf, None
     best: Shortest | None = None
-    reaching, lost = 0, 0
+    in_vain, lost = 0, 0
     for k in range(_ROUNDS):
         problem = ShortestProblem(task, errors * factor[:, np.newaxis], robot, around)
-        many = _EVERYWHERE * starts if around is None else starts
+        # The first round only tells what noise there is beside that of the wrench.
+        many = _EVERYWHERE * starts if k > 0 and around is None else starts
         found = design(problem, seed=seed + _OTHER * k, starts=many, progress=progress)
         found = [each for each in found if each.value <= _LONGEST]
         if not found:
@@ -125,11 +129,13 @@ def shortest(
         reached = deviations_of(errors, covariance)
         worst = float(reached.max())
         around = problem.best if worst < _NEAR else None
-        if worst <= 1.0 and (best is None or trajectory.period < best.excitation.trajectory.period):
-            best = Shortest(_excitation(robot, trajectory, covariance, uses, found), reached)
-        reaching += worst <= 1.0
-        if reaching == _REACH:
-            break
+        if worst <= 1.0:
+            least = np.inf if best is None else best.excitation.trajectory.period
+            in_vain = 0 if trajectory.period < _SHORTER * least else in_vain + 1
+            if trajectory.period < least:
+                best = Shortest(_excitation(robot, trajectory, covariance, uses, found), reached)
+            if in_vain == _IN_VAIN:
+                break
         seen = problem.deviations(motion, trajectory.period)
         now = factor * (reached / seen)
         # Not less than before, where a round fell short: else it might go to and fro.
@@ -191,7 +197,7 @@ class ShortestProblem(Problem):
         self._density = robot.noise.white[:6]
         samples, n = self._vectors.shape[1], len(task.home)
         self._gradients = np.empty((2 + len(LIMITS), 3, samples, n))
-        self._period = 1.0
+        self._period, self._shortest = 1.0, task.harmonics / _FASTEST
 
     def trajectory(self, x: Array) -> FourierTrajectory:
         """The trajectory that x stands for."""
@@ -204,17 +210,24 @@ class ShortestProblem(Problem):
             x = self._around + np.append(other * rng.standard_normal(len(self._around) - 1), 0.0)
             x[-1] += np.log(_PERIODS) * rng.uniform(-1.0, 1.0)
             return x
-        period = float(np.exp(rng.uniform(np.log(2 * _SHORTEST), np.log(0.5 * _LONGEST))))
+        period = float(np.exp(rng.uniform(np.log(2 * self._shortest), np.log(0.5 * _LONGEST))))
         task = self.task
         self.task = replace(task, period=period)  # how large it may be depends on it
         x = super().candidate(rng, near_home=near_home)
         self.task = task
         return np.append(x, np.log(period))
 
+    def bounds(self, x: Array) -> Bounds:
+        """Of log T."""
+        least, largest = np.log(self._shortest), np.log(2.0 * _LONGEST)
+        around = (np.clip(x[-1] + step, least, largest) for step in (-_STEP, _STEP))
+        low, high = (float(each) for each in around)
+        return [(None, None)] * (len(x) - 1) + [(low, high)]
+
     def evaluate(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
         """log T, and eight limits: those of the arm, and what is asked."""
         task, n, self._at = self.task, len(self.task.home), x.copy()
-        log_period = float(np.clip(x[-1], np.log(_SHORTEST), np.log(2.0 * _LONGEST)))
+        log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _LONGEST)))
         self._period = T = float(np.exp(log_period))
         coefficients = x[n:-1].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q, qd, qdd = self._basis @ coefficients

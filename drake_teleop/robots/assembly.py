@@ -16,22 +16,23 @@ seen, and is the delay that `identify` finds.
 from __future__ import annotations
 
 import math
-import time
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW, smoother
 from drake_teleop.logs.read.rotations import quaternions, rotation_matrices
 from drake_teleop.robots.compensator import DRIFT, JUMP_S, STALE_S
 from drake_teleop.robots.export import turn
-from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Flag, Part, PartSource, Reading
+from drake_teleop.robots.parts import Parts
+from drake_teleop.robots.streams import IMU, VALUES, WRENCH, Flag, Part, Reading
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
+NOWHERE = np.array([1.0, 0, 0, 0, 0, 0, 0])
+"""Pose of a sensor that is where the posed frame is."""
 _KEPT_S = 0.5  # of motions and wrenches
 _LEAST_DT, _LATEST, _LARGEST = 1e-4, 1e11, 1e5  # [s], [s], of any unit
 _SPACINGS = 20  # that tell the rate of the motion
@@ -145,43 +146,30 @@ class _Offset:
 
 
 class Assembly:
-    """A source of readings made of one or two of parts.
+    """A source of readings made of parts.
 
     Args:
-        wrench: tells the wrench, and without `motion` the motion, too.
-        motion: tells the motion.
+        parts: wrench and motion.
         cutoff_hz: see the module.
         delay_s: by how much the motion's stamps come behind the wrench's [s].
         X_FS: (7,) [w, x, y, z] and position [m] of the sensor in the frame that is posed.
 
     Attributes:
         lag_s: by how much readings come late, if poses come often enough for the window [s].
-
-    Raises:
-        DrakeTeleopError: if nobody tells a motion.
     """
 
     live = True
 
     def __init__(
         self,
-        wrench: PartSource,
-        motion: PartSource | None = None,
+        parts: Parts,
         *,
         cutoff_hz: float | None = 30.0,
         delay_s: float = 0.0,
-        X_FS: Array | None = None,
+        X_FS: Array = NOWHERE,
     ) -> None:
-        self._wrench, self._motion, self._delay = wrench, motion, delay_s
-        self.dt = wrench.dt
-        streams = (wrench if motion is None else motion).streams
-        self._told = next((stream for stream in (POSE, IMU) if stream in streams), "")
-        if not self._told:
-            raise DrakeTeleopError(
-                "tells no motion", where="the source", remedy="give --motion rtde://HOST, say"
-            )
-        nowhere = np.array([1.0, 0, 0, 0, 0, 0, 0])
-        self._window = Window(cutoff_hz, nowhere if X_FS is None else X_FS)
+        self._parts, self._delay, self.dt = parts, delay_s, parts.dt
+        self._window = Window(cutoff_hz, X_FS)
         self.lag_s = max(0.0, delay_s)
         if cutoff_hz is not None:
             self.lag_s = max(0.0, 0.5 * SMOOTHER_WINDOW / cutoff_hz + delay_s)
@@ -191,28 +179,20 @@ class Assembly:
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         """See `Source`."""
-        found: list[Reading] = []
-        if self._motion is not None:
-            for part in self._motion.read(0.0) or ():
-                if part.stream != WRENCH:
-                    found += self.take(part, time.monotonic())
-        parts = self._wrench.read(timeout_s)
-        if parts is None:
+        came = self._parts.read(timeout_s)
+        if came is None:
             return None
-        for part in parts:
-            if self._motion is None or part.stream == WRENCH:
-                found += self.take(part, time.monotonic())
-        return found
+        return [reading for part, now in came for reading in self.take(part, now)]
 
     def take(self, part: Part, now: float) -> list[Reading]:
         """The readings that are whole by a part that came at `now`. It never raises."""
         if part.stream == WRENCH:
             self._clocks[0].follow(part.t, now)
             self._waiting.append(part)
-        elif part.stream == self._told:
+        elif part.stream == self._parts.told:
             self._clocks[1].follow(part.t, now)
             shift = -self._delay
-            if self._motion is not None:
+            if self._parts.two_clocks:
                 shift += self._clocks[1].now_less_t - self._clocks[0].now_less_t
             for t, motion in self._window.take(part, now):
                 self._keep(t + shift, motion)
@@ -251,6 +231,4 @@ class Assembly:
 
     def close(self) -> None:
         """See `Source`."""
-        self._wrench.close()
-        if self._motion is not None:
-            self._motion.close()
+        self._parts.close()

@@ -47,7 +47,10 @@ class Messages:
     """
 
     def __init__(self, sign: float, frames: tuple[str, ...] = ()) -> None:
+        from rosbags.serde.errors import SerdeError
+
         self._sign, self._frames, self._types = sign, frames, types()
+        self._damaged = SerdeError
         self._links: dict[str, tuple[str, Array]] = {}
         self._counts = dict.fromkeys(KINDS, 0)
         for name in KINDS:  # what reads them is made now: the first messages would wait for that
@@ -67,16 +70,15 @@ class Messages:
         if number is None:
             number = self._counts[name]
         stream = _STREAMS.get(name, name)
-        # What rosbags makes of damaged bytes fails in many ways.
         try:
             data = self._types.deserialize_cdr(message, KINDS[name])
-            told = self._posed(data) if name == "tf" else [(data.header, self._values(name, data))]
-            return [
-                Part(stream, number, stamp.sec + 1e-9 * stamp.nanosec, values)
-                for stamp, values in ((header.stamp, values) for header, values in told)
-            ]
-        except Exception:
+        except self._damaged:
             return [Part(stream, -1, math.nan, np.full(6, math.nan), int(Flag.DAMAGED))]
+        told = self._posed(data) if name == "tf" else [(data.header, self._values(name, data))]
+        return [
+            Part(stream, number, stamp.sec + 1e-9 * stamp.nanosec, values)
+            for stamp, values in ((header.stamp, values) for header, values in told)
+        ]
 
     def _values(self, name: str, data: Any) -> Array:
         if name == WRENCH:

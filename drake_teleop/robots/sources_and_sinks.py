@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array
 from drake_teleop.load.identification import Identification
-from drake_teleop.robots.assembly import Assembly, pose_of
+from drake_teleop.robots.assembly import NOWHERE, Assembly, pose_of
 from drake_teleop.robots.lines import LineSink, LineSource
+from drake_teleop.robots.parts import Parts
+from drake_teleop.robots.recording import PartRecorder, Recorder, Records
 from drake_teleop.robots.replay_log import LogSource
 from drake_teleop.robots.streams import PartSource, Sink, Source
 from drake_teleop.robots.table import TableSink
@@ -23,6 +27,7 @@ _SINKS = (
     " .mcap file"
 )
 _REPLAY = "replay:"
+_ANY_HZ = 1000.0
 _OF_PARTS = ("posed", "rtde", "netft", "zenoh")
 
 
@@ -54,10 +59,15 @@ def source_of(
     """
     kind = _kind(address)
     if kind in _OF_PARTS:
-        return _assembled(address, load, rate_hz, cutoff_hz, delay, motion, sensor_pose)
+        if isinstance(delay, str):
+            delay = 0.0 if load is None else load.delay_s
+        parts = _parts(address, rate_hz, motion)
+        return Assembly(parts, cutoff_hz=cutoff_hz, delay_s=delay, X_FS=_pose(sensor_pose))
     if motion is not None or sensor_pose is not None:
         raise DrakeTeleopError(
-            "tells the motion of the sensor itself", where=address, remedy="without --motion"
+            "tells the motion of the sensor itself",
+            where=address,
+            remedy="without --motion and --sensor-pose",
         )
     if kind == "replay":
         path = address.removeprefix(_REPLAY)
@@ -67,6 +77,33 @@ def source_of(
         raise DrakeTeleopError("is no source", where=address, remedy=_SOURCES)
     dt = _period(rate_hz, address)
     return LineSource(sys.stdin.fileno(), dt) if kind == "-" else UdpSource(address, dt)
+
+
+def recorded(
+    address: str,
+    largest: Array | None,
+    *,
+    real_time: bool = False,
+    motion: str | None = None,
+    sensor_pose: tuple[float, ...] | None = None,
+) -> tuple[Any, Records[Any]]:
+    """What `calibrate` reads, readings or parts as they come, and who keeps them.
+
+    Args:
+        address, real_time, motion, sensor_pose: see `source_of`.
+        largest: see `Recorder`.
+
+    Raises:
+        DrakeTeleopError: as `source_of`.
+    """
+    kind = _kind(address)
+    # All is kept with its times: the rate is asked of a box alone, whose times are counts.
+    rate_hz = None if kind == "netft" else _ANY_HZ
+    if kind in _OF_PARTS:
+        parts = _parts(address, rate_hz, motion)
+        return parts, PartRecorder(parts, largest, _pose(sensor_pose))
+    readings = {"real_time": real_time, "motion": motion, "sensor_pose": sensor_pose}
+    return source_of(address, None, rate_hz=rate_hz, **readings), Recorder(largest)  # type: ignore[arg-type]
 
 
 def sink_of(address: str) -> Sink:
@@ -127,26 +164,18 @@ def _of_parts(address: str, rate_hz: float | None) -> PartSource:
     raise DrakeTeleopError("tells no motion", where=address, remedy="rtde://HOST or zenoh://HOST")
 
 
-def _assembled(
-    address: str,
-    load: Identification | None,
-    rate_hz: float | None,
-    cutoff_hz: float | None,
-    delay: str | float,
-    motion: str | None,
-    sensor_pose: tuple[float, ...] | None,
-) -> Source:
+def _parts(address: str, rate_hz: float | None, motion: str | None) -> Parts:
     wrench = _of_parts(address, rate_hz)
     other: PartSource | None = None
     try:
-        if motion is not None:
-            other = _of_parts(motion, 1.0 / wrench.dt)
-        if isinstance(delay, str):
-            delay = 0.0 if load is None else load.delay_s
-        X_FS = None if sensor_pose is None else pose_of(sensor_pose)
-        return Assembly(wrench, other, cutoff_hz=cutoff_hz, delay_s=delay, X_FS=X_FS)
+        other = None if motion is None else _of_parts(motion, 1.0 / wrench.dt)
+        return Parts(wrench, other)
     except BaseException:
         for each in (wrench, other):
             if each is not None:
                 each.close()
         raise
+
+
+def _pose(sensor_pose: tuple[float, ...] | None) -> Array:
+    return NOWHERE if sensor_pose is None else pose_of(sensor_pose)

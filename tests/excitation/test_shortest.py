@@ -8,6 +8,7 @@ import pytest
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.excitation import shortest as module
 from drake_teleop.excitation.criteria import Criterion
+from drake_teleop.excitation.design import design
 from drake_teleop.excitation.problem import Task
 from drake_teleop.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.excitation.shortest import ShortestProblem, reliable_factor, shortest
@@ -22,10 +23,10 @@ def slave() -> Robot:
     return RobotFromScenario(LoadScenario("identification"))
 
 
-def problem_of(slave: Robot) -> ShortestProblem:
+def problem_of(slave: Robot, times: float = 1.0) -> ShortestProblem:
     criterion = Criterion("A16", slave.scales)
     task = Task(slave.arm.table, slave.limits, criterion, slave.home, 1.0, 3)
-    return ShortestProblem(task, errors_of(ASKED, slave.limits.phi), slave, None)
+    return ShortestProblem(task, times * errors_of(ASKED, slave.limits.phi), slave, None)
 
 
 def test_ten_numbers_at_once_need_more_than_one() -> None:
@@ -61,14 +62,23 @@ def test_what_is_asked_is_the_deviation_over_the_period(slave: Robot) -> None:
 def test_it_reaches_what_is_asked_within_all_limits(
     slave: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_REACH", 1)
+    monkeypatch.setattr(module, "_IN_VAIN", 0)
+    monkeypatch.setattr(module, "_EVERYWHERE", 1)
     found = shortest(slave, read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %"), starts=1)
-    assert 0.2 < found.excitation.trajectory.period < 2.0
+    assert 3 / 15.0 <= found.excitation.trajectory.period < 0.5
     assert 0.3 < found.reached.max() <= 1.0
     assert all(use.share <= 1.0 for use in found.excitation.uses)
 
 
+@pytest.mark.slow
+def test_each_start_ends_near_the_shortest(slave: Robot) -> None:
+    found = design(problem_of(slave, 10.0), seed=0, starts=3)
+    periods = [min(each.value for each in found if each.start == k) for k in range(3)]
+    assert max(periods) < 1.15 * min(periods)
+
+
 def test_what_is_out_of_reach_is_said(slave: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_LOST", 1)
+    monkeypatch.setattr(module, "_EVERYWHERE", 1)
     with pytest.raises(DrakeTeleopError, match="no motion within the limits"):
         shortest(slave, read_tolerance("inertia 0.00001 %"), starts=1)

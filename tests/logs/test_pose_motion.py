@@ -45,7 +45,7 @@ from drake_teleop.logs.pose_motion.rigid import (
 from drake_teleop.logs.pose_motion.saturated import best_delay, saturated, spectra_of, wandering
 from drake_teleop.logs.pose_motion.spectra import Grid, bands, end_taper, moments, signal_spectrum
 from drake_teleop.logs.pose_motion.spectra import without as taper_without
-from drake_teleop.logs.pose_motion.splines import PoseSplines
+from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, _knots, _sparser
 from drake_teleop.logs.read.rotations import rotation_matrices
 
 
@@ -77,6 +77,14 @@ def test_signals_are_those_of_the_motion_on_stamps_that_jitter_and_over_a_gap():
     assert error[:, 1:4].max() < 0.01  # of 2 m/s^2
     assert error[:, 7:10].max() < 0.05  # of 25 rad/s^2
     assert error[:, 10:].max() < 1e-3
+
+
+def test_where_one_pose_to_a_knot_is_too_little_there_are_fewer_knots():
+    """As a busy machine records: gaps of all lengths. The whole spline would not be determined."""
+    t = np.cumsum(np.random.default_rng(1).exponential(0.0125, 200))
+    knots = _sparser(_knots(t, 0.0125), t)
+    assert np.diff(np.searchsorted(t, knots[DEGREE:-DEGREE])).min() >= 2 and len(knots) > 80
+    assert knots[0] == t[0] and knots[-1] == t[-1]
 
 
 def test_quaternions_need_not_stay_of_unit_length():

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
+import sockets
 from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
+from test_peers import ADDRESS, peer
+from test_reading_assembly import X_FS, Told, truth
 
 from drake_teleop.cli import cli
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -15,9 +20,11 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import errors_of, read_tolerance, sizes_of, values_of
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.robots.calibrate import Recorder, calibrate
+from drake_teleop.robots.calibrate import calibrate
 from drake_teleop.robots.calibration import Look, look, missing_motion
-from drake_teleop.robots.streams import DAMAGED, Reading
+from drake_teleop.robots.parts import Parts
+from drake_teleop.robots.recording import PartRecorder, Recorder
+from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Flag, Part, Reading
 
 DT = 0.005
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
@@ -62,7 +69,8 @@ class Stream:
 
 def test_it_stops_when_two_looks_know_and_says_what_identify_says(tmp_path: Path) -> None:
     path = tmp_path / "log.parquet"
-    looks, recorder = calibrate(Stream(recorded(20.0, [0, 1, 2])), path, ASKED)
+    recorder = Recorder()
+    looks = calibrate(Stream(recorded(20.0, [0, 1, 2])), recorder, path, ASKED)
     assert recorder.seconds < 8.0
     assert [at.sure.all() for at in looks[-3:]] == [False, True, True]
     assert [at.known.all() for at in looks[-3:]] == [False, False, True]
@@ -133,3 +141,55 @@ def test_the_command_says_by_its_status_that_it_is_not_known(tmp_path: Path) -> 
     assert summary["all_known"] is False and summary["known"] == {"mass": False}
     for name in ("log.parquet", "identification.json", "settling.png", "report.html"):
         assert (out / name).stat().st_size > 0
+
+
+def posed(seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times at 500 Hz, noisy wrenches of S and noisy poses of F, which is not S."""
+    t, rng = 0.002 * np.arange(round(seconds / 0.002)), np.random.default_rng(2)
+    told = [truth(each) for each in t]
+    motion = np.split(np.array([each[1] for each in told]), 3, axis=1)
+    wrench = non_contact_wrench(*motion, PHI) + 1.0 + NOISE * rng.normal(size=(len(t), 6))
+    poses = np.array([each[0] for each in told])
+    return t, wrench, poses + np.repeat([2e-5, 2e-5], [4, 3]) * rng.normal(size=(len(t), 7))
+
+
+def test_poses_of_another_frame_and_clock_are_kept_as_they_came(tmp_path: Path) -> None:
+    """Stamps of the motion are 4 ms late, and of another clock."""
+    recorder = PartRecorder(Parts(Told(WRENCH), Told(POSE)), np.full(6, 80.0), X_FS)
+    late, clock = 0.004, 1e4
+    for k, (t, wrench, pose) in enumerate(zip(*posed(2.0), strict=True)):
+        recorder.take((Part(WRENCH, k, t, wrench), t + 0.001))
+        recorder.take((Part(POSE, k, t + clock + late, pose), t + late + 0.001))
+    bad = np.full(6, 80.0), np.full(7, np.nan), np.full(7, 0.9)
+    for stream, values, flags in zip((WRENCH, POSE, POSE), bad, (0, 0, Flag.DAMAGED), strict=True):
+        recorder.take((Part(stream, 0, 2.1, values, int(flags)), 2.1))
+    assert recorder.left_out == 3 and recorder.began_anew == 0
+    recorder.write(tmp_path / recorder.file)
+    found = identify_log(tmp_path / recorder.file)
+    assert found.identification.delay_s == pytest.approx(late, abs=1e-3)
+    error = values_of(ASKED, found.identification.phi) - values_of(ASKED, PHI)
+    assert (np.abs(error) < sizes_of(ASKED, PHI)).all()
+    recorder.take((Part(POSE, 0, 50.0, posed(0.01)[2][0]), 50.0))
+    assert recorder.began_anew == 1 and recorder.seconds == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("rtde_receive") is None, reason="ur_rtde has no wheel here")
+def test_a_robot_of_ur_with_a_turned_and_shifted_sensor(tmp_path: Path) -> None:
+    sockets.on_purpose.add(30004)
+    _, wrench, pose = posed(9.0)
+    turn = Rotation.from_quat(pose[:, [1, 2, 3, 0]]).as_rotvec()
+    (tmp_path / "told").write_bytes(np.hstack([-wrench, pose[:, 4:], turn]).tobytes())
+    pitch = np.degrees(2.0 * np.arctan2(X_FS[2], X_FS[0]))
+    with peer("rtde", ADDRESS, str(tmp_path / "told")) as (host, _):
+        words = ["calibrate", f"rtde://{host}", "--until", "mass 1 %, com 1 mm"]
+        words += ["--sensor-pose", *map(str, X_FS[4:]), "0", str(pitch), "0"]
+        words += ["--range", "100", "10", "--seconds", "8", "--out", str(tmp_path / "out")]
+        known = CliRunner().invoke(cli, words, standalone_mode=False)
+    assert known.return_value == 0, known.output
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["all_known"] and summary["seconds"] < 8.0
+    asked = read_tolerance("mass 1 %, com 1 mm")
+    phi = json.loads((tmp_path / "out" / "identification.json").read_text())["phi"]
+    error = values_of(asked, np.array(phi)) - values_of(asked, PHI)
+    assert (np.abs(error) < sizes_of(asked, PHI)).all()

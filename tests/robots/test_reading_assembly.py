@@ -12,6 +12,7 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.compensator import Compensator
+from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.streams import IMU, POSE, WRENCH, Flag, Part, Reading
 
 DT, GRAVITY = 0.001, np.array([0.0, 0.0, 9.81])
@@ -76,7 +77,7 @@ def played(
 
 @pytest.mark.parametrize("lost", [lambda k: False, lambda k: k % 14 == 0])
 def test_the_motion_is_that_of_the_wrenchs_instant(lost) -> None:
-    found = played(Assembly(Told(WRENCH, POSE), X_FS=X_FS), 0.4, lost=lost)
+    found = played(Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS), 0.4, lost=lost)
     good = [each for each in found if not each.flags]
     assert len(good) > 200 and good[-1].t > 0.4 - 0.035  # half a window late
     wanted = np.array([truth(each.t)[1] for each in good])
@@ -91,18 +92,18 @@ def test_the_motion_is_that_of_the_wrenchs_instant(lost) -> None:
 
 
 def test_two_clocks() -> None:
-    apart = Assembly(Told(WRENCH), Told(POSE), X_FS=X_FS)
-    same = Assembly(Told(WRENCH, POSE), X_FS=X_FS)
+    apart = Assembly(Parts(Told(WRENCH), Told(POSE)), X_FS=X_FS)
+    same = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS)
     a, b = played(apart, 0.3, later=1e4), played(same, 0.3)
     good = [each.values for each in a if not each.flags], [x.values for x in b if not x.flags]
     np.testing.assert_allclose(good[0][-150:], good[1][-150:], atol=1e-4)
-    late = Assembly(Told(WRENCH), Told(POSE), X_FS=X_FS, delay_s=0.01)
+    late = Assembly(Parts(Told(WRENCH), Told(POSE)), X_FS=X_FS, delay_s=0.01)
     shifted = [each for each in played(late, 0.3, later=1e4) if not each.flags]
     np.testing.assert_allclose(shifted[-1].values[6:], truth(shifted[-1].t + 0.01)[1], atol=0.1)
 
 
 def test_without_poses_there_is_no_motion_and_it_begins_anew() -> None:
-    assembly = Assembly(Told(WRENCH, POSE), X_FS=X_FS)
+    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS)
     found = played(assembly, 0.6, lost=lambda k: 200 <= k < 280)
     assert not any(0.2 <= each.t < 0.28 for each in found if not each.flags)
     assert {each.flags for each in found} == {0, int(Flag.STALE)}
@@ -110,7 +111,7 @@ def test_without_poses_there_is_no_motion_and_it_begins_anew() -> None:
 
 
 def test_what_is_no_pose_or_out_of_order_is_left_out() -> None:
-    assembly = Assembly(Told(WRENCH, POSE), X_FS=X_FS)
+    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS)
     played(assembly, 0.3)
     for values, t in (
         (np.full(7, math.nan), 0.3),
@@ -124,7 +125,7 @@ def test_what_is_no_pose_or_out_of_order_is_left_out() -> None:
 
 
 def test_a_clock_that_is_set_back() -> None:
-    assembly = Assembly(Told(WRENCH, POSE), X_FS=X_FS)
+    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS)
     compensator = Compensator(load(), DT)
     for each in played(assembly, 0.2):
         compensator.step(each, each.t + 0.03)
@@ -142,7 +143,7 @@ def test_a_clock_that_is_set_back() -> None:
 
 
 def test_an_imu_tells_it_too() -> None:
-    assembly, found = Assembly(Told(WRENCH, IMU)), []
+    assembly, found = Assembly(Parts(Told(WRENCH, IMU))), []
     for k in range(250):
         t = k * DT
         found += assembly.take(Part(IMU, k, t, truth(t)[1][:6]), t)
@@ -155,4 +156,4 @@ def test_an_imu_tells_it_too() -> None:
 
 def test_a_wrench_alone_is_not_enough() -> None:
     with pytest.raises(DrakeTeleopError, match="tells no motion; give --motion"):
-        Assembly(Told(WRENCH))
+        Assembly(Parts(Told(WRENCH)))

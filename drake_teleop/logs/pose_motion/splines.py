@@ -50,9 +50,16 @@ class PoseSplines:
         self._start = float(poses.t[0])
         t = poses.t - self._start
         parts = [slice(k, k + _CHUNK) for k in range(0, len(t), _CHUNK)]
+        self._parts, knots = parts, _knots(t, spacing)
+        try:
+            self._spline = self._fitted(t, knots)
+        except np.linalg.LinAlgError:  # between gaps one pose to a knot is too little
+            self._spline = self._fitted(t, _sparser(knots, t))
+
+    def _fitted(self, t: Array, knots: Array) -> BSpline:
+        poses, parts = self.poses, self._parts
         values = (np.hstack([poses.position[part], poses.quaternion[part]]) for part in parts)
-        self._spline = _least_squares([t[part] for part in parts], values, _knots(t, spacing))
-        self._parts = parts
+        return _least_squares([t[part] for part in parts], values, knots)
 
     def signals(self, t: Array, gravity_W: Array) -> Array:
         """(N, 16) signals of P at times t, in the axes of P; outside of the poses those of the end.
@@ -139,6 +146,16 @@ def _knots(t: Array, spacing: float) -> Array:
     inner = inner[first[(before[first] > 0) & (before[first] < len(t))]]
     ends = np.repeat(t[[0, -1]], DEGREE + 1)
     return np.concatenate([ends[: DEGREE + 1], inner, ends[DEGREE + 1 :]])
+
+
+def _sparser(knots: Array, t: Array) -> Array:
+    """Those with `FEWEST_PER_KNOT` samples between any two."""
+    inner, kept, last = knots[DEGREE + 1 : -DEGREE - 1], [], 0
+    for knot, before in zip(inner, np.searchsorted(t, inner), strict=True):
+        if min(before - last, len(t) - before) >= FEWEST_PER_KNOT:
+            kept.append(knot)
+            last = before
+    return np.concatenate([knots[: DEGREE + 1], kept, knots[-DEGREE - 1 :]])
 
 
 def _least_squares(times: list[Array], values: Iterable[Array], knots: Array) -> BSpline:
