@@ -94,7 +94,9 @@ def run(
     metavar="ADDRESS",
     help="A haptic device is the hand: udp://127.0.0.1:PORT or haply://localhost:10001.",
 )
-@click.option("--study", metavar="FILE", help="A blind experiment, in place of SCENARIO.")
+@click.option(
+    "--study", metavar="FILE", help="A blind experiment with people, in place of SCENARIO."
+)
 @click.option(
     "--results",
     type=option.PATH,
@@ -102,6 +104,12 @@ def run(
     show_default=True,
     metavar="DIR",
     help="Of --study: the same folder goes on where it stopped.",
+)
+@click.option(
+    "--participant",
+    type=option.Whole(1, 9999),
+    show_default="who is not done, or the next",
+    help="Of --study: whose turn it is.",
 )
 @click.option(
     "--simulated",
@@ -117,6 +125,7 @@ def drive(
     device: str | None,
     study: str | None,
     results: Path,
+    participant: int | None,
     simulated: int,
 ) -> None:
     """Drive a station live in the browser.
@@ -124,14 +133,20 @@ def drive(
     SCENARIO is the name of a shipped one or a YAML file; its operator gives the grip alone. One
     page, on this machine: the hand by mouse, keys, touch or gamepad, which vibrates in contact;
     forces, sigma, gamma and eta while you press. `run --inputs DIR` repeats what was recorded.
-    With --study, a shipped experiment or a YAML file, simulated participants do an experiment.
+    With --study, a shipped experiment or a YAML file, the page asks participants what they feel.
     """
     if study is not None:
         from drake_teleop.experiment.command import experiment_command
 
-        if not simulated:
-            raise click.UsageError("--study needs --simulated")
-        experiment_command(study, results, simulated=simulated)
+        experiment_command(
+            study,
+            results,
+            participant=participant,
+            simulated=simulated,
+            port=port,
+            browser=not no_browser,
+            device=device,
+        )
         return
     from drake_teleop.live.server import drive_command
 

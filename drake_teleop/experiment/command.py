@@ -1,4 +1,4 @@
-"""`drake-teleop drive --study STUDY.yaml`: an experiment."""
+"""`drake-teleop drive --study STUDY.yaml`: an experiment in the page, or with simulated people."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.experiment.design import Experiment, LoadExperiment
+from drake_teleop.experiment.procedure import trials_of
 from drake_teleop.experiment.results import write_results
 from drake_teleop.experiment.store import MOST, Store, open_results
 from drake_teleop.scenario import Scenario
@@ -19,14 +20,21 @@ def experiment_command(
     study: str | Path,
     out: Path,
     *,
-    simulated: int,
+    participant: int | None = None,
+    simulated: int = 0,
+    port: int = 0,
+    browser: bool = True,
+    device: str | None = None,
 ) -> pl.DataFrame:
     """Goes on with an experiment where its folder ends.
 
     Args:
         study: the experiment's file, or the name of one that is shipped.
         out: the folder of the results.
-        simulated: how many simulated participants there are in all.
+        participant: whose turn it is; by default of the first who has not done all, or else the
+            next number.
+        simulated: how many simulated participants there are in all; 0: people, in the page.
+        port, browser, device: as of `drive`.
 
     Returns:
         The table of `write_results`.
@@ -38,7 +46,14 @@ def experiment_command(
     experiment, scenarios = LoadExperiment(study)
     with open_results(out, experiment) as store:
         try:
-            _simulate(experiment, scenarios, store, simulated)
+            if simulated:
+                _simulate(experiment, scenarios, store, simulated)
+            else:
+                from drake_teleop.experiment.server import serve_experiment
+
+                number = whose_turn(store, len(trials_of(experiment, 1)), participant)
+                setup = (experiment, scenarios, store, number)
+                serve_experiment(*setup, port=port, browser=browser, device=device)
         finally:
             table = write_results(experiment, store)
             print(f"written {out / 'results.csv'} and .png, from {out / 'trials.csv'}", flush=True)

@@ -85,6 +85,7 @@ class Procedure:
         phase: see `CONSENT` and the following.
         interval: 1 or 2 of the trial; of peg in slot 1.
         level: of the trial's stimulus, as it should be.
+        prepared: counts the intervals that are to come, also those that come again.
         said: whether the last answer was right, for practice.
         again: whether the trial is done again, because the tool touched nothing.
 
@@ -108,6 +109,7 @@ class Procedure:
         for trial, row in zip(self.trials, self._rows, strict=False):
             self._learn(trial, row)
         self.phase, self.said, self.again = CONSENT, False, False
+        self.prepared = 0
         self._new_trial()
 
     @property
@@ -140,6 +142,7 @@ class Procedure:
 
     def _new_trial(self) -> None:
         self.interval, self._felt, self.level = 1, [Felt(), Felt()], 0.0
+        self.prepared += 1
         task, trial = self.task, self.trial
         if not isinstance(task, PegInSlot):
             psi = self._psi[trial.task, trial.condition]
@@ -165,13 +168,14 @@ class Procedure:
         elif self.trial.signal == 0:
             self._over(0, felt.done, felt.time_s)
         elif self.interval == 1:
-            self.phase = GAP
+            self.interval, self.phase = 2, GAP
+            self.prepared += 1
         else:
             self.phase = ANSWER
 
     def second(self) -> None:
         """The gap between the intervals is over."""
-        self.interval, self.phase = 2, INTERVAL
+        self.phase = INTERVAL
 
     def interrupted(self) -> None:
         """Whoever drives has gone: the trial begins again."""

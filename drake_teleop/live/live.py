@@ -8,7 +8,7 @@ stands still and the record is complete on the disk.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,8 @@ class Live:
         show: what shows the scene.
         now: the clock [s].
         link: to a haptic device that is the hand; None for that of a page.
+        log: whether the log is recorded, too, or the inputs that it follows from alone.
+        begin: inputs with which it begins, other than the scenario's.
     """
 
     def __init__(
@@ -68,7 +70,11 @@ class Live:
         show: Show,
         now: float,
         link: DeviceLink | None = None,
+        *,
+        log: bool = True,
+        begin: Mapping[str, int] | None = None,
     ) -> None:
+        self._log, self._first = log, begin or {}
         self._link, self._slice_ms = link, SLICE_MS if link is None else TICK_MS
         self.refused, self.asked, self.scene = 0, "", SCENES[0]
         self._scenario, self._load, self._record, self._show = scenario, load, record, show
@@ -87,10 +93,11 @@ class Live:
             folder = _next_to(folder)
         self._drives += 1
         self._folder = "" if folder is None else str(folder)
-        log = None if folder is None else folder / "log.parquet"
+        log = folder / "log.parquet" if folder is not None and self._log else None
         self._session = Session(
             self._scenario, self._load, log=log, record=folder, device=self._link is not None
         )
+        self._session.apply(self._session.inputs.changed(self._first))
         if self._link is not None:
             self._link.begin_anew(now)
         self._cockpit, self._stopped, self._asleep = Cockpit(self._scenario), "", False
@@ -175,6 +182,11 @@ class Live:
         if self._asleep:
             self.pace.start(now)
         self._asleep = False
+
+    @property
+    def ms(self) -> int:
+        """Simulated time [ms]."""
+        return self._session.ms
 
     @property
     def still(self) -> bool:
@@ -281,9 +293,13 @@ class Live:
             return "stopped"
         return "paused" if self._paused else "waiting" if self._asleep else "running"
 
-    def close(self) -> None:
-        """Ends the drive; its record is complete."""
+    def end(self) -> None:
+        """Its record is complete; a device may go on in another drive."""
         self._session.close()
+
+    def close(self) -> None:
+        """Ends the drive, and the link to a device."""
+        self.end()
         if self._link is not None:
             self._link.close()
 

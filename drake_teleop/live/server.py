@@ -206,6 +206,9 @@ class LiveDrive:
         more = {"you": self._pages[page], "meshcat": self._meshcat.ws_url()}
         return json.dumps({"hello": self._live.hello() | more})
 
+    def _page(self) -> bytes:
+        return resources.files("drake_teleop.live").joinpath("page.html").read_bytes()
+
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Serves a file, or lets a socket be opened; refuses whatever is not from our own page."""
         host = f"{_HOST}:{self._port}"
@@ -221,8 +224,7 @@ class LiveDrive:
                 return _response(HTTPStatus.FORBIDDEN, "text/plain", b"Another page's.\n")
             return None
         if address.path == "/":
-            page = resources.files("drake_teleop.live").joinpath("page.html").read_bytes()
-            return _response(HTTPStatus.OK, "text/html; charset=utf-8", page)
+            return _response(HTTPStatus.OK, "text/html; charset=utf-8", self._page())
         if address.path == "/meshcat.js":
             script = Path(FindResourceOrThrow("drake/geometry/meshcat.js")).read_bytes()
             return _response(HTTPStatus.OK, "text/javascript; charset=utf-8", script)

@@ -1,0 +1,36 @@
+"""What the page of an experiment may say: less than that of a drive, and nothing of the station."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from drake_teleop.live.messages import parse
+
+#: Of a drive's inputs, those that are the hand's.
+HAND = ("x", "y", "z", "rx", "ry", "rz", "clutch")
+
+
+def parse_study(text: Any) -> dict[str, Any] | None:
+    """What a message asks for; None if it is not one.
+
+    Returns:
+        Any of "set" (numbers of `HAND`), "drive", "go" (True), "answer" (1 or 2).
+    """
+    said = parse(text) or {}
+    found: dict[str, Any] = {}
+    if "set" in said:
+        found["set"] = {name: value for name, value in said["set"].items() if name in HAND}
+    if "drive" in said:
+        found["drive"] = True
+    try:
+        whole = json.loads(text) if isinstance(text, str) and len(text) < 100 else None
+    except (ValueError, RecursionError):
+        whole = None
+    if isinstance(whole, dict):
+        if whole.get("go") is True:
+            found["go"] = True
+        answer = whole.get("answer")
+        if isinstance(answer, int) and not isinstance(answer, bool) and answer in (1, 2):
+            found["answer"] = answer
+    return found or None

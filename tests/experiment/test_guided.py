@@ -1,0 +1,150 @@
+"""An experiment in virtual time, driven by the page's messages: what a page is told, and can do."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from drake_teleop.experiment.apparatus import make_apparatus
+from drake_teleop.experiment.design import Condition, ContactDetection, Experiment
+from drake_teleop.experiment.guided import Guided
+from drake_teleop.experiment.messages import HAND, parse_study
+from drake_teleop.experiment.procedure import Procedure
+from drake_teleop.experiment.store import Store
+from drake_teleop.identified_load import IdentifiedLoad
+from drake_teleop.live.session import read_drive, repeat
+from drake_teleop.load.identification import Identification
+from drake_teleop.pages.progress import silent
+from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.slave.plant import NominalSlave
+
+EXPERIMENT = Experiment(
+    tasks=[ContactDetection(trials=1, practice=0, interval=0.5)],
+    conditions=[Condition(name="secret", sigma=0.37)],
+)
+
+
+class Person:
+    """A participant with a clock of its own, who presses when something is asked."""
+
+    def __init__(self, folder) -> None:
+        scenario = LoadScenario("contact_transition")
+        place = [0.55, 0.0, 0.233]  # 6 mm below the tool
+        scenario = replace(scenario, sheet_spring__position=place, wrist_sensor__ideal=True)
+        phi = NominalSlave(scenario.slave).arm.phi_load
+        truth = Identification(
+            phi=phi, offsets=np.zeros(6), covariance=np.eye(16), identifiable=np.ones(16, bool),
+            condition_number=1.0, delay_s=0.0, residual_rms=np.zeros(6),
+            method="known", samples=0,
+        )  # fmt: skip
+        load = IdentifiedLoad(truth, None, from_cache=False)
+        task, condition = EXPERIMENT.tasks[0], EXPERIMENT.conditions[0]
+        self.now, self.folder, self.frames = 0.0, folder, []
+        self.store = Store(folder)
+        self.procedure = Procedure(EXPERIMENT, 1, self.store)
+        self.guided = Guided(
+            self.procedure,
+            {(0, 0): make_apparatus(task, condition, scenario, load)},
+            [scenario],
+            self.store,
+            lambda scenario: lambda rows: None,
+            self.now,
+        )
+        self.guided.join(1, self.now)
+
+    def say(self, client: int = 1, **message) -> None:
+        self.guided.hear(client, json.dumps(message), self.now)
+
+    def wait(self, phase: str, seconds: float = 3.0) -> None:
+        """Until the procedure has come there; time goes by as fast as it is simulated."""
+        end = self.now + seconds
+        while self.procedure.phase != phase and self.now < end:
+            self.now += 0.005
+            frame = self.guided.tick(lambda: self.now)
+            if frame is not None:
+                self.frames.append(frame)
+        assert self.procedure.phase == phase
+
+    def begin(self) -> None:
+        for _ in range(3):
+            self.say(go=True)
+        assert self.procedure.phase == "interval"
+
+
+@pytest.mark.slow
+def test_a_trial_from_consent_to_the_table_and_its_drives_repeat(tmp_path):
+    person = Person(tmp_path)
+    person.say(answer=1)  # nobody asked
+    person.begin()
+    person.say(set={"z": -1500, "sigma": 300, "gamma": 0})
+    person.wait("gap")
+    person.wait("interval")
+    person.say(set={"z": -1500})
+    person.wait("answer")
+    person.say(client=2, answer=1)  # who only watches
+    assert person.procedure.phase == "answer"
+    person.say(answer=2)
+    (row,) = person.store.rows(1)
+    assert row.answer == 2 and row.force_N > 1.0 and row.level > 0.0
+    assert person.procedure.phase == "end"
+    person.guided.close()
+    drive = read_drive(tmp_path / "drives" / "01" / "0000-1")
+    assert all(inputs.sigma == 37 for ms, inputs in drive.changes[1:])
+    assert repeat(drive, silent).t[-1] == pytest.approx(0.5, abs=0.03)
+    told = json.dumps(person.frames) + json.dumps(person.guided.hello())
+    assert "secret" not in told
+    assert all(f["inputs"]["sigma"] == 0 and f["inputs"]["gamma"] == 100 for f in person.frames)
+    felt = [f["f"] for f in person.frames]
+    assert all(f[0] == f[1] == f[2] for f in felt)
+
+
+@pytest.mark.slow
+def test_when_the_page_is_closed_the_trial_begins_again(tmp_path):
+    person = Person(tmp_path)
+    person.begin()
+    person.say(set={"z": -1500})
+    person.wait("gap")
+    person.guided.leave(1, person.now)
+    assert (person.procedure.phase, person.procedure.interval) == ("ready", 1)
+    person.say(client=2, go=True)  # is not there
+    person.guided.join(3, person.now)
+    person.say(client=3, go=True)
+    assert person.procedure.phase == "interval" and person.store.participants() == []
+
+
+def test_10000_messages_change_nothing_but_what_they_may():
+    rng = np.random.default_rng(0)
+    pieces = [
+        "{",
+        "}",
+        '"go"',
+        '"answer"',
+        ":",
+        "true",
+        "1",
+        "3",
+        "1.0",
+        "null",
+        ",",
+        '"set"',
+        "NaN",
+    ]
+    pieces += ['{"x":1e999}', '{"sigma":5}', '[[[["', "\u0000", '"drive"', "é", "-1e308", "[" * 200]
+    heard = [parse_study("".join(rng.choice(pieces, rng.integers(1, 9)))) for _ in range(10_000)]
+    for found in filter(None, heard):
+        assert set(found) <= {"set", "drive", "go", "answer"}
+        assert found.get("answer", 1) in (1, 2) and set(found.get("set", {})) <= set(HAND)
+    for bad in (
+        b"{}",
+        None,
+        7,
+        '{"answer": true}',
+        '{"answer": 1.0}',
+        '{"answer": 3}',
+        '{"go": 1}',
+    ):
+        assert parse_study(bad) is None
+    assert parse_study('{"set": {"sigma": 5, "x": 3}}') == {"set": {"x": 3}}
+    assert parse_study('{"answer": 2}') == {"answer": 2}
