@@ -237,13 +237,15 @@ class Procedure:
 
     def view(self) -> dict[str, Any]:
         """What the participant may know."""
+        number = self.number - (self.phase == TOLD)  # of a trial that is over
+        trial = self.trials[min(number, len(self.trials) - 1)]
         return {
             "phase": self.phase,
             "participant": self.participant,
-            "task": type(self.task).__name__,
-            "trial": min(self.number + 1, len(self.trials)),
+            "task": type(self.experiment.tasks[trial.task]).__name__,
+            "trial": min(number + 1, len(self.trials)),
             "trials": len(self.trials),
-            "practice": self.trial.practice,
+            "practice": trial.practice,
             "interval": self.interval,
             "again": self.again,
             "said": self.said if self.phase == TOLD else None,

@@ -8,14 +8,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pydrake.geometry import Meshcat, MeshcatParams
-
 from drake_teleop.experiment.design import Experiment
 from drake_teleop.experiment.guided import Guided
 from drake_teleop.experiment.procedure import Procedure
 from drake_teleop.experiment.simulated import all_apparatus
 from drake_teleop.experiment.store import Store
-from drake_teleop.film import quiet_drake
 from drake_teleop.identified_load import IdentifiedLoad
 from drake_teleop.live.external_master import with_device
 from drake_teleop.live.live import Show
@@ -50,9 +47,6 @@ class ExperimentDrive(LiveDrive):
         super().__init__(scenarios[0], None, port, device)
 
     def _make(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> Any:
-        with quiet_drake():
-            self._meshcat = Meshcat(MeshcatParams(host="localhost"))
-
         def shows(scenario: Scenario) -> Show:
             self._meshcat.Delete()
             return show_in(self._meshcat, scenario)

@@ -101,6 +101,8 @@ class LiveDrive:
     def _run(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> None:
         """The drive's thread. Meshcat is made and unmade here: no other thread may touch it."""
         try:
+            with quiet_drake():
+                self._meshcat = Meshcat(MeshcatParams(host="localhost"))
             self._live = self._make(scenario, load, record)
             asyncio.run(self._serve())
         except Exception as error:
@@ -115,8 +117,6 @@ class LiveDrive:
             self._ready.set()
 
     def _make(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> Live:
-        with quiet_drake():
-            self._meshcat = Meshcat(MeshcatParams(host="localhost"))
         show = show_in(self._meshcat, scenario)
         link = None if self._device is None else self._device.link
         return Live(scenario, load, record, show, time.perf_counter(), link)
