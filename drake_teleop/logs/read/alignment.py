@@ -55,11 +55,12 @@ def _interpolated(
     t_new: NDArray[np.float64], t: NDArray[np.float64], x: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     # One search serves all columns; np.interp would search, and copy, for each.
-    after = np.clip(np.searchsorted(t, t_new, side="right"), 1, len(t) - 1)
-    share = np.clip((t_new - t[after - 1]) / (t[after] - t[after - 1]), 0.0, 1.0)
+    before = np.searchsorted(t[1:-1], t_new, side="right")
+    start, end = t[before], t[before + 1]
+    share = np.minimum(np.maximum((t_new - start) / (end - start), 0.0), 1.0)
     share = share.reshape(-1, *[1] * (x.ndim - 1))
-    before = x[after - 1]
-    return before + share * (x[after] - before)
+    first = x.take(before, axis=0)
+    return first + share * (x.take(before + 1, axis=0) - first)
 
 
 def low_pass(x: NDArray[np.float64], dt: float, cutoff_hz: float | None) -> NDArray[np.float64]:

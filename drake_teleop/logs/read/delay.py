@@ -106,9 +106,10 @@ def _cost(
     rounding = (1e-9 * np.abs(wrench).max()) ** 2 + 1e-30
     variance = np.repeat(wrench.var(axis=0).reshape(2, 3).sum(axis=1), 3) + rounding
     scale, floor = np.sqrt(variance), 1e-9 * variance
+    motion = np.hstack(log.motion)  # one search for the times serves all
 
     def residual(shift: float) -> NDArray[np.float64]:
-        s, omega, alpha = (resample(t + shift, log.t, x) for x in log.motion)
+        s, omega, alpha = np.split(resample(t + shift, log.t, motion), 3, axis=1)
         if phi is not None:
             return contact_wrench(wrench, np.zeros(6), s, omega, alpha, phi)
         V = regressor(s, omega, alpha)

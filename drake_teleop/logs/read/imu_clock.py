@@ -38,8 +38,11 @@ def best_shift(
     def beyond(x: NDArray[np.float64]) -> NDArray[np.float64]:
         return x - U @ (U.T @ x)
 
+    expected, sensed = [beyond(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
+
     def cost(shift: float) -> float:
-        return sum(_unmapped(beyond(y), beyond(resample(t + shift, t_imu, x))) for y, x in pairs)
+        moved = beyond(resample(t + shift, t_imu, sensed))
+        return sum(_unmapped(y, moved[:, 3 * k : 3 * k + 3]) for k, y in enumerate(expected))
 
     step = 0.01
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)

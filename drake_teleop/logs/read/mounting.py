@@ -163,11 +163,14 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     turned = resample(t, pose.t, smooth.angular_velocity)
     K = lever_matrix(turned, resample(t, pose.t, smooth.angular_acceleration))
 
+    known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
+
     def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
         turning, at = _turned(R, x[:3]), t + x[3] + drift * (t - centre)
-        signals = [resample(at, imu.t, signal) @ turning.T - y for y, signal in pairs]
-        signals[0] -= K @ x[4:7]
-        return np.hstack(signals) + x[7:]
+        seen = resample(at, imu.t, moving).reshape(-1, 3) @ turning.T
+        left = seen.reshape(known.shape) - known
+        left[:, 0] -= K @ x[4:7]
+        return left.reshape(len(t), -1) + x[7:]
 
     first = np.zeros(7 + 3 * len(pairs))
     first[3] = middle
