@@ -74,5 +74,5 @@ def test_ci_runs_the_readmes_test_commands(tmp_path):
         "pip install -q -e .[test,docs]",
         "pytest -n 2 --dist worksteal",
         "python benchmarks/fuzz.py --seconds 60 --seed 1",
-        "sphinx-build -q -W --keep-going docs out/site",
+        "sphinx-build -q -W --keep-going -j 2 docs out/site",
     ]
