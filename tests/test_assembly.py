@@ -351,6 +351,7 @@ def test_the_drag_that_charges_a_channel_is_the_one_at_the_hand(slave):
         assert felt.max() == pytest.approx(drag, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_flag_of_a_contact_comes_with_the_slaves_packets(slave):
     """With a floor so low that the moving load is taken for contacts."""
     rising, still = np.zeros((6, 2)), np.zeros(6)

@@ -115,6 +115,7 @@ def test_gains_that_are_stated_widen_the_deviations(folder):
     assert 0.005 * load.mass < load.standard_deviations[6] < 0.03 * load.mass
 
 
+@pytest.mark.slow
 def test_what_no_rigid_load_explains_identifies_none_unless_it_is_stated(folder):
     found = identify_log(described(folder, "gains"))
     assert not found.identification.identifiable[6:].any()

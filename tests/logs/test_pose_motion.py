@@ -235,6 +235,7 @@ def test_noise_in_the_signals_makes_no_load_lighter():
     assert (compensated < 0.02).all()
 
 
+@pytest.mark.slow
 def test_a_frame_that_is_declared_or_left_to_the_data_gives_the_load():
     arrays = record(Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4))
     declared = estimate_from_poses(*arrays, GRAVITY_W, p_SoPo_S=SHIFT, R_SP=TURN)
@@ -348,6 +349,7 @@ def test_gains_that_are_wrong_are_a_misfit_and_those_stated_are_in_the_deviation
     assert found.fit.explained
 
 
+@pytest.mark.slow
 def test_gains_explain_no_more_than_is_stated():
     kind = Kind(gain=0.01, seed=8)
     assert not estimate_from_poses(*record(kind), GRAVITY_W, gain=0.001).fit.explained
@@ -410,6 +412,7 @@ def test_deviations_count_that_the_weights_are_estimated():
     assert fit.covariance[0, 0] == pytest.approx(variance, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_clock_that_runs_away_costs_nothing():
     """By 0.2 ms a second, over 20 s; the delay is that in the middle."""
     t, wrench, poses = record(Kind())
