@@ -96,6 +96,8 @@ def drag(browser: Browser, x: int, y: int, dx: int, dy: int) -> None:
 @pytest.mark.slow
 def test_the_page_drives(browser):
     browser.until("typeof frame !== 'undefined' && frame && frame.tool && target && viewer")
+    # Meshcat tells where the camera is after all else; from its own place, right is another way.
+    browser.until("Math.hypot(...view().place.map((p, k) => p - frame.tool[k])) < 2")
     x, z = browser.run("[frame.tool[0], frame.tool[2]]")
     drag(browser, 300, 300, 20, -10)
     browser.until(f"frame.tool[0] > {x + 0.005} && frame.tool[2] > {z + 0.002}")
