@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +30,11 @@ SMALL = Experiment(
         Condition(name="b", sigma=1.0),
         Condition(name="c", gamma=2.0),
     ],
+)
+
+
+SHORT = dataclasses.replace(
+    SMALL, tasks=[ContactDetection(trials=5, practice=1)], conditions=SMALL.conditions[:2]
 )
 
 
@@ -72,6 +80,42 @@ def test_a_participant_goes_on_where_it_stopped_with_the_same_levels(tmp_path):
     go_through(again, rng, 2.0)
     assert cut.path(3).read_bytes() == whole.path(3).read_bytes()
     assert len(cut.rows(3)) == len(trials_of(SMALL, 3))
+
+
+def goes_through(folder: str) -> None:
+    """A participant with answers that a trial's number tells, who says each trial that is over."""
+    with open_results(Path(folder), SHORT) as store:
+        procedure = Procedure(SHORT, 1, store)
+        while procedure.phase != "end":
+            if procedure.phase == "answer":
+                right = procedure.number % 4 != 2
+                signal = procedure.trial.signal
+                procedure.answer(signal if right else 3 - signal, 0.5)
+                print(procedure.number, flush=True)
+            elif procedure.phase == "interval":
+                procedure.finished(Felt(procedure.shown, force_N=5.0, done=True, time_s=1.0))
+            elif procedure.phase == "gap":
+                procedure.second()
+            else:
+                procedure.go()
+
+
+@pytest.mark.slow
+def test_a_killed_experiment_has_all_trials_that_were_over_and_goes_on(tmp_path):
+    code = "import sys; from test_procedure import goes_through; goes_through(sys.argv[1])"
+    command = [sys.executable, "-c", code, str(tmp_path / "cut")]
+    folder = Path(__file__).parent
+    process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    said = next(int(line) for line in process.stdout if int(line) >= 4)
+    process.kill()
+    process.communicate()
+    cut = Store(tmp_path / "cut")
+    left = len(cut.rows(1))
+    assert said <= left < len(trials_of(SHORT, 1))
+    goes_through(str(tmp_path / "cut"))
+    goes_through(str(tmp_path / "whole"))
+    assert cut.rows(1) == Store(tmp_path / "whole").rows(1)
 
 
 def test_practice_does_not_count_and_what_touched_nothing_is_done_again(tmp_path):
