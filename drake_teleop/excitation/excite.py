@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 
 # A trajectory between whose samples the optimiser missed a peak is made smaller about its middle.
 _REPAIRS = (1.0, 0.995, 0.99, 0.98)
+# Of one descent, a candidate at every such factor of the criterion; how many are checked at most.
+_WORSE, _CHECKED = 1.05, 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,18 +167,26 @@ def _deviations(robot: Robot, trajectory: FourierTrajectory) -> Array:
 
 
 def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
-    """Of each start the best that respects the limits between the optimiser's samples too.
+    """What respects the limits between the optimiser's samples too, the best first.
 
-    The best first. This saves vain checks, no more: the check has kernels of its own.
+    The optimiser knows shapes as capsules and may pass a corner too near, along all of a descent's
+    end. So of each descent there are iterates at every `_WORSE`, as long as the check fails them.
     """
     ranked = sorted(found, key=lambda iterate: iterate.value)
-    for start in dict.fromkeys(iterate.start for iterate in ranked):
-        of_start = [iterate for iterate in ranked if iterate.start == start]
+    last = dict.fromkeys((iterate.start for iterate in ranked), 0.0)
+    offered = 0
+    for iterate in ranked:
+        if iterate.value < _WORSE * last[iterate.start]:
+            continue
+        last[iterate.start] = iterate.value
         for factor in _REPAIRS:
-            trajectory = of_start[0].trajectory.scaled(factor)
+            trajectory = iterate.trajectory.scaled(factor)
             if _largest_use(robot, trajectory) <= 1:
                 yield trajectory
+                offered += 1
                 break
+        if offered == _CHECKED:
+            return
 
 
 def _largest_use(robot: Robot, trajectory: FourierTrajectory) -> float:
