@@ -30,6 +30,7 @@ from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, und
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
+from drake_teleop.one_thread import one_blas_thread
 
 _FEWEST_TO_TARE = 10
 _LARGEST_SCALE = 100.0  # as of `ForceScalingConfig`
@@ -137,6 +138,13 @@ def identify_log(
             worthless, see `drake_teleop.logs.check.conventions.question_fit`.
     """
     check_method(method)
+    with one_blas_thread():
+        return _identified(path, method, cutoff_hz, delay)
+
+
+def _identified(
+    path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
+) -> IdentifiedLog:
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in ROBUST)
     posed = fit_posed(log, method, cutoff_hz, delay)
     if posed is None and log.posed is not None:  # too short for splines

@@ -20,6 +20,7 @@ from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
+from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.logs.read.tables import read_table
 
 WRENCH, POSE = ("fx", "fy", "fz", "tx", "ty", "tz"), ("qw", "qx", "qy", "qz", "x", "y", "z")
@@ -242,3 +243,31 @@ def test_a_wrong_unit_of_the_torque_is_no_shift(unit):
     posed = Posed(poses, GRAVITY_W)
     found = estimate_from_poses(t, wrench, poses, GRAVITY_W)
     assert frame_finding(found, posed) is None
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_quaternions_are_read_as_their_matrices_are(tmp_path, inverse):
+    t, wrench, poses = record(Kind(seed=3))
+    q = 1.002 * poses.quaternion[:, [1, 2, 3, 0]]  # as long as rounding may make them
+    R = rotation_matrices(poses.quaternion, "quaternion_wxyz").reshape(-1, 9)
+    columns = {"t": t} | dict(zip(WRENCH, wrench.T, strict=True))
+    pl.DataFrame(columns).write_parquet(tmp_path / "a_wrench.parquet")
+    columns = {"t": poses.t, "q": q, "R": R, "p": poses.position}
+    np.savez(tmp_path / "a_pose.npz", **columns)
+    read = []
+    for form, column in (("quaternion_xyzw", "q"), ("matrix", "R")):
+        path = described(
+            tmp_path,
+            "a",
+            {"file": "a_wrench.parquet"},
+            file="a_pose.npz",
+            orientation={"columns": [column], "form": form, "inverse": inverse},
+            position={"columns": ["p"]},
+            position_in_sensor=[0.1, 0.0, -0.2],
+        )
+        posed = read_log(path, differentiate=False).posed
+        assert posed is not None
+        read.append(posed.poses)
+    one, other = (rotation_matrices(x.quaternion, "quaternion_wxyz") for x in read)
+    np.testing.assert_allclose(one, other, atol=1e-12)
+    np.testing.assert_allclose(read[0].position, read[1].position, atol=1e-12)

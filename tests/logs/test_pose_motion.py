@@ -439,6 +439,19 @@ def test_best_delay_is_found_from_afar():
     assert best_delay(spectra, 0.1)[0] == pytest.approx(LATE, abs=2e-3)
 
 
+@pytest.mark.parametrize("chopped", [False, True])
+def test_delays_are_tried_together_as_one_by_one(chopped):
+    t, wrench, poses = record(Kind(seed=10))
+    grid = Grid.of(t, wrench)
+    taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
+    taper = taper_without(taper, chopped & (np.abs(grid.t - 5.0) < 0.3), grid.dt)
+    spectra = spectra_of(PoseSplines(poses.continued(), 0.07), grid, taper, GRAVITY_W, -0.02, 20.0)
+    assert spectra.chopped is chopped
+    delays = np.array([-0.05, -0.02, LATE])
+    alone = [spectra.at(delay).fit().cost for delay in delays]
+    np.testing.assert_allclose(spectra.costs(delays), alone, rtol=1e-9)
+
+
 def test_a_taper_is_zero_where_lost_and_has_edges():
     taper = end_taper(np.arange(1000) / 100, 0.0, 10.0)
     lost = np.zeros(1000, bool)

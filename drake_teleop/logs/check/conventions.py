@@ -34,6 +34,7 @@ from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
+from drake_teleop.one_thread import one_blas_thread
 
 _STILL = 0.3, 0.1
 """Specific force [m/s^2] and angular velocity [rad/s], rms, below which nothing is said of axes."""
@@ -160,7 +161,8 @@ def check_conventions(
     Raises:
         DrakeTeleopError: if the log cannot be read as it is described.
     """
-    found = _check(LogData(description, source, dict(tables or {})), description)
+    with one_blas_thread():
+        found = _check(LogData(description, source, dict(tables or {})), description)
     if Path(source).suffix.lower() not in FORMATS:
         return found
     # A canonical table has no lines that could be changed.

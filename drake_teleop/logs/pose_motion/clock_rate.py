@@ -16,9 +16,9 @@ import numpy as np
 
 from drake_teleop.load.arrays import Array
 from drake_teleop.logs.pose_motion.poses import Poses
-from drake_teleop.logs.pose_motion.saturated import Spectra, for_search, spectra_of
+from drake_teleop.logs.pose_motion.saturated import Spectra, spectra_of
 from drake_teleop.logs.pose_motion.spectra import Grid, signal_spectrum
-from drake_teleop.logs.pose_motion.splines import PoseSplines
+from drake_teleop.logs.pose_motion.splines import Choice, PoseSplines
 
 _STEPS, _BELIEVED = 3, 25.0
 # Farther than that from the middle's [s] is no clock's rate, but a motion that does not show it.
@@ -26,7 +26,7 @@ _FARTHEST = 0.2
 
 
 def clock_rate(
-    poses: Poses,
+    few: Choice,
     grid: Grid,
     taper: Array,
     gravity_W: Array,
@@ -37,20 +37,15 @@ def clock_rate(
     """The rate, such as 5e-5; 0 if none is believed.
 
     Args:
-        poses: continued.
+        few: `for_search`.
         grid, taper: of the wrench.
         gravity_W: (3,) [m/s^2].
         delay: in the middle of the grid [s].
         top: highest frequency [Hz].
         spacing: of the knots [s].
     """
-    few = for_search(poses)
-
-    def spectra(rate: float) -> Spectra:
-        splines = PoseSplines(at_rate(few, rate, grid, delay), spacing)
-        return spectra_of(splines, grid, taper, gravity_W, delay, top)
-
-    now, best = spectra(0.0), 0.0
+    first = spectra_of(few.at(spacing), grid, taper, gravity_W, delay, top)
+    now, best = first, 0.0
     least = start = now.fit().cost
     for _ in range(_STEPS):
         step, gain = _step(now)
@@ -59,7 +54,8 @@ def clock_rate(
             return 0.0
         if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _FARTHEST:
             break
-        now = spectra(trial)
+        splines = PoseSplines(at_rate(few.poses, trial, grid, delay), spacing)
+        now = first.with_motion(splines, gravity_W, delay)
         cost = now.fit().cost
         if not cost < least:
             break

@@ -38,12 +38,14 @@ from drake_teleop.logs.pose_motion.saturated import (
     Spectra,
     best_spacing,
     first_guess,
+    for_search,
     saturated,
     spectra_of,
     wandering,
 )
 from drake_teleop.logs.pose_motion.spectra import TOP, Grid, end_taper, without
 from drake_teleop.logs.pose_motion.splines import PoseSplines
+from drake_teleop.one_thread import one_blas_thread
 from drake_teleop.vectors import cross_matrix
 
 SEARCHED = 120.0
@@ -168,51 +170,52 @@ def estimate_from_poses(
     Raises:
         DrakeTeleopError: for arrays of another shape, or if fewer than 100 instants remain.
     """
-    t = checked("t", t, np.size(t))
-    wrench = checked("wrench", wrench, len(t), 6)
-    gravity = checked("gravity_W", gravity_W, 3)
-    grid, poses = Grid.of(t, wrench), poses.continued()
-    guess = near if delay is None else delay
-    if (_base_taper(grid, poses, lost, guess) > 0.5).sum() < _FEWEST:
-        raise DrakeTeleopError(
-            "wrench and poses have too little in common",
-            remedy="record longer, without interruptions",
+    with one_blas_thread():
+        t = checked("t", t, np.size(t))
+        wrench = checked("wrench", wrench, len(t), 6)
+        gravity = checked("gravity_W", gravity_W, 3)
+        grid, poses = Grid.of(t, wrench), poses.continued()
+        guess = near if delay is None else delay
+        if (_base_taper(grid, poses, lost, guess) > 0.5).sum() < _FEWEST:
+            raise DrakeTeleopError(
+                "wrench and poses have too little in common",
+                remedy="record longer, without interruptions",
+            )
+        top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
+        splines, spectra, rejected, rate, note = _searched(
+            grid, poses, lost, gravity, guess, top, known=delay is not None
         )
-    top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
-    splines, spectra, rejected, rate, note = _searched(
-        grid, poses, lost, gravity, guess, top, known=delay is not None
-    )
-    Z = spectra.moments()
-    Q = noise_moments(splines, grid, spectra.taper, spectra.zeta, spectra.of, splines.noise())
-    levels = wandering(Z, spectra.of)
-    best = saturated(Z, levels)
+        Z = spectra.moments()
+        Q = noise_moments(splines, grid, spectra.taper, spectra.zeta, spectra.of, splines.noise())
+        levels = wandering(Z, spectra.of)
+        best = saturated(Z, levels)
 
-    def fitted(start: State, free: NDArray[np.bool_]) -> RigidFit:
-        return fit_rigid(Z, Q, levels, start, free, best, gain=gain)
+        def fitted(start: State, free: NDArray[np.bool_]) -> RigidFit:
+            return fit_rigid(Z, Q, levels, start, free, best, gain=gain)
 
-    seen = read_off(best)
-    start = _start(p_SoPo_S, R_SP, seen)
-    fixed = np.ones(PARAMETERS, bool)
-    fixed[16] = delay is None
-    fixed[LEVER], fixed[TURN] = p_SoPo_S is None, R_SP is None
-    fit = fitted(start, fixed)
-    everything = np.ones(PARAMETERS, bool)
-    everything[16] = delay is None
-    free = fit if (fixed == everything).all() else fitted(_freed(fit, start, seen), everything)
-    return PoseEstimate(
-        fit=fit,
-        delay_s=spectra.delay + fit.state.tau,
-        delay_deviation=float(np.sqrt(fit.covariance[16, 16])),
-        clock_rate=rate,
-        frame=_frame(free, start),
-        free=free,
-        seen=seen,
-        spacing=splines.spacing,
-        splines=splines,
-        t=grid.t,
-        rejected=rejected,
-        note=note,
-    )
+        seen = read_off(best)
+        start = _start(p_SoPo_S, R_SP, seen)
+        fixed = np.ones(PARAMETERS, bool)
+        fixed[16] = delay is None
+        fixed[LEVER], fixed[TURN] = p_SoPo_S is None, R_SP is None
+        fit = fitted(start, fixed)
+        everything = np.ones(PARAMETERS, bool)
+        everything[16] = delay is None
+        free = fit if (fixed == everything).all() else fitted(_freed(fit, start, seen), everything)
+        return PoseEstimate(
+            fit=fit,
+            delay_s=spectra.delay + fit.state.tau,
+            delay_deviation=float(np.sqrt(fit.covariance[16, 16])),
+            clock_rate=rate,
+            frame=_frame(free, start),
+            free=free,
+            seen=seen,
+            spacing=splines.spacing,
+            splines=splines,
+            t=grid.t,
+            rejected=rejected,
+            note=note,
+        )
 
 
 def _searched(
@@ -228,16 +231,18 @@ def _searched(
     """Splines with the knots, and spectra with the delay and taper, that are used."""
     part = _liveliest(grid)
     some = replace(grid, t=grid.t[part], wrench=_rows(grid, part))
-    few = _within(poses, some)
+    near = _within(poses, some)
+    few = for_search(near)
     taper = _base_taper(grid, poses, lost, delay)[part] * end_taper(some.t, some.t[0], some.t[-1])
     spacing, late = first_guess(few, some, taper, gravity, delay, top, known=known)
-    first = spectra_of(PoseSplines(few, spacing), some, taper, gravity, late, top)
+    first = spectra_of(PoseSplines(near, spacing), some, taper, gravity, late, top)
     clear = without(taper, disturbed(first, some, taper, spacing)[0], grid.dt)
     rate = 0.0
     if not known:
         rate = clock_rate(few, some, clear, gravity, late, top, spacing)
     if rate:
-        few, poses = (at_rate(x, rate, some, late) for x in (few, poses))
+        near, poses = (at_rate(x, rate, some, late) for x in (near, poses))
+        few = for_search(near)
     spacing, late = best_spacing(few, some, clear, gravity, late, top, known=known)
     splines, base = PoseSplines(poses, spacing), _base_taper(grid, poses, lost, late)
     spectra = spectra_of(splines, grid, base, gravity, late, top)

@@ -43,17 +43,17 @@ class Levels:
         return cls(of.sizes, of.group, np.ones((of.count, 6)))
 
     def power(self, sums: Array, taken: Array | None = None) -> Array:
-        """(bands, 6) mean power of a number.
+        """(..., bands, 6) mean power of a number.
 
         Args:
-            sums: (bands, 6) of the power of the residual's numbers.
+            sums: (..., bands, 6) of the power of the residual's numbers.
             taken: (bands, 6) numbers that parameters took, of twice `sizes`.
         """
         left = self._numbers
         if taken is not None:
             left = np.maximum(left - 0.5 * self.grouped(taken), _LEAST_LEFT * left)
-        level = self.grouped(sums / self.shape) / left
-        return np.asarray(level[self.group] * self.shape)
+        level = np.add.reduceat(sums / self.shape, self._starts, axis=-2) / left
+        return np.asarray(level[..., self.group, :] * self.shape)
 
     def grouped(self, x: Array) -> Array:
         """(groups, ...) sums of (bands, ...)."""
@@ -69,7 +69,8 @@ class Levels:
         return self.grouped(self.sizes)[:, None]
 
     def costs(self, power: Array) -> Array:
-        """(6,) minus the log likelihood of each channel with these powers, but for a constant."""
+        """(..., 6) minus the log likelihood of each channel with powers (..., bands, 6), but for a
+        constant."""
         return np.asarray(self.sizes @ np.log(power))
 
 

@@ -38,6 +38,7 @@ from drake_teleop.logs.pose_motion.spectra import (
 from drake_teleop.logs.pose_motion.splines import (
     FEWEST_PER_KNOT,
     SIGNALS,
+    Choice,
     PoseSplines,
 )
 
@@ -81,49 +82,70 @@ class Saturated:
 
 def saturated(Z: Array, levels: Levels) -> Saturated:
     """The fit to moments (bands, 38, 38) of bands with such noise."""
-    sizes = levels.sizes
-    zz, zf = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES]
-    ff = np.diagonal(Z[:, FORCES, FORCES], axis1=1, axis2=2)
-    floor = least_power(Z, sizes)
-    scale = 1.0 / np.sqrt(np.diagonal(zz.sum(axis=0)) + 1e-300)
-    scale = np.where(np.diagonal(zz.sum(axis=0)) > 1e-18 * zz[:, 0, 0].sum(), scale, 0.0)
-    zz, zf = zz * np.outer(scale, scale), zf * scale[:, None]
-    power = np.maximum(ff / sizes[:, None], floor)
-    power[:] = power.mean(axis=0)
+    return _fitted(Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _powers(Z), levels)
+
+
+def _powers(Z: Array) -> Array:
+    """(bands, 6) of the wrench, summed over each band."""
+    return np.diagonal(Z[:, FORCES, FORCES], axis1=1, axis2=2)
+
+
+def _fitted(zz: Array, zf: Array, ff: Array, levels: Levels) -> Saturated:
+    """`saturated`, of moments of the signals with themselves and with the wrench, and its powers.
+
+    Args:
+        zz, zf, ff: (..., bands, 16, 16), (..., bands, 16, 6) and (bands, 6). What comes back has
+            the dimensions before the bands too: many fits cost little more than one.
+        levels: of the noise.
+    """
+    size = np.diagonal(zz.sum(axis=-3), axis1=-2, axis2=-1)
+    constant = zz[..., 0, 0].sum(axis=-1)[..., None]
+    scale = np.where(size > 1e-18 * constant, 1.0 / np.sqrt(size + 1e-300), 0.0)
+    both = scale[..., :, None] * scale[..., None, :]
+    zz, zf = zz * both[..., None, :, :], zf * scale[..., None, :, None]
+    floor = _least(ff, levels.sizes)
+    power = np.maximum(ff / levels.sizes[:, None], floor)
+    power = np.broadcast_to(power.mean(axis=0), (*zf.shape[:-2], 6))
+    flat = zz.reshape(*zz.shape[:-2], -1)
     for _ in range(_ITERATIONS):
         weight = 1.0 / power
-        gram = (weight.T @ zz.reshape(len(zz), -1)).reshape(6, SIGNALS, SIGNALS)
-        right = np.sum(zf * weight[:, None], axis=0).T
+        gram = (np.swapaxes(weight, -1, -2) @ flat).reshape(*zz.shape[:-3], 6, SIGNALS, SIGNALS)
+        right = np.swapaxes(np.sum(zf * weight[..., None, :], axis=-3), -1, -2)
         inverse = _inverses(gram)
         C = (inverse @ right[..., None])[..., 0]
-        explained = np.sum((2.0 * zf - zz @ C.T) * C.T, axis=1)
+        across = np.swapaxes(C, -1, -2)[..., None, :, :]
+        explained = np.sum((2.0 * zf - zz @ across) * across, axis=-2)
         power = np.maximum(levels.power(ff - explained), floor)
     return Saturated(
-        coefficients=C * scale,
-        covariance=0.5 * inverse * np.outer(scale, scale),
+        coefficients=C * scale[..., None, :],
+        covariance=0.5 * inverse * both[..., None, :, :],
         power=power,
         costs=levels.costs(power),
     )
 
 
 def _inverses(gram: Array) -> Array:
-    """(6, 16, 16) pseudo-inverses of symmetric matrices."""
-    largest = np.diagonal(gram, axis1=1, axis2=2).max(axis=1, keepdims=True)
+    """(..., 16, 16) pseudo-inverses of symmetric matrices."""
+    largest = np.diagonal(gram, axis1=-2, axis2=-1).max(axis=-1, keepdims=True)
     try:
-        pivots = np.diagonal(np.linalg.cholesky(gram), axis1=1, axis2=2) ** 2
+        pivots = np.diagonal(np.linalg.cholesky(gram), axis1=-2, axis2=-1) ** 2
         if (pivots > _FULL_RANK * largest).all():
             return np.asarray(np.linalg.inv(gram))  # in a third of the time
     except np.linalg.LinAlgError:
         pass
     values, vectors = np.linalg.eigh(gram)
-    good = values > _RANK * values[:, -1:]
-    scaled = vectors * np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)[:, None]
-    return np.asarray(scaled @ vectors.transpose(0, 2, 1))
+    good = values > _RANK * values[..., -1:]
+    scaled = vectors * np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)[..., None, :]
+    return np.asarray(scaled @ np.swapaxes(vectors, -1, -2))
 
 
 def least_power(Z: Array, sizes: Array) -> Array:
     """(6,) below which a residual's power is rounding, not noise."""
-    power = np.diagonal(Z[:, FORCES, FORCES].sum(axis=0)) / sizes.sum()
+    return _least(_powers(Z), sizes)
+
+
+def _least(ff: Array, sizes: Array) -> Array:
+    power = ff.sum(axis=0) / sizes.sum()
     both = power.reshape(2, 3).sum(axis=1).repeat(3)
     return np.maximum(ROUNDING**2 * both, 1e-60)
 
@@ -191,6 +213,44 @@ class Spectra:
     def fit(self) -> Saturated:
         return saturated(moments(self.signals, self.wrench, self.of), Levels.flat(self.of))
 
+    def costs(self, delays: Array) -> Array:
+        """(D,) L of the fits at these delays (D,)."""
+        if self.chopped:
+            Z = np.array([moments(x.signals, x.wrench, x.of) for x in map(self.at, delays)])
+            zz, zf = Z[..., :SIGNALS, :SIGNALS], Z[..., :SIGNALS, FORCES]
+        else:
+            zz, zf = self._moved(np.asarray(delays))
+        power = np.abs(self.wrench) ** 2
+        return _fitted(zz, zf, self.of.sums(power), Levels.flat(self.of)).costs.sum(axis=-1)
+
+    def _moved(self, delays: Array) -> tuple[Array, Array]:
+        """(D, bands, 16, 16) and (D, bands, 16, 6) moments at delays (D,), the taper whole.
+
+        Phases cancel in products of the signals, but for those with the constant, which stays.
+        """
+        of, Z = self.of, moments(self.signals, self.wrench, self.of)
+        fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * of.weight[:, None]
+        products = np.conj(self.signals)[:, :, None] * fixed[:, None]
+        flat = products.reshape(len(products), -1)
+        angle = 2.0 * np.pi * np.outer(delays - self.delay, of.frequency)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        starts = np.searchsorted(of.band, np.arange(of.count + 1))
+        sums = np.empty((len(delays), of.count, flat.shape[1]))
+        for k in range(of.count):
+            part = slice(starts[k], starts[k + 1])
+            sums[:, k] = cosine[:, part] @ flat[part].real + sine[:, part] @ flat[part].imag
+        zf = sums.reshape(len(delays), of.count, SIGNALS, 7)
+        zf[:, :, 0, :6], zf[:, :, 0, 6] = Z[:, 0, FORCES], Z[:, 0, 0]
+        zz = np.repeat(Z[None, :, :SIGNALS, :SIGNALS], len(delays), axis=0)
+        zz[..., 0] = zz[..., 0, :] = zf[..., 6]
+        return zz, zf[..., :6]
+
+    def with_motion(self, splines: PoseSplines, gravity_W: Array, delay: float) -> Spectra:
+        """The same wrench and taper with the motion of other splines, `delay` [s] later."""
+        zeta = splines.signals(self.grid.t + delay, gravity_W)
+        signals = signal_spectrum(self.grid, self.taper, zeta, len(self.wrench))
+        return replace(self, signals=signals, delay=delay, zeta=zeta)
+
 
 def spectra_of(
     splines: PoseSplines,
@@ -215,8 +275,8 @@ def best_delay(spectra: Spectra, reach: float, finest: float = _FINEST) -> tuple
     To `finest` [s], at the least.
     """
     step = min(_COARSE, reach / 2)
-    at = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1)
-    costs = np.array([spectra.at(x).fit().cost for x in at])
+    at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
+    costs = spectra.costs(at)
     while step > finest:
         best = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
         left, middle, right = costs[best - 1 : best + 2]
@@ -225,13 +285,13 @@ def best_delay(spectra: Spectra, reach: float, finest: float = _FINEST) -> tuple
         centre = float(at[best] + step * np.clip(move, -1.0, 1.0))
         step /= 8.0
         at = centre + step * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
-        costs = np.array([spectra.at(x).fit().cost for x in at])
+        costs = spectra.costs(at)
     best = int(np.argmin(costs))
     return float(at[best]), float(costs[best])
 
 
 def first_guess(
-    poses: Poses,
+    few: Choice,
     grid: Grid,
     taper: Array,
     gravity_W: Array,
@@ -244,17 +304,18 @@ def first_guess(
 
     A delay that is known stays. With knots too fine the motion is noise, and no delay shows.
     """
-    few, found = for_search(poses), []
     reach = min(REACH, 0.1 * float(grid.t[-1] - grid.t[0]))
-    for h in _allowed(few)[::2]:
-        spectra = spectra_of(PoseSplines(few, h), grid, taper, gravity_W, delay, top)
+    spacings, found = _allowed(few.poses)[::2], []
+    start = spectra_of(few.at(spacings[0]), grid, taper, gravity_W, delay, top)
+    for h in spacings:
+        spectra = start.with_motion(few.at(h), gravity_W, delay)
         late, cost = (delay, spectra.fit().cost) if known else best_delay(spectra, reach, _NEARLY)
         found.append((cost, h, late))
     return min(found)[1:]
 
 
 def best_spacing(
-    poses: Poses,
+    few: Choice,
     grid: Grid,
     taper: Array,
     gravity_W: Array,
@@ -265,29 +326,30 @@ def best_spacing(
 ) -> tuple[float, float]:
     """Distance of the knots [s] and delay [s] of the least L, from nearly the right delay.
 
-    Poses faster than 125 Hz are averaged for this. Knots are then a little closer than where L is
-    least: the fit takes noise that they pass into account, but not motion that they do not. The
-    delay, unless it is known, is found again with them.
+    Knots are then a little closer than where L is least: the fit takes noise that they pass into
+    account, but not motion that they do not. The delay, unless it is known, is found again with
+    them.
     """
-    few = for_search(poses)
+    spacings = _allowed(few.poses)
+    start = spectra_of(few.at(spacings[0]), grid, taper, gravity_W, delay, top)
 
-    def spectra(h: float, late: float) -> Spectra:
-        return spectra_of(PoseSplines(few, h), grid, taper, gravity_W, late, top)
+    def spectra(h: float) -> Spectra:
+        return start.with_motion(few.at(h), gravity_W, delay)
 
-    costs = {h: spectra(h, delay).fit().cost for h in _allowed(few)}
+    costs = {h: spectra(h).fit().cost for h in spacings}
     middle = min(costs, key=lambda h: costs[h])
-    for other in _neighbours(middle, list(costs)):
+    for other in _neighbours(middle, spacings):
         h = float(np.sqrt(middle * other))
-        costs[h] = spectra(h, delay).fit().cost
-    best = max(_FINER * min(costs, key=lambda h: costs[h]), FEWEST_PER_KNOT / few.rate)
+        costs[h] = spectra(h).fit().cost
+    best = max(_FINER * min(costs, key=lambda h: costs[h]), FEWEST_PER_KNOT / few.poses.rate)
     if not known:
-        delay, _ = best_delay(spectra(best, delay), 3 * _COARSE)
+        delay, _ = best_delay(spectra(best), 3 * _COARSE)
     return best, delay
 
 
-def for_search(poses: Poses) -> Poses:
-    """Means of poses that are faster than the search needs."""
-    return poses.averaged(max(1, int(poses.rate / _SEARCH_RATE + 1e-6)))
+def for_search(poses: Poses) -> Choice:
+    """Splines of means of poses, if these are faster than the search needs."""
+    return Choice(poses.averaged(max(1, int(poses.rate / _SEARCH_RATE + 1e-6))))
 
 
 def _neighbours(h: float, of: list[float]) -> list[float]:

@@ -131,6 +131,21 @@ class PoseSplines:
         return np.array([np.abs(np.fft.rfft(x)[inside]) ** 2 / n for x in residual.T])
 
 
+class Choice:
+    """Splines of the same poses with knots of several distances, each fitted once."""
+
+    def __init__(self, poses: Poses) -> None:
+        """`poses` with continuous signs."""
+        self.poses = poses
+        self._fitted: dict[float, PoseSplines] = {}
+
+    def at(self, spacing: float) -> PoseSplines:
+        """Those with knots at this distance [s]."""
+        if spacing not in self._fitted:
+            self._fitted[spacing] = PoseSplines(self.poses, spacing)
+        return self._fitted[spacing]
+
+
 def passed(frequency: Array, spacing: float) -> Array:
     """Share of white noise's power that splines pass (module docstring)."""
     x = np.minimum(frequency * spacing, 0.999)
@@ -164,27 +179,40 @@ def _least_squares(times: list[Array], values: Iterable[Array], knots: Array) ->
     By the banded normal equations, as `scipy.interpolate.make_lsq_spline` did before it took QR,
     which is five times slower; with two poses to a knot they lose no digit that a pose has.
     """
-    size = len(knots) - DEGREE - 1
-    band, right = np.zeros((DEGREE + 1, size)), np.zeros((size, 7))
+    size, order = len(knots) - DEGREE - 1, DEGREE + 1
+    band, right = np.zeros((order, size)), np.zeros((size, 7))
     for t, x in zip(times, values, strict=True):
         A = BSpline.design_matrix(t, knots, DEGREE)
-        gram = A.T @ A
-        for k in range(DEGREE + 1):
-            band[DEGREE - k, k:] += gram.diagonal(k)
-        right += A.T @ x
+        basis, first = A.data.reshape(-1, order), A.indices[::order]
+        starts = np.flatnonzero(np.diff(first, prepend=-1))  # of the rows between two knots
+        columns = np.hstack([basis, x])
+        for i in range(order):
+            sums = np.add.reduceat(basis[:, i : i + 1] * columns[:, i:], starts)
+            at = first[starts] + i
+            for k in range(order - i):
+                band[DEGREE - k, at + k] += sums[:, k]
+            right[at] += sums[:, -7:]
     return BSpline(knots, solveh_banded(band, right), DEGREE)
 
 
 def _vector(q: Array, p: Array) -> Array:
     """(N, 3) vector part of q* p."""
     v, w = q[:, 1:], p[:, 1:]
-    out: Array = q[:, :1] * w - p[:, :1] * v - np.cross(v, w)
+    out: Array = q[:, :1] * w - p[:, :1] * v - _cross(v, w)
     return out
 
 
 def _in_P(q: Array, n: Array, x: NDArray[np.float64]) -> Array:
     """(N, 3) vectors in the axes of P, of such in the world."""
     v = -q[:, 1:]
-    once = np.cross(v, x)
-    out: Array = x + 2.0 * (q[:, :1] * once + np.cross(v, once)) / n
+    once = _cross(v, x)
+    out: Array = x + 2.0 * (q[:, :1] * once + _cross(v, once)) / n
+    return out
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """(N, 3) in a fifth of the time that numpy takes."""
+    out = np.empty(a.shape)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.subtract(a[:, j] * b[:, k], a[:, k] * b[:, j], out=out[:, i])
     return out

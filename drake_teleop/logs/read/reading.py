@@ -249,14 +249,18 @@ class _Reader:
             position = clock.taken(position)
         columns = self._orientation("pose", stream.orientation, table, clock.total)
         quaternion = np.empty((len(clock.rows), 4))
+        origin = np.array(stream.position_in_sensor)
         for start in range(0, len(quaternion), _CHUNK):
             part = slice(start, start + _CHUNK)
-            R_WS = self._rotations("pose", stream.orientation, table, columns, clock.rows[part])
-            if stream.R_SP is not None:
-                R_WS = R_WS @ stream.R_SP.T
-            quaternion[part] = quaternions(R_WS)
-            if position is not None:  # from the posed origin to that of S
-                position[part] -= R_WS @ np.array(stream.position_in_sensor)
+            q = self._quaternions("pose", stream.orientation, table, columns, clock.rows[part])
+            if stream.R_SP is not None or (position is not None and origin.any()):
+                R_WS = rotation_matrices(q, "quaternion_wxyz")
+                if stream.R_SP is not None:
+                    R_WS = R_WS @ stream.R_SP.T
+                    q = quaternions(R_WS)
+                if position is not None:  # from the posed origin to that of S
+                    position[part] -= R_WS @ origin
+            quaternion[part] = q
         return quaternion, position
 
     def _imu(self, stream: Imu, pose: Stream | None) -> Stream:
@@ -382,6 +386,27 @@ class _Reader:
             columns *= self._description.scale(orientation.unit)
         return columns
 
+    def _quaternions(
+        self,
+        name: str,
+        orientation: Orientation,
+        table: Table,
+        columns: NDArray[np.float64],
+        rows: NDArray[np.intp],
+    ) -> NDArray[np.float64]:
+        """(len(rows), 4) [w, x, y, z] of `_rotations`, without matrices where the log has none."""
+        if not orientation.form.startswith("quaternion"):
+            return quaternions(self._rotations(name, orientation, table, columns, rows))
+        q = columns[rows]
+        if orientation.form == "quaternion_xyzw":
+            q = np.roll(q, 1, axis=1)
+        squared = np.einsum("ij,ij->i", q, q)  # q stands for the matrix of this, times a rotation
+        self._check_rotations(np.abs(squared**2 - 1.0), name, orientation, table, rows)
+        q /= np.sqrt(squared)[:, None]
+        if orientation.inverse:
+            q[:, 1:] *= -1.0
+        return q
+
     def _rotations(
         self,
         name: str,
@@ -392,7 +417,18 @@ class _Reader:
     ) -> NDArray[np.float64]:
         """(len(rows), 3, 3) rotations of some rows of `_orientation`."""
         R = rotation_matrices(columns[rows], orientation.form)
-        errors = rotation_error(R)
+        self._check_rotations(rotation_error(R), name, orientation, table, rows)
+        return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
+
+    def _check_rotations(
+        self,
+        errors: NDArray[np.float64],
+        name: str,
+        orientation: Orientation,
+        table: Table,
+        rows: NDArray[np.intp],
+    ) -> None:
+        """Refuses what is farther from a rotation, by `rotation_error`, than rounding makes it."""
         worst = int(np.argmax(errors))
         if errors[worst] > ROTATION_TOLERANCE:
             raise DrakeTeleopError(
@@ -400,7 +436,6 @@ class _Reader:
                 where=f"{self._source}:{name}.orientation",
                 remedy=f"check the columns and their order; form is {orientation.form}",
             )
-        return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def _common_time(
         self, wrench_t: NDArray[np.float64], streams: Sequence[Stream]
