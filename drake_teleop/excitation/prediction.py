@@ -102,7 +102,7 @@ def predicted_covariance(
     influence[:, :6] = weighted @ inverse
     if noise.filters is not None:
         of_s, of_alpha = noise.filters
-        of_motion = -_spatial_inertia(phi) @ influence[:, :6]
+        of_motion = -spatial_inertia(phi) @ influence[:, :6]
         through_s = _backwards(of_s, of_motion[:, :3], step)
         # s of So is s of Ao plus p_SoAo x alpha.
         through_alpha = of_motion[:, 3:] + cross_matrix(noise.place).T @ through_s
@@ -136,7 +136,7 @@ def _backwards(polynomials: tuple[Array, Array], signals: Array, step: float) ->
     return np.asarray(lfilter(b, a, signals[::-1], axis=0)[::-1])
 
 
-def _spatial_inertia(phi: Array) -> Array:
+def spatial_inertia(phi: Array) -> Array:
     """(6, 6) from [s, alpha] of S to the wrench of phi."""
     moment = cross_matrix(phi[1:4])
     return np.block([[phi[0] * np.eye(3), -moment], [moment, inertia_about_origin(phi)]])
