@@ -22,10 +22,17 @@ from collections import deque
 import numpy as np
 
 from drake_teleop.load.arrays import Array
-from drake_teleop.load.compensation import scaled_wrench_into
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
+from drake_teleop.robots.live_step import (
+    AT_RANGE,
+    NOT_FINITE,
+    TOO_LARGE,
+    clipped,
+    doubts,
+    eliminated_into,
+)
 from drake_teleop.robots.streams import ONLY_SAID, VALUES, Compensated, Flag, Reading
 from drake_teleop.robots.watch import Watch
 
@@ -36,11 +43,16 @@ JUMP_S = 1.0
 DRIFT = 1e-3
 """How fast clocks may drift apart [s/s]."""
 RATE_OFF = 0.05
-"""Share by which the rate may be another, over `_RATE_OF` readings."""
+"""Share by which the rate may be another, over `_RATE_OF` readings, and `_RATE_S`."""
 TARE_S = 0.5
 """How long it has to rest before a tare [s]."""
-_RATE_OF = 200
+_RATE_OF, _RATE_S = 200, 0.4  # readings, [s]: a burst is no rate
+_LATEST = 1e12  # [s]
 _LARGEST = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
+# Whole numbers: what is done with a `Flag` in Python takes a microsecond each time.
+_DAMAGED, _STALE, _CLIPPED = int(Flag.DAMAGED), int(Flag.STALE), int(Flag.CLIPPED)
+_ONLY_SAID, _GAP, _WRONG_RATE = int(ONLY_SAID), int(Flag.GAP), int(Flag.WRONG_RATE)
+_DOUBTS = {NOT_FINITE: Flag.NOT_FINITE, TOO_LARGE: Flag.OUT_OF_RANGE, AT_RANGE: Flag.SATURATED}
 # At rest, rms: specific force [m/s^2], angular velocity [rad/s]; noise of the wrench, as a multiple
 # of what the identification left, and at least [N, N m].
 _MOVED, _TURNING = 0.1, 0.02
@@ -83,49 +95,56 @@ class Compensator:
         tare_limit: tuple[float, float] = (5.0, 0.25),
     ) -> None:
         self._phi, self._nothing = usable_phi(load)[0], np.zeros(10)
-        self._scales, self._dt = (float(sigma), float(sigma), float(gamma)), dt
+        self._scales, self._dt = np.array([sigma, sigma, gamma], float), dt
         self.offsets = load.offsets.copy()
         self.lag_s = wait * dt + filter_lag(dt, cutoff_hz)
-        self._filter, self._watch = None, watch
+        self._low_pass, self._watch = np.empty(0), watch
         if cutoff_hz is not None and cutoff_hz < 0.5 / dt:
-            self._filter = low_pass_coefficients(dt, cutoff_hz, self.lag_s if predicted else 0.0)
-        self._range = np.full(6, np.inf) if largest is None else np.asarray(largest, float)
+            b, a, settled = low_pass_coefficients(dt, cutoff_hz, self.lag_s if predicted else 0.0)
+            self._low_pass = np.concatenate([b, a[1:], settled])
+        self._range = np.full(6, np.inf) if largest is None else np.array(largest, float)
         self._largest = np.concatenate([np.minimum(_LARGEST[:6], 2.0 * self._range), _LARGEST[6:]])
         self._wavers = np.maximum(_WAVERS * load.residual_rms, _WAVERS_LEAST)
         self._tare_limit = np.repeat(tare_limit, 3)
-        self._memory: tuple[Array, Array] | None = None
+        self._memory = np.full((2, 12), np.nan)
         self._late: deque[Array] = deque(maxlen=wait + 1)
         self._number, self._t, self._now = -1, 0.0, -math.inf
         self._offset = math.inf  # the least now - t
         self._in_time = -math.inf  # when the last one came that was not late
         self._since, self._first, self._readings, self._rate_off = 0.0, 0, 0, 0
+        self._rate_of = max(_RATE_OF, round(_RATE_S / dt))
         self._rest = np.zeros((max(2, round(TARE_S / dt)), VALUES + 6))
         self.rested = 0
         # What is compiled is loaded now: the first readings would be stale before they are judged.
-        self._eliminated(np.zeros(VALUES))
+        doubts(np.zeros(VALUES), self._largest, self._range)
+        clipped(self._eliminated(np.zeros(VALUES)), self._range)
+        self._settle_anew()
         self.rested = 0
 
     def step(self, reading: Reading, now: float) -> Compensated:
         """Takes a reading that came at `now` [s], of a clock that never goes back."""
         flags = self._judge(reading, now)
-        wrong = flags & ~ONLY_SAID
-        if wrong & ~(Flag.GAP):
+        wrong = flags & ~_ONLY_SAID
+        if wrong & ~_GAP:
             return self._zero(flags)
         if now - self._now > STALE_S:
             self._settle_anew()
         self._now, self._number, self._t = now, reading.number, reading.t
-        wrench = self._filtered(self._eliminated(reading.values))
+        self._late.append(self._eliminated(reading.values))
         if wrong:
             return self._zero(flags)
         if self._watch is not None:
             flags |= self._watch.flags(reading.values)
-        return self._limited(reading, wrench, flags)
+        wrench = self._late[0].copy()
+        if clipped(wrench, self._range):
+            flags |= _CLIPPED
+        return Compensated(reading.number, reading.t, wrench[:6], wrench[6:], flags)
 
     def idle(self, now: float) -> Compensated | None:
         """What to say when nothing comes: nothing at first, then that it is stale."""
         if now - self._now <= STALE_S:
             return None
-        return self._zero(Flag.STALE)
+        return self._zero(_STALE)
 
     def left(self, now: float) -> float:
         """How long the last reading is not stale yet [s]."""
@@ -156,36 +175,38 @@ class Compensator:
 
     def _judge(self, reading: Reading, now: float) -> int:
         """The reading's flags; keeps the clocks."""
-        if reading.flags & Flag.DAMAGED:
-            return int(Flag.DAMAGED)
-        values, flags = reading.values, reading.flags
-        if not (math.isfinite(reading.t) and np.isfinite(values).all()):
-            return flags | Flag.NOT_FINITE
-        size = np.abs(values)
-        if (size > self._largest).any() or abs(reading.t) > 1e12:
-            return flags | Flag.OUT_OF_RANGE
-        if (size[:6] >= self._range).any():
-            flags |= Flag.SATURATED
+        flags = reading.flags
+        if flags & _DAMAGED:
+            return _DAMAGED
+        doubt = doubts(reading.values, self._largest, self._range)
+        if not math.isfinite(reading.t):
+            doubt = NOT_FINITE
+        elif abs(reading.t) > _LATEST and doubt != NOT_FINITE:
+            doubt = TOO_LARGE
+        if doubt:
+            flags |= int(_DOUBTS[doubt])
+        if doubt in (NOT_FINITE, TOO_LARGE):
+            return flags
         ahead = now - reading.t
         known = not math.isinf(self._offset)
         step = reading.t - self._t
         # What is out of order comes between what is not; if nothing else comes, it is the order.
         lost = now - self._now > STALE_S
         if known and reading.number <= self._number and (abs(step) > JUMP_S or lost):
-            return self._anew(reading, ahead, flags | Flag.RESTART)
+            return self._anew(reading, ahead, flags | int(Flag.RESTART))
         if known and (abs(ahead - self._offset) > JUMP_S or (step <= 0.0 and lost)):
-            return self._anew(reading, ahead, flags | Flag.CLOCK_JUMP)
+            return self._anew(reading, ahead, flags | int(Flag.CLOCK_JUMP))
         if known and step <= 0.0:
-            return flags | Flag.REORDERED
+            return flags | int(Flag.REORDERED)
         if known and reading.number <= self._number:
-            return self._anew(reading, ahead, flags | Flag.RESTART)
+            return self._anew(reading, ahead, flags | int(Flag.RESTART))
         self._offset = min(ahead, self._offset + (DRIFT * self._dt if known else 0.0))
         if ahead - self._offset <= STALE_S:
             self._in_time = now
         elif now - self._in_time > JUMP_S:
-            return self._anew(reading, ahead, flags | Flag.CLOCK_JUMP)
+            return self._anew(reading, ahead, flags | int(Flag.CLOCK_JUMP))
         else:
-            flags |= Flag.STALE
+            flags |= _STALE
         return flags | self._rate(reading)
 
     def _anew(self, reading: Reading, ahead: float, flags: int) -> int:
@@ -197,7 +218,7 @@ class Compensator:
         return flags
 
     def _settle_anew(self) -> None:
-        self._memory = None
+        self._memory[:] = np.nan
         self._late.clear()
 
     def _rate(self, reading: Reading) -> int:
@@ -205,43 +226,21 @@ class Compensator:
         if self._readings == 0:
             self._since, self._first = reading.t, reading.number
         self._readings += 1
-        if self._readings > _RATE_OF:
+        if self._readings > self._rate_of:
             spacing = (reading.t - self._since) / max(1, reading.number - self._first)
             off = abs(spacing / self._dt - 1.0) > RATE_OFF
-            self._rate_off, self._readings = int(Flag.WRONG_RATE) if off else 0, 0
+            self._rate_off, self._readings = _WRONG_RATE if off else 0, 0
         return self._rate_off
 
     def _eliminated(self, values: Array) -> Array:
-        """(12,) contact and scaled."""
-        out = np.empty((2, 6))
-        wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:15]
-        motion = wrench, self.offsets, s, omega, alpha
-        scaled_wrench_into(*motion, self._phi, self._nothing, 0.0, 0.0, 1.0, out[0])
-        scaled_wrench_into(*motion, self._nothing, self._phi, *self._scales, out[1])
-        row = self._rest[self.rested % len(self._rest)]
-        row[:VALUES], row[VALUES:] = values, out[0]
+        """(12,) contact and scaled, behind the low-pass; keeps what a tare wants to know."""
+        out = np.empty(12)
+        at = self.rested % len(self._rest)
+        load = self._phi, self._nothing, self._scales
+        kept = self._low_pass, self._memory, self._rest, at
+        eliminated_into(values, self.offsets, *load, *kept, out)
         self.rested += 1
-        return out.ravel()
-
-    def _filtered(self, x: Array) -> Array:
-        """The low-pass, in the order of operations of `scipy.signal.lfilter`; then the wait."""
-        if self._filter is not None:
-            b, a, settled = self._filter
-            if self._memory is None:
-                self._memory = settled[0] * x, settled[1] * x
-            z0, z1 = self._memory
-            y = z0 + b[0] * x
-            self._memory = z1 + x * b[1] - y * a[1], x * b[2] - y * a[2]
-            x = y
-        self._late.append(x)
-        return self._late[0]
-
-    def _limited(self, reading: Reading, wrench: Array, flags: int) -> Compensated:
-        contact, scaled = wrench[:6], wrench[6:]
-        if (np.abs(wrench).reshape(2, 6) > self._range).any():
-            flags |= Flag.CLIPPED
-            contact, scaled = (np.clip(x, -self._range, self._range) for x in (contact, scaled))
-        return Compensated(reading.number, reading.t, contact, scaled, int(flags))
+        return out
 
     def _zero(self, flags: int) -> Compensated:
         self.rested = 0

@@ -7,8 +7,10 @@ flags, number, time [s], contact (6), scaled (6).
 
 from __future__ import annotations
 
+import select
 import socket
 import struct
+from contextlib import suppress
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -25,6 +27,7 @@ WRENCH = struct.Struct("<4sIQd12d")
 _IN, _POSED, _OUT = b"DTW1", b"DTP1", b"DTC1"
 _HEAD = struct.Struct("<4sIQd")
 _MOST = 256  # packets at once
+_SATURATED = int(Flag.SATURATED)
 
 
 def packed(reading: Reading) -> bytes:
@@ -38,7 +41,7 @@ def unpacked(packet: bytes) -> Reading:
         return DAMAGED
     _, flags, number, t = _HEAD.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 15, _HEAD.size).astype(np.float64)
-    return Reading(number, t, values, flags & Flag.SATURATED)
+    return Reading(number, t, values, flags & _SATURATED)
 
 
 def packed_parts(wrench: Part, pose: Part) -> bytes:
@@ -53,13 +56,14 @@ def unpacked_parts(packet: bytes) -> list[Part]:
         return [Part(streams.WRENCH, -1, np.nan, np.full(6, np.nan), int(Flag.DAMAGED))]
     _, flags, number, t = _HEAD.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 13, _HEAD.size).astype(np.float64)
-    wrench = Part(streams.WRENCH, number, t, values[:6], flags & Flag.SATURATED)
+    wrench = Part(streams.WRENCH, number, t, values[:6], flags & _SATURATED)
     return [wrench, Part(streams.POSE, number, t, values[6:])]
 
 
 def packed_wrench(out: Compensated) -> bytes:
     """The packet of a wrench."""
-    return WRENCH.pack(_OUT, out.flags, out.number, out.t, *out.contact, *out.scaled)
+    wrenches = (np.asarray(each, "<f8").tobytes() for each in (out.contact, out.scaled))
+    return _HEAD.pack(_OUT, out.flags, out.number, out.t) + b"".join(wrenches)
 
 
 def unpacked_wrench(packet: bytes) -> Compensated:
@@ -113,18 +117,18 @@ class _Receiver:
     def __init__(self, address: str, dt: float) -> None:
         self.dt = dt
         self._socket = listening(*endpoint(address))
+        self._socket.setblocking(False)
+        self._poll = select.poll()
+        self._poll.register(self._socket, select.POLLIN)
         self.port = self._socket.getsockname()[1]
 
     def packets(self, timeout_s: float) -> list[bytes]:
         """Those that have come."""
         found: list[bytes] = []
-        self._socket.settimeout(timeout_s)
-        try:
-            while len(found) < _MOST:
-                found.append(self._socket.recv(READING.size + 1))
-                self._socket.settimeout(0.0)
-        except (TimeoutError, BlockingIOError):
-            pass
+        if self._poll.poll(1e3 * timeout_s):
+            with suppress(BlockingIOError):
+                while len(found) < _MOST:
+                    found.append(self._socket.recv(READING.size + 1))
         return found
 
     def close(self) -> None:
