@@ -3,7 +3,7 @@
 `python benchmarks/calibrate.py [--json FILE] [--loads 100]` lets it calibrate simulated loads (0.8
 to 6 kg, radii of gyration of 4 to 9 cm) in virtual time, at 500 Hz, until "mass 0.5 %, com 0.5 mm"
 is known from a hand's motion, and until "inertia 5 %" is known, too, from that of `excite` for the
-shipped station:
+shipped station; and the former from noisy poses of a hand (`posed_hand.py`):
 
 * hand: rotations and accelerations of sines from 0.2 to 1.5 Hz with a rms of 1 to 3 rad/s, another
   for each load, which begin with half a second of rest;
@@ -155,6 +155,8 @@ def judged(at: Look, tolerance: Tolerance, phi: Array) -> dict[str, Any]:
 
 def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
     """Figures of one motion."""
+    from posed_hand import posed
+
     tolerance, t = read_tolerance(until), np.arange(round(SECONDS * HZ)) / HZ
     motion = excited(t) if name == "excite" else None
     stops: list[dict[str, Any]] = []
@@ -163,8 +165,13 @@ def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
     for k in range(loads):
         rng = np.random.default_rng([k, len(name)])
         phi = load_of(rng)
-        stream = stream_of(rng, phi, t, motion or hand(rng, t))
-        looks = calibrate(stream, Recorder(), folder / "log.parquet", tolerance)
+        stream: Any
+        keeps: Any
+        if name == "poses":
+            stream, keeps = posed(rng, phi, SECONDS)
+        else:
+            stream, keeps = stream_of(rng, phi, t, motion or hand(rng, t)), Recorder()
+        looks = calibrate(stream, keeps, folder / keeps.file, tolerance)
         for at in looks:
             if at.found is not None:
                 wrong = np.array(judged(at, tolerance, phi)["error"]) > 1.0
@@ -195,13 +202,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--loads", type=int, default=100, help="for each motion")
+    parser.add_argument("--only", choices=["hand", "excite", "poses"], help="one motion alone")
     options = parser.parse_args()
     figures = {}
     with tempfile.TemporaryDirectory() as folder:
         for name, until in (
             ("hand", "mass 0.5 %, com 0.5 mm"),
             ("excite", "mass 0.5 %, com 0.5 mm, inertia 5 %"),
+            ("poses", "mass 0.5 %, com 0.5 mm"),
         ):
+            if options.only not in (None, name):
+                continue
             for key, value in study(name, until, options.loads, Path(folder)).items():
                 figures[f"{name}.{key}"] = round(value, 4)
                 print(f"{name + '.' + key:40} {value:.4g}", flush=True)

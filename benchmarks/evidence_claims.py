@@ -15,6 +15,7 @@ RUNS = {
     "adversary_methods": "benchmarks/adversary.py --runs 900 --json FILE",
     "analysis": "benchmarks/analysis.py --json FILE",
     "calibrate": "benchmarks/calibrate.py --json FILE",
+    "calibrate_poses": "benchmarks/calibrate.py --only poses --loads 50 --json FILE",
     "calls": "benchmarks/calls.py --json FILE",
     "compensate": "benchmarks/compensate.py --json FILE",
     "contact_detection": "benchmarks/contact_detection.py --json FILE",
@@ -36,7 +37,9 @@ RUNS = {
     ),
     "realistic_sensor": "benchmarks/realistic_sensor.py --json FILE",
     "recovery": "benchmarks/recovery.py --networks 300 --json FILE",
+    "replayed": "benchmarks/replayed.py --json FILE",
     "reproduce": "drake-teleop reproduce --quiet --out FOLDER",
+    "shortest": "benchmarks/shortest.py --json FILE",
     "station": "benchmarks/station.py --json FILE",
     "stations": (
         "benchmarks/stations.py --devices phantom_premium_15,geomagic_touch,omega_6,leader"
@@ -449,6 +452,31 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(LIVE, "mass and centre of mass are known after, in the middle"),
         *("by hand, 0.5 % and 0.5 mm", "robot.md", "calibrate"),
         *(lambda f: f["hand.median_s"], "s", 0.0, 5.0),
+    ),
+    Claim(
+        *(LIVE, "The same from a robot's poses"),
+        *("50 loads by hand, 0.1 mm and 0.2 mrad; right gains", "robot.md", "calibrate_poses"),
+        *(lambda f: f["poses.false_known"], "", 0.0, 0.0),
+    ),
+    Claim(
+        *(LIVE, "`compensate replay:LOG` differs from `eliminate --causal` in"),
+        *("all logs that there are, at any chunking", "robot.md", "replayed"),
+        *(lambda f: f["different"], "numbers", 0.0, 0.0),
+    ),
+    Claim(
+        *(LIVE, "Force left of NTNU's vibrations, live, without its mean"),
+        *("30 Hz; zero-phase 0.316 N", "robot.md", "replayed"),
+        *(lambda f: f["2-vibrations.own.live_N"], "N", 0.0, 0.35),
+    ),
+    Claim(
+        *(LIVE, "`excite --until` ends at periods up to, over the shortest of 20 seeds"),
+        *("the station's arm, 0.1 %, 0.1 mm, 1 %", "robot.md", "shortest"),
+        *(lambda f: f["longest_over_shortest"], "times", 0.0, 1.1),
+    ),
+    Claim(
+        *(LIVE, "and that motion reaches what was asked in"),
+        *("50 simulated records", "robot.md", "shortest"),
+        *(lambda f: 100 * f["reached"], "%", 93.0),
     ),
     Claim(
         *(LIVE, "A drive is as fast as the clock"),

@@ -178,6 +178,18 @@ def stream(command: Callable[..., Any]) -> Callable[..., Any]:
             metavar="X Y Z ROLL PITCH YAW",
             help="Of the sensor in the frame whose poses come [m, deg].",
         ),
+        click.option(
+            "--package-path",
+            "package_paths",
+            type=PATH,
+            multiple=True,
+            metavar="DIR",
+            help="Where package:// addresses of the model are looked up; may be repeated.",
+        ),
+        click.option("--sensor-frame", metavar="NAME", help="Its frame or link with the sensor."),
+        click.option(
+            "--model", type=PATH, help="The arm, if its joints tell the motion: URDF, SDF, MJCF."
+        ),
         click.option("--motion", metavar="SOURCE", help="Who tells the motion, if not SOURCE."),
     ):
         command = option(command)

@@ -10,7 +10,7 @@ Specific force and angular velocity of an IMU in S go the same way, if nobody te
 
 **Clocks.** Streams of one source have one clock. Those of two are related by what each took least
 time for, as in `compensator`: what the motion takes longer on its way than the wrench cannot be
-seen, and is the delay that `identify` finds.
+seen in that. It is the delay that `identify` finds, and that `delay_following` follows from there.
 """
 
 from __future__ import annotations
@@ -23,9 +23,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from drake_teleop.load.arrays import Array
+from drake_teleop.load.identification import Identification
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW, smoother
 from drake_teleop.logs.read.rotations import quaternions, rotation_matrices
 from drake_teleop.robots.compensator import DRIFT, JUMP_S, STALE_S
+from drake_teleop.robots.delay_following import DelayFollower
 from drake_teleop.robots.export import turn
 from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.streams import IMU, VALUES, WRENCH, Flag, Part, Reading
@@ -152,6 +154,7 @@ class Assembly:
         parts: wrench and motion.
         cutoff_hz: see the module.
         delay_s: by how much the motion's stamps come behind the wrench's [s].
+        follow: a load whose wrench tells how that delay changes; None: it stays.
         X_FS: (7,) [w, x, y, z] and position [m] of the sensor in the frame that is posed.
 
     Attributes:
@@ -166,9 +169,13 @@ class Assembly:
         *,
         cutoff_hz: float | None = 30.0,
         delay_s: float = 0.0,
+        follow: Identification | None = None,
         X_FS: Array = NOWHERE,
     ) -> None:
         self._parts, self._delay, self.dt = parts, delay_s, parts.dt
+        self._follower = None
+        if follow is not None:
+            self._follower = DelayFollower(follow, self.dt, cutoff_hz, delay_s)
         self._window = Window(cutoff_hz, X_FS)
         self.lag_s = max(0.0, delay_s)
         if cutoff_hz is not None:
@@ -176,6 +183,11 @@ class Assembly:
         self._clocks = _Offset(), _Offset()
         self._motions: deque[tuple[float, Array]] = deque()
         self._waiting: deque[Part] = deque(maxlen=round(_KEPT_S / self.dt))
+
+    @property
+    def delay_s(self) -> float:
+        """The present delay [s]."""
+        return self._delay if self._follower is None else self._follower.delay_s
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         """See `Source`."""
@@ -191,7 +203,7 @@ class Assembly:
             self._waiting.append(part)
         elif part.stream == self._parts.told:
             self._clocks[1].follow(part.t, now)
-            shift = -self._delay
+            shift = -self.delay_s
             if self._parts.two_clocks:
                 shift += self._clocks[1].now_less_t - self._clocks[0].now_less_t
             for t, motion in self._window.take(part, now):
@@ -227,6 +239,8 @@ class Assembly:
             return Reading(part.number, part.t, values, flags | Flag.STALE)
         share = (part.t - before[0]) / max(after[0] - before[0], 1e-9)
         values[6:] = before[1] + share * (after[1] - before[1])
+        if self._follower is not None and not flags and np.isfinite(part.values).all():
+            self._follower.take((part.t, values[6:]), part.values, before, after)
         return Reading(part.number, part.t, values, flags)
 
     def close(self) -> None:

@@ -28,6 +28,7 @@ import numpy as np
 from drake_teleop.load.tolerance import Tolerance, read_tolerance
 from drake_teleop.logs.commands import identify_command
 from drake_teleop.robots.calibration import FIRST_S, GROWS, Look, look
+from drake_teleop.robots.joints import arm_of
 from drake_teleop.robots.recording import Records
 from drake_teleop.robots.sources_and_sinks import recorded
 from drake_teleop.writing import make_folder, write_json, write_picture
@@ -119,6 +120,9 @@ def calibrate_command(
     delay: str | float = "auto",
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
+    model: Path | None = None,
+    sensor_frame: str | None = None,
+    package_paths: tuple[Path, ...] = (),
     quiet: bool = False,
 ) -> dict[str, Any]:
     """The command `calibrate`; see the top of this module.
@@ -129,6 +133,7 @@ def calibrate_command(
         until: see `read_tolerance`.
         largest: the sensor's range [N], [N m].
         seconds, cutoff_hz, delay: see `calibrate`.
+        model, sensor_frame, package_paths: see `compensate_command`.
         quiet: no table.
 
     Returns:
@@ -143,10 +148,11 @@ def calibrate_command(
     from drake_teleop.robots.calibrate_view import draw_settling, shown
 
     tolerance = read_tolerance(until)
+    arm = arm_of(model, sensor_frame, package_paths)
     make_folder(out)
     limits = None if largest is None else np.repeat(largest, 3)
     stream, recorder = recorded(
-        source, limits, real_time=real_time, motion=motion, sensor_pose=sensor_pose
+        source, limits, real_time=real_time, motion=motion, sensor_pose=sensor_pose, arm=arm
     )
     console = Console(stderr=True, quiet=quiet)
     options = {"cutoff_hz": cutoff_hz, "delay": delay, "seconds": seconds}

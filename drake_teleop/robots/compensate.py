@@ -13,7 +13,9 @@ import numpy as np
 
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.identification import Identification
+from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
+from drake_teleop.robots.joints import arm_of
 from drake_teleop.robots.lines import names_of
 from drake_teleop.robots.sources_and_sinks import sink_of, source_of
 from drake_teleop.robots.streams import Compensated, Sink, Source
@@ -111,6 +113,9 @@ def compensate_command(
     delay: str | float = "auto",
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
+    model: Path | None = None,
+    sensor_frame: str | None = None,
+    package_paths: tuple[Path, ...] = (),
 ) -> None:
     """The command `compensate`; what there is to know goes to stderr.
 
@@ -122,6 +127,7 @@ def compensate_command(
         tare: at the start.
         watch: for contact and another load, see `drake_teleop.robots.watch`.
         control: port of `Control`.
+        model, sensor_frame, package_paths: of the arm whose joints tell the motion, see `arm_of`.
 
     Raises:
         DrakeTeleopError: if one of them cannot be used.
@@ -136,6 +142,7 @@ def compensate_command(
         real_time=real_time,
         motion=motion,
         sensor_pose=sensor_pose,
+        arm=arm_of(model, sensor_frame, package_paths),
     )
     limits: Array | None = None if largest is None else np.repeat(largest, 3)
     compensator = Compensator(
@@ -163,6 +170,8 @@ def compensate_command(
     try:
         counts = run(readings, compensator, wrenches, control=asked, tare=tare, say=say)
         say(", ".join(f"{name} {count}" for name, count in counts.items()))
+        if isinstance(readings, Assembly):
+            say(f"the motion came {1e3 * readings.delay_s:.1f} ms behind the wrench at the end")
     finally:
         for each in (readings, wrenches, asked):
             if each is not None:

@@ -24,7 +24,7 @@ from drake_teleop.robots.ros2 import (
     topic_of,
     types,
 )
-from drake_teleop.robots.streams import IMU, POSE, WRENCH, Flag, Part
+from drake_teleop.robots.streams import IMU, JOINTS, POSE, WRENCH, Flag, Part
 
 _TF = "tf2_msgs/msg/TFMessage"
 KINDS = {
@@ -32,6 +32,7 @@ KINDS = {
     "tf": _TF,
     POSE: "geometry_msgs/msg/PoseStamped",
     IMU: "sensor_msgs/msg/Imu",
+    JOINTS: "sensor_msgs/msg/JointState",
 }
 _STREAMS = {"tf": POSE}
 _MOST = 4096  # messages that wait; more are lost, the newest first
@@ -44,12 +45,16 @@ class Messages:
     Args:
         sign: of wrenches.
         frames: parent and child whose pose is told by transforms; empty for none.
+        joints: names of the joints whose positions are told, in that order.
     """
 
-    def __init__(self, sign: float, frames: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, sign: float, frames: tuple[str, ...] = (), joints: tuple[str, ...] = ()
+    ) -> None:
         from rosbags.serde.errors import SerdeError
 
         self._sign, self._frames, self._types = sign, frames, types()
+        self._joints = joints
         self._damaged = SerdeError
         self._links: dict[str, tuple[str, Array]] = {}
         self._counts = dict.fromkeys(KINDS, 0)
@@ -74,18 +79,27 @@ class Messages:
             data = self._types.deserialize_cdr(message, KINDS[name])
         except self._damaged:
             return [Part(stream, -1, math.nan, np.full(6, math.nan), int(Flag.DAMAGED))]
-        told = self._posed(data) if name == "tf" else [(data.header, self._values(name, data))]
+        if name == "tf":
+            told = self._posed(data)
+        else:
+            values = self._values(name, data)
+            told = [] if values is None else [(data.header, values)]
         return [
             Part(stream, number, stamp.sec + 1e-9 * stamp.nanosec, values)
             for stamp, values in ((header.stamp, values) for header, values in told)
         ]
 
-    def _values(self, name: str, data: Any) -> Array:
+    def _values(self, name: str, data: Any) -> Array | None:
+        """None of joints that are of something else, such as a gripper."""
         if name == WRENCH:
             wrench = data.wrench
             return self._sign * np.array([*_xyz(wrench.force), *_xyz(wrench.torque)])
         if name == POSE:
             return _pose(data.pose.position, data.pose.orientation)
+        if name == JOINTS:
+            told = dict(zip(data.name, data.position, strict=False))
+            whole = self._joints and all(joint in told for joint in self._joints)
+            return np.array([told[joint] for joint in self._joints], float) if whole else None
         return np.array([*_xyz(data.linear_acceleration), *_xyz(data.angular_velocity)])
 
     def _posed(self, data: Any) -> list[tuple[Any, Array]]:
@@ -111,7 +125,7 @@ class Messages:
 
 
 class Ros2Source:
-    """Parts of zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&imu=TOPIC&tf=PARENT,CHILD&...].
+    """Parts of zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&...].
 
     Args:
         address: TOPIC is of WrenchStamped; sign -1, the default, is for a sensor that tells what
@@ -119,6 +133,7 @@ class Ros2Source:
             put together of what `/tf` tells: all frames between them have to be in it. `domain` is
             that of ROS, 0 without.
         dt: between wrenches [s].
+        joints: names of the joints of whose JointState `joints` tells, see `Messages`.
 
     Attributes:
         streams: see `PartSource`.
@@ -128,11 +143,11 @@ class Ros2Source:
         DrakeTeleopError: if the address cannot be used, or a library is missing.
     """
 
-    def __init__(self, address: str, dt: float) -> None:
-        told = Address(address, PORT, known=("pose", "imu", "tf", "domain", "sign"))
+    def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
+        told = Address(address, PORT, known=("pose", "imu", "joints", "tf", "domain", "sign"))
         self.dt, sign, domain = dt, told.sign(), domain_of(told)
         topics = {WRENCH: topic_of(told, told.path)}
-        for stream in (POSE, IMU):
+        for stream in (POSE, IMU, JOINTS):
             if (text := told.text_of(stream)) is not None:
                 topics[stream] = topic_of(told, text)
         frames: tuple[str, ...] = ()
@@ -140,9 +155,15 @@ class Ros2Source:
             frames, topics["tf"] = tuple(text.split(",")), "tf"
             if len(frames) != 2 or not all(frames):
                 raise DrakeTeleopError("tf is not PARENT,CHILD", where=address)
+        if JOINTS in topics and not joints:
+            raise DrakeTeleopError(
+                "joints are of an arm that is not known",
+                where=address,
+                remedy="give --model and --sensor-frame",
+            )
         self.streams = tuple(_STREAMS.get(name, name) for name in topics)
         needed(address)
-        self.messages = Messages(sign, frames)
+        self.messages = Messages(sign, frames, joints)
         self._came: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
         self._session = opened(told)
         for stream, topic in topics.items():

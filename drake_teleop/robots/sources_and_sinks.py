@@ -10,11 +10,12 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import NOWHERE, Assembly, pose_of
+from drake_teleop.robots.joints import Arm, PosedByJoints
 from drake_teleop.robots.lines import LineSink, LineSource
 from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.recording import PartRecorder, Recorder, Records
 from drake_teleop.robots.replay_log import LogSource
-from drake_teleop.robots.streams import PartSource, Sink, Source
+from drake_teleop.robots.streams import JOINTS, PartSource, Sink, Source
 from drake_teleop.robots.table import TableSink
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
@@ -41,6 +42,7 @@ def source_of(
     real_time: bool = False,
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
+    arm: Arm | None = None,
 ) -> Source:
     """The source at an address: udp, posed, rtde, netft, zenoh, - for stdin, or replay:LOG.
 
@@ -48,26 +50,30 @@ def source_of(
         address: see the sources; docs/robot.md lists them.
         load: tells the delay, of a log that of which it is the wrench, else its own.
         rate_hz: of the wrenches; a log, a UR and a NetBox tell their own.
-        cutoff_hz, delay: as of `eliminate_log`; see `Assembly`, too.
+        cutoff_hz, delay: as of `eliminate_log`; see `Assembly`, too, where "auto" begins with the
+            delay of the load file, and follows it.
         real_time: replays a log in its own time.
         motion: address of another source that tells the motion, if the first does not.
         sensor_pose: of the sensor in the frame whose poses come: x, y, z [m], and roll, pitch, yaw
             [deg] about its axes, as in a URDF.
+        arm: whose joint positions come.
 
     Raises:
         DrakeTeleopError: for another address, a live source without a rate, or as the source does.
     """
     kind = _kind(address)
     if kind in _OF_PARTS:
+        follow = load if isinstance(delay, str) else None
         if isinstance(delay, str):
             delay = 0.0 if load is None else load.delay_s
-        parts = _parts(address, rate_hz, motion)
-        return Assembly(parts, cutoff_hz=cutoff_hz, delay_s=delay, X_FS=_pose(sensor_pose))
-    if motion is not None or sensor_pose is not None:
+        parts = _parts(address, rate_hz, motion, arm)
+        how = {"cutoff_hz": cutoff_hz, "delay_s": delay, "follow": follow}
+        return Assembly(parts, X_FS=_pose(sensor_pose), **how)  # type: ignore[arg-type]
+    if motion is not None or sensor_pose is not None or arm is not None:
         raise DrakeTeleopError(
             "tells the motion of the sensor itself",
             where=address,
-            remedy="without --motion and --sensor-pose",
+            remedy="without --motion, --model and --sensor-pose",
         )
     if kind == "replay":
         path = address.removeprefix(_REPLAY)
@@ -86,11 +92,12 @@ def recorded(
     real_time: bool = False,
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
+    arm: Arm | None = None,
 ) -> tuple[Any, Records[Any]]:
     """What `calibrate` reads, readings or parts as they come, and who keeps them.
 
     Args:
-        address, real_time, motion, sensor_pose: see `source_of`.
+        address, real_time, motion, sensor_pose, arm: see `source_of`.
         largest: see `Recorder`.
 
     Raises:
@@ -100,9 +107,9 @@ def recorded(
     # All is kept with its times: the rate is asked of a box alone, whose times are counts.
     rate_hz = None if kind == "netft" else _ANY_HZ
     if kind in _OF_PARTS:
-        parts = _parts(address, rate_hz, motion)
+        parts = _parts(address, rate_hz, motion, arm)
         return parts, PartRecorder(parts, largest, _pose(sensor_pose))
-    readings = {"real_time": real_time, "motion": motion, "sensor_pose": sensor_pose}
+    readings = {"real_time": real_time, "motion": motion, "sensor_pose": sensor_pose, "arm": arm}
     return source_of(address, None, rate_hz=rate_hz, **readings), Recorder(largest)  # type: ignore[arg-type]
 
 
@@ -145,7 +152,7 @@ def _period(rate_hz: float | None, address: str) -> float:
     return 1.0 / rate_hz
 
 
-def _of_parts(address: str, rate_hz: float | None) -> PartSource:
+def _of_parts(address: str, rate_hz: float | None, joints: tuple[str, ...] = ()) -> PartSource:
     kind = _kind(address)
     if kind == "posed":
         return PosedSource(address, _period(rate_hz, address))
@@ -160,16 +167,27 @@ def _of_parts(address: str, rate_hz: float | None) -> PartSource:
     if kind == "zenoh":
         from drake_teleop.robots.ros2_source import Ros2Source
 
-        return Ros2Source(address, _period(rate_hz, address))
+        return Ros2Source(address, _period(rate_hz, address), joints)
     raise DrakeTeleopError("tells no motion", where=address, remedy="rtde://HOST or zenoh://HOST")
 
 
-def _parts(address: str, rate_hz: float | None, motion: str | None) -> Parts:
-    wrench = _of_parts(address, rate_hz)
+def _parts(address: str, rate_hz: float | None, motion: str | None, arm: Arm | None) -> Parts:
+    names = () if arm is None else arm.joint_names
+    wrench = _of_parts(address, rate_hz, names)
     other: PartSource | None = None
     try:
-        other = None if motion is None else _of_parts(motion, 1.0 / wrench.dt)
-        return Parts(wrench, other)
+        other = None if motion is None else _of_parts(motion, 1.0 / wrench.dt, names)
+        if arm is None:
+            return Parts(wrench, other)
+        told = wrench if other is None else other
+        if JOINTS not in told.streams:
+            raise DrakeTeleopError(
+                "tells no joints of --model",
+                where=address if motion is None else motion,
+                remedy="zenoh://HOST/TOPIC?joints=/joint_states, say",
+            )
+        posed = PosedByJoints(told, arm)
+        return Parts(posed) if other is None else Parts(wrench, posed)
     except BaseException:
         for each in (wrench, other):
             if each is not None:

@@ -53,9 +53,10 @@ class Part(NamedTuple):
     """What one stream of several told, on its own clock; readings are made of them.
 
     Args:
-        stream: one of `WRENCH`, `POSE`, `IMU`, `ACCELERATION`, whose values are the wrench of S
-            (6), the pose X_WF of a frame on the wrist (7), specific force and angular velocity of
-            S (6), or what an accelerometer somewhere on the wrist says (3), which nobody reads yet.
+        stream: one of `WRENCH`, `POSE`, `IMU`, `JOINTS`, `ACCELERATION`, whose values are the
+            wrench of S (6), the pose X_WF of a frame on the wrist (7), specific force and angular
+            velocity of S (6), positions of the arm's joints (n), or what an accelerometer somewhere
+            on the wrist says (3), which nobody reads yet.
         number: of the stream, one more each time.
         t: of the stream [s].
     """
@@ -67,7 +68,8 @@ class Part(NamedTuple):
     flags: int = 0
 
 
-WRENCH, POSE, IMU, ACCELERATION = "wrench", "pose", "imu", "acceleration"
+WRENCH, POSE, IMU, JOINTS = "wrench", "pose", "imu", "joints"
+ACCELERATION = "acceleration"
 
 
 class Compensated(NamedTuple):

@@ -42,6 +42,18 @@ LEAST = np.repeat([0.05, 0.0025], 3)
 _BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
+def raw_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
+    """(6,) noise of a reading [N, N m], from what was left behind a low-pass, taken for white.
+
+    Args:
+        load: tells what was left.
+        dt: between readings [s].
+        cutoff_hz: of the low-pass; None for none.
+    """
+    share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _BANDWIDTH * cutoff_hz * dt)
+    return np.maximum(load.residual_rms / math.sqrt(share), LEAST * math.sqrt(1e-3 / dt))
+
+
 class Watch:
     """What `Compensator` asks of each good reading.
 
@@ -52,8 +64,7 @@ class Watch:
     """
 
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
-        share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _BANDWIDTH * cutoff_hz * dt)
-        noise = np.maximum(load.residual_rms / math.sqrt(share), LEAST * math.sqrt(1e-3 / dt))
+        noise = raw_noise(load, dt, cutoff_hz)
         self._parameters = change_parameters(noise, np.zeros(9), dt, model_error=MODEL_ERROR)
         self._phi = usable_phi(load)[0]
         self._covariance = finite_covariance(self._phi, load.covariance)

@@ -189,6 +189,68 @@ def ros(port):
             play(send, flaws)
 
 
+def joint_state(ns, names, positions):
+    """A sensor_msgs/JointState in CDR, as velocity and effort are left out."""
+    data = struct.pack("<iII5s", ns // 10**9, ns % 10**9, 5, b"base\0")
+
+    def aligned(data, size):
+        return data + b"\0" * (-len(data) % size)
+
+    data = aligned(data, 4) + struct.pack("<I", len(names))
+    for name in names:
+        text = name.encode() + b"\0"
+        data = aligned(data, 4) + struct.pack("<I", len(text)) + text
+    data = aligned(data, 4) + struct.pack("<I", len(positions))
+    data = aligned(data, 8) + struct.pack(f"<{len(positions)}d", *positions)
+    return b"\0\1\0\0" + data + struct.pack("<II", 0, 0)
+
+
+def moving(table, columns, epoch, send):
+    """Calls send(number, row) in the time of the table, which began at `epoch`."""
+    with open(table, "rb") as file:
+        rows = list(struct.iter_unpack(f"<{columns}d", file.read()))
+    while (k := int((time.time() - float(epoch)) / DT)) < len(rows):
+        send(k, rows[k])
+        time.sleep(max(0.0, float(epoch) + (k + 1) * DT - time.time()))
+
+
+def netft_moving(table, columns, epoch):
+    """A box on a moving tool."""
+    box = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    box.bind(("127.0.0.1", 0))
+    print(box.getsockname()[1], flush=True)
+    _, there = box.recvfrom(16)
+
+    def send(number, row):
+        counts = [round(1e5 * x) for x in row[:6]]
+        box.sendto(struct.pack(">III6i", number, 7 * number, 0, *counts), there)
+
+    moving(table, columns, epoch, send)
+
+
+def ros_moving(port, table, columns, epoch, names):
+    """Wrench and joints of a moving tool, and joints of a gripper between them."""
+    wrench_kind, joint_kind = (
+        f"{package}::msg::dds_::{name}_"
+        for package, name in (("geometry_msgs", "WrenchStamped"), ("sensor_msgs", "JointState"))
+    )
+    with router(port) as session:
+        wrenches = session.declare_publisher(f"0/ft/wrench/{wrench_kind}/RIHS01_{HASH}")
+        joints = session.declare_publisher(f"0/joint_states/{joint_kind}/RIHS01_0")
+        print(port, flush=True)
+
+        def send(number, row):
+            ns = round((float(epoch) + DT * number) * 1e9)
+            attached = struct.pack("<qqB16s", number, ns, 16, b"x" * 16)
+            message = b"\0\1\0\0" + struct.pack("<iII6s6x", ns // 10**9, ns % 10**9, 6, b"tool0")
+            wrenches.put(message + struct.pack("<6d", *row[:6]), attachment=attached)
+            of_arm = joint_state(ns, names.split(",")[::-1], row[:5:-1])
+            joints.put(of_arm, attachment=attached)
+            joints.put(joint_state(ns, ["finger"], [0.1]), attachment=attached)
+
+        moving(table, columns, epoch, send)
+
+
 def ros_echo(port):
     """What a node of ROS would have seen of the first message: tokens, key, attachment, CDR."""
     with router(port) as session:
@@ -209,4 +271,5 @@ HASH = "8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77"
 if __name__ == "__main__":
     with contextlib.suppress(OSError, KeyboardInterrupt):
         PEERS = {"netft": netft, "rtde": rtde, "ros": ros, "ros_echo": ros_echo}
+        PEERS |= {"netft_moving": netft_moving, "ros_moving": ros_moving}
         PEERS[sys.argv[1]](*sys.argv[2:])

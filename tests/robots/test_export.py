@@ -45,48 +45,117 @@ def in_flange() -> tuple[np.ndarray, np.ndarray]:
     return X_FS @ COM, R @ INERTIA @ R.T
 
 
-@pytest.mark.parametrize("name", ["urdf", "sdf", "mjcf"])
-def test_drake_reads_the_models(name):
-    text, warnings = export(FOUND, name, **TURNED)
-    assert warnings == []
+Values = tuple[float, np.ndarray, np.ndarray | None]
+"""What a format says of mass, centre of mass, and inertia about it, if it takes one."""
+
+
+def tensor(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> np.ndarray:
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def by_drake(text: str, kind: str) -> Values:
     plant = MultibodyPlant(0.0)
-    Parser(plant).AddModelsFromString(text, {"mjcf": "xml"}.get(name, name))
+    Parser(plant).AddModelsFromString(text, kind)
     read = plant.GetBodyByName("load").default_spatial_inertia()
-    com, inertia = in_flange()
-    assert read.get_mass() == pytest.approx(MASS, rel=1e-12)
-    np.testing.assert_allclose(read.get_com(), com, atol=1e-12)
     about_centre = read.Shift(read.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
-    np.testing.assert_allclose(about_centre, inertia, atol=1e-11)
+    return read.get_mass(), read.get_com(), about_centre
 
 
-def test_a_ur_gets_its_six_in_its_order():
+def by_mujoco(text: str) -> Values:
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(text)
+    k = model.body("load").id
+    R = np.empty(9)
+    mujoco.mju_quat2Mat(R, model.body_iquat[k])
+    R = R.reshape(3, 3)
+    return model.body_mass[k], model.body_ipos[k], R @ np.diag(model.body_inertia[k]) @ R.T
+
+
+def numbers(text: str) -> list[float]:
+    return [float(x) for x in re.findall(r"-?\d+\.\d+(?:e-\d+)?", text)]
+
+
+def by_ur(text: str) -> Values:
+    mass, x, y, z, *six = numbers(text)
+    return mass, np.array([x, y, z]), tensor(*six)
+
+
+def by_franka(text: str) -> Values:
+    read = json.loads(text)
+    return read["mass"], read["centerOfMass"], np.reshape(read["inertia"], (3, 3), "F")
+
+
+def by_xarm(text: str) -> Values:
+    mass, *com = numbers(text.splitlines()[-1])
+    return mass, 1e-3 * np.array(com), None
+
+
+def by_kth(text: str) -> Values:
+    read = yaml.safe_load(text)
+    return read["gripper_mass"], read["gripper_com_pose"][:3], None
+
+
+def by_ft_tools(text: str) -> Values:
+    read = yaml.safe_load(text)
+    return read["mass"], read["sensor_frame_to_com"], None
+
+
+def by_admittance(text: str) -> Values:
+    told = yaml.safe_load(text)["admittance_controller"]["ros__parameters"]
+    centre = told["gravity_compensation"]["CoG"]
+    return centre["force"] / STANDARD_GRAVITY, centre["pos"], None
+
+
+def by_bota(text: str) -> Values:
+    read = json.loads(text)["payload_compensator_config"]["payload_properties"]
+    six = (read["inertia"][f"I{axes}"] for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
+    return read["mass"], [read["com"][axis] for axis in "xyz"], tensor(*six)
+
+
+READERS = {
+    "ur": by_ur,
+    "franka": by_franka,
+    "xarm": by_xarm,
+    "kth": by_kth,
+    "ft_tools": by_ft_tools,
+    "ros2-admittance": by_admittance,
+    "bota": by_bota,
+    "urdf": lambda text: by_drake(text, "urdf"),
+    "sdf": lambda text: by_drake(text, "sdf"),
+    "mjcf": lambda text: by_drake(text, "xml"),
+}
+
+
+def test_all_targets_are_read_here():
+    assert READERS.keys() == FORMATS.keys()
+
+
+@pytest.mark.parametrize("name", [*READERS, "mjcf by MuJoCo"])
+def test_what_is_read_back_is_the_load(name):
+    """To 1e-9 of each number's size, with a turned and shifted sensor where it may be."""
+    target, _, other = name.partition(" ")
+    of_sensor = FORMATS[target].of_sensor
+    text, warnings = export(FOUND, target, **({} if of_sensor else TURNED))
+    assert FORMATS[target].inertia == (not any("no place for" in text for text in warnings))
+    mass, com, inertia = (by_mujoco if other else READERS[target])(text)
+    com_0, inertia_0 = (COM, INERTIA) if of_sensor else in_flange()
+    assert mass == pytest.approx(MASS, rel=1e-9)
+    np.testing.assert_allclose(com, com_0, rtol=0.0, atol=1e-9 * 0.1)
+    assert (inertia is not None) == FORMATS[target].inertia
+    if inertia is not None:
+        np.testing.assert_allclose(inertia, inertia_0, rtol=0.0, atol=1e-9 * 5e-3)
+
+
+def test_a_ur_and_an_xarm_get_a_call():
     text, _ = export(FOUND, "ur", **TURNED)
-    mass, com, six = re.fullmatch(
-        r"set_target_payload\((.*?), \[(.*?)\], \[(.*?)\]\)\n", text
-    ).groups()
-    com, six = (np.array(part.split(","), dtype=float) for part in (com, six))
-    expected, i = in_flange()
-    assert float(mass) == MASS
-    np.testing.assert_allclose(com, expected, atol=1e-12)
-    np.testing.assert_allclose(
-        six, [i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]], atol=1e-12
-    )
-
-
-def test_a_franka_gets_columns_and_the_centre():
-    read = json.loads(export(FOUND, "franka", **TURNED)[0])
-    com, inertia = in_flange()
-    assert read["mass"] == MASS
-    np.testing.assert_allclose(read["centerOfMass"], com, atol=1e-12)
-    np.testing.assert_allclose(np.reshape(read["inertia"], (3, 3), "F"), inertia, atol=1e-12)
-    np.testing.assert_array_equal(np.reshape(read["transformation"], (4, 4), "F"), np.eye(4))
-
-
-def test_an_xarm_gets_millimetres_and_is_told_what_it_drops():
+    assert re.fullmatch(r"set_target_payload\([^,]+, \[([^,]+, ){2}[^,]+\], \[.*\]\)\n", text)
     text, warnings = export(FOUND, "xarm", **TURNED)
-    com = re.search(r"\[(.*)\]\)", text)[1].split(",")
-    np.testing.assert_allclose(np.array(com, dtype=float), 1e3 * in_flange()[0], atol=1e-9)
     assert "no place for the inertia" in warnings[0] and text.startswith(f"# {warnings[0]}\n")
+
+
+def test_a_franka_gets_the_identity():
+    read = json.loads(export(FOUND, "franka", **TURNED)[0])
+    np.testing.assert_array_equal(np.reshape(read["transformation"], (4, 4), "F"), np.eye(4))
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -106,15 +175,8 @@ def test_compensations_take_off_what_the_sensor_reads(sign):
         np.testing.assert_allclose(left, 0.0, atol=1e-12)
     kth = yaml.safe_load(export(FOUND, "kth", sign=sign)[0])
     np.testing.assert_allclose(kth["bias"], sign * OFFSETS, atol=1e-15)
-    np.testing.assert_allclose(kth["gripper_com_pose"][:3], COM, atol=1e-12)
-    assert kth["gripper_mass"] == MASS
     bota = json.loads(export(FOUND, "bota", sign=sign)[0])["payload_compensator_config"]
     assert list(bota["payload_properties"]["bias"].values()) == pytest.approx(sign * OFFSETS)
-    assert bota["payload_properties"]["inertia"]["Ixz"] == pytest.approx(INERTIA[0, 2])
-    ros = yaml.safe_load(export(FOUND, "ros2-admittance")[0])
-    centre = ros["admittance_controller"]["ros__parameters"]["gravity_compensation"]["CoG"]
-    assert centre["force"] == pytest.approx(MASS * STANDARD_GRAVITY)
-    np.testing.assert_allclose(centre["pos"], COM, atol=1e-12)
 
 
 def test_what_is_not_identified_is_not_to_be_entered():

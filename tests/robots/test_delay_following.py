@@ -1,0 +1,75 @@
+"""The delay of the motion behind the wrench, followed by what the load shows of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_compensator import OFFSETS, PHI, load
+from test_reading_assembly import DT as WRENCH_DT
+from test_reading_assembly import X_FS, Told, played, truth
+
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.robots.assembly import Assembly
+from drake_teleop.robots.delay_following import EVERY_S, DelayFollower
+from drake_teleop.robots.parts import Parts
+from drake_teleop.robots.streams import POSE, WRENCH
+
+DT = 1.01 * EVERY_S
+NOISE = np.repeat([0.05, 0.0025], 3)
+
+
+def followed(
+    follower: DelayFollower, start: float, stop: float, late: float, *, push: float = 0.0
+) -> None:
+    """Wrenches with noise and drifted offsets, and motions whose stamps are `late`."""
+    rng = np.random.default_rng(0)
+    for t in np.arange(start, stop, DT):
+        wrench = non_contact_wrench(*np.split(truth(t)[1], 3), PHI) + OFFSETS
+        wrench[:3] += 1.0
+        wrench += NOISE * rng.normal(size=6)
+        wrench[0] += push * (1.0 + np.sin(7.0 * t))
+        error = follower.delay_s - late
+        at, before, after = [(t + e, truth(t + e + error)[1]) for e in (0.0, -0.001, 0.001)]
+        follower.take(at, wrench, before, after)
+
+
+@pytest.mark.parametrize("late", [-0.006, 0.011])
+def test_it_is_found_and_followed(late: float) -> None:
+    follower = DelayFollower(load(), 0.001, 30.0, 0.0)
+    followed(follower, 0.0, 3.0, late)
+    assert follower.delay_s == pytest.approx(late, abs=2e-4)
+    followed(follower, 3.0, 5.0, late + 0.003)
+    assert late + 5e-4 < follower.delay_s < late + 0.003
+
+
+def test_contact_is_left_out_and_another_clock_begins_anew() -> None:
+    follower = DelayFollower(load(), 0.001, 30.0, 0.005)
+    followed(follower, 0.0, 1.0, 0.005)
+    followed(follower, 1.0, 3.0, 0.005, push=10.0)
+    assert follower.delay_s == pytest.approx(0.005, abs=5e-4)
+    followed(follower, -50.0, -48.5, 0.007)
+    assert follower.delay_s == pytest.approx(0.007, abs=3e-4)
+
+
+def test_a_tool_at_rest_shows_nothing() -> None:
+    follower = DelayFollower(load(), 0.001, 30.0, 0.005)
+    rest, rng = truth(0.3)[1], np.random.default_rng(0)
+    rest[3:] = 0.0
+    still = non_contact_wrench(*np.split(rest, 3), PHI) + OFFSETS
+    for t in np.arange(0.0, 2.0, DT):
+        shaken = rest + np.repeat([1e-3, 0.0], [3, 6]) * rng.normal(size=9)
+        wrench = still + NOISE * rng.normal(size=6)
+        follower.take((t, rest), wrench, (t - 0.001, rest), (t + 0.001, shaken))
+    assert follower.delay_s == 0.005
+
+
+def test_what_waits_for_its_motion_gets_the_right_one() -> None:
+    """Without being told that poses are stamped 4 ms late."""
+    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS, follow=load())
+    good = [each for each in played(assembly, 1.6, later=0.004) if not each.flags]
+    assert assembly.delay_s == pytest.approx(0.004, abs=2e-4)
+    assert good[-1].t > 1.6 - 0.035 - WRENCH_DT
+    wanted = np.array([truth(each.t)[1] for each in good[-50:]])
+    motion = np.array([each.values[6:] for each in good[-50:]])
+    worst = np.abs(motion - wanted).max(axis=0)
+    np.testing.assert_array_less(worst, np.repeat([0.05, 0.01, 0.2], 3))
