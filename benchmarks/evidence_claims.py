@@ -26,6 +26,7 @@ RUNS = {
     "identification": "benchmarks/identification.py --json FILE",
     "intervals": "benchmarks/intervals.py --json FILE",
     "inverse_kinematics": "benchmarks/inverse_kinematics.py --json FILE",
+    "ledger_in_station": "benchmarks/ledger_in_station.py --json FILE",
     "live": "benchmarks/live.py --json FILE",
     "load_change": "benchmarks/load_change.py --json FILE",
     "mujoco_wrench": "benchmarks/mujoco_wrench.py --json FILE",
@@ -316,6 +317,21 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *("300 random networks, one axis, all methods", "delay.md", "recovery"),
         lambda f: 100 * min(row["recovered"] / row["runs"] for row in f["rows"]),
         *("%", 100.0, 100.0),
+    ),
+    Claim(
+        *(NETWORK, "The whole station with `ledger` is at rest on a leaf"),
+        *("4 networks, 2 leaves, 3 grips, σ 0 and 1; noisy JR3", "delay.md", "ledger_in_station"),
+        *(lambda f: f["cells"] - f["missed"]["stable"], "of 48", 48.0),
+    ),
+    Claim(
+        *(NETWORK, "feels the contact within a tenth"),
+        *("the same holds", "delay.md", "ledger_in_station"),
+        *(lambda f: f["cells"] - f["missed"]["felt"], "of 48", 47.0),
+    ),
+    Claim(
+        *(NETWORK, "and creates no energy at hand and actual motion"),
+        *("least of translation and rotation, the same runs", "delay.md", "ledger_in_station"),
+        *(lambda f: min(min(row["energy_J"]) for row in f["rows"]), "J", -1e-6),
     ),
     NotShown(
         NETWORK, "That a person feels any of it", "no person has tried it; the hand is simulated"

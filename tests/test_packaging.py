@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -12,6 +13,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
+
+import drake_teleop
 
 ROOT = Path(__file__).parents[1]
 
@@ -110,3 +114,10 @@ def test_the_wheel_works_from_an_empty_folder(wheel, tmp_path):
     assert "teleop_station free_motion_force" in listing
     assert "reproduce" in run(str(scripts / "drake-teleop"), "--help", cwd=empty)
     assert not list(empty.iterdir())
+
+
+def test_the_version_that_is_released_is_the_one_that_is_cited():
+    released = re.findall(r"^## \[(\d\S+)\] - (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.M)[0]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert released == (citation["version"], str(citation["date-released"]))
+    assert drake_teleop.__version__.startswith(released[0])
