@@ -259,6 +259,11 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: f["kth.mass_%"] / f["ours.mass_%"], "times ours", 1.0),
     ),
     Claim(
+        *(LOGS, "their centre of mass, over what `identify` makes of the same poses"),
+        *("the same; of ten seconds of motion it is 1.3 times theirs", "logs.md", "peers"),
+        *(lambda f: f["kth.com_mm"] / f["ours at rest.com_mm"], "times ours", 0.999),
+    ),
+    Claim(
         *(LOGS, "torque that those poses leave in fast motion"),
         *("held-out motion, 30 Hz", "logs.md", "peers"),
         *(lambda f: f["kth.left_N_m"] / f["ours.left_N_m"], "times ours", 1.0),

@@ -7,8 +7,10 @@
   ("mass 0.5 %, com 0.5 mm, inertia 5 %");
 * least squares: mass, centre of mass, inertia and offsets by plain least squares of the same log,
   low-passed, no delay, N and N m alike, as scripts do it; intervals of white noise;
-* kth: 20 poses at rest for as long together, mass, centre of mass and offsets by plain least
-  squares, as force_torque_tools and ft_tools_ros2 do it; no inertia;
+* kth: 20 poses at rest for as long together, with no time to go from one to the next, mass, centre
+  of mass and offsets by plain least squares, as force_torque_tools and ft_tools_ros2 do it; no
+  inertia. The mean of a pose has what the same noise, of the same colours, leaves of it;
+* ours at rest: what `identify` makes of those very poses;
 * static: the same without offsets, as aiofranka's payload.py does it from joint torques, after a
   tare in free air: their offsets are taken away with an error of 0.2 N and 0.01 N m;
 * vendor: gravity alone, of the true mass and centre of mass, typed in, and a tare at the start.
@@ -29,7 +31,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from calibrate import HZ, NOISE, Motion, Stream, excited, hand, load_of, stream_of, turned
+from calibrate import COLOURS, HZ, NOISE, Motion, Stream, excited, hand, load_of, stream_of, turned
 from numpy.typing import NDArray
 
 from drake_teleop.load.batch.methods import identify_batch
@@ -49,7 +51,7 @@ Array = NDArray[np.float64]
 ASKED = read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %")
 SECONDS, POSES = 10.0, 20
 WORDS = ("mass_%", "com_mm", "inertia_%", "physical", "left_N", "left_N_m")
-PEERS = ("ours", "least squares", "kth", "static", "vendor")
+PEERS = ("ours", "least squares", "kth", "ours at rest", "static", "vendor")
 
 
 class Found(NamedTuple):
@@ -83,19 +85,33 @@ def least_squares(log: Log) -> Found:
     return Found(theta[6:], theta - 1.96 * deviations, theta + 1.96 * deviations)
 
 
-def static(rng: np.random.Generator, phi: Array, *, offsets: bool) -> Found:
-    """From poses at rest: first moments and, or not, offsets."""
+def at_rest(rng: np.random.Generator, phi: Array, *, tared: bool) -> tuple[Array, Array]:
+    """(20, 3) specific forces and (20, 6) mean wrenches of poses at rest."""
     up = rng.normal(size=(POSES, 3))
     s = 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
     still = np.zeros_like(s)
+    a = rng.choice(COLOURS)  # AR(1): the variance of a mean grows by (1 + a) / (1 - a)
     noise = NOISE * rng.normal(size=(POSES, 6)) / np.sqrt(SECONDS * HZ / POSES)
-    left = rng.normal(size=6) * (np.repeat([5.0, 0.3], 3) if offsets else [0.2] * 3 + [0.01] * 3)
-    wrench = non_contact_wrench(s, still, still, phi) + left + noise
+    noise *= np.sqrt((1.0 + a) / (1.0 - a))
+    left = rng.normal(size=6) * (np.repeat([0.2, 0.01] if tared else [5.0, 0.3], 3))
+    return s, non_contact_wrench(s, still, still, phi) + left + noise
+
+
+def static(s: Array, wrench: Array, *, offsets: bool) -> Found:
+    """First moments and, or not, offsets, by plain least squares."""
+    still = np.zeros_like(s)
     rows = regressor(s, still, still)[:, :, :4]
     if offsets:
         rows = np.concatenate([rows, np.tile(np.eye(6), (POSES, 1, 1))], axis=2)
     theta = np.linalg.lstsq(rows.reshape(6 * POSES, -1), wrench.ravel(), rcond=None)[0]
     return Found(np.concatenate([theta[:4], np.zeros(6)]))
+
+
+def ours_at_rest(s: Array, wrench: Array) -> Found:
+    """`identify` of static poses."""
+    still = np.zeros_like(s)
+    load = identify_batch(wrench, s, still, still, shared_noise=True).identification
+    return Found(usable_phi(load)[0])
 
 
 def held_out(log: Log, phi: Array, up: Array | None = None) -> tuple[float, float]:
@@ -126,11 +142,13 @@ def simulated(loads: int, folder: Path) -> dict[str, Any]:
         fresh: Motion = hand(rng, t)
         other = log_of(stream_of(rng, phi, t, fresh, late=0))
         up = turned(fresh[1], t[1])
+        poses = at_rest(rng, phi, tared=False)
         found = {
             "ours": ours(log, path),
             "least squares": least_squares(log),
-            "kth": static(rng, phi, offsets=True),
-            "static": static(rng, phi, offsets=False),
+            "kth": static(*poses, offsets=True),
+            "ours at rest": ours_at_rest(*poses),
+            "static": static(*at_rest(rng, phi, tared=True), offsets=False),
             "vendor": Found(np.concatenate([phi[:4], np.zeros(6)])),
         }
         at = look(path, ASKED, None, cutoff_hz=30.0, delay="auto")

@@ -222,6 +222,13 @@ def test_no_wrench_is_above_the_sensors_range() -> None:
     np.testing.assert_allclose(out.contact[0], 5.0)
 
 
+def test_what_waits_is_clipped_whenever_it_comes_out() -> None:
+    compensator = Compensator(load(), DT, wait=2, cutoff_hz=None, largest=np.full(6, 60.0))
+    compensator.offsets = OFFSETS - 20.0 * (np.arange(6) == 0)
+    out = [compensator.step(each, each.t) for each in readings(3, touched=45.0)]
+    assert all(row.flags == Flag.CLIPPED and row.contact[0] == 60.0 for row in out)
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [("free", "done"), ("short", "not 0.5 s"), ("moving", "it moves"), ("push", "is touched"),

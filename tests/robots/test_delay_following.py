@@ -21,15 +21,19 @@ NOISE = np.repeat([0.05, 0.0025], 3)
 def followed(
     follower: DelayFollower, start: float, stop: float, late: float, *, push: float = 0.0
 ) -> None:
-    """Wrenches with noise and drifted offsets, and motions whose stamps are `late`."""
+    """Wrenches with noise and drifted offsets, and motions whose stamps are `late`.
+
+    A push is [N] along x with the sign of the wrench's slope, as a longer delay would make it.
+    """
     rng = np.random.default_rng(0)
     for t in np.arange(start, stop, DT):
         wrench = non_contact_wrench(*np.split(truth(t)[1], 3), PHI) + OFFSETS
         wrench[:3] += 1.0
         wrench += NOISE * rng.normal(size=6)
-        wrench[0] += push * (1.0 + np.sin(7.0 * t))
         error = follower.delay_s - late
         at, before, after = [(t + e, truth(t + e + error)[1]) for e in (0.0, -0.001, 0.001)]
+        ends = (non_contact_wrench(*np.split(each[1], 3), PHI)[0] for each in (before, after))
+        wrench[0] += push * np.sign(-np.subtract(*ends))
         follower.take(at, wrench, before, after)
 
 
@@ -45,8 +49,10 @@ def test_it_is_found_and_followed(late: float) -> None:
 def test_contact_is_left_out_and_another_clock_begins_anew() -> None:
     follower = DelayFollower(load(), 0.001, 30.0, 0.005)
     followed(follower, 0.0, 1.0, 0.005)
-    followed(follower, 1.0, 3.0, 0.005, push=10.0)
+    followed(follower, 1.0, 2.0, 0.005, push=5.0)
     assert follower.delay_s == pytest.approx(0.005, abs=5e-4)
+    followed(follower, 2.0, 3.5, 0.007)  # and is followed at once after it
+    assert follower.delay_s > 0.0057
     followed(follower, -50.0, -48.5, 0.007)
     assert follower.delay_s == pytest.approx(0.007, abs=3e-4)
 
