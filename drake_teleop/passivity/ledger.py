@@ -39,7 +39,8 @@ if k_c exceeds half of the wall's stiffness.
 At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
 
 :M1: L_m -= f_(k-1) . dx; below zero it is a debt, never written off. While something is touched,
-    what the hand pays is sent instead: the slave presses with it. L_m += what came.
+    and L_m has half of R_m, what the hand pays is sent instead: the slave presses with it.
+    L_m += what came.
 :M2: What is touched pushes along one unit wrench n, the mean of w over two round trips and 3 s
     at least: force and torque together, so that a point that is touched far from So is one spring
     and not two. With w_n = w . n and x_n = n . x, where a torque counts as a force at 0.1 m,
@@ -172,6 +173,7 @@ _GONE, _EXPECTED, _SURE = 3e-3, 1.0, 1e-3
 # m, N s: deeper than this it should meet something, and so much of it until the wall has gone.
 _SLIGHT, _UNMET = 0.3e-3, 0.03
 _ALIGNED = 0.7  # cosine between the wrenches of one wall
+_OWN = 0.5  # of the hand's reserve, below which its end keeps what the hand pays
 _DRAIN = 50.0  # 1/s, share of the ledger that the wrench may spend
 _RETURN = 0.02  # s, in which a shortened wrench comes back
 _START = 5.0  # m/s^2, by which a hand may be faster at the next step
@@ -258,7 +260,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     memory[_DEPTH] += over_way(memory[_INWARD], dx)
     inside = memory[_WALL] > 0.0 and memory[_DEPTH] > 0.0
     for g in range(2):
-        _account_of_hand(g, dx, inside or memory[TOUCHED] > 0.0, memory)
+        _account_of_hand(g, dx, inside or memory[TOUCHED] > 0.0, p, memory)
         receive(g, received, memory)
     ahead[:] = 0.0
     if arrived(received):
@@ -289,11 +291,11 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 
 @njit(cache=True)
-def _account_of_hand(g, dx, touched, memory):
+def _account_of_hand(g, dx, touched, p, memory):
     """M1, but for what came."""
     work, ledger = dot(memory[HELD], dx, g), memory[LEDGER]
     memory[_GIVEN][g] = max(memory[_GIVEN][g] + work, 0.0)
-    if work < 0.0 < ledger[g] and touched:
+    if work < 0.0 and touched and ledger[g] > _OWN * p[HAND_RESERVE][g]:
         memory[SENT][g] -= work
     else:
         ledger[g] -= work

@@ -6,20 +6,22 @@ m, K, D mass and servo as they are believed, all in the master's power units:
 :S1: L_s += min((w + l)_k . dx, (w + l)_(k-1) . dx) + what came; likewise Q, from zero at each
     contact's onset; A = L_s - m v^2 / 2.
 :S2: To the master goes what is above the reserve R_s, if it is short; in contact and nearly at rest
-    what is above 0.3 R_s, because pushing back takes energy then and moving does not.
+    what is above 0.3 R_s, because pushing back takes energy then and moving does not; above 0.1 R_s
+    as long as R_m is not full. A hand that nothing pushes back goes deeper, and that costs more.
 :S3: The contact's direction n is the mean of w, as in M2; its stiffness k and damping b follow from
     w_n, way and speed along n, over the last 1 to 10 mm of way since the onset. Of k the slave
     shows the share rho = min(1, k_d / k), k_d = max(k_0, 2 c R_m / (v_p R)^2) with the largest
     round trip R: a hand goes v_p R deep before it feels anything, and R_m has to push it back. A
     hand that stays feels at once how deep it goes, and in contact its end has 4.5 R_m (S2): c goes
-    from 1 to 10 in about a second, for k_d up to 1200 N/m; but not over a network that falls
-    silent for half a round trip, or 60 ms (20 ms at least). At a contact's onset k is that of the
-    last one, so that a bounce does not stiffen the wall. Beyond the wall x_w the target is
-    x_w + rho (x_received - x_w), along n. rho is left alone while it would change by less than a
+    from 1 to 10 in about a second, for k_d up to 1200 N/m; but not over a network that falls silent
+    for half a round trip, or 60 ms (20 ms at least), and only by the share of R_m that the hand's
+    end has. Without that it feels 2 N where the slave presses with 16. At a contact's onset k is
+    that of the last one, so that a bounce does not stiffen the wall. Beyond the wall x_w the target
+    is x_w + rho (x_received - x_w), along n. rho is left alone while it would change by less than a
     tenth: it moves the slave, and friction makes a new k of that. Friction that lasts tilts n, and
-    where it lets go w_n steps by as much as f^2 / |w|, f the largest across n of about a second.
-    A step up to that which k and b do not explain is shown in 0.6 s, or over 1 mm of way.
-    It is no stiffness either: of a stretch's change of force what neither 0 nor 2 k explains.
+    where it lets go w_n steps by as much as f^2 / |w|, f the largest across n of about a second. A
+    step up to that which k and b do not explain is shown in 0.6 s, or over 1 mm of way. It is no
+    stiffness either: of a stretch's change of force what neither 0 nor 2 k explains.
 :S4: The command follows the target with bounded acceleration, and m v^2 / 2 <= L_s.
 :S5: Motors that push with the motion, f . v > 0, spend at most what A holds in 4 ms; pressing on
     the wall what was paid since the onset, Q, and c F_u^2 / 2 k that nobody paid. With A at its end
@@ -77,6 +79,7 @@ from drake_teleop.vectors import put
 # master's power units it depends on the scales of both.
 ARM, LEVER = (1.0, 10.0), (1.0, 0.01)
 MARGIN = 0.03  #: of the slave's reserve: never spent; more than what a step can cost
+_KEPT = 0.1  # of that reserve, in contact, however short the hand's end is
 PASSED = 0.7  #: share of the slave's reserve that the hand's end may have in contact
 
 # What servo and mass are taken for, over what was configured: so errors of 20 % brake, and do not
@@ -94,7 +97,8 @@ _SMOOTH = 0.02  # s, of the wall's place and of rho
 _SURE = 0.1  # of rho, by which it is not changed: it moves the slave, which changes k
 _DIRECTION = 3.0  # s, of the contact's direction at least: a tip that sticks and slips turns it
 _TILTED, _RUBBED = 0.6, 1.0  # s, in which friction's step along n is shown; of the largest one
-_SETTLED, _TIMES = 0.5, 10.0  # s and c, of a hand that stays
+# s and c, of a hand that stays; s, in which c falls: faster than the news it hunts
+_SETTLED, _TIMES, _TIRED = 0.5, 10.0, 1.0
 _STIFFEST = 1200.0  # N/m, of its k_d
 _FOLLOW = 0.01  # s, of the command's generator
 _FASTER = 30.0  # m/s^2, its acceleration
@@ -217,7 +221,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         weight[i] += share * (load[i] - weight[i])
     for g in range(2):
         _account_of_slave(g, received, heard, touched, twist, dx, wrench, T, p, memory)
-    _learn(touched, dx, contact, T, p, memory)
+    _learn(received, touched, dx, contact, T, p, memory)
     put(memory, HELD.start, wrench, 0, 6)
     gap[:] = 0.0
     if heard:
@@ -259,10 +263,13 @@ def _account_of_slave(g, received, heard, touched, twist, dx, wrench, T, p, memo
     moving = 0.5 * HEAVY * p[MASS][g] * speed * speed
     # At rest in contact energy is needed to push the hand back, else for speed.
     keep, hold, rate = reserve, p[HAND_RESERVE][g], _RATE
+    free, short, give = ledger[g] - moving, hold - received[LEVEL][g], 0.0
+    needed = short
     if touched and speed < _CALM * ARM[g]:
-        keep, hold, rate = (1.0 - PASSED) * reserve, hold + PASSED * reserve, _CALM_RATE
-    needed = max(hold - received[LEVEL][g], 0.0) if heard else 0.0
-    give = min(max(ledger[g] - moving - keep, 0.0), needed) * min(T * rate, 1.0)
+        keep, rate = (1.0 - PASSED) * reserve, _CALM_RATE
+        needed += PASSED * reserve
+        give = min(free - _KEPT * reserve, short)
+    give = max(give, min(free - keep, needed), 0.0) * min(T * rate, 1.0) if heard else 0.0
     lost = max(ledger[g] - give - _CAPACITY * reserve, 0.0)
     memory[SENT][g] += give
     memory[LOST][g] += lost
@@ -277,29 +284,34 @@ def _lag(p):
 
 
 @njit(cache=True)
-def _shown_at_most(T, p, memory):
+def _shown_at_most(received, T, p, memory):
     """k_d, of S3."""
+    normal, paid = memory[NORMAL], 0.0
     depth, first = _PRESS * (memory[_ROUND_TRIP] + _lag(p)), math.inf
     for g in range(2):
-        part = ARM[g] * length(memory[NORMAL], g) * depth
-        first = min(first, 2.0 * p[HAND_RESERVE][g] / max(part * part, 1e-300))
+        part, reserve = ARM[g] * length(normal, g) * depth, p[HAND_RESERVE][g]
+        first = min(first, 2.0 * reserve / max(part * part, 1e-300))
+        there = min(max(received[LEVEL][g] / reserve, 0.0), 1.0)
+        paid += p[METRIC][g] * dot(normal, normal, g) * there
     quiet = min(max(_NEWS, _SHORT * memory[_ROUND_TRIP]), _LONGER)
     if memory[TOUCHED] == 0.0 or memory[_GAP] >= quiet:
         memory[_STAYED] = 0.0
     else:
-        memory[_STAYED] += T / _SETTLED * (_TIMES - 1.0 - memory[_STAYED])
+        more = (_TIMES - 1.0) * paid - memory[_STAYED]
+        memory[_STAYED] += T / (_SETTLED if more > 0.0 else _TIRED) * more
     return max(_SHOWN, first, min((1.0 + memory[_STAYED]) * first, _STIFFEST))
 
 
 @njit(cache=True)
-def _learn(touched, dx, wrench, T, p, memory):
+def _learn(received, touched, dx, wrench, T, p, memory):
     """S3 but for the target: direction, stiffness, damping, share, how deep the slave is."""
     if not touched:
         memory[TOUCHED] = memory[_SMOOTHED] = memory[_ACROSS] = 0.0
         return
     normal, k, velocity = memory[NORMAL], memory[_STIFFNESS], memory[VELOCITY_HERE]
     size = find_direction(wrench, memory[_ROUND_TRIP], T, p, memory)
-    most, turned = _shown_at_most(T, p, memory), _turns(wrench, size, T, p, memory)
+    most = _shown_at_most(received, T, p, memory)
+    turned = _turns(wrench, size, T, p, memory)
     inward, rate = -over_way(normal, dx), min(T / _FILTER, 1.0)
     speed = -over_way(normal, velocity)
     if memory[_SMOOTHED] == 0.0:

@@ -325,3 +325,22 @@ def test_taps_are_felt_from_the_second_on(rate):
     later = t > 3.2 + 2.0 / rate
     pressed = model().force_scale * run.wall[later].sum()
     assert 0.75 < run.felt[later].sum() / pressed < 1.15
+
+
+@pytest.mark.parametrize(
+    ("grip", "wall", "delay", "end", "share"),
+    [(FIRM, 5.1e3, 0.15, 6.0, 0.98), (MEDIUM, 20e3, 0.15, 9.0, 0.85), (FIRM, 20e3, 0.05, 12.0, 0.7)],
+    ids=["firm", "hard", "both"],
+)
+def test_a_hand_that_was_faster_than_the_news_feels_what_is_pressed(grip, wall, delay, end, share):
+    """30 mm within a second: the slave has spent its reserve before the hand pays."""
+    axis = model(grip, wall)
+    run = run_one_dof(
+        axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT,
+        intent=charging(times(end), 3.0, 0.03),
+    )  # fmt: skip
+    last = run.t > end - 0.3
+    felt, pressed = np.abs(run.felt[last]), axis.force_scale * np.abs(run.wall[last]).mean()
+    assert felt.mean() == pytest.approx(pressed, rel=0.02) and felt.std() < 0.05 * pressed
+    softer = 1.0 / (1.0 / axis.servo_stiffness + 1.0 / wall) * axis.force_scale
+    assert pressed > share * 0.03 * softer * grip[2] / (softer + grip[2])
