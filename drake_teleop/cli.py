@@ -406,6 +406,12 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
 )
 @click.option("--predicted", is_flag=True, help="Extrapolate over the low-pass's lag.")
 @click.option("--watch", is_flag=True, help="Flag contact, and another load than the known one.")
+@click.option(
+    "--free",
+    type=option.PATH,
+    metavar="LOG",
+    help="Flag contact by the noise floor of this log of free motion, as `detect` does.",
+)
 @click.option("--tare", is_flag=True, help="Set the offsets at the start, untouched and at rest.")
 @click.option(
     "--control",

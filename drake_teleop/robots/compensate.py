@@ -15,6 +15,7 @@ from drake_teleop.load.arrays import Array
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
+from drake_teleop.robots.detector import Detector
 from drake_teleop.robots.joints import arm_of
 from drake_teleop.robots.lines import names_of
 from drake_teleop.robots.sources_and_sinks import sink_of, source_of
@@ -107,6 +108,7 @@ def compensate_command(
     predicted: bool = False,
     tare: bool = False,
     watch: bool = False,
+    free: Path | None = None,
     control: int | None = None,
     real_time: bool = False,
     cutoff_hz: float | None = 30.0,
@@ -126,6 +128,7 @@ def compensate_command(
         largest: the sensor's range [N], [N m].
         tare: at the start.
         watch: for contact and another load, see `drake_teleop.robots.watch`.
+        free: log of free motion, whose noise floor contact is told by, see `Detector`.
         control: port of `Control`.
         model, sensor_frame, package_paths: of the arm whose joints tell the motion, see `arm_of`.
 
@@ -155,6 +158,7 @@ def compensate_command(
         predicted=predicted,
         largest=limits,
         watch=Watch(found, readings.dt, cutoff_hz) if watch else None,
+        detector=None if free is None else Detector(found, free, readings.dt, cutoff_hz),
     )
     wrenches = sink_of(sink)
     asked = None if control is None else Control(control)

@@ -25,6 +25,7 @@ from drake_teleop.load.arrays import Array
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
+from drake_teleop.robots.detector import Detector
 from drake_teleop.robots.live_step import (
     AT_RANGE,
     NOT_FINITE,
@@ -52,6 +53,7 @@ _LARGEST = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
 # Whole numbers: what is done with a `Flag` in Python takes a microsecond each time.
 _DAMAGED, _STALE, _CLIPPED = int(Flag.DAMAGED), int(Flag.STALE), int(Flag.CLIPPED)
 _ONLY_SAID, _GAP, _WRONG_RATE = int(ONLY_SAID), int(Flag.GAP), int(Flag.WRONG_RATE)
+_IN_CONTACT = int(Flag.IN_CONTACT)
 _DOUBTS = {NOT_FINITE: Flag.NOT_FINITE, TOO_LARGE: Flag.OUT_OF_RANGE, AT_RANGE: Flag.SATURATED}
 # At rest, rms: specific force [m/s^2], angular velocity [rad/s]; noise of the wrench, as a multiple
 # of what the identification left, and at least [N, N m].
@@ -72,6 +74,7 @@ class Compensator:
         predicted: extrapolate over wait and low-pass.
         largest: (6,) the sensor's range [N, N m].
         watch: says of each good reading whether something is touched, or it is another load.
+        detector: says of each whether something is touched, instead of `watch`.
         tare_limit: how far offsets may drift [N], [N m].
 
     Attributes:
@@ -92,13 +95,14 @@ class Compensator:
         predicted: bool = False,
         largest: Array | None = None,
         watch: Watch | None = None,
+        detector: Detector | None = None,
         tare_limit: tuple[float, float] = (5.0, 0.25),
     ) -> None:
         self._phi, self._nothing = usable_phi(load)[0], np.zeros(10)
         self._scales, self._dt = np.array([sigma, sigma, gamma], float), dt
         self.offsets = load.offsets.copy()
         self.lag_s = wait * dt + filter_lag(dt, cutoff_hz)
-        self._low_pass, self._watch = np.empty(0), watch
+        self._low_pass, self._watch, self._detector = np.empty(0), watch, detector
         if cutoff_hz is not None and cutoff_hz < 0.5 / dt:
             b, a, settled = low_pass_coefficients(dt, cutoff_hz, self.lag_s if predicted else 0.0)
             self._low_pass = np.concatenate([b, a[1:], settled])
@@ -135,6 +139,9 @@ class Compensator:
             return self._zero(flags)
         if self._watch is not None:
             flags |= self._watch.flags(reading.values)
+        if self._detector is not None:
+            flags &= ~_IN_CONTACT
+            flags |= self._detector.flags(reading.values, self._late[-1][:6])
         wrench = self._late[0].copy()
         if clipped(wrench, self._range):
             flags |= _CLIPPED
@@ -170,6 +177,8 @@ class Compensator:
         self.offsets = self.offsets + step
         if self._watch is not None:
             self._watch.restart(self.offsets)
+        if self._detector is not None:
+            self._detector.restart()
         self.rested = 0
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
@@ -219,6 +228,8 @@ class Compensator:
 
     def _settle_anew(self) -> None:
         self._memory[:] = np.nan
+        if self._detector is not None:
+            self._detector.restart()
         self._late.clear()
 
     def _rate(self, reading: Reading) -> int:

@@ -36,6 +36,26 @@ def doubts(values, largest, limits):
 
 
 @njit(cache=True)
+def low_passed_into(x, low_pass, memory):
+    """One sample through a low-pass of second order, in place.
+
+    Args:
+        x: (n,) the sample.
+        low_pass: (7,) b, a_1, a_2 and the memory that is settled at 1.
+        memory: (2, n), NaN if it is to settle.
+    """
+    anew = math.isnan(memory[0, 0])
+    for i in range(len(x)):
+        u = x[i]
+        if anew:
+            memory[0, i], memory[1, i] = low_pass[5] * u, low_pass[6] * u
+        y = memory[0, i] + low_pass[0] * u
+        memory[0, i] = memory[1, i] + u * low_pass[1] - y * low_pass[3]
+        memory[1, i] = u * low_pass[2] - y * low_pass[4]
+        x[i] = y
+
+
+@njit(cache=True)
 def eliminated_into(values, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
     """Contact and scaled wrench of a good reading.
 
@@ -44,8 +64,7 @@ def eliminated_into(values, offsets, phi, nothing, scales, low_pass, memory, res
         offsets: (6,) of the sensor.
         phi, nothing: (10,) the load, and zeros.
         scales: (3,) of what is scaled, see `scaled_wrench_into`.
-        low_pass: (7,) b, a_1, a_2 and the settled memory; empty without one.
-        memory: (2, 12) of the low-pass, NaN if it is to settle.
+        low_pass, memory: see `low_passed_into`; the former is empty without one.
         rest: (rows, 21) whose row `at` becomes the reading and its contact, not filtered.
         out: (12,) contact and scaled.
     """
@@ -56,17 +75,8 @@ def eliminated_into(values, offsets, phi, nothing, scales, low_pass, memory, res
     scaled_wrench_into(wrench, offsets, s, omega, alpha, nothing, phi, a, b, c, scaled)
     rest[at, :15] = values
     rest[at, 15:] = contact
-    if len(low_pass) == 0:
-        return
-    anew = math.isnan(memory[0, 0])
-    for i in range(12):
-        x = out[i]
-        if anew:
-            memory[0, i], memory[1, i] = low_pass[5] * x, low_pass[6] * x
-        y = memory[0, i] + low_pass[0] * x
-        memory[0, i] = memory[1, i] + x * low_pass[1] - y * low_pass[3]
-        memory[1, i] = x * low_pass[2] - y * low_pass[4]
-        out[i] = y
+    if len(low_pass) > 0:
+        low_passed_into(out, low_pass, memory)
 
 
 @njit(cache=True)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
 
+import numpy as np
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensator import Compensator
+from drake_teleop.robots.detector import Detector
 from drake_teleop.robots.streams import Flag, Reading
 from drake_teleop.robots.watch import Watch
 
@@ -20,7 +26,7 @@ LOAD = Identification(
 )
 
 
-def readings() -> tuple[np.ndarray, np.ndarray]:
+def readings(seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """4 s of turning, (N,) times and (N, 15) values."""
     t = DT * np.arange(2000)
     angle, w = 0.8 * np.sin(3.0 * t), 2.4 * np.cos(3.0 * t)
@@ -28,7 +34,7 @@ def readings() -> tuple[np.ndarray, np.ndarray]:
     s = 9.81 * np.column_stack([np.sin(angle), zero, np.cos(angle)])
     omega = np.column_stack([zero, -w, zero])
     alpha = np.column_stack([zero, 7.2 * np.sin(3.0 * t), zero])
-    noise = np.random.default_rng(2).normal(size=(2000, 6)) * np.repeat([0.1, 0.005], 3)
+    noise = np.random.default_rng(seed).normal(size=(2000, 6)) * np.repeat([0.1, 0.005], 3)
     wrench = non_contact_wrench(s, omega, alpha, PHI) + OFFSETS + noise
     return t, np.hstack([wrench, s, omega, alpha])
 
@@ -53,6 +59,39 @@ def test_a_push_is_flagged_while_it_lasts_and_nothing_else() -> None:
     flags = flagged(t, values)
     assert not flags[:1000].any() and not flags[1400:].any()
     assert (flags[1025:1250] == Flag.IN_CONTACT).all()
+
+
+def test_a_log_of_free_motion_tells_what_is_no_contact(tmp_path: Path) -> None:
+    """Of a gain that is wrong by 5 %, too: a third of what the watch needs is found then."""
+    gains, free = np.array([1.05, 1.0, 0.95, 1.0, 1.05, 1.0]), tmp_path / "free.parquet"
+    t, before = readings(seed=5)
+    before[:, :6] *= gains
+    write_log(Log(t, *np.split(before, [6, 9, 12], axis=1)), free)
+    _, values = readings()
+    values[:, :6] *= gains
+    start = np.split(values[:250, 6:], 3, axis=1)
+    tared = (values[:250, :6] - non_contact_wrench(*start, PHI)).mean(axis=0)
+    for push in (0.0, 0.5):
+        rows = values.copy()
+        rows[1000:1250, 1] += push
+        compensator = Compensator(LOAD, DT, detector=Detector(LOAD, free, DT, 30.0, 0.0))
+        compensator.offsets = tared.copy()
+        out = [
+            compensator.step(Reading(k, float(t[k]), row), float(t[k]))
+            for k, row in enumerate(rows)
+        ]
+        flags = np.array([row.flags for row in out])
+        assert not flags[:1000].any() and not flags[1350:].any()
+        assert (flags[1030:1250] == (Flag.IN_CONTACT if push else 0)).all()
+
+
+def test_a_noise_floor_needs_the_streams_rate_and_a_low_pass(tmp_path: Path) -> None:
+    t, values = readings()
+    write_log(Log(t, *np.split(values, [6, 9, 12], axis=1)), tmp_path / "free.parquet")
+    with pytest.raises(DrakeTeleopError, match="has 500 Hz, and the stream 1000 Hz"):
+        Detector(LOAD, tmp_path / "free.parquet", 0.001, 30.0, 0.0)
+    with pytest.raises(DrakeTeleopError, match="needs a low-pass"):
+        Detector(LOAD, tmp_path / "free.parquet", DT, None)
 
 
 def test_another_load_is_flagged_as_that_once_it_has_moved() -> None:

@@ -1,0 +1,135 @@
+"""Contact by the detector of `detect`, in the loop: `--watch --free LOG`.
+
+Its noise floor, which rises with the motion, and its threshold are fitted to a log of free motion
+with the same load, as `detect --free` does, but to what the loop will see: wrench and motion behind
+the causal low-pass, and gravity as what is slower than `_GRAVITY_HZ` in the specific force. The
+mean of the contact wrench follows in `FOLLOWS_S` while nothing is touched, as offsets drift.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from drake_teleop._compiled import njit
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.arrays import Array
+from drake_teleop.load.contact.detection import ContactDetector, flag_update
+from drake_teleop.load.contact.noise_floor import finite_covariance
+from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
+from drake_teleop.load.contact.statistics import RARE
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.causal import low_pass_coefficients
+from drake_teleop.logs.processing import usable_phi
+from drake_teleop.robots.live_step import low_passed_into
+from drake_teleop.robots.replay_log import LogSource
+from drake_teleop.robots.streams import Flag
+
+FOLLOWS_S = 3.0
+"""Time constant of the mean [s]."""
+_GRAVITY_HZ = 0.5
+_STATISTIC = "level"
+_SAME_RATE = 0.05
+
+
+class Detector:
+    """What `Compensator` asks whether something is touched.
+
+    Args:
+        load: that hangs there.
+        free: log of its free motion, at the rate of the stream.
+        dt: between readings [s].
+        cutoff_hz: of the low-pass.
+        delay: of the log, as of `eliminate_log`.
+
+    Raises:
+        DrakeTeleopError: if the log cannot be read, has another rate or too little motion, or there
+            is no low-pass.
+    """
+
+    def __init__(
+        self,
+        load: Identification,
+        free: Path,
+        dt: float,
+        cutoff_hz: float | None,
+        delay: str | float = "auto",
+    ) -> None:
+        if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
+            raise DrakeTeleopError("needs a low-pass", where="--free", remedy="give --cutoff HZ")
+        source = LogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
+        if abs(source.dt / dt - 1.0) > _SAME_RATE:
+            raise DrakeTeleopError(
+                f"has {1.0 / source.dt:.4g} Hz, and the stream {1.0 / dt:.4g} Hz",
+                where=str(free),
+                remedy="take the log that `calibrate` wrote of this stream",
+            )
+        self._fast, self._slow = (_packed(dt, hz) for hz in (cutoff_hz, _GRAVITY_HZ))
+        readings = [each for each in source.read(0.0) or () if not each.flags]
+        values = np.array([each.values for each in readings]).reshape(-1, 15)
+        phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
+        contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
+        contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare would
+        rows = self._behind(np.hstack([contact, values[:, 6:]]))
+        # The low-passes settle first.
+        settled = rows[round(0.5 / (_GRAVITY_HZ * dt)) :]
+        hold = round(1.0 / (cutoff_hz * dt))
+        fade = float(np.exp(-1.0 / hold))
+        covariance = finite_covariance(phi, load.covariance, tared=True)
+        contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
+        floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
+        threshold = max(RARE, floor.threshold(_STATISTIC))
+        self._settings = ContactDetector(
+            floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / FOLLOWS_S
+        ).settings
+        self.restart()
+        self.flags(np.zeros(15), np.zeros(6))  # what is compiled is loaded now
+        self.restart()
+
+    def restart(self) -> None:
+        """Forgets all but the noise floor: after a fault, or a tare."""
+        self._memory = ContactDetector.initial_memory()
+        self._filters = np.full((2, 12), np.nan)
+
+    def _behind(self, rows: Array) -> Array:
+        """(N, 18) contact, motion and acceleration behind the low-passes, of (N, 15)."""
+        filters, contacts = np.full((2, 12), np.nan), np.full((2, 6), np.nan)
+        out = np.empty((len(rows), 18))
+        for row, to in zip(rows, out, strict=True):
+            to[:6] = row[:6]
+            low_passed_into(to[:6], self._fast, contacts)
+            _moved_into(row, self._fast, self._slow, filters, to[6:])
+        return out
+
+    def flags(self, values: Array, contact: Array) -> int:
+        """Takes a good reading (15,) and what came out of it (6,), behind the low-pass."""
+        touched = _touched(
+            self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
+        )
+        return int(Flag.IN_CONTACT) if touched else 0
+
+
+def _packed(dt: float, cutoff_hz: float) -> Array:
+    b, a, settled = low_pass_coefficients(dt, cutoff_hz)
+    return np.concatenate([b, a[1:], settled])
+
+
+@njit(cache=True)
+def _moved_into(values, fast, slow, filters, out):
+    """Motion (9,) behind the low-pass, and acceleration without gravity (3,), into out (12,)."""
+    out[:9] = values[6:]
+    low_passed_into(out[:9], fast, filters[:, :9])
+    out[9:] = values[6:9]
+    low_passed_into(out[9:], slow, filters[:, 9:])
+    for i in range(3):
+        out[9 + i] = out[i] - out[9 + i]
+
+
+@njit(cache=True)
+def _touched(memory, values, contact, fast, slow, filters, settings):
+    moved = np.empty(12)
+    _moved_into(values, fast, slow, filters, moved)
+    s, omega, alpha, acceleration = moved[:3], moved[3:6], moved[6:9], moved[9:]
+    return flag_update(memory, contact, s, omega, alpha, acceleration, *settings)
