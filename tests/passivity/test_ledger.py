@@ -329,7 +329,7 @@ def test_taps_are_felt_from_the_second_on(rate):
 
 @pytest.mark.parametrize(
     ("grip", "wall", "delay", "end", "share"),
-    [(FIRM, 5.1e3, 0.15, 6.0, 0.98), (MEDIUM, 20e3, 0.15, 9.0, 0.85), (FIRM, 20e3, 0.05, 12.0, 0.7)],
+    [(FIRM, 5.1e3, 0.15, 6.0, 0.98), (MEDIUM, 20e3, 0.15, 9.0, 0.85), (FIRM, 2e4, 0.05, 12.0, 0.7)],
     ids=["firm", "hard", "both"],
 )
 def test_a_hand_that_was_faster_than_the_news_feels_what_is_pressed(grip, wall, delay, end, share):
