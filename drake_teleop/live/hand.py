@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DependencyTicket,
+    Diagram,
+    DiagramBuilder,
+)
 
 from drake_teleop._compiled import njit
-from drake_teleop.lifetime import ONE_DICT, weak_callback
+from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.live.handing_on import GoesOver
-from drake_teleop.operator.operator import HandImpedance
+from drake_teleop.operator.operator import (
+    HandImpedance,
+    Operator,
+    OperatorConfig,
+    hand_wrench_into,
+)
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.scenario import Scenario
 from drake_teleop.sides.master import MakeMasterSide
@@ -76,39 +88,42 @@ def _rate_of(r: Array, omega: Array) -> Array:
     return np.linalg.solve(np.eye(3) + a * across + b * across @ across, omega)
 
 
-class LiveHand(LeafSystem):
-    """The wanted pose of a hand that is led from outside: critically damped to its target.
+@njit(cache=True)
+def _wrench_into(path, time, impedance, pose, twist, wanted, wrench):
+    """Writes what the hand wants now (13,), and the wrench (6,) of the hand on the stylus."""
+    _wanted_into(path, time, pose, wanted)
+    hand_wrench_into(impedance, wanted[:7], wanted[7:], pose, twist, wrench)
+
+
+class LiveHand(Operator):
+    """The hand of an operator whose intention is led from outside: critically damped to a target.
 
     .. pydrake_system::
 
         name: LiveHand
         input_ports:
         - pose_master: (7,) X_BE
-        - twist_master: (6,) [v; omega] of E in B, read by `Hold`
+        - twist_master: (6,) [v; omega] of E in B
         output_ports:
-        - intended_pose: (7,) X_BE that the operator wants
-        - intended_twist: (6,) its twist [v; omega] in B [m/s, rad/s]
+        - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
+        - intent: (7,) X_BE that it wants
 
     Args:
+        config: the grip.
         start: (7,) X_BE that it holds until it is led elsewhere.
     """
 
     __slots__ = ONE_DICT
 
-    def __init__(self, start: Array) -> None:
-        super().__init__()
+    def __init__(self, config: OperatorConfig, start: Array) -> None:
+        super().__init__(dataclasses.replace(config, intent=[], task=None), start)
+        self._now = np.empty(13)
+
+    def _declare_intention(self) -> set[DependencyTicket]:
         path = np.zeros(_PATH)
-        path[_HELD], path[_TARGET:_AWAY] = 1.0, start
+        path[_HELD], path[_TARGET:_AWAY] = 1.0, self._intent[1]
         self._path = self.DeclareNumericParameter(BasicVector(path))
-        self._pose = self.DeclareVectorInputPort("pose_master", 7)
-        self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        self._wanted = np.empty(13)
-        needed = {self.all_parameters_ticket(), self.time_ticket(), self._pose.ticket()}
-        for name, size, calc in (
-            ("intended_pose", 7, self._calc_pose),
-            ("intended_twist", 6, self._calc_twist),
-        ):
-            self.DeclareVectorOutputPort(name, size, weak_callback(calc), needed)
+        return {self.all_parameters_ticket(), self._pose.ticket()}
 
     def Lead(self, context: Context, target: Array | None) -> None:
         """From now on it wants the stylus at `target` (7,) X_BE, or with None lets go of it.
@@ -116,7 +131,7 @@ class LiveHand(LeafSystem):
         The way begins where it is, as fast as it is. A hand that lets go pulls nowhere; only its
         damping is left.
         """
-        now = self._now(context).copy()
+        now = self._wants(context).copy()
         path = np.zeros(_PATH)
         if target is not None:
             path[_HELD], path[_START], path[_TARGET:_AWAY] = 1.0, context.get_time(), target
@@ -136,7 +151,7 @@ class LiveHand(LeafSystem):
         if path[_HELD] < 0.5:
             return
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
-        wanted = self._now(context)
+        wanted = self._wants(context)
         turn = np.array(logarithm(multiply(tuple(wanted[:4]), conjugate(tuple(pose[:4])))))
         turn *= before.rotational_stiffness / after.rotational_stiffness
         way = before.stiffness / after.stiffness * (wanted[4:7] - pose[4:])
@@ -152,16 +167,24 @@ class LiveHand(LeafSystem):
         path[_AWAY + 3 : _TURNED], path[_TURNED + 3 :] = speed[:3], speed[3:]
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def _now(self, context: Context) -> Array:
+    def _wants(self, context: Context) -> Array:
         path = context.get_numeric_parameter(self._path).value()
-        _wanted_into(path, context.get_time(), self._pose.Eval(context), self._wanted)
-        return self._wanted
+        _wanted_into(path, context.get_time(), self._pose.Eval(context), self._now)
+        return self._now
 
-    def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._now(context)[:7])
+    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
+        _wrench_into(
+            context.get_numeric_parameter(self._path).value(),
+            context.get_time(),
+            self._impedance,
+            self._pose.Eval(context),
+            self._twist.Eval(context),
+            self._now,
+            output.get_mutable_value(),
+        )
 
-    def _calc_twist(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._now(context)[7:])
+    def _calc_intent(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._wants(context)[:7])
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Diagram:
@@ -171,13 +194,9 @@ def MakeLiveMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Diagra
     follows another station goes over to what is felt now: `GoesOver`.
     """
     builder = DiagramBuilder()
-    side = builder.AddNamedSystem("led", MakeMasterSide(scenario))
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
-    hand = builder.AddNamedSystem("live_hand", LiveHand(start))
-    for name in ("pose_master", "twist_master"):
-        builder.Connect(side.GetOutputPort(name), hand.GetInputPort(name))
-    for name in ("intended_pose", "intended_twist"):
-        builder.Connect(hand.GetOutputPort(name), side.GetInputPort(name))
+    hand = LiveHand(scenario.operator, start)
+    side = builder.AddNamedSystem("led", MakeMasterSide(scenario, hand))
     felt = side.GetInputPort("wrench_command")
     if goes_over:
         block = builder.AddNamedSystem("goes_over", GoesOver())

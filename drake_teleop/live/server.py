@@ -38,6 +38,7 @@ from drake_teleop.live.device import DrivenBy
 from drake_teleop.live.external_master import with_device
 from drake_teleop.live.live import Live, Show
 from drake_teleop.live.messages import LONGEST
+from drake_teleop.live.pace import without_collections
 from drake_teleop.live.scenes import scene
 from drake_teleop.live.session import live_scenario
 from drake_teleop.replay import ReplayScene
@@ -151,10 +152,7 @@ class LiveDrive:
 
     async def _drive(self, server: Server) -> None:
         """The one loop: slices and frames, and messages whenever there is time between them."""
-        gc.collect()
-        gc.freeze()
-        gc.disable()  # a full collection takes as long as ten slices
-        try:
+        with without_collections():
             while not self._stop.is_set():
                 if self._live.asked:
                     await self._change_scene()
@@ -167,9 +165,6 @@ class LiveDrive:
                     ]
                     broadcast(ready, json.dumps({"frame": frame}))
                 await self._sleep()
-        finally:
-            gc.enable()
-            gc.unfreeze()
 
     async def _sleep(self) -> None:
         """Until there is something to do; then messages that have come are listened to.

@@ -122,12 +122,9 @@ class _Station:
 
     def block(self, name: str) -> tuple[Any, Context]:
         """A block, and its context."""
-        side = self.station.GetSubsystemByName("master_side")
-        found = (
-            side.GetSubsystemByName("led").GetSubsystemByName(name)
-            if name == "kinematic_scaling"
-            else GetBlock(self.station, name)
-        )
+        led = self.station.GetSubsystemByName("master_side").GetSubsystemByName("led")
+        inside = led.HasSubsystemNamed(name)
+        found = led.GetSubsystemByName(name) if inside else GetBlock(self.station, name)
         return found, found.GetMyMutableContextFromRoot(self.context)
 
     def value(self, signal: str) -> NDArray[np.float64]:

@@ -344,25 +344,26 @@ class Operator(LeafSystem):
         )
         # Segments, the pose that they are relative to, and how that moves.
         self._intent = (pack_intent(config.intent), np.array(start, dtype=float), np.zeros(6))
-        self._wanted, self._wanted_twist = np.empty(7), np.empty(6)
+        self._wanted, self._wanted_twist, self._intended = np.empty(7), np.empty(6), np.empty(7)
         self._no_memory, self._no_segments = np.empty(0), self._intent[0][:0]
-        self._intended = np.empty(7)
+        self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
-        self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
-        self._has_task = config.task is not None
-        held = {self._pose.ticket(), self._twist.ticket()}
-        intended = {self._intended_pose.ticket(), self._intended_twist.ticket()}
-        moving = intended | {self.time_ticket()}
+        moving = self._declare_intention() | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
                 raise ValueError("a task needs training, arm and tip")
             moving.add(self._declare_task(config, config.task, training, arm, tip))
-        self._wrench = self.DeclareVectorOutputPort(
-            "hand_wrench_E", 6, weak_callback(self._calc_wrench), held | moving
-        )
+        held = moving | {self._pose.ticket(), self._twist.ticket()}
+        calc = weak_callback(self._calc_wrench)
+        self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
+
+    def _declare_intention(self) -> set[DependencyTicket]:
+        """Ports that the intention is taken from; what it depends on, besides time and task."""
+        pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
+        twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
+        return {pose.ticket(), twist.ticket()}
 
     def _declare_task(
         self,

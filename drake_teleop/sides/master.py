@@ -24,7 +24,7 @@ from drake_teleop.slave.plant import NominalSlave, start_pose
 CLUTCH_PERIOD = 0.01
 
 
-def MakeMasterSide(scenario: Scenario) -> Diagram:
+def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diagram:
     """Operator, haptic device, kinematic scaling and force display.
 
     .. pydrake_system::
@@ -45,6 +45,10 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
         - displayed_and_fault: the last two side by side, for the log
         - task_state: signal (with a task)
 
+    Args:
+        scenario: what the station is made of.
+        operator: who holds the device, "live_hand"; None for the scenario's operator.
+
     Raises:
         DrakeTeleopError: for a value that cannot be right.
     """
@@ -54,15 +58,17 @@ def MakeMasterSide(scenario: Scenario) -> Diagram:
     start_W = start_pose(scenario.slave)
     builder = DiagramBuilder()
 
-    operator = builder.AddNamedSystem("operator", _operator(scenario, start_B))
+    name = "operator" if operator is None else "live_hand"
+    operator = builder.AddNamedSystem(name, operator or _operator(scenario, start_B))
     period, model = 1 / scenario.rates.hand_hz, scenario.master.device(hand.mass, hand.inertia)
     q_start = model.inverse_kinematics(start_B)
     device, display = AddDevice(builder, period, model, q_start)
     builder.Connect(operator.GetOutputPort("hand_wrench_E"), device.GetInputPort("hand_wrench_E"))
     builder.Connect(device.GetOutputPort("pose_master"), operator.GetInputPort("pose_master"))
     builder.Connect(device.GetOutputPort("twist_master"), operator.GetInputPort("twist_master"))
-    builder.ExportInput(operator.GetInputPort("intended_pose"), "intended_pose")
-    builder.ExportInput(operator.GetInputPort("intended_twist"), "intended_twist")
+    for name in ("intended_pose", "intended_twist"):
+        if operator.HasInputPort(name):
+            builder.ExportInput(operator.GetInputPort(name), name)
     if scenario.operator.task is not None:
         builder.ExportInput(operator.GetInputPort("slave_state"), "slave_state")
         export(builder, operator, "task_state")
