@@ -29,7 +29,7 @@ from drake_teleop.fault import sound
 from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.passivity import methods
-from drake_teleop.passivity.memory import LIMIT, MEMORY, OF_LOAD, Slots
+from drake_teleop.passivity.memory import FILLS, LIMIT, MEMORY, OF_LOAD, Slots
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.passivity.packet import (
     CONTACT,
@@ -434,7 +434,11 @@ class TeleopChannel(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def Begin(
-        self, context: Context, command: NDArray[np.float64], slave: NDArray[np.float64]
+        self,
+        context: Context,
+        command: NDArray[np.float64],
+        slave: NDArray[np.float64],
+        fills: float,
     ) -> None:
         """Begins in a running station: nothing is on its way yet, and the slave keeps its command.
 
@@ -442,9 +446,11 @@ class TeleopChannel(LeafSystem):
             context: of this block.
             command: (7,) X_WS that the slave follows now; the master's command has to be the same.
             slave: (7,) X_WS of the slave, actual.
+            fills: for how long the clutch is open [s]. The slave of `wave` keeps its command
+                until then, and reflects the wrench that stands.
         """
         ends = initial_ends(*self._begin, command)
-        ends[_POSE_S][:7] = slave
+        ends[_POSE_S][:7], ends[MEMORY_S][FILLS] = slave, fills
         context.SetDiscreteState(self._groups[2], ends)
         context.SetDiscreteState(self._groups[3], command)
 

@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 OBJECT = Payload(mass=0.8)
 #: In which the hand goes over to what it feels of another station [s].
 BLEND = 0.25
+# Of `wave`'s line, where the scenario does not use it [N m s/rad]. A ball on a leaf has 1.5 N m of
+# friction about the sensor, which a line of the default 0.05 does not hold: over 0.2 s it topples.
+_TURNING = 0.5
 _TENTH_OF_MS, _PERCENT, _PER_MILLE = 1e-4, 1e-2, 1e-3
 
 
@@ -43,6 +46,12 @@ def chosen(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> S
         "passivity__method": METHODS[inputs.method],
         "operator__grip": list(GRIPS)[inputs.grip],
     }
+    if METHODS[inputs.method] == "wave" != scenario.passivity.method:
+        along, turning = scenario.passivity.wave.impedance
+        wave = dataclasses.replace(
+            scenario.passivity.wave, impedance=[along, max(turning, _TURNING)]
+        )
+        changes["passivity__wave"] = wave
     name = NETWORKS[inputs.network]
     if name == "custom":
         changes["channel"] = Channel(

@@ -162,7 +162,7 @@ class _Station:
             channel, context = self.block("channel")
             side = self.station.GetSubsystemByName("slave_side")
             pose = side.GetOutputPort("pose_slave").Eval(side.GetMyContextFromRoot(self.context))
-            channel.Begin(context, command, pose)
+            channel.Begin(context, command, pose, wait)
         return wait + BLEND
 
 

@@ -354,9 +354,8 @@ class Operator(LeafSystem):
             if training is None or arm is None or tip is None:
                 raise ValueError("a task needs training, arm and tip")
             moving.add(self._declare_task(config, config.task, training, arm, tip))
-        held = moving | {self._pose.ticket(), self._twist.ticket()}
-        calc = weak_callback(self._calc_wrench)
-        self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held)
+        calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
+        self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
 
     def _declare_intention(self) -> set[DependencyTicket]:

@@ -50,6 +50,8 @@ LOST = _memory.vector(2)  #: energy that the method took out of the loop here [J
 HELD = _memory.vector(6)  #: the wrench at this port since the last step
 OF_LOAD = _memory.vector(6)  #: of the slave's wrench now, what its load's weight and inertia are
 COMMAND = _memory.vector(13)  #: the slave's command since the last step, X_WS and its twist
+#: At the slave, for how long from now on its command stays where it is: a new channel fills [s].
+FILLS = _memory.number()
 HAND_VELOCITY = _memory.vector(6)  #: at the master, filtered, see `retreat`
 PACKET = _memory.vector(38)  #: the last packet that was sent, see `packet`
 _OWN = _memory.rest()

@@ -43,6 +43,7 @@ from drake_teleop.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
+    FILLS,
     HELD,
     LEDGER,
     LOST,
@@ -189,7 +190,11 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     """One step of the slave's end; see `methods.slave_step`."""
     now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
     memory[_SILENT] = 0.0 if fresh else memory[_SILENT] + T
-    if memory[_SILENT] <= p[_PATIENCE]:
+    if memory[FILLS] > 0.0:
+        memory[FILLS] -= T
+        step[:] = 0.0
+        _stand(received, wrench, T, p, memory)
+    elif memory[_SILENT] <= p[_PATIENCE]:
         _reflect(received, wrench, T, p, memory)
         if arrived(received):
             _correct(received, wrench, T, p, memory)
@@ -240,6 +245,27 @@ def _rest(wrench, T, p, memory):
             for i in range(3 * g, 3 * g + 3):
                 played[i] += T * wave[i]
                 integral[i] -= T * wave[i]
+
+
+@njit(cache=True)
+def _stand(received, wrench, T, p, memory):
+    """Reflects as a rigid wall while a new line fills, and has in store what would play that on.
+
+    What comes is not played but made up to what stands: a filter that has been playing the wave of
+    `wrench` for long is behind by its time constant of it, and a step more when the next has come:
+    a store of half of that lets it. So the line begins with the energy of a contact that stood
+    before there was a line.
+    """
+    wave, ledger, accounted = memory[_WAVE], memory[LEDGER], memory[RECEIVED]
+    played, integral = memory[_PLAYED], memory[_INTEGRAL]
+    for g in range(2):
+        accounted[g] = max(accounted[g], received[ENERGY][g])
+        for i in range(3 * g, 3 * g + 3):
+            wave[i] = -wrench[i] / math.sqrt(2.0 * p[IMPEDANCE][g])
+            integral[i] -= T * wave[i]
+            played[i] = received[INTEGRAL][i] - p[_FILTER] * wave[i]
+        memory[SENT][g] += 0.5 * T * dot(wave, wave, g)
+        ledger[g] = 0.5 * (T + p[_FILTER]) * dot(wave, wave, g)
 
 
 @njit(cache=True)

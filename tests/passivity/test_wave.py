@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.passivity.memory import LIMIT
+from drake_teleop.passivity.memory import FILLS, LIMIT
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -21,16 +21,17 @@ T, STEPS = 1e-3, 1200
 WAVE = METHODS.index("wave")
 
 
-def line(config, motion, contact, forward, backward, missing=range(0)):
+def line(config, motion, contact, forward, backward, missing=range(0), fills=0):
     """Wrench at the hand and motion of the slave's command (x alone), both (N,).
 
     `contact(u, x)` is the force of the slave's end [N], for the wave u that arrives there and the
     command x of the last step; packets travel for `forward` and `backward` steps. At the steps
-    `missing` none comes to the hand.
+    `missing` none comes to the hand; for the first `fills` the slave's command stays.
     """
     p = parameters(PassivityConfig(method="wave", force_limit=1e3, retreat=[1e3, 1e3], wave=config))
     start = np.array([1.0, 0, 0, 0, 0, 0, 0])
     memory = [initial_memory("wave", p, start) for _ in range(2)]
+    memory[1][FILLS] = (fills - 0.5) * T
     sent, command = np.zeros((2, len(motion), PACKET_SIZE)), np.zeros((len(motion), 13))
     nothing, zero, wrench = np.zeros(PACKET_SIZE), np.zeros(6), np.zeros((len(motion), 6))
     u = np.zeros(len(motion))
@@ -90,6 +91,14 @@ def test_the_slave_stays_behind_by_the_momentum_on_the_line(delay):
     f, x = line(config, pressed, lambda u, x: -stiffness * max(x, 0.0), delay, delay)
     assert -f[-1] == pytest.approx(stiffness * x[-1], rel=0.01)
     assert pressed[-1] - x[-1] == pytest.approx(-f[-1] * (delay * T + filtering) / b, rel=0.03)
+
+
+@pytest.mark.parametrize("delay", [1, 40])
+def test_a_line_that_filled_in_contact_holds_it(delay):
+    """5 N stand before there is a line: then the command never moves, and the hand feels them."""
+    f, x = line(WaveConfig(), np.zeros(400), lambda u, x: -5.0, delay, delay, fills=2 * delay + 100)
+    assert np.abs(x).max() < 1e-12
+    np.testing.assert_allclose(f[-200:], -5.0, rtol=1e-9)
 
 
 @pytest.mark.parametrize("missing", [1, 40, 90])
