@@ -20,6 +20,7 @@ class Named(click.Path):
     """A path that all libraries can say: its name is UTF-8."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The value of an option's text; what cannot be one fails in one line."""
         path = super().convert(value, param, ctx)
         try:
             str(path).encode()
@@ -38,6 +39,7 @@ class Shipped(Named):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
+        """What the shell offers for a word that is begun."""
         names = sorted(path.stem for path in self._folder.glob("*.yaml"))
         fitting = [CompletionItem(name) for name in names if name.startswith(incomplete)]
         return fitting + super().shell_complete(ctx, param, incomplete)
@@ -72,6 +74,7 @@ class Number(click.FloatRange):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
+        """The value of an option's text; what cannot be one fails in one line."""
         number: float = click.FLOAT.convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
@@ -85,6 +88,7 @@ class Whole(click.IntRange):
     name = "integer"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """The value of an option's text; what cannot be one fails in one line."""
         number: int = click.INT.convert(value, param, ctx)
         _check_range(self, number, param, ctx)
         return number
@@ -98,6 +102,7 @@ class Delay(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str:
+        """The value of an option's text; what cannot be one fails in one line."""
         return "auto" if value == "auto" else Number(-10, 10).convert(value, param, ctx)
 
 
@@ -228,6 +233,7 @@ class Names(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, ...]:
+        """The value of an option's text; what cannot be one fails in one line."""
         if isinstance(value, tuple):
             return value
         return tuple(name.strip() for name in value.split(","))
@@ -241,6 +247,7 @@ class PositiveNumbers(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[float, ...]:
+        """The value of an option's text; what cannot be one fails in one line."""
         if isinstance(value, tuple):
             return value
         number = Number(0, 1e5, min_open=True)

@@ -54,3 +54,27 @@ def test_nobody_pays_for_what_they_do_not_use(statement, foreign):
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert not foreign & set(answer.stdout.split())
+
+
+def without_a_docstring(file: str, node: ast.Module | ast.ClassDef) -> list[str]:
+    """Public classes, functions and methods; a setter has its property's."""
+    found = []
+    for each in node.body:
+        if not isinstance(each, ast.FunctionDef | ast.ClassDef) or each.name.startswith("_"):
+            continue
+        if any(ast.unparse(line).endswith(".setter") for line in each.decorator_list):
+            continue
+        found += [] if ast.get_docstring(each) else [f"{file}: {each.name}"]
+        if isinstance(each, ast.ClassDef):
+            found += without_a_docstring(file, each)
+    return found
+
+
+def test_everything_public_says_what_it_is():
+    files = sorted(Path(drake_teleop.__file__).parent.rglob("*.py"))
+    assert len(files) > 300
+    root = Path(drake_teleop.__file__).parent
+    trees = {str(f.relative_to(root)): ast.parse(f.read_text(encoding="utf-8")) for f in files}
+    assert [file for file, tree in trees.items() if not ast.get_docstring(tree)] == []
+    missing = [without_a_docstring(file, tree) for file, tree in trees.items()]
+    assert [names for names in missing if names] == []

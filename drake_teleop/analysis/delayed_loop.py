@@ -281,12 +281,14 @@ def least_along(value: Array, at: Array, axis: int = -1) -> tuple[Array, Array]:
 
 
 def angle_of(value: Complex) -> Array:
+    """(...) of complex numbers [rad], from -pi to pi."""
     return np.arctan2(value.imag, value.real)
 
 
 def checked_held(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike
 ) -> tuple[Array, Array, Array]:
+    """Mass, damping and stiffness of hand and device as arrays; an error for what cannot be."""
     m = checked_positive(mass, "mass of hand and device")
     b = checked_positive(damping, "damping of hand and device")
     k = np.asarray(stiffness, dtype=float)
@@ -296,6 +298,7 @@ def checked_held(
 
 
 def checked_positive(value: ArrayLike, what: str) -> Array:
+    """The value as an array; a DrakeTeleopError that says `what` it is, if it is not positive."""
     value = np.asarray(value, dtype=float)
     if not np.all(value > 0):
         raise DrakeTeleopError(f"the {what} is not positive")

@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 
 
 def stack(*coefficients: Any) -> Array:
+    """(..., n) coefficients along the last axis, of n that are broadcast."""
     return np.stack(np.broadcast_arrays(*(np.asarray(c, float) for c in coefficients)), axis=-1)
 
 

@@ -373,6 +373,7 @@ def at_an_end(q: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def check_limits(q: NDArray[np.float64]) -> None:
+    """Raises a DrakeTeleopError for the first of six joint angles [rad] out of its range."""
     margin = 1e-9
     for i in range(6):
         if not JOINT_LOWER[i] - margin <= q[i] <= JOINT_UPPER[i] + margin:

@@ -60,6 +60,7 @@ def plan_move(memory, time, length, change, end_speed):
 
 @njit(cache=True)
 def plan_stop(memory, time):
+    """Plans from now to rest, in `STOP` seconds, as far on as the motion takes it."""
     plan, change = memory[PLAN : PLAN + PLAN_SIZE], np.empty(3)
     for i in range(3):
         change[i] = 0.5 * STOP * plan_at(plan, time, i)[1]

@@ -54,7 +54,9 @@ class Records(Protocol[_T]):
     began_anew: int
 
     @property
-    def seconds(self) -> float: ...
+    def seconds(self) -> float:
+        """How long what was kept is."""
+        ...
 
     def take(self, one: _T) -> None:
         """Keeps it if it is good."""

@@ -47,10 +47,12 @@ class Record:
 
     @property
     def arrays(self) -> tuple[Array, Array, Array, Array]:
+        """Wrench (N, 6), then s, omega and alpha (N, 3) each."""
         return self.wrench, self.s, self.omega, self.alpha
 
     @cached_property
     def moments(self) -> Moments:
+        """Its sums of squares and products, added up once."""
         moments = Moments()
         moments.add(*self.arrays)
         return moments

@@ -134,6 +134,7 @@ def _square(x):
 
 @njit(cache=True)
 def hold_peaks(memory, acceleration, alpha, fade):
+    """Updates the largest squares of acceleration and alpha so far, which fade at each sample."""
     memory[HELD_A] = max(_square(acceleration), fade * memory[HELD_A])
     memory[HELD_ALPHA] = max(_square(alpha), fade * memory[HELD_ALPHA])
 
@@ -156,6 +157,7 @@ def parameter_variance(s, omega, alpha, P, V, out):
 
 @njit(cache=True)
 def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out):
+    """Writes the (N, 6) deviations of a record's contact wrench: noise, load, motion."""
     memory, V = np.zeros(3), np.empty((6, 10))
     for k in range(s.shape[0]):
         hold_peaks(memory, acceleration[k], alpha[k], fade)
@@ -166,6 +168,7 @@ def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out)
 
 
 def checked_motion(**arrays: ArrayLike) -> list[Array]:
+    """The arrays by name as (N, 3), `contact` as (N, 6), of one length and finite."""
     sizes = {name: (value, 6 if name == "contact" else 3) for name, value in arrays.items()}
     return checked_rows(**sizes)[1]
 

@@ -203,6 +203,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveTotalLeastSquares:
+        """One for noise of (6,) wrench and (9,) motion, as `__init__` takes them."""
         return cls(noise_std, motion_std, forgetting=forgetting, bound=bound)
 
     @property

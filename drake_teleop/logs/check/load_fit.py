@@ -48,6 +48,7 @@ class LoadFit:
 
     @property
     def good(self) -> bool:
+        """Whether some load of positive mass explains the wrench."""
         return self.mass > 0 and self.unexplained < EXPLAINED + self.noise
 
 

@@ -58,6 +58,7 @@ class ReadOff:
 
     @property
     def mirrored(self) -> bool:
+        """Whether the axes are left-handed."""
         return bool(np.linalg.det(self.R_SP) < 0.0)
 
 

@@ -211,6 +211,7 @@ class Spectra:
         return moments(self.signals, self.wrench, self.of, rates)
 
     def fit(self) -> Saturated:
+        """The fit of all coefficients to the wrench, with noise that is level."""
         return saturated(moments(self.signals, self.wrench, self.of), Levels.flat(self.of))
 
     def costs(self, delays: Array) -> Array:

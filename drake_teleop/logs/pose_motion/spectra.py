@@ -67,6 +67,7 @@ class Grid:
 
     @property
     def dt(self) -> float:
+        """Time from one instant to the next [s]."""
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     @cached_property
@@ -98,6 +99,7 @@ class Bands:
 
     @property
     def count(self) -> int:
+        """How many bands there are."""
         return int(self.band[-1]) + 1
 
     @cached_property

@@ -1,4 +1,6 @@
-"""Log descriptions: YAML files that say where a foreign log keeps what, in which units and frames.
+"""Log descriptions: where a foreign log keeps what (long: all classes of one file's format).
+
+YAML files that say it, with units and frames.
 
 Every field is documented in docs/logs.md. A number x of a file becomes a quantity in S by
 
@@ -106,28 +108,38 @@ class Time(_Strict):
 
 
 class Force(_Strict):
+    """Columns of a force and their unit."""
+
     columns: tuple[Column, ...]
     unit: Literal["N", "lbf"] = "N"
 
 
 class Torque(_Strict):
+    """Columns of a torque and their unit."""
+
     columns: tuple[Column, ...]
     unit: Literal["N m", "N mm", "lbf in"] = "N m"
 
 
 class Acceleration(_Strict):
+    """Columns of a linear acceleration, their unit, and what it reads of none."""
+
     columns: tuple[Column, ...]
     unit: Literal["m/s^2", "g", "mm/s^2"] = "m/s^2"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
 class AngularVelocity(_Strict):
+    """Columns of an angular velocity, their unit, and what it reads of none."""
+
     columns: tuple[Column, ...]
     unit: Literal["rad/s", "deg/s"] = "rad/s"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
 class AngularAcceleration(_Strict):
+    """Columns of an angular acceleration, their unit, and what it reads of none."""
+
     columns: tuple[Column, ...]
     unit: Literal["rad/s^2", "deg/s^2"] = "rad/s^2"
     bias: Vector = (0.0, 0.0, 0.0)
@@ -143,6 +155,8 @@ class Orientation(_Strict):
 
 
 class Position(_Strict):
+    """Columns of a position and their unit."""
+
     columns: tuple[Column, ...]
     unit: Literal["m", "mm"] = "m"
 
@@ -203,6 +217,8 @@ class _Recorded(_Stream):
 
 
 class Wrench(_Recorded):
+    """The force-torque sensor's file and columns."""
+
     _defaults = ("force", "torque")
 
     force: Force
@@ -219,6 +235,8 @@ class Wrench(_Recorded):
 
 
 class Imu(_Recorded):
+    """The file and columns of an IMU."""
+
     _defaults = ("specific_force", "angular_velocity")
 
     specific_force: Acceleration | None = None
@@ -248,6 +266,8 @@ class Imu(_Recorded):
 
 
 class Pose(_Recorded):
+    """The file and columns of a pose of sensor, flange or TCP."""
+
     _defaults = ("orientation", "position")
 
     orientation: Orientation

@@ -94,6 +94,7 @@ class Mounting:
 
     @property
     def is_right_angled(self) -> bool:
+        """Whether axes only change places and signs."""
         return self.oblique_deg < RIGHT_ANGLED_DEG
 
     @property

@@ -39,6 +39,7 @@ class Stream:
 
     @property
     def dt(self) -> float:
+        """Usual time from one sample to the next [s]."""
         return spacing(self.t)
 
 
