@@ -6,13 +6,17 @@ does; any warning is an error. Nothing is loaded from elsewhere: the site can be
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib import metadata
 from pathlib import Path
 
 from sphinx.ext import autosummary
 
-sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+_EXT = str(Path(__file__).parent / "_ext")
+sys.path.insert(0, _EXT)
+# Of the processes that run the gallery, too.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (_EXT, os.environ.get("PYTHONPATH"))))
 
 project = "drake_teleop"
 author = "The drake_teleop authors"
@@ -29,6 +33,7 @@ extensions = [
     "mathml",
     "formulas",
     "keywords",
+    "known_names",
     "pydrake_system",
     "repository",
     "offline",
@@ -59,6 +64,7 @@ sphinx_gallery_conf = {
     "gallery_dirs": ["examples"],
     "filename_pattern": r"/.*\.py$",
     "abort_on_example_error": True,
+    "parallel": True,  # as many at once as sphinx-build's -j says
     "download_all_examples": False,
     "show_memory": False,
     "min_reported_time": 1e9,

@@ -13,6 +13,7 @@ from pathlib import Path
 import click
 import pytest
 from docutils.nodes import make_id
+from sphinx.domains.python import ObjectEntry, PythonDomain
 
 import drake_teleop
 from drake_teleop.cli import cli
@@ -42,6 +43,7 @@ BLOCKS = [
     if not language.startswith("{")
 ]
 loaded_from_elsewhere = runpy.run_path(str(DOCS / "_ext" / "offline.py"))["loaded_from_elsewhere"]
+KnownNames = runpy.run_path(str(DOCS / "_ext" / "known_names.py"))["KnownNames"]
 KEYWORDS = runpy.run_path(str(DOCS / "_ext" / "keywords.py"))["KEYWORDS"]
 links = runpy.run_path(str(DOCS / "_ext" / "formulas.py"))["links"]
 
@@ -80,6 +82,20 @@ def test_words_to_look_for_lead_to_sections_that_exist():
     for page, sections in KEYWORDS.items():
         text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
         assert sections.keys() <= set(map(make_id, re.findall(r"^#+ (.+)$", text, re.M))), page
+
+
+def test_a_name_is_found_as_sphinx_finds_it():
+    known = KnownNames.__new__(KnownNames)
+    names = ("a.b.Scenario", "a.Scenario.check", "a.b", "c.check")
+    known.data = {"objects": {}, "modules": {}}
+    known.object_types, known._type2role, known._role2type = {}, {}, {"class": ["class"]}
+    known.objtypes_for_role = lambda role: ["class"]
+    for name in names:
+        known.objects[name] = ObjectEntry("page", name, "class", False)
+        for asked in ("Scenario", "check", "check()", "b.Scenario", "float", "c.check", "Scen", ""):
+            for how in (("class", 0), ("class", 1)):
+                place = (None, "a.b", None, asked, *how)
+                assert known.find_obj(*place) == PythonDomain.find_obj(known, *place)
 
 
 def test_a_script_of_the_gallery_is_short_and_says_what_it_shows():

@@ -15,6 +15,7 @@ import nbformat
 from notebook_checks import CHECKS
 from sphinx.application import Sphinx
 from sphinx.config import Config
+from sphinx.environment import BuildEnvironment
 
 DOCS = Path(__file__).parents[1]
 ROOT = DOCS.parent
@@ -36,6 +37,7 @@ LINKS = {
 def setup(app: Sphinx) -> dict[str, Any]:
     """Copies as soon as the settings are read, before Sphinx looks for sources."""
     app.connect("config-inited", _copy)
+    app.connect("env-before-read-docs", _spread)
     app.connect("source-read", _pages_link)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
@@ -48,6 +50,16 @@ def _copy(_app: Sphinx, _config: Config) -> None:
         text = (ROOT / source).read_text(encoding="utf-8")
         _write(DOCS / page, text.replace("](../docs/", "](").replace("](docs/", "]("))
     _write(DOCS / "evidence.md", _evidence())
+
+
+def _spread(_app: Sphinx, _env: BuildEnvironment, pages: list[str]) -> None:
+    """Notebooks stand far from each other: a process reads, and runs, neighbours one by one."""
+    notebooks = [page for page in pages if page.startswith("notebooks/")]
+    others = [page for page in pages if page not in notebooks]
+    apart = len(others) // max(len(notebooks), 1)
+    for k, notebook in enumerate(notebooks):
+        others.insert(k * (apart + 1), notebook)
+    pages[:] = others
 
 
 def _evidence() -> str:
