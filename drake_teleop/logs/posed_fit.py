@@ -1,4 +1,4 @@
-"""The load of a log whose motion is known by poses alone: `pose_motion` for `identify_log`."""
+"""The load of a log whose motion is known by poses: `pose_motion` for `identify_log`."""
 
 from __future__ import annotations
 
@@ -40,20 +40,21 @@ class PosedFit:
         fit: the load.
         delay_s: that was taken out [s].
         source: "given", "estimated", or "undetermined" (0 was taken).
-        finding: that the poses are of another frame, or None.
     """
 
     log: Log
     fit: BatchResult
     delay_s: float
     source: str
-    finding: Finding | None
 
 
 def fit_posed(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
-) -> PosedFit | None:
-    """The load from wrench and poses; None where the method or the log is not of that kind.
+) -> tuple[PosedFit | None, tuple[Finding, ...]]:
+    """The load from wrench and poses, and whether the poses are of another frame.
+
+    No load where the method or the log is not of that kind. An IMU beside the poses is heard too:
+    if it tells another motion, or the poses are of another frame, its word is the better one.
 
     Args:
         log: as it was read.
@@ -62,11 +63,14 @@ def fit_posed(
         delay: of the motion behind the wrench [s], or "auto".
     """
     if log.posed is None or method not in ROBUST or not usable(log):
-        return None
+        return None, ()
     known, source = (None, "estimated") if delay == "auto" else delay_of(log, None, delay)
     found = _estimate(log, known)
     if known is None and not found.delay_deviation < _DELAY_KNOWN:
         found, source = _estimate(log, 0.0), "undetermined"
+    finding = frame_finding(found, log.posed)
+    if log.posed.imu is not None and not (found.imu_agrees and finding is None):
+        return None, () if finding is None else (finding,)
     moved = _moved(_fewer(log, cutoff_hz), found)
     shown = low_passed(moved, cutoff_hz)
     margin = 2.0 * found.spacing
@@ -74,7 +78,6 @@ def fit_posed(
     shown = shown.only(measured(moved, cutoff_hz) & inside)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _fit(shown, found, found.rejected[at], method, log.posed.gain_std)
-    finding = frame_finding(found, log.posed)
     # Gains that are wrong are no rigid load's; what stated ones explain is in the deviations.
     if finding is not None or not found.fit.explained:  # then nothing of the load is what it seems
         flags = fit.identification.identifiable & np.repeat([True, False], [6, 10])
@@ -83,7 +86,8 @@ def fit_posed(
         fit = replace(fit, note="")
         if Path(log.source).suffix.lower() in FORMATS:
             finding = replace(finding, message=f"{finding.message} ({NO_YAML})")
-    return PosedFit(shown, fit, found.delay_s, source, finding)
+    findings = () if finding is None else (finding,)
+    return PosedFit(shown, fit, found.delay_s, source), findings
 
 
 def _estimate(log: Log, delay: float | None) -> PoseEstimate:
@@ -96,6 +100,7 @@ def _estimate(log: Log, delay: float | None) -> PoseEstimate:
         delay=delay,
         gain=log.posed.gain_std,
         lost=log.bridged,
+        imu=log.posed.imu,
     )
 
 

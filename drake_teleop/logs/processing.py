@@ -123,9 +123,10 @@ def identify_log(
 ) -> IdentifiedLog:
     """Identifies the load and the sensor's offsets from a log.
 
-    Where poses alone tell the motion it is of splines, and their noise is taken out, see
-    `drake_teleop.logs.pose_motion`. Otherwise wrench and motion pass the same zero-phase low-pass,
-    and the motion is taken as exact. Static poses are used as they are.
+    Where poses have positions the motion is of splines, of them and of an IMU beside them, and the
+    noise of both is taken out: `drake_teleop.logs.pose_motion`. Otherwise wrench and motion pass
+    the same zero-phase low-pass, and the motion is taken as exact. Static poses are used as they
+    are.
 
     Args:
         path: canonical table or log description.
@@ -146,8 +147,8 @@ def _identified(
     path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
 ) -> IdentifiedLog:
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in ROBUST)
-    posed = fit_posed(log, method, cutoff_hz, delay)
-    if posed is None and log.posed is not None:  # too short for splines
+    posed, other = fit_posed(log, method, cutoff_hz, delay)
+    if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
     if posed is not None:
         log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.source
@@ -164,9 +165,7 @@ def _identified(
     log = replace(log, notes=(*log.notes, *notes))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
-    findings = question_fit(Path(path), log, result, predicted, known_delay)
-    if posed is not None and posed.finding is not None and not findings:
-        findings = (posed.finding,)
+    findings = question_fit(Path(path), log, result, predicted, known_delay) or other
     if any(finding.name == "payload" for finding in findings):
         result = replace(
             result, identifiable=np.repeat([True, False], [6, 10]) & result.identifiable

@@ -2,7 +2,8 @@
 
 1. Splines with knots of a middle distance; a first delay; stretches in which something else acts;
    the rate of the poses' clock (`clock_rate`).
-2. Distance of the knots and delay by the wrench (`saturated`), then splines of all poses.
+2. Distance of the knots, delay, and whether an IMU is asked too (`aid`), by the wrench
+   (`saturated`), then splines of all poses.
 3. What the saturated model says (`read_off`), and a rigid load twice: with the frame as described,
    and with the transform between pose and sensor free (`rigid`).
 
@@ -19,9 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array, checked
+from drake_teleop.logs.pose_motion.aid import aid_of
 from drake_teleop.logs.pose_motion.clock_rate import at_rate, clock_rate
 from drake_teleop.logs.pose_motion.noise import noise_moments
-from drake_teleop.logs.pose_motion.poses import Poses
+from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
 from drake_teleop.logs.pose_motion.rejection import disturbed
 from drake_teleop.logs.pose_motion.rigid import (
@@ -44,7 +46,7 @@ from drake_teleop.logs.pose_motion.saturated import (
     wandering,
 )
 from drake_teleop.logs.pose_motion.spectra import TOP, Grid, end_taper, without
-from drake_teleop.logs.pose_motion.splines import PoseSplines
+from drake_teleop.logs.pose_motion.splines import Choice, PoseSplines
 from drake_teleop.one_thread import one_blas_thread
 from drake_teleop.vectors import cross_matrix
 
@@ -114,6 +116,7 @@ class PoseEstimate:
         t: (M,) about 100 Hz [s].
         rejected: (M,) where something else acts than the load.
         note: what a user has to know; mostly empty.
+        imu_agrees: whether an IMU beside the poses tells the same; True without one.
     """
 
     fit: RigidFit
@@ -128,6 +131,7 @@ class PoseEstimate:
     t: Array
     rejected: NDArray[np.bool_]
     note: str
+    imu_agrees: bool
 
     @property
     def theta(self) -> Array:
@@ -152,6 +156,7 @@ def estimate_from_poses(
     near: float = 0.0,
     gain: float = 0.0,
     lost: NDArray[np.bool_] | None = None,
+    imu: Inertial | None = None,
 ) -> PoseEstimate:
     """Load and offsets, delay, and the frame of the poses.
 
@@ -166,6 +171,8 @@ def estimate_from_poses(
         near: a delay that is found is within 0.25 s of this one, and a tenth of the record [s].
         gain: standard deviation of the sensor's gains, such as 0.01; it enters the covariance.
         lost: (N,) samples that do not count, such as bridged gaps.
+        imu: what an IMU beside the poses tells of the frame of S; taken if the wrench likes the
+            motion better with it (`aid`).
 
     Raises:
         DrakeTeleopError: for arrays of another shape, or if fewer than 100 instants remain.
@@ -182,8 +189,8 @@ def estimate_from_poses(
                 remedy="record longer, without interruptions",
             )
         top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
-        splines, spectra, rejected, rate, note = _searched(
-            grid, poses, lost, gravity, guess, top, known=delay is not None
+        splines, spectra, rejected, rate, note, agrees = _searched(
+            grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu
         )
         Z = spectra.moments()
         Q = noise_moments(splines, grid, spectra.taper, spectra.zeta, spectra.of, splines.noise())
@@ -215,6 +222,7 @@ def estimate_from_poses(
             t=grid.t,
             rejected=rejected,
             note=note,
+            imu_agrees=agrees,
         )
 
 
@@ -227,7 +235,8 @@ def _searched(
     top: float,
     *,
     known: bool,
-) -> tuple[PoseSplines, Spectra, NDArray[np.bool_], float, str]:
+    imu: Inertial | None = None,
+) -> tuple[PoseSplines, Spectra, NDArray[np.bool_], float, str, bool]:
     """Splines with the knots, and spectra with the delay and taper, that are used."""
     part = _liveliest(grid)
     some = replace(grid, t=grid.t[part], wrench=_rows(grid, part))
@@ -243,13 +252,22 @@ def _searched(
     if rate:
         near, poses = (at_rate(x, rate, some, late) for x in (near, poses))
         few = for_search(near)
-    spacing, late = best_spacing(few, some, clear, gravity, late, top, known=known)
-    splines, base = PoseSplines(poses, spacing), _base_taper(grid, poses, lost, late)
+    first_spacing, agrees = spacing, True
+    choices = [few]
+    if imu is not None:
+        aid = aid_of(PoseSplines(near, first_spacing), imu, gravity)
+        agrees = aid is not None
+        choices += [] if aid is None else [Choice(few.poses, aid)]
+    chosen, spacing, late = best_spacing(choices, some, clear, gravity, late, top, known=known)
+    aid = chosen.aid
+    if aid is not None and imu is not None and len(near.t) < len(poses.t):
+        aid = aid_of(PoseSplines(poses, first_spacing), imu, gravity)  # of the whole record
+    splines, base = PoseSplines(poses, spacing, aid), _base_taper(grid, poses, lost, late)
     spectra = spectra_of(splines, grid, base, gravity, late, top)
     rejected, note = disturbed(spectra, grid, base, spacing)
     taper = without(base, rejected, grid.dt)
     spectra = spectra_of(splines, grid, taper, gravity, late, top)
-    return splines, spectra, rejected, rate, note
+    return splines, spectra, rejected, rate, note, agrees
 
 
 def _rows(grid: Grid, part: slice) -> Array:

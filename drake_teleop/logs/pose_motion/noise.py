@@ -46,6 +46,9 @@ def noise_moments(
     per_number = np.sum(taper**2) / (grid.dt * splines.rate)
     share = per_number * passed(of.frequency, splines.spacing)
     place, turn = (std**2 * share for std in noise)
+    if splines.aid is not None:
+        left = splines.aid.share(of.frequency)
+        place, turn = place * left[0], turn * left[1]
     weight = taper**2 / np.sum(taper**2)
     still, first, second, third = _turning(zeta, weight)
     eye = np.zeros((SIGNALS, SIGNALS))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -47,8 +47,41 @@ class Poses:
 
 
 @dataclass(frozen=True, eq=False)
+class Inertial:
+    """What an IMU tells of the same frame, at So and in its axes.
+
+    Attributes:
+        t: (K,) evenly spaced but for gaps [s].
+        specific_force: (K, 3) [m/s^2], or None.
+        angular_velocity: (K, 3) [rad/s], or None.
+    """
+
+    t: Array
+    specific_force: Array | None
+    angular_velocity: Array | None
+
+    @property
+    def rate(self) -> float:
+        """Without the gaps [Hz]."""
+        return float(1.0 / np.median(np.diff(self.t)))
+
+    def averaged(self, fastest: float) -> Inertial:
+        """Means of as many rows that the rate is not below `fastest` [Hz]; none over a gap."""
+        count = max(1, int(self.rate / fastest))
+        rows = len(self.t) // count * count
+        at = self.t[:rows].reshape(-1, count)
+        whole = at[:, -1] - at[:, 0] < count / self.rate
+
+        def means(x: Array | None) -> Array | None:
+            return None if x is None else x[:rows].reshape(-1, count, 3).mean(axis=1)[whole]
+
+        means_t = at.mean(axis=1)[whole]
+        return Inertial(means_t, means(self.specific_force), means(self.angular_velocity))
+
+
+@dataclass(frozen=True, eq=False)
 class Posed:
-    """What a motion that is known by poses alone hangs on.
+    """The poses of a log and what else is described of them.
 
     Attributes:
         poses: of the sensor's frame S, as far as the description is right.
@@ -56,6 +89,7 @@ class Posed:
         gain_std: standard deviation of the sensor's gains, as stated.
         p_SoPo_S: (3,) where the recorded frame was said to be [m].
         R_SP: (3, 3) how it was said to be turned.
+        imu: what an IMU beside them tells.
     """
 
     poses: Poses
@@ -63,3 +97,9 @@ class Posed:
     gain_std: float = 0.0
     p_SoPo_S: Array = field(default_factory=lambda: np.zeros(3))
     R_SP: Array = field(default_factory=lambda: np.eye(3))
+    imu: Inertial | None = None
+
+    def earlier(self, start: float) -> Posed:
+        """The same with the times since `start` [s]."""
+        imu = None if self.imu is None else replace(self.imu, t=self.imu.t - start)
+        return replace(self, poses=replace(self.poses, t=self.poses.t - start), imu=imu)

@@ -14,6 +14,7 @@ then the accelerations are noise.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -306,7 +307,7 @@ def first_guess(
     A delay that is known stays. With knots too fine the motion is noise, and no delay shows.
     """
     reach = min(REACH, 0.1 * float(grid.t[-1] - grid.t[0]))
-    spacings, found = _allowed(few.poses)[::2], []
+    spacings, found = _allowed(few)[::2], []
     start = spectra_of(few.at(spacings[0]), grid, taper, gravity_W, delay, top)
     for h in spacings:
         spectra = start.with_motion(few.at(h), gravity_W, delay)
@@ -316,7 +317,7 @@ def first_guess(
 
 
 def best_spacing(
-    few: Choice,
+    choices: Sequence[Choice],
     grid: Grid,
     taper: Array,
     gravity_W: Array,
@@ -324,28 +325,32 @@ def best_spacing(
     top: float,
     *,
     known: bool = False,
-) -> tuple[float, float]:
-    """Distance of the knots [s] and delay [s] of the least L, from nearly the right delay.
+) -> tuple[Choice, float, float]:
+    """What the splines are fitted to, distance of their knots [s], and delay [s], of the least L.
 
     Knots are then a little closer than where L is least: the fit takes noise that they pass into
-    account, but not motion that they do not. The delay, unless it is known, is found again with
-    them.
+    account, but not motion that they do not. The delay is nearly right at first and, unless it is
+    known, found again.
     """
-    spacings = _allowed(few.poses)
-    start = spectra_of(few.at(spacings[0]), grid, taper, gravity_W, delay, top)
+    start = spectra_of(choices[0].at(SPACINGS[0]), grid, taper, gravity_W, delay, top)
+    found = []
+    for few in choices:
+        spacings = _allowed(few)
 
-    def spectra(h: float) -> Spectra:
-        return start.with_motion(few.at(h), gravity_W, delay)
+        def cost(h: float, few: Choice = few) -> float:
+            return start.with_motion(few.at(h), gravity_W, delay).fit().cost
 
-    costs = {h: spectra(h).fit().cost for h in spacings}
-    middle = min(costs, key=lambda h: costs[h])
-    for other in _neighbours(middle, spacings):
-        h = float(np.sqrt(middle * other))
-        costs[h] = spectra(h).fit().cost
-    best = max(_FINER * min(costs, key=lambda h: costs[h]), FEWEST_PER_KNOT / few.poses.rate)
+        costs = [(cost(h), h) for h in spacings]
+        middle = min(costs)[1]
+        between = [float(np.sqrt(middle * h)) for h in _neighbours(middle, spacings)]
+        found.append(min(costs + [(cost(h), h) for h in between]))
+    least = min(range(len(found)), key=lambda k: found[k])
+    few = choices[least]
+    best = max(_FINER * found[least][1], FEWEST_PER_KNOT / few.rate)
     if not known:
-        delay, _ = best_delay(spectra(best), 3 * _COARSE)
-    return best, delay
+        last = start.with_motion(few.at(best), gravity_W, delay)
+        delay, _ = best_delay(last, 3 * _COARSE)
+    return few, best, delay
 
 
 def for_search(poses: Poses) -> Choice:
@@ -358,5 +363,5 @@ def _neighbours(h: float, of: list[float]) -> list[float]:
     return of[max(0, k - 1) : k] + of[k + 1 : k + 2]
 
 
-def _allowed(poses: Poses) -> list[float]:
-    return [h for h in SPACINGS if h * poses.rate >= FEWEST_PER_KNOT] or [SPACINGS[0]]
+def _allowed(few: Choice) -> list[float]:
+    return [h for h in SPACINGS if h * few.rate >= FEWEST_PER_KNOT] or [SPACINGS[0]]

@@ -16,11 +16,13 @@ of the power, h the distance of the knots: nearly all up to 0.3 / h, nearly noth
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
+from scipy.sparse import diags_array, eye_array
 
 from drake_teleop.load.arrays import Array
 from drake_teleop.logs.pose_motion.poses import Poses
@@ -35,6 +37,67 @@ _NOISE_BAND = (0.7, 1.5)
 _CHUNK = 2**17
 
 
+@dataclass(frozen=True, eq=False)
+class Aid:
+    """What an IMU adds to the splines (`aid`), its axes, biases and clock being those of the poses.
+
+    Attributes:
+        t: (K,) [s].
+        rate: of them [Hz].
+        acceleration_W: (K, 3) of So in the world [m/s^2], or None.
+        quaternion_rate: (K, 4) derivatives [1/s], or None.
+        pose_powers: of white noise of position [m^2/Hz] and turn [rad^2/Hz].
+        own_powers: likewise of acceleration and angular velocity.
+    """
+
+    t: Array
+    rate: float
+    acceleration_W: Array | None
+    quaternion_rate: Array | None
+    pose_powers: tuple[float, float]
+    own_powers: tuple[float, float]
+
+    @classmethod
+    def of(
+        cls,
+        splines: PoseSplines,
+        t: Array,
+        gravity_W: Array,
+        s: Array | None,
+        omega: Array | None,
+        *,
+        rate: float,
+        pose_powers: tuple[float, float],
+        own_powers: tuple[float, float],
+    ) -> Aid:
+        """From specific force and angular velocity (K, 3), with the orientation of splines."""
+        q = splines.quaternion(t)
+        n = np.sum(q * q, axis=1, keepdims=True)
+        acceleration = rates = None
+        if s is not None:
+            acceleration = _in_P(q * (1.0, -1.0, -1.0, -1.0), n, s) + gravity_W
+        if omega is not None:
+            w, v = q[:, :1], q[:, 1:]
+            real = -np.sum(v * omega, axis=1, keepdims=True)
+            rates = 0.5 * np.hstack([real, w * omega + _cross(v, omega)])
+        return cls(t, rate, acceleration, rates, pose_powers, own_powers)
+
+    def share(self, frequency: Array) -> tuple[Array, Array]:
+        """Of the poses' noise in position and turn that is left at frequencies (K,) [Hz]."""
+        w = 2.0 * np.pi * frequency
+        left = []
+        for pose, own, order, rows in zip(
+            self.pose_powers,
+            self.own_powers,
+            (4, 2),
+            (self.acceleration_W, self.quaternion_rate),
+            strict=True,
+        ):
+            ratio = 0.0 if rows is None else pose / own
+            left.append(1.0 / (1.0 + ratio * w**order))
+        return left[0], left[1]
+
+
 class PoseSplines:
     """Splines of poses.
 
@@ -42,24 +105,56 @@ class PoseSplines:
         poses: what they were fitted to, signs continuous.
         spacing: h of the knots [s].
         rate: of the poses [Hz].
+        aid: what else, or None.
     """
 
-    def __init__(self, poses: Poses, spacing: float) -> None:
+    def __init__(self, poses: Poses, spacing: float, aid: Aid | None = None) -> None:
         """Fits them; `poses` with continuous signs, see `Poses.continued`."""
-        self.poses, self.spacing, self.rate = poses, spacing, poses.rate
+        self.poses, self.spacing, self.rate, self.aid = poses, spacing, poses.rate, aid
         self._start = float(poses.t[0])
         t = poses.t - self._start
-        parts = [slice(k, k + _CHUNK) for k in range(0, len(t), _CHUNK)]
-        self._parts, knots = parts, _knots(t, spacing)
+        self._parts, knots = _parts(len(t)), _knots(t, spacing, aided=aid is not None)
         try:
             self._spline = self._fitted(t, knots)
         except np.linalg.LinAlgError:  # between gaps one pose to a knot is too little
             self._spline = self._fitted(t, _sparser(knots, t))
 
     def _fitted(self, t: Array, knots: Array) -> BSpline:
-        poses, parts = self.poses, self._parts
-        values = (np.hstack([poses.position[part], poses.quaternion[part]]) for part in parts)
-        return _least_squares([t[part] for part in parts], values, knots)
+        """By banded normal equations.
+
+        `scipy.interpolate.make_lsq_spline` takes QR now, which is five times slower; with two poses
+        to a knot they lose no digit that a pose has.
+        """
+        poses, aid = self.poses, self.aid
+        values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._parts)
+        times = (t[x] for x in self._parts)
+        gram, right = _normal(zip(times, values, strict=True), knots, DEGREE, 7)
+        if aid is None:
+            return BSpline(knots, solveh_banded(gram, right), DEGREE)
+        columns = []
+        for part, order, rows, pose, own in zip(
+            (slice(0, 3), slice(3, 7)),
+            (2, 1),
+            (aid.acceleration_W, aid.quaternion_rate),
+            aid.pose_powers,
+            aid.own_powers,
+            strict=True,
+        ):
+            band, side = gram, right[:, part]
+            if rows is not None:
+                weight = pose * self.rate / (own * aid.rate)
+                more, other = _normal_of_rates(aid.t - self._start, rows, knots, order)
+                band, side = gram + weight * more, side + weight * other
+            columns.append(solveh_banded(band, side))
+        return BSpline(knots, np.hstack(columns), DEGREE)
+
+    def quaternion(self, t: Array) -> Array:
+        """(N, 4) at times t, nearly of unit length."""
+        return np.asarray(self._at(t, 0)[:, 3:])
+
+    def _at(self, t: Array, order: int) -> Array:
+        at = np.clip(t, self.poses.t[0], self.poses.t[-1]) - self._start
+        return np.asarray(self._spline(at, order))
 
     def signals(self, t: Array, gravity_W: Array) -> Array:
         """(N, 16) signals of P at times t, in the axes of P; outside of the poses those of the end.
@@ -97,8 +192,7 @@ class PoseSplines:
         return out[0], out[1], out[2], out[3]
 
     def _motion_at(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
-        at = np.clip(t, self.poses.t[0], self.poses.t[-1]) - self._start
-        x, first, second = (self._spline(at, order) for order in range(3))
+        x, first, second = (self._at(t, order) for order in range(3))
         q, qd, qdd = x[:, 3:], first[:, 3:], second[:, 3:]
         n = np.sum(q * q, axis=1, keepdims=True)
         omega = 2.0 * _vector(q, qd) / n
@@ -110,8 +204,11 @@ class PoseSplines:
         """Standard deviations per axis of position [m] and turn [rad], as if they were white.
 
         From what the splines leave just above the frequencies that they pass: coloured noise has
-        more there than at higher ones.
+        more there than at higher ones. With an aid it is known from splines without.
         """
+        if self.aid is not None:
+            place_power, turn_power = self.aid.pose_powers
+            return float(np.sqrt(place_power * self.rate)), float(np.sqrt(turn_power * self.rate))
         sums, count = np.zeros(2), 0
         for part in self._parts:
             fitted = self._spline(self.poses.t[part] - self._start)
@@ -134,15 +231,20 @@ class PoseSplines:
 class Choice:
     """Splines of the same poses with knots of several distances, each fitted once."""
 
-    def __init__(self, poses: Poses) -> None:
+    def __init__(self, poses: Poses, aid: Aid | None = None) -> None:
         """`poses` with continuous signs."""
-        self.poses = poses
+        self.poses, self.aid = poses, aid
         self._fitted: dict[float, PoseSplines] = {}
+
+    @property
+    def rate(self) -> float:
+        """Of what they are fitted to [Hz]."""
+        return self.poses.rate + (0.0 if self.aid is None else self.aid.rate)
 
     def at(self, spacing: float) -> PoseSplines:
         """Those with knots at this distance [s]."""
         if spacing not in self._fitted:
-            self._fitted[spacing] = PoseSplines(self.poses, spacing)
+            self._fitted[spacing] = PoseSplines(self.poses, spacing, self.aid)
         return self._fitted[spacing]
 
 
@@ -153,9 +255,11 @@ def passed(frequency: Array, spacing: float) -> Array:
     return np.where(frequency * spacing < 1.0, share, 0.0)
 
 
-def _knots(t: Array, spacing: float) -> Array:
+def _knots(t: Array, spacing: float, *, aided: bool = False) -> Array:
     """Uniform ones, without those that no sample stands before: over a gap goes one polynomial."""
     inner = np.arange(t[0] + spacing, t[-1] - 0.5 * spacing, spacing)
+    if aided:
+        return np.concatenate([np.repeat(t[0], DEGREE + 1), inner, np.repeat(t[-1], DEGREE + 1)])
     before = np.searchsorted(t, inner)
     first = np.unique(before, return_index=True)[1]
     inner = inner[first[(before[first] > 0) & (before[first] < len(t))]]
@@ -173,16 +277,21 @@ def _sparser(knots: Array, t: Array) -> Array:
     return np.concatenate([knots[: DEGREE + 1], kept, knots[-DEGREE - 1 :]])
 
 
-def _least_squares(times: list[Array], values: Iterable[Array], knots: Array) -> BSpline:
-    """The spline of these knots next to values (k, 7) at times (k,), part after part.
+def _parts(count: int) -> list[slice]:
+    return [slice(k, k + _CHUNK) for k in range(0, count, _CHUNK)]
 
-    By the banded normal equations, as `scipy.interpolate.make_lsq_spline` did before it took QR,
-    which is five times slower; with two poses to a knot they lose no digit that a pose has.
+
+def _normal(
+    parts: Iterable[tuple[Array, Array]], knots: Array, degree: int, width: int
+) -> tuple[Array, Array]:
+    """Upper band (degree + 1, n) and right-hand side (n, width) of the normal equations.
+
+    Of splines next to values (k, width) at times (k,), part after part.
     """
-    size, order = len(knots) - DEGREE - 1, DEGREE + 1
-    band, right = np.zeros((order, size)), np.zeros((size, 7))
-    for t, x in zip(times, values, strict=True):
-        A = BSpline.design_matrix(t, knots, DEGREE)
+    size, order = len(knots) - degree - 1, degree + 1
+    band, right = np.zeros((order, size)), np.zeros((size, width))
+    for t, x in parts:
+        A = BSpline.design_matrix(t, knots, degree)
         basis, first = A.data.reshape(-1, order), A.indices[::order]
         starts = np.flatnonzero(np.diff(first, prepend=-1))  # of the rows between two knots
         columns = np.hstack([basis, x])
@@ -190,9 +299,31 @@ def _least_squares(times: list[Array], values: Iterable[Array], knots: Array) ->
             sums = np.add.reduceat(basis[:, i : i + 1] * columns[:, i:], starts)
             at = first[starts] + i
             for k in range(order - i):
-                band[DEGREE - k, at + k] += sums[:, k]
-            right[at] += sums[:, -7:]
-    return BSpline(knots, solveh_banded(band, right), DEGREE)
+                band[degree - k, at + k] += sums[:, k]
+            right[at] += sums[:, -width:]
+    return band, right
+
+
+def _normal_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Array, Array]:
+    """`_normal` of values x (k, width) that the derivatives of this order are next to."""
+    change = eye_array(len(knots) - DEGREE - 1, format="csr")
+    for k in range(order):  # coefficients of a derivative, from those of what it is one of
+        inner, degree = knots[k : len(knots) - k], DEGREE - k
+        span = inner[degree + 1 : -1] - inner[1 : -degree - 1]
+        n = len(span)
+        step = diags_array([-degree / span, degree / span], offsets=[0, 1], shape=(n, n + 1))
+        change = step @ change
+    degree, parts = DEGREE - order, _parts(len(t))
+    inner = knots[order : len(knots) - order]
+    band, right = _normal(((t[p], x[p]) for p in parts), inner, degree, x.shape[1])
+    upper = diags_array(
+        [band[degree - k, k:] for k in range(degree + 1)], offsets=list(range(degree + 1))
+    ).tocsr()
+    gram = (change.T @ (upper + upper.T - diags_array(band[degree])) @ change).tocsr()
+    out = np.zeros((DEGREE + 1, gram.shape[0]))
+    for k in range(DEGREE + 1):
+        out[DEGREE - k, k:] = gram.diagonal(k)
+    return out, change.T @ right
 
 
 def _vector(q: Array, p: Array) -> Array:

@@ -69,7 +69,7 @@ class Log:
             if there are no gaps.
         notes: what the reader had to assume, in words.
         source: the file, for messages.
-        posed: the poses themselves, on the clock of `t`, where they alone tell the motion.
+        posed: the poses themselves, on the clock of `t`, where they have positions.
 
     Raises:
         DrakeTeleopError: if the arrays do not fit each other, hold NaN or infinity, or `t` does not
@@ -127,10 +127,7 @@ class Log:
 
     def earlier(self, start: float) -> Log:
         """The same with the times since `start` [s]."""
-        posed = self.posed
-        if posed is not None:
-            poses = replace(posed.poses, t=posed.poses.t - start)
-            posed = replace(posed, poses=poses)
+        posed = None if self.posed is None else self.posed.earlier(start)
         return replace(self, t=self.t - start, posed=posed)
 
     def only(self, rows: slice | NDArray[np.bool_]) -> Log:

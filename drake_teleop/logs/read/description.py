@@ -32,7 +32,7 @@ from pydantic import (
 )
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.logs.pose_motion.poses import Posed, Poses
+from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
 from drake_teleop.logs.read.description_fields import (
     Column,
     Frame,
@@ -373,12 +373,12 @@ class Description(_Strict):
         """(3,) gravity in W [m/s^2]."""
         return np.array(self.gravity)
 
-    def posed(self, poses: Poses) -> Posed:
-        """Poses of S with what else is described of them."""
+    def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
+        """Poses of S with what else is described of them, and what an IMU tells of S."""
         assert self.wrench is not None and self.pose is not None
         place, turn = self.pose.position_in_sensor, self.pose.R_SP
         turn = np.eye(3) if turn is None else turn
-        return Posed(poses, self.gravity_W, self.wrench.gain_std, np.array(place), turn)
+        return Posed(poses, self.gravity_W, self.wrench.gain_std, np.array(place), turn, imu)
 
     def scale(self, unit: str) -> float:
         """SI value of a unit; "g" is the magnitude of this description's gravity."""

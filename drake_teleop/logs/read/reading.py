@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError, expect
 from drake_teleop.load.arrays import number
-from drake_teleop.logs.pose_motion.poses import Poses
+from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW,
     angular_motion,
@@ -50,6 +50,7 @@ MINIMUM_SAMPLES = 16
 MINIMUM_POSES = 3
 _LEAST_HZ = 1e-3
 _CHUNK = 2**16
+_BRIDGED = 4.0
 
 
 def read_log(
@@ -153,8 +154,9 @@ class _Reader:
         streams = [stream for stream in (imu, pose) if stream is not None]
         t = self._common_time(wrench_t, streams)
         log = self._assembled(t, resample(t, wrench_t, wrench), imu, pose)
-        if pose is not None and pose.raw is not None and imu is None:
-            log = replace(log, posed=self._description.posed(pose.raw))
+        if pose is not None and pose.raw is not None:
+            told = None if imu is None else imu.told
+            log = replace(log, posed=self._description.posed(pose.raw, told))
         return log if keep_origin else log.earlier(float(wrench_t[0]))
 
     def _find(
@@ -284,7 +286,10 @@ class _Reader:
         assert stream.position != "auto"
         if s is not None and any(stream.position):
             s = at_S(s, np.array(stream.position), t, omega, alpha, pose)
-        return Stream("imu", t, s, omega, alpha)
+        at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
+        kept = raw_t[at] - raw_t[at - 1] < _BRIDGED * dt  # not within a gap
+        both = (None if x is None else x[kept] for x in (s, omega))
+        return Stream("imu", t, s, omega, alpha, told=Inertial(t[kept], *both))
 
     def _to_S(
         self,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.logs.pose_motion.poses import Poses
+from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.read.alignment import low_pass, resample, spacing
 
 LARGEST = {
@@ -26,7 +26,7 @@ LARGEST = {
 class Stream:
     """Signals on one clock. Arrays (N, ...) or None; `t` is [s] on the common clock.
 
-    `raw` are the poses of S as they were recorded.
+    `raw` are the poses of S as they were recorded, `told` what an IMU tells of S.
     """
 
     name: str
@@ -36,6 +36,7 @@ class Stream:
     angular_acceleration: NDArray[np.float64] | None = None
     R_WS: NDArray[np.float64] | None = None
     raw: Poses | None = None
+    told: Inertial | None = None
 
     @property
     def dt(self) -> float:

@@ -1,0 +1,157 @@
+"""An IMU beside noisy poses: splines of both, and when it is not heard."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from posed_record import GRAVITY_W, LATE, PHI, SECONDS, TRUTH, Kind, motion_at, record
+from scipy.interpolate import BSpline
+
+from drake_teleop.logs.pose_motion.aid import aid_of
+from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
+from drake_teleop.logs.pose_motion.noise import noise_moments
+from drake_teleop.logs.pose_motion.poses import Inertial, Poses
+from drake_teleop.logs.pose_motion.spectra import Grid, bands, end_taper, signal_spectrum
+from drake_teleop.logs.pose_motion.splines import DEGREE, Choice, PoseSplines, _normal_of_rates
+from drake_teleop.logs.processing import identify_log
+
+RATE, NOISE = 250.0, (0.03, 2e-3)
+BIAS, MATRIX = (
+    np.array([0.2, -0.1, 0.05]),
+    np.eye(3) + 0.02 * np.array([[0.3, 1.0, -0.5], [-1.0, -0.4, 0.2], [0.6, -0.1, 0.5]]),
+)
+ROUGH = Kind(place=1e-3, turn=1e-3, rate=50.0, seed=4)
+
+
+def sensed(seed: int, later: float = 0.0) -> Inertial:
+    """An IMU on the clock of the poses but for `later`, with a bias and wrong gains and axes."""
+    rng, t = np.random.default_rng([seed, 5]), np.arange(0.05, SECONDS - 0.05, 1 / RATE)
+    at = motion_at(t - LATE - later)
+    s, omega = (
+        x @ MATRIX.T + k * BIAS + std * rng.normal(size=x.shape)
+        for x, k, std in zip((at.specific_force, at.omega), (1.0, 0.1), NOISE, strict=True)
+    )
+    return Inertial(t, s, omega)
+
+
+def poses_of(kind: Kind) -> tuple[np.ndarray, np.ndarray, Poses]:
+    t, wrench, poses = record(kind)
+    return t, wrench, poses.continued()
+
+
+def test_poses_tell_bias_axes_clock_and_noise_of_an_imu():
+    splines = PoseSplines(poses_of(Kind(seed=4))[2], 0.07)
+    aid = aid_of(splines, sensed(4, later=0.008), GRAVITY_W)
+    assert aid is not None
+    truth = motion_at(aid.t - LATE)
+    acceleration = np.einsum("nij,nj->ni", truth.R_WS, truth.specific_force) + GRAVITY_W
+    error = (aid.acceleration_W - acceleration)[100:-100]
+    assert np.sqrt((error**2).mean()) == pytest.approx(NOISE[0], rel=0.1)
+    assert np.abs(error.mean(axis=0)).max() < 3e-3
+    assert aid.own_powers == pytest.approx([x**2 / RATE for x in NOISE], rel=0.3)
+
+
+def test_derivatives_enter_the_normal_equations_as_rows():
+    rng, t = np.random.default_rng(1), np.sort(np.random.default_rng(2).uniform(0.0, 3.0, 200))
+    inner = np.arange(0.3, 2.8, 0.3)
+    knots = np.concatenate([np.zeros(DEGREE + 1), inner, np.full(DEGREE + 1, 3.0)])
+    x = rng.normal(size=(200, 2))
+    size = len(knots) - DEGREE - 1
+    for order in (1, 2):
+        rows = BSpline(knots, np.eye(size), DEGREE).derivative(order)(t)
+        band, right = _normal_of_rates(t, x, knots, order)
+        gram = sum(np.diag(band[DEGREE - k, k:], k) for k in range(DEGREE + 1))
+        gram = gram + np.triu(gram, 1).T
+        np.testing.assert_allclose(gram, rows.T @ rows, atol=1e-9 * np.abs(gram).max())
+        np.testing.assert_allclose(right, rows.T @ x, atol=1e-9 * np.abs(right).max())
+
+
+def test_the_noise_that_splines_of_both_leave_is_as_said():
+    """Means of 6 records, of acceleration and angular acceleration, 2 to 6 Hz."""
+    exact = poses_of(replace(ROUGH, place=0.0, turn=0.0))[2]
+    t = np.arange(0.0, SECONDS, 0.01)
+    grid, taper = Grid(t, np.zeros((len(t), 6)), 1), end_taper(t, 1.0, SECONDS - 1.0)
+    of = bands(grid, taper, 6.0)
+    clean = PoseSplines(exact, 0.05).signals(t, GRAVITY_W)
+    sums, said = np.zeros(2), np.zeros(2)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        moved = exact.position + ROUGH.place * rng.normal(size=exact.position.shape)
+        # Half an angle in each part of the quaternion.
+        q = exact.quaternion + 0.5 * ROUGH.turn * rng.normal(size=exact.quaternion.shape)
+        noisy = Poses(exact.t, moved, q / np.linalg.norm(q, axis=1, keepdims=True))
+        aid = aid_of(PoseSplines(noisy, 0.1), sensed(seed), GRAVITY_W)
+        assert aid is not None
+        splines = Choice(noisy, aid).at(0.05)
+        error = splines.signals(t, GRAVITY_W) - clean
+        power = of.sums(np.abs(signal_spectrum(grid, taper, error, len(of.frequency))) ** 2)
+        Q = noise_moments(splines, grid, taper, clean, of, splines.noise())
+        fast = of.sums(of.frequency) / of.sizes > 2.0
+        for k, where in enumerate((slice(1, 4), slice(7, 10))):
+            sums[k] += power[fast, where].sum()
+            said[k] += np.diagonal(Q, axis1=1, axis2=2)[fast, where].sum()
+    np.testing.assert_allclose(said / sums, 1.0, atol=0.2)
+
+
+def test_an_imu_makes_a_load_of_rough_poses_surer():
+    t, wrench, poses = poses_of(ROUGH)
+    alone = estimate_from_poses(t, wrench, poses, GRAVITY_W)
+    both = estimate_from_poses(t, wrench, poses, GRAVITY_W, imu=sensed(4))
+    assert both.splines.aid is not None
+    deviations = np.sqrt(np.diag(both.covariance))
+    assert np.abs((both.theta - TRUTH) / deviations).max() < 3.5
+    inertia = deviations[10:] / np.sqrt(np.diag(alone.covariance))[10:]
+    assert inertia.mean() < 0.8
+
+
+def test_an_imu_of_other_axes_is_not_heard():
+    splines, imu = PoseSplines(poses_of(Kind(seed=4))[2], 0.07), sensed(4)
+    assert imu.specific_force is not None
+    other = replace(imu, specific_force=imu.specific_force[:, [1, 0, 2]])
+    assert aid_of(splines, other, GRAVITY_W) is None
+
+
+@pytest.mark.slow  # two loads from files of 20 s
+def test_identify_hears_both_but_the_imu_alone_if_the_poses_are_of_another_frame(tmp_path):
+    kinds = Kind(seed=4), Kind(seed=4, p_SoPo_S=(0.0, 0.0, 0.1))
+    own, tcp = (identify_log(written(tmp_path / str(k), kind)) for k, kind in enumerate(kinds))
+    assert not own.findings
+    assert [finding.name for finding in tcp.findings] == ["pose frame"]
+    of_splines, of_imu = (
+        np.abs((x.log.specific_force - motion_at(x.log.t).specific_force)[500:-500]).max()
+        for x in (own, tcp)
+    )
+    assert of_splines < 0.05 < of_imu  # the IMU has a bias and wrong gains
+    load = own.identification
+    assert np.abs((load.phi - PHI) / load.standard_deviations[6:]).max() < 4.0
+    assert tcp.identification.mass == pytest.approx(PHI[0], rel=0.03)
+
+
+def written(folder: Path, kind: Kind) -> Path:
+    """The files of a record with an IMU, and their description."""
+    folder.mkdir()
+    t, wrench, poses = record(kind)
+    imu = sensed(4)
+    np.savez(folder / "wrench.npz", t=t, f=wrench[:, :3], tau=wrench[:, 3:])
+    np.savez(folder / "pose.npz", t=poses.t, q=poses.quaternion, p=poses.position)
+    np.savez(folder / "imu.npz", t=imu.t, s=imu.specific_force, omega=imu.angular_velocity)
+
+    def stream(name: str, **columns: str) -> dict[str, Any]:
+        fields = {field: {"columns": [column]} for field, column in columns.items()}
+        return {"file": f"{name}.npz", "time": {"column": "t"}} | fields
+
+    document: dict[str, Any] = {
+        "gravity": GRAVITY_W.tolist(),
+        "wrench": stream("wrench", force="f", torque="tau"),
+        "pose": stream("pose", orientation="q", position="p"),
+        "imu": stream("imu", specific_force="s", angular_velocity="omega"),
+    }
+    document["pose"]["orientation"]["form"] = "quaternion_wxyz"
+    path = folder / "log.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return path
