@@ -21,7 +21,7 @@ from drake_teleop.robots.ros2 import attachment, types
 from drake_teleop.robots.ros2_source import KINDS, Messages
 from drake_teleop.robots.rtde import parts_of
 from drake_teleop.robots.rtde_reader import SAMPLE
-from drake_teleop.robots.streams import IMU, ONLY_SAID, POSE, WRENCH, Part, Reading
+from drake_teleop.robots.streams import IMU, JOINTS, ONLY_SAID, POSE, WRENCH, Part, Reading
 
 LOAD = Identification(
     phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003])),
@@ -29,6 +29,7 @@ LOAD = Identification(
     *("batch least squares", 100),
 )
 DT, COUNT, RANGE = 0.002, 60, 50.0
+_JOINTS = ("shoulder", "elbow")
 _WRENCH = (1.0, -2.0, 16.0, 0.1, 0.2, 0.3)
 _SENT, _FRAMES = 33, ("base", "tool0")
 
@@ -62,6 +63,7 @@ def _message(name: str, k: int) -> bytes:
         WRENCH: lambda: (kinds["Wrench"](vector, kinds["Vector3"](*_WRENCH[3:])),),
         POSE: lambda: (kinds["Pose"](kinds["Point"](0.4, 0.1, 0.3), turn),),
         IMU: lambda: (turn, nine, vector, nine, vector, nine),
+        JOINTS: lambda: (list(_JOINTS), np.array([0.1, 0.2]), np.zeros(2), np.zeros(2)),
     }
     if name == "tf":
         motion = kinds["Transform"](vector, turn)
@@ -107,7 +109,7 @@ def rtde_wrenches(path: Path) -> None:
 
 
 _SIZES = {name: len(_message(name, 0)) for name in KINDS}
-_MESSAGES = Messages(-1.0, _FRAMES)
+_MESSAGES = Messages(-1.0, _FRAMES, _JOINTS)
 
 
 def ros_wrenches(path: Path) -> None:
