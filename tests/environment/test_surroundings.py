@@ -28,6 +28,7 @@ from drake_teleop.resources import models_dir
 from drake_teleop.run import ScenarioRun, summarise
 from drake_teleop.scenario import LoadScenario, Scenario, ScenarioFromData, replace
 from drake_teleop.simulation import MakeSimulator, simulate
+from drake_teleop.slave.contact_twin import ContactTwin
 from drake_teleop.slave.drake_contact import contact_wrench_W
 from drake_teleop.slave.plant import AddSlavePlant
 from drake_teleop.slave.scene import Scene
@@ -215,8 +216,15 @@ def test_the_wrist_wrench_is_the_reaction_whatever_is_touched(case, pad):
     assert "leaf is not alone" in sensor.beyond
 
 
-def test_what_the_law_does_not_know_drake_tells_between_the_steps():
+def test_what_the_law_does_not_know_drake_tells_between_the_steps(monkeypatch):
     """With a box inside the ball, which nothing reaches: the same samples, told by Drake."""
+    asked, wrench_W = [], ContactTwin.wrench_W
+
+    def remember(twin, x, state):
+        asked.append((x.copy(), state.copy()))
+        return wrench_W(twin, x, state)
+
+    monkeypatch.setattr(ContactTwin, "wrench_W", remember)
     ball, box = Ball(0.012, [0.0, 0.0, 0.188]), ToolBox([0.004] * 3, [0.0, 0.0, 0.188])
     logs, watched = [], []
     for shapes in ([ball], [ball, box]):
@@ -234,6 +242,11 @@ def test_what_the_law_does_not_know_drake_tells_between_the_steps():
         slave = AddSlavePlant(DiagramBuilder(), scenario.slave, scenario.surroundings)
         watched.append(len(slave.contact.watched))
     assert watched == [0, 2]  # its table, too
+    # Every number of a state that Drake is asked in is one: the arm's stands twice in it.
+    start = slave.arm.num_joints
+    assert len(asked) > 10
+    for x, state in asked:
+        np.testing.assert_allclose(state[:start], x[:start], atol=1e-4)
     law, drake = (log["measured_wrench_S"] for log in logs)
     assert np.abs(law[:, 0]).max() > 1.0
     np.testing.assert_allclose(drake, law, atol=1e-9)
