@@ -20,6 +20,7 @@ TWO = ("good", "good")
 LONG = 20
 EACH = 6  # samples of a chapter; what is wrong stands in its middle
 SILENCE_S = 0.09
+SATURATED = 1  # of the flags in a UDP packet
 
 
 def chapters(flaws=FLAWS):
@@ -189,6 +190,23 @@ def ros(port):
             play(send, flaws)
 
 
+def udp(port):
+    """A sender that is started again, and then its clock is set; as the C header has it."""
+    print(port, flush=True)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for flaws, later, first in ((FLAWS, 0, 0), (TWO, 0, 0), (TWO, 50, 500)):
+            start = time.time() + later
+
+            def send(number, flaw, start=start, first=first):
+                numbers = wrench(number) if flaw != "nan" else (float("nan"),) * 6
+                flags, t = SATURATED * (flaw == "saturated"), start + DT * number
+                values = (*numbers, 0.0, 0.0, 9.81, *(0.0,) * 6)
+                packet = struct.pack("<4sIQd15d", b"DTW1", flags, number + first, t, *values)
+                sender.sendto(packet[: 20 if flaw == "short" else 144], ("127.0.0.1", int(port)))
+
+            play(send, flaws)
+
+
 def joint_state(ns, names, positions):
     """A sensor_msgs/JointState in CDR, as velocity and effort are left out."""
     data = struct.pack("<iII5s", ns // 10**9, ns % 10**9, 5, b"base\0")
@@ -270,6 +288,6 @@ HASH = "8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77"
 
 if __name__ == "__main__":
     with contextlib.suppress(OSError, KeyboardInterrupt):
-        PEERS = {"netft": netft, "rtde": rtde, "ros": ros, "ros_echo": ros_echo}
+        PEERS = {"udp": udp, "netft": netft, "rtde": rtde, "ros": ros, "ros_echo": ros_echo}
         PEERS |= {"netft_moving": netft_moving, "ros_moving": ros_moving}
         PEERS[sys.argv[1]](*sys.argv[2:])
