@@ -27,6 +27,7 @@ WRENCH = struct.Struct("<4sIQd12d")
 _IN, _POSED, _OUT = b"DTW1", b"DTP1", b"DTC1"
 _HEAD = struct.Struct("<4sIQd")
 _MOST = 256  # packets at once
+_BUFFER = 1 << 20  # bytes: a tenth of a second at 8 kHz, while the system is busy elsewhere
 _SATURATED = int(Flag.SATURATED)
 
 
@@ -118,6 +119,7 @@ class _Receiver:
         self.dt = dt
         self._socket = listening(*endpoint(address))
         self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
         self.port = self._socket.getsockname()[1]

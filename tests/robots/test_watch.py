@@ -85,6 +85,38 @@ def test_a_log_of_free_motion_tells_what_is_no_contact(tmp_path: Path) -> None:
         assert (flags[1030:1250] == (Flag.IN_CONTACT if push else 0)).all()
 
 
+def shaken(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """2 s at rest, 2 s along x with 8 m/s^2 at 4 Hz; forces are told 5 % too large."""
+    t, values = readings(seed)
+    at, zero = t - 2.0, np.zeros_like(t)
+    x = np.where(at > 0.0, 8.0 * np.minimum(at / 0.2, 1.0) * np.sin(8 * np.pi * at), 0.0)
+    motion = np.column_stack([x, zero, zero + 9.81]), np.zeros((2000, 3)), np.zeros((2000, 3))
+    noise = np.random.default_rng(seed).normal(size=(2000, 6)) * np.repeat([0.1, 0.005], 3)
+    wrench = 1.05 * non_contact_wrench(*motion, PHI) + OFFSETS + noise
+    return t, np.hstack([wrench, *motion])
+
+
+def test_the_floor_rises_with_the_acceleration_and_not_at_rest(tmp_path: Path) -> None:
+    """What the gains leave of 8 m/s^2 is 0.7 N and no contact; at rest half of it is one."""
+    free = tmp_path / "free.parquet"
+    t, before = shaken(seed=5)
+    write_log(Log(t, *np.split(before, [6, 9, 12], axis=1)), free)
+    _, values = shaken(seed=2)
+    start = np.split(values[:250, 6:], 3, axis=1)
+    tared = (values[:250, :6] - non_contact_wrench(*start, PHI)).mean(axis=0)
+    # At the centre of mass, as inertia acts: no other channel betrays it.
+    values[500:750, :6] += 0.35 * np.array([1.0, 0.0, 0.0, 0.0, 0.06, 0.02])
+    compensator = Compensator(LOAD, DT, detector=Detector(LOAD, free, DT, 30.0, 0.0))
+    compensator.offsets = tared
+    out = [
+        compensator.step(Reading(k, float(t[k]), row), float(t[k])) for k, row in enumerate(values)
+    ]
+    flags = np.array([row.flags for row in out])
+    assert (flags[530:750] == Flag.IN_CONTACT).all()
+    assert not flags[:500].any() and not flags[850:].any()
+    assert max(abs(row.contact[0]) for row in out[1200:]) > 0.6
+
+
 def test_a_noise_floor_needs_the_streams_rate_and_a_low_pass(tmp_path: Path) -> None:
     t, values = readings()
     write_log(Log(t, *np.split(values, [6, 9, 12], axis=1)), tmp_path / "free.parquet")
