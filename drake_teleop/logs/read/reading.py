@@ -35,14 +35,8 @@ from drake_teleop.logs.read.description import (
     Wrench,
     load_description,
 )
-from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
-from drake_teleop.logs.read.rotations import (
-    WIDTHS,
-    nearest_rotation,
-    quaternions,
-    rotation_error,
-    rotation_matrices,
-)
+from drake_teleop.logs.read.orientations import Orientations
+from drake_teleop.logs.read.rotations import nearest_rotation, quaternions, rotation_matrices
 from drake_teleop.logs.read.streams import LARGEST, Stream, at_S, in_S, on_clock, turned_wrench
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 
@@ -249,12 +243,12 @@ class _Reader:
         if stream.position is not None:
             position = self._vectors("pose", "position", stream.position, table, clock.total)
             position = clock.taken(position)
-        columns = self._orientation("pose", stream.orientation, table, clock.total)
+        orientations = self._orientations("pose", stream.orientation, table, clock.total)
         quaternion = np.empty((len(clock.rows), 4))
         origin = np.array(stream.position_in_sensor)
         for start in range(0, len(quaternion), _CHUNK):
             part = slice(start, start + _CHUNK)
-            q = self._quaternions("pose", stream.orientation, table, columns, clock.rows[part])
+            q = orientations.quaternions(clock.rows[part])
             if stream.R_SP is not None or (position is not None and origin.any()):
                 R_WS = rotation_matrices(q, "quaternion_wxyz")
                 if stream.R_SP is not None:
@@ -322,9 +316,8 @@ class _Reader:
             gravity = -s
         else:
             assert stream.orientation is not None
-            columns = self._orientation("static", stream.orientation, table, table.rows)
-            every = np.arange(table.rows)
-            R_WS = self._rotations("static", stream.orientation, table, columns, every)
+            orientations = self._orientations("static", stream.orientation, table, table.rows)
+            R_WS = orientations.rotations(np.arange(table.rows))
             R_SW = np.swapaxes(R_WS, 1, 2)
             gravity = R_SW @ self._description.gravity_W
         if stream.frame == "base":
@@ -381,66 +374,11 @@ class _Reader:
             self._gaps.append(holes + np.array([-seen, seen]))
         return clock
 
-    def _orientation(
+    def _orientations(
         self, name: str, orientation: Orientation, table: Table, rows: int
-    ) -> NDArray[np.float64]:
-        """(rows, k) the columns, a rotation vector in radians."""
-        where = f"{self._source}:{name}.orientation.columns"
-        columns = table.numbers(orientation.columns, WIDTHS[orientation.form], where, rows)
-        if orientation.form == "rotation_vector":
-            columns *= self._description.scale(orientation.unit)
-        return columns
-
-    def _quaternions(
-        self,
-        name: str,
-        orientation: Orientation,
-        table: Table,
-        columns: NDArray[np.float64],
-        rows: NDArray[np.intp],
-    ) -> NDArray[np.float64]:
-        """(len(rows), 4) [w, x, y, z] of `_rotations`, without matrices where the log has none."""
-        if not orientation.form.startswith("quaternion"):
-            return quaternions(self._rotations(name, orientation, table, columns, rows))
-        q = columns[rows]
-        if orientation.form == "quaternion_xyzw":
-            q = np.roll(q, 1, axis=1)
-        squared = np.einsum("ij,ij->i", q, q)  # q stands for the matrix of this, times a rotation
-        self._check_rotations(np.abs(squared**2 - 1.0), name, orientation, table, rows)
-        q /= np.sqrt(squared)[:, None]
-        if orientation.inverse:
-            q[:, 1:] *= -1.0
-        return q
-
-    def _rotations(
-        self,
-        name: str,
-        orientation: Orientation,
-        table: Table,
-        columns: NDArray[np.float64],
-        rows: NDArray[np.intp],
-    ) -> NDArray[np.float64]:
-        """(len(rows), 3, 3) rotations of some rows of `_orientation`."""
-        R = rotation_matrices(columns[rows], orientation.form)
-        self._check_rotations(rotation_error(R), name, orientation, table, rows)
-        return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
-
-    def _check_rotations(
-        self,
-        errors: NDArray[np.float64],
-        name: str,
-        orientation: Orientation,
-        table: Table,
-        rows: NDArray[np.intp],
-    ) -> None:
-        """Refuses what is farther from a rotation, by `rotation_error`, than rounding makes it."""
-        worst = int(np.argmax(errors))
-        if errors[worst] > ROTATION_TOLERANCE:
-            raise DrakeTeleopError(
-                f"row {rows[worst] + table.first_row} of {table.path.name} is not a rotation",
-                where=f"{self._source}:{name}.orientation",
-                remedy=f"check the columns and their order; form is {orientation.form}",
-            )
+    ) -> Orientations:
+        where = f"{self._source}:{name}.orientation"
+        return Orientations(self._description, orientation, table, rows, where)
 
     def _common_time(
         self, wrench_t: NDArray[np.float64], streams: Sequence[Stream]

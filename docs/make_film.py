@@ -1,0 +1,109 @@
+"""Records docs/figures/drive.webp: a drive in the page of `drake-teleop drive`, in Chromium.
+
+    python docs/make_film.py
+
+A script in the page leads the hand and moves the slider, by the station's own time. Pictures are
+kept as the browser paints them and shown for as long as they stood there, so that the film is as
+fast as the drive was. Prints its size, pictures a second, and the drive's real-time factor.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import time
+from base64 import b64decode
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from drake_teleop.live.server import drive
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "benchmarks"))
+import live_page  # noqa: E402
+
+FILM = ROOT / "docs" / "figures" / "drive.webp"
+WIDTH, HEIGHT = 1100, 660
+MOST_PER_S = 12.0
+SECONDS = 12.5
+# Free motion to and fro; down onto the leaf; sigma to 1 and back while it presses; up again. The
+# hand's steps are of 10 um.
+LEAD = """const smooth = (t, from, to) => {
+  const s = Math.min(Math.max((t - from) / (to - from), 0), 1); return s * s * (3 - 2 * s); };
+window.began = frame.t;
+setInterval(() => {
+  const t = frame.t - began, free = smooth(t, .5, 1) - smooth(t, 3.5, 4);
+  if (!target) return;
+  target.x = 1500 * free * Math.sin(2 * Math.PI * 1.5 * t);
+  target.z = 1500 + 2500 * free * Math.sin(2 * Math.PI * 2 * t)
+    - 9000 * (smooth(t, 4.5, 5.5) - smooth(t, 10, 11));
+  const sigma = at("sigma"), wanted = Math.round(100 * (smooth(t, 6.5, 7.5) - smooth(t, 8.5, 9.5)));
+  if (+sigma.value === wanted) return;
+  sigma.value = wanted;
+  sigma.dispatchEvent(new Event("input"));
+}, 10); 1"""
+
+
+class Filmed(live_page.Page):
+    """A page that keeps what it shows: (seconds, PNG)."""
+
+    def __init__(self, socket: Any) -> None:
+        super().__init__(socket)
+        self.pictures: list[tuple[float, bytes]] = []
+
+    def heard(self, event: str, params: Any) -> None:
+        """Keeps a picture, and asks for the next."""
+        if event == "Page.screencastFrame":
+            self.pictures.append((params["metadata"]["timestamp"], b64decode(params["data"])))
+            self.send("Page.screencastFrameAck", sessionId=params["sessionId"])
+
+
+def filmed(url: str) -> tuple[list[tuple[float, bytes]], list[float]]:
+    """The pictures of a drive, and its real-time factors meanwhile."""
+    factors = []
+    drawing = ("--use-angle=swiftshader", f"--window-size={WIDTH},{HEIGHT}")
+    with live_page.opened(url, "", Filmed, drawing) as page:
+        size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
+        page.answer(page.send("Emulation.setDeviceMetricsOverride", **size))
+        while not page.run("!!(typeof target !== 'undefined' && target && frame && frame.tool)"):
+            time.sleep(0.1)
+        time.sleep(3.0)  # until all of the scene has come
+        page.run(LEAD)
+        page.send("Page.startScreencast", format="png")
+        while page.run("frame.t - began") < SECONDS:
+            factors.append(page.run("frame.factor"))
+            time.sleep(0.05)
+        page.send("Page.stopScreencast")
+        return page.pictures, factors
+
+
+def main() -> None:
+    """Records, writes, and says what it has recorded."""
+    driven = drive("contact_transition")
+    try:
+        pictures, factors = filmed(driven.url)
+    finally:
+        driven.stop()
+    kept = pictures[:1]
+    for at, picture in pictures[1:]:
+        if at - kept[-1][0] >= 1.0 / MOST_PER_S:
+            kept.append((at, picture))
+    times = [at for at, _ in kept]
+    shown = [
+        round(1e3 * (b - a)) for a, b in zip(times, [*times[1:], times[-1] + 1.0], strict=True)
+    ]
+    first, *others = (Image.open(io.BytesIO(picture)).convert("RGB") for _, picture in kept)
+    first.save(
+        FILM, save_all=True, append_images=others, duration=shown, loop=0, quality=60, method=6
+    )
+    seconds = times[-1] - times[0]
+    print(
+        f"{FILM}: {FILM.stat().st_size / 1e6:.2f} MB, {seconds:.1f} s, {len(kept) / seconds:.1f}"
+        f" pictures a second; real-time factor {min(factors):.3f} to {max(factors):.3f}"
+    )
+
+
+if __name__ == "__main__":
+    main()
