@@ -144,10 +144,11 @@ def page() -> str:
     parts.append("\n## Not shown\n")
     for claim in CLAIMS:
         if isinstance(claim, NotShown):
-            parts.append(f"- {claim.says}: {claim.why}.")
+            parts.append(f"- *{claim.section}.* {claim.says}: {claim.why}.")
         elif not _shown(claim, known):
             assert isinstance(claim, Claim)
-            parts.append(f"- {claim.says}: no record of `{RUNS[claim.run]}` is kept.")
+            lacks = f"no record of `{RUNS[claim.run]}` is kept"
+            parts.append(f"- *{claim.section}.* {claim.says} ({claim.where}): {lacks}.")
     return "\n".join(parts) + "\n"
 
 

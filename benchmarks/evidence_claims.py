@@ -114,7 +114,7 @@ class NotShown:
 
 
 def _said(value: float, unit: str) -> str:
-    digits = f"{value:.3g}"
+    digits = f"{value:.0f}" if 100.0 <= abs(value) < 1e4 else f"{value:.3g}"
     if "e" in digits:
         mantissa, exponent = digits.split("e")
         digits = f"{mantissa}·10{str(int(exponent)).translate(_RAISED)}"
@@ -209,13 +209,13 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: 100 * min(min(c["coverage"]) for c in f["colours"].values()), "%", 90.0, 98.0),
     ),
     Claim(
-        *(LOAD, "What the motion did not excite is called identified never"),
+        *(LOAD, "What the motion did not excite is called identified"),
         *("poses, one axis, one pose; 500 records", "logs.md", "intervals"),
         lambda f: sum(n for counts in f["called identified"].values() for n in counts.values()),
-        *("", 0.0, 0.0),
+        *("times", 0.0, 0.0),
     ),
     Claim(
-        *(LOAD, "Total least squares takes out the bias of noisy accelerations, but for"),
+        *(LOAD, "Total least squares takes out the bias of noisy accelerations, to within"),
         *("JR3, 200 records of 1.5 s", "theory.md", "errors_in_variables"),
         *(lambda f: 100 * f["JR3"]["RTLS"]["bias_over_rls_max"], "%", 0.0, 10.0),
     ),
@@ -293,7 +293,7 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: f["ledger"]["searched"]["actual"], "J", -1e-6),
     ),
     Claim(
-        *(NETWORK, "Nor if it begins with nothing and the servo is not as told"),
+        *(NETWORK, "nor if it begins with nothing and the servo is not as told"),
         *("the same, charged by drag, servo ±20 %, 3 ms lag, encoder, noise", "delay.md"),
         *("adversary_drag", lambda f: f["ledger"]["searched"]["actual"], "J", -1e-6),
     ),
@@ -343,7 +343,10 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
     ),
     # Analysis
     Claim(
-        *(ANALYSIS, "The linearised Diagram predicts the hand's force over its velocity, but for"),
+        *(
+            ANALYSIS,
+            "The linearised Diagram predicts the hand's force over its velocity, to within",
+        ),
         *("σ = 0.5, 0.5 to 30 Hz, without Coulomb friction", "analysis.md", "frequency_response"),
         *(_response("0.5", "hand_force / hand_velocity, magnitude"), "%", 0.0, 1.0),
     ),
@@ -353,7 +356,7 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: f["sigma 0.5: apparent mass, kg"], "kg", 1.5337, 1.5963),
     ),
     Claim(
-        *(ANALYSIS, "Delay margins are where a simulation becomes unstable, but for"),
+        *(ANALYSIS, "Delay margins are where a simulation becomes unstable, to within"),
         *("one axis, sampled; 12 walls and grips; round trip", "analysis.md", "analysis"),
         lambda f: (
             max(
@@ -366,7 +369,7 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *("ms", 0.0, 1.0),
     ),
     Claim(
-        *(ANALYSIS, "The one-axis model is the Diagram on other arms and devices, but for"),
+        *(ANALYSIS, "The one-axis model is the Diagram on other arms and devices, to within"),
         *("Panda and omega.6, UR5 and Touch, RX90; to 20 Hz", "analysis.md", "foreign_analysis"),
         lambda f: max(max(station["from the sampled axis, %"].values()) for station in f.values()),
         *("%", 0.0, 1.0),
@@ -388,7 +391,7 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: max(f[arm]["torque_off_Nm"] for arm in ("panda", "ur5")), "N m", 0.0, 1e-9),
     ),
     Claim(
-        *(OWN, "The load is identified"),
+        *(OWN, "The load of such a station is identified, to within"),
         *("the same stations, from the samples of their sensor", "station.md", "stations"),
         *(lambda f: max(_rows(f, "mass_error_percent")), "%", 0.0, 0.1),
     ),
@@ -398,12 +401,12 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: max(_rows(f, "left_percent", surroundings="free motion")), "%", 0.0, 1.5),
     ),
     Claim(
-        *(OWN, "The hand feels σ m / scale, but for"),
+        *(OWN, "The hand feels σ m / scale, to within"),
         *("the same, σ = 0.5", "station.md", "stations"),
         *(lambda f: max(_rows(f, "felt_error_percent")), "%", 0.0, 2.0),
     ),
     Claim(
-        *(OWN, "Numeric inverse kinematics meets every pose, but for (it says so)"),
+        *(OWN, "Poses that numeric inverse kinematics does not meet, and says so"),
         *("10⁵ random poses of each of six arms", "station.md", "inverse_kinematics"),
         lambda f: max(
             arm["random"]["poses"] - arm["random"]["statuses"]["OK"] for arm in f.values()
@@ -432,7 +435,7 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: f["free_motion_over_bare"], "times", 0.0, 2.0),
     ),
     Claim(
-        *(SPEED, "The same, over a contact"),
+        *(SPEED, "and in a contact"),
         *("`contact_transition`", "station.md", "station"),
         *(lambda f: f["contact_over_bare"], "times", 0.0, 3.0),
     ),
@@ -461,7 +464,8 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
     Claim(
         *(LIVE, "`calibrate` calls a number known that is wrong"),
         *("100 loads by hand, and by `excite`'s motion; right gains", "robot.md", "calibrate"),
-        *(lambda f: f["hand.wrong_at_the_end"] + f["excite.wrong_at_the_end"], "", 0.0, 0.0),
+        lambda f: f["hand.wrong_at_the_end"] + f["excite.wrong_at_the_end"],
+        *("numbers", 0.0, 0.0),
     ),
     Claim(
         *(LIVE, "its 95 % intervals hold at the moment it stops, at least"),
@@ -475,9 +479,9 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: f["hand.median_s"], "s", 0.0, 5.0),
     ),
     Claim(
-        *(LIVE, "The same from a robot's poses"),
+        *(LIVE, "`calibrate` calls one known that is wrong, from a robot's poses"),
         *("50 loads by hand, 0.1 mm and 0.2 mrad; right gains", "robot.md", "calibrate_poses"),
-        *(lambda f: f["poses.false_known"], "", 0.0, 0.0),
+        *(lambda f: f["poses.false_known"], "numbers", 0.0, 0.0),
     ),
     Claim(
         *(LIVE, "`compensate replay:LOG` differs from `eliminate --causal` in"),

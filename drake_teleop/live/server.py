@@ -111,7 +111,8 @@ class LiveDrive:
         finally:
             for name in ("_live", "_meshcat"):  # none, if it could not be made
                 self.__dict__.pop(name, None)
-            gc.collect()
+            while gc.collect():  # what Drake's objects keep alive is garbage after they are gone
+                pass
             if self._device is not None:
                 self._device.close()
             self._over.set()
