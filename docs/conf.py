@@ -7,6 +7,7 @@ does; any warning is an error. Nothing is loaded from elsewhere: the site can be
 from __future__ import annotations
 
 import os
+import re
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -94,6 +95,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = "drake_teleop"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_sidebars = {"start": []}  # a page without others below it
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
@@ -105,8 +107,13 @@ html_theme_options = {
 }
 
 
-def _as_rst(_app, _what, _name, _object, _options, lines: list[str]) -> None:
-    """|x| is an absolute value in docstrings, no substitution, and `Range`s is a word with an s."""
+def _as_rst(_app, what, _name, _object, _options, lines: list[str]) -> None:
+    """|x| is an absolute value in docstrings, no substitution, and `Range`s is a word with an s.
+
+    Why a file is long is for who works on it.
+    """
+    if what == "module":
+        lines[:1] = [re.sub(r" \(long: [^)]*\)", "", line) for line in lines[:1]]
     for i, line in enumerate(lines):
         parts = line.split("`")
         parts[::2] = [part.replace("|", r"\|") for part in parts[::2]]

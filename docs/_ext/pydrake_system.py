@@ -32,7 +32,8 @@ class PydrakeSystem(Directive):
             for kind in PORTS
             for port, text in ports[kind]
         )
-        table = f'<table class="ports"><tbody>{rows}</tbody></table>'
+        # Where it is wider than the page it scrolls, by keys too.
+        table = f'<table class="ports" tabindex="0"><tbody>{rows}</tbody></table>'
         return [nodes.raw("", block + table, format="html")]
 
 
