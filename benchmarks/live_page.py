@@ -20,6 +20,8 @@ import shutil
 import subprocess
 import tempfile
 import time
+from collections.abc import Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -83,7 +85,12 @@ class Page:
             if "id" in message:
                 value = message.get("result", {}).get("result", {}).get("value")
                 self._answers[message["id"]] = value
+            else:
+                self.heard(message["method"], message["params"])
         return self._answers.pop(number)
+
+    def heard(self, event: str, params: Any) -> None:
+        """What the browser says unasked."""
 
     def begin(self, script: str) -> int:
         return self.send(
@@ -100,6 +107,34 @@ class Page:
                 buttons=int(kind != "Released"), clickCount=1,
             )
         )  # fmt: skip
+
+
+@contextmanager
+def opened(url: str, script: str, page: type[Page] = Page, more: Sequence[str] = ()) -> Any:
+    """A page that headless Chromium has open; the script runs before any of its own does."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        process = subprocess.Popen(
+            [CHROMIUM or "", *OPTIONS, *more, f"--user-data-dir={folder}"],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            assert process.stderr is not None
+            said = next(line for line in process.stderr if "DevTools listening" in line)
+            port = said.rpartition(":")[2].partition("/")[0]
+            tabs = json.load(urlopen(f"http://127.0.0.1:{port}/json"))
+            address = next(tab["webSocketDebuggerUrl"] for tab in tabs if tab["type"] == "page")
+            with connect(address, max_size=None, origin=None) as socket:
+                shown = page(socket)
+                for domain in ("Runtime", "Page"):
+                    shown.answer(shown.send(f"{domain}.enable"))
+                shown.answer(shown.send("Emulation.setFocusEmulationEnabled", enabled=True))
+                shown.answer(shown.send("Page.addScriptToEvaluateOnNewDocument", source=script))
+                shown.answer(shown.send("Page.navigate", url=url))
+                yield shown
+        finally:
+            process.kill()
+            process.communicate()
 
 
 def latencies(page: Page, trials: int) -> dict[str, list[float | None]]:
@@ -159,42 +194,23 @@ def vibration(page: Page, driven: LiveDrive, trials: int) -> list[float | None]:
 def in_the_browser(trials: int) -> dict[str, float]:
     """Figures of a page in headless Chromium."""
     driven = drive("touch")
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        process = subprocess.Popen(
-            [CHROMIUM or "", *OPTIONS, f"--user-data-dir={folder}"],
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        try:
-            assert process.stderr is not None
-            said = next(line for line in process.stderr if "DevTools listening" in line)
-            port = said.rpartition(":")[2].partition("/")[0]
-            tabs = json.load(urlopen(f"http://127.0.0.1:{port}/json"))
-            address = next(tab["webSocketDebuggerUrl"] for tab in tabs if tab["type"] == "page")
-            with connect(address, max_size=None, origin=None) as socket:
-                page = Page(socket)
-                for domain in ("Runtime", "Page"):
-                    page.answer(page.send(f"{domain}.enable"))
-                page.answer(page.send("Emulation.setFocusEmulationEnabled", enabled=True))
-                page.answer(page.send("Page.addScriptToEvaluateOnNewDocument", source=SPY))
-                page.answer(page.send("Page.navigate", url=driven.url))
-                while not page.run("!!(window.place && typeof target !== 'undefined' && target)"):
-                    time.sleep(0.1)
-                figures = {}
-                for kind, times in (
-                    *latencies(page, trials).items(),
-                    ("vibration", vibration(page, driven, trials)),
-                ):
-                    known = [x for x in times if x is not None] or [np.nan]
-                    p50, p95 = np.percentile(known, [50, 95])
-                    figures |= {f"{kind}_p50_ms": float(p50), f"{kind}_p95_ms": float(p95)}
-                    figures[f"{kind}_not_in_10_s"] = trials - len(known)
-                figures["real_time_factor"] = page.run("frame.factor")
-                return figures
-        finally:
-            process.kill()
-            process.communicate()
-            driven.stop()
+    try:
+        with opened(driven.url, SPY) as page:
+            while not page.run("!!(window.place && typeof target !== 'undefined' && target)"):
+                time.sleep(0.1)
+            figures = {}
+            for kind, times in (
+                *latencies(page, trials).items(),
+                ("vibration", vibration(page, driven, trials)),
+            ):
+                known = [x for x in times if x is not None] or [np.nan]
+                p50, p95 = np.percentile(known, [50, 95])
+                figures |= {f"{kind}_p50_ms": float(p50), f"{kind}_p95_ms": float(p95)}
+                figures[f"{kind}_not_in_10_s"] = trials - len(known)
+            figures["real_time_factor"] = page.run("frame.factor")
+            return figures
+    finally:
+        driven.stop()
 
 
 class Clock:

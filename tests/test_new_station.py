@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
+from shown import type_in
 
 from drake_teleop import new_station
 from drake_teleop.errors import DrakeTeleopError
@@ -55,6 +57,14 @@ def test_a_station_is_written_and_run(tmp_path, runs, capsys):
     assert 0.0 < into <= 0.0101
     with pytest.raises(DrakeTeleopError, match="is there already"):
         new_command(tmp_path / "mine", ARM, "sensor")
+
+
+def test_it_is_written_as_the_page_for_beginners_says(tmp_path, runs, monkeypatch):
+    (tmp_path / "models").symlink_to(ARM.parent)
+    monkeypatch.chdir(tmp_path)
+    type_in("docs/start.md", ".venv/bin/drake-teleop new")
+    assert LoadScenario("out/mine/station.yaml").master.model == "omega_6"
+    assert runs == [(Path("out/mine/station.yaml"), Path("out/mine/first_run"), {"quiet": False})]
 
 
 def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():

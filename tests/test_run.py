@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 from matplotlib.figure import Figure
+from shown import type_in
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import slave_arm
@@ -32,9 +33,23 @@ operator:
 
 
 @pytest.fixture(scope="module")
-def contact(tmp_path_factory):
-    out = tmp_path_factory.mktemp("contact")
-    return run_command("contact_transition", out, quiet=True), out
+def typed(tmp_path_factory):
+    """Where what the README and the page for beginners show of `run` has been typed."""
+    folder = tmp_path_factory.mktemp("typed")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        type_in("README.md", ".venv/bin/drake-teleop run contact_transition")
+        type_in("docs/start.md", ".venv/bin/drake-teleop run mine.yaml")
+    return folder / "out"
+
+
+def summary_of(out):
+    return json.loads((out / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def contact(typed):
+    return summary_of(typed / "contact"), typed / "contact"
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +93,6 @@ def test_everything_is_written(contact):
     summary, out = contact
     session = json.loads((out / "session.json").read_text())
     assert set(session) == {"load_source", "real_time_factor"}
-    assert json.loads((out / "summary.json").read_text()) | session == summary
     result = SimulationResult.read_parquet(out / "log.parquet")
     assert len(result.t) == summary["samples"] == 801
     assert {"measured_wrench_S", "sheet_state", "force_to_master"} <= set(result)
@@ -87,6 +101,21 @@ def test_everything_is_written(contact):
     assert (out / "overview.png").read_bytes().startswith(b"\x89PNG")
     assert LoadScenario(out / "scenario.yaml") == LoadScenario("contact_transition")
     assert summary["description"] in (out / "replay.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_scenario_that_is_printed_is_the_one_that_was_run(typed):
+    contact, mine = (
+        sorted((typed / name / "log.parquet").iterdir()) for name in ("contact", "mine")
+    )
+    assert [part.read_bytes() for part in contact] == [part.read_bytes() for part in mine]
+
+
+@pytest.mark.slow
+def test_the_peg_is_put_into_the_slot(typed):
+    """With everything as it is shipped; `tests/operator/test_task.py` has what goes otherwise."""
+    summary = summary_of(typed / "insert")
+    assert summary["success"] == 1 and summary["false_notices"] == 0
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from shown import type_in
 
 from drake_teleop.analysis import analyze
 from drake_teleop.analysis import figures as of_summary
@@ -12,7 +13,6 @@ from drake_teleop.analysis.maps import stability_map
 from drake_teleop.analysis.report import print_tables
 from drake_teleop.analysis.task_direction import task_direction
 from drake_teleop.analysis.verdict import verdict
-from drake_teleop.cli import main
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 
@@ -30,10 +30,11 @@ def coarse_maps():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """The command on the paper's contact: its summary and its folder."""
-    out = tmp_path_factory.mktemp("analyze")
-    with pytest.raises(SystemExit) as exit:
-        main(["analyze", "contact_transition", "--out", str(out), "--quiet"])
-    assert exit.value.code == 0
+    folder = tmp_path_factory.mktemp("analyze")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        type_in("docs/analysis.md", "drake-teleop analyze")
+    out = folder / "out" / "analysis"
     return json.loads((out / "summary.json").read_text()), out
 
 

@@ -13,6 +13,7 @@ from arms import execute, write_sdf, write_urdf
 from numba import njit
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
+from shown import type_in
 
 from drake_teleop.cli import main
 from drake_teleop.errors import DrakeTeleopError
@@ -29,6 +30,7 @@ from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.resources import models_dir
 from drake_teleop.scenario import LoadScenario, replace
 from drake_teleop.sensor.motion_estimation import (
     MotionEstimationConfig,
@@ -275,6 +277,16 @@ def test_what_a_scenario_has_to_touch_is_not_touched(name):
         q[robot.arm.position_index] = found.trajectory.evaluate(t)[0]
         robot.plant.SetPositions(of_plant, q)
         assert not port.Eval(of_scene).HasCollisions()
+
+
+@pytest.mark.slow
+def test_what_the_readme_shows(tmp_path, monkeypatch):
+    (tmp_path / "models").symlink_to(models_dir())
+    monkeypatch.chdir(tmp_path)
+    type_in("README.md", ".venv/bin/drake-teleop excite")
+    for name in ("excite", "arm"):
+        found = FourierTrajectory.load(tmp_path / "out" / name / "excitation.yaml")
+        assert found.period == 6.0 and (tmp_path / "out" / name / "excitation.html").exists()
 
 
 @pytest.mark.slow

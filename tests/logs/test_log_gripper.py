@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 from known_motion import motion_at
+from shown import type_in
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
@@ -19,6 +20,20 @@ from drake_teleop.logs.processing import eliminate_log
 from drake_teleop.logs.read.canonical import WRENCH, Log, write_log
 
 GRIPPER = phi_from_mass_com_inertia(1.2, [0.0, 0.01, 0.05], np.diag([0.004, 0.004, 0.002]))
+DESCRIPTION = """
+wrench:
+  file: {name}.parquet
+  time: {{column: t}}
+  force: {{columns: [f_x, f_y, f_z]}}
+  torque: {{columns: [tau_x, tau_y, tau_z]}}
+  sign: 1
+imu:
+  file: {name}.parquet
+  time: {{column: t}}
+  specific_force: {{columns: [s_x, s_y, s_z]}}
+  angular_velocity: {{columns: [omega_x, omega_y, omega_z]}}
+  angular_acceleration: {{columns: [alpha_x, alpha_y, alpha_z]}}
+"""
 OBJECT = phi_from_mass_com_inertia(0.7, [0.01, -0.02, 0.16], np.diag([0.003, 0.002, 0.002]))
 
 
@@ -37,18 +52,21 @@ def simulated(path: Path, phi: np.ndarray, seed: int, contact: np.ndarray | None
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """gripper/identification.json, and total/ with identification.json and object.json."""
+    """Where docs/theory.md's commands were typed.
+
+    gripper/identification.json, total/ with identification.json and object.json, out/eliminate.
+    """
     folder = tmp_path_factory.mktemp("gripper")
-    alone = simulated(folder / "gripper.parquet", GRIPPER, 1)
-    identify_command(alone, folder / "gripper", delay=0.0, quiet=True)
-    both = simulated(folder / "total.parquet", GRIPPER + OBJECT, 2)
-    identify_command(
-        both,
-        folder / "total",
-        gripper=folder / "gripper" / "identification.json",
-        delay=0.0,
-        quiet=True,
-    )
+    push = np.zeros((2000, 6))
+    push[1000:1200, 2] = 20.0
+    simulated(folder / "gripper.parquet", GRIPPER, 1)
+    simulated(folder / "total.parquet", GRIPPER + OBJECT, 2)
+    simulated(folder / "log.parquet", GRIPPER + OBJECT, 3, push)
+    for name in ("gripper", "total", "log"):
+        (folder / f"{name}.yaml").write_text(DESCRIPTION.format(name=name))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        type_in("docs/theory.md", "drake-teleop identify gripper.yaml")
     return folder
 
 
@@ -72,6 +90,16 @@ def test_identify_writes_the_object(files: Path) -> None:
     assert len(summary["object"]["identifiable"]) == 10
     assert summary["object"]["consistency_margin"] > summary["object"]["consistency_margin_std"]
     assert not [note for note in summary["notes"] if "object" in note]
+
+
+@pytest.mark.slow
+def test_half_of_the_object_and_the_push_are_left(files: Path) -> None:
+    summary = json.loads((files / "out" / "eliminate" / "summary.json").read_text())
+    (push,) = summary["contacts"]
+    assert push["peak_N"] == pytest.approx(20.0, rel=0.1)
+    # The zero-phase low-pass of 30 Hz spreads it by some 30 ms.
+    assert 1.95 < push["start_s"] < 2.02 and 2.38 < push["stop_s"] < 2.45
+    assert summary["eta"] == 0.5
 
 
 @pytest.mark.slow

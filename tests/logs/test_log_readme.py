@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from pathlib import Path
 from typing import Any
 
 import pytest
+from shown import type_in
 
-from drake_teleop.cli import main
 from drake_teleop.logs.sample import sample_log_command
 
 ROOT = Path(__file__).parents[2]
 
 
-def block(page: str, language: str, start: str) -> str:
+def yaml_block(page: str, start: str) -> str:
     text = (ROOT / page).read_text(encoding="utf-8")
-    (found,) = re.findall(f"```{language}\n({re.escape(start)}.*?)```", text, re.S)
+    (found,) = re.findall(f"```yaml\n({re.escape(start)}.*?)```", text, re.S)
     return found
 
 
@@ -32,12 +31,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("readme")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        for command in block("README.md", "sh", ".venv/bin/drake-teleop sample-log").splitlines():
-            program, *arguments = shlex.split(command)
-            assert program == ".venv/bin/drake-teleop"
-            with pytest.raises(SystemExit) as stop:
-                main(arguments)
-            assert stop.value.code == 0, command
+        type_in("README.md", ".venv/bin/drake-teleop sample-log")
     return folder
 
 
@@ -48,7 +42,7 @@ def here(folder, monkeypatch):
 
 @pytest.mark.slow
 def test_the_description_is_the_one_that_the_docs_show():
-    shown = block("docs/logs.md", "yaml", "# A gripper")
+    shown = yaml_block("docs/logs.md", "# A gripper")
     assert Path("out/sample/free.yaml").read_text() == shown
 
 
@@ -81,6 +75,20 @@ def test_what_is_left_is_the_touches():
         assert contact["push"] == pytest.approx(touch["push"], abs=0.03)
         assert contact["start_s"] == pytest.approx(touch["start_s"], abs=0.015)
         assert contact["stop_s"] == pytest.approx(touch["stop_s"], abs=0.06)
+
+
+@pytest.mark.slow
+def test_it_is_printed_as_a_robot_of_ur_takes_it(capsys):
+    type_in("docs/robot.md", "drake-teleop export")
+    mass, com, inertia = re.findall(
+        r"set_target_payload\((.*?), \[(.*?)\], \[(.*?)\]\)", capsys.readouterr().out
+    )[0]
+    load = contents("out/load/identification.json")
+    assert float(mass) == pytest.approx(load["mass"], rel=1e-5)
+    x, y, z = load["com"]  # turned by 45 degrees and moved along the axis
+    moved = [(x - y) / 2**0.5, (x + y) / 2**0.5, z + 0.045]
+    assert [float(word) for word in com.split(",")] == pytest.approx(moved, abs=1e-6)
+    assert len(inertia.split(",")) == 6
 
 
 @pytest.mark.slow

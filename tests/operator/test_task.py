@@ -186,13 +186,6 @@ def test_weight_that_is_felt_makes_one_slow_and_blunt(touch):
 
 
 @pytest.mark.slow
-def test_the_peg_is_felt_into_the_slot():
-    _, measures = run("insert")
-    assert measures["success"] == 1.0
-    assert measures["false_notices"] == 0
-
-
-@pytest.mark.slow
 def test_who_misses_the_mouth_looks_around():
     """The chamfers reach 4 mm to each side; who sees the mouth farther off lands beside them."""
     task = Insert(translation=[0.0, 0.0085, -0.02], depth=0.04)

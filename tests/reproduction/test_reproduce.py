@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from shown import type_in
 
 from drake_teleop.identification import slave_arm
 from drake_teleop.load.compensation import contact_wrench
@@ -21,7 +22,6 @@ from drake_teleop.reproduction.reproduce import (
     free_figures,
     free_motion,
     raw_excess,
-    reproduce_command,
 )
 from drake_teleop.result import Signal, SimulationResult
 from drake_teleop.run import in_contact
@@ -32,8 +32,13 @@ FORCE_SCALE = 1 / 17.5
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    out = tmp_path_factory.mktemp("reproduce")
-    return reproduce_command(out, quiet=True), out
+    folder = tmp_path_factory.mktemp("reproduce")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        type_in("docs/start.md", ".venv/bin/drake-teleop reproduce")
+    out = folder / "out" / "r"
+    written = (json.loads((out / f"{name}.json").read_text()) for name in ("summary", "session"))
+    return next(written) | next(written), out
 
 
 def log(out, name: str) -> SimulationResult:
@@ -99,7 +104,7 @@ def test_everything_is_as_accepted(run):
 def test_everything_is_written(run):
     summary, out = run
     written = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-    assert written | json.loads((out / "session.json").read_text()) == summary
+    assert written.items() <= summary.items()
     assert "speed" not in written
     for name in ("fig6", "fig7", "fig8"):
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import polars as pl
 import pytest
+from shown import type_in
 
 from drake_teleop.resources import studies_dir
 from drake_teleop.scenario import ScenarioNames
@@ -16,7 +17,6 @@ from drake_teleop.studies.scaling_study import (
     WAYS,
     answer,
     choice_picture,
-    scaling_study_command,
 )
 from drake_teleop.studies.study import LoadStudy
 
@@ -123,7 +123,7 @@ def test_the_answer_of_a_folder(tmp_path, monkeypatch):
 
     def made_up(name, out, *, repeats, **others):
         study = LoadStudy(name)
-        study.repeats = repeats
+        assert repeats is None
         noise, rows = np.random.default_rng(0), study.rows(study.points())
         for row in rows:
             row |= {measure: 1 + noise.random() for measure in study.measures}
@@ -132,11 +132,13 @@ def test_the_answer_of_a_folder(tmp_path, monkeypatch):
         pl.DataFrame(rows).write_parquet(out / "runs.parquet" / "run_00000000.parquet")
 
     monkeypatch.setattr(scaling_study, "study_command", made_up)
-    summary = scaling_study_command(tmp_path, repeats=3)
-    assert summary == json.loads((tmp_path / "answer.json").read_text())
-    assert summary["runs"] == 3 * (5 + 3 * 30 + 5)
+    monkeypatch.chdir(tmp_path)
+    type_in("docs/scaling-study.md", "drake-teleop scaling-study")
+    out = tmp_path / "out" / "scaling-study"
+    summary = json.loads((out / "answer.json").read_text())
+    assert summary["runs"] == 12 * (5 + 3 * 30 + 5)
     assert summary["choice"]["effort"]["sigma"] == 0
     assert summary["choice"]["effort"]["merit"] == pytest.approx(0.5)
     assert [row["eta"] for row in summary["eta"]] == [0, 0.25, 0.5, 0.75, 1]
-    assert pl.read_csv(tmp_path / "answer.csv").height == 4 * 30
-    assert (tmp_path / "answer.png").exists() and (tmp_path / "choice.png").exists()
+    assert pl.read_csv(out / "answer.csv").height == 4 * 30
+    assert (out / "answer.png").exists() and (out / "choice.png").exists()

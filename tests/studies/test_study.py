@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from shown import type_in
 from sockets import THIS_MACHINE, listening
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -105,6 +106,43 @@ def files(tmp_path_factory):
 def serial(files):
     out = files / "serial"
     return study_command(files / "study.yaml", out, jobs=1, quiet=True), out
+
+
+@pytest.fixture
+def two_runs(monkeypatch):
+    """A study has one seed and two points, and this process alone."""
+    load, command = studies.LoadStudy, studies.study_command
+
+    def small(path):
+        study = load(path)
+        first, *others = study.factors
+        factors = [dataclasses.replace(first, values=first.values[:2])]
+        factors += [dataclasses.replace(f, values=f.values[:1]) for f in others]
+        return dataclasses.replace(study, factors=factors, samples=2, repeats=1)
+
+    def alone(*arguments, **options):
+        return command(*arguments, **(options | {"jobs": 1}))
+
+    monkeypatch.setattr(studies, "LoadStudy", small)
+    monkeypatch.setattr(studies, "study_command", alone)
+
+
+@pytest.mark.slow
+def test_what_the_pages_show(two_runs, tmp_path, monkeypatch):
+    """Down to two runs each, they come to their end."""
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "studies.md").read_text(encoding="utf-8")
+    (file,) = re.findall("```yaml\n(scenario: .*?)```", page, re.S)
+    Path("study.yaml").write_text(file)
+    type_in("docs/studies.md", "drake-teleop study")
+    (script,) = re.findall("```python\n(from pathlib.*?)```", page, re.S)
+    names: dict = {}
+    exec(compile(script, "studies.md", "exec"), names)  # and finds that all is done
+    assert names["summary"] == json.loads(Path("out/study/summary.json").read_text())
+    type_in("README.md", ".venv/bin/drake-teleop study")
+    for out in ("study", "touch"):
+        summary = json.loads(Path(f"out/{out}/summary.json").read_text())
+        assert (summary["runs"], summary["failed"]) == (2, 0)
 
 
 def parts(out: Path) -> dict[str, bytes]:

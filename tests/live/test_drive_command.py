@@ -1,0 +1,102 @@
+"""`drake-teleop drive` as the pages have it typed, with a client in the place of the browser."""
+
+from __future__ import annotations
+
+import _thread
+import json
+import re
+import threading
+import time
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from shown import type_in
+from websockets.sync.client import connect
+
+from drake_teleop.live.session import read_drive
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
+    """What the browser does when it is told to open the page, and then Ctrl-C; it keeps frames."""
+    monkeypatch.chdir(tmp_path)
+    for room in ("live.server", "experiment.apparatus"):
+        monkeypatch.setattr(f"drake_teleop.{room}.identified_load", lambda scenario: load)
+    for painted in ("write_replay", "write_picture", "overview"):
+        monkeypatch.setattr(f"drake_teleop.run.{painted}", lambda *_: None)
+
+    def opens(
+        says: str = '{"set": {"z": -3000}}',
+        until: Callable[[dict], bool] = lambda frame: frame["t"] > 0.3,
+        does: Callable[[], None] = lambda: None,
+    ) -> list[dict]:
+        frames: list[dict] = []
+
+        def visit(url: str) -> None:
+            try:
+                address = url.replace("http:", "ws:").replace("/?", "/socket?")
+                with connect(address, origin=url.partition("/?")[0]) as socket:
+                    end = time.monotonic() + 20.0
+                    while time.monotonic() < end and not (frames and until(frames[-1])):
+                        said = json.loads(socket.recv(20.0))
+                        if "frame" in said and not frames:
+                            socket.send(says)
+                            does()
+                        frames.extend([said["frame"]] if "frame" in said else [])
+            finally:
+                _thread.interrupt_main()
+
+        monkeypatch.setattr(
+            webbrowser, "open", lambda url: threading.Thread(target=visit, args=(url,)).start()
+        )
+        return frames
+
+    return opens
+
+
+def log(folder: str) -> list[bytes]:
+    return [part.read_bytes() for part in sorted(Path(folder, "log.parquet").iterdir())]
+
+
+def test_a_drive_is_recorded_and_repeated(page, capsys):
+    frames = page()
+    type_in("docs/live.md", "drake-teleop drive contact_transition --record")
+    assert "repeat it: drake-teleop run --inputs out/drive" in capsys.readouterr().out
+    assert frames[-1]["inputs"]["z"] == -3000
+    type_in("docs/live.md", "drake-teleop run --inputs")
+    assert log("out/again") == log("out/drive")
+    type_in("docs/start.md", ".venv/bin/drake-teleop drive")
+
+
+def test_a_virtual_device_is_the_hand(page, capfd):
+    enough = threading.Event()
+
+    def client() -> None:
+        type_in("docs/live.md", "python -m drake_teleop.live", ctrl_c=enough)
+
+    device = threading.Thread(target=client)
+    places = set()
+
+    def tapped(frame: dict) -> bool:
+        places.add(frame["tool"][2])
+        return len(places) > 100
+
+    page(says="{}", until=tapped, does=device.start)
+    type_in("docs/live.md", "drake-teleop drive contact_transition --device")
+    enough.set()
+    device.join()
+    changes = read_drive(Path("out/drive")).changes
+    assert len({inputs.z for _, inputs in changes}) > 20
+    (figures,) = re.findall(r"^{.*}$", capfd.readouterr().out, re.M)
+    assert json.loads(figures)["largest_force_n"] > 0.0
+
+
+def test_an_experiment_asks_for_consent_first(page, capsys):
+    frames = page('{"go": true}', lambda frame: frame["study"]["phase"] == "task")
+    type_in("docs/experiment.md", "drake-teleop drive --study", status=130)
+    assert [frame["study"]["phase"] for frame in (frames[0], frames[-1])] == ["consent", "task"]
+    assert "written out/experiment/results.csv" in capsys.readouterr().out

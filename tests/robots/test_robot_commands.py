@@ -1,0 +1,137 @@
+"""What docs/robot.md has typed beside a stream on this machine, with a sender that is a thread."""
+
+from __future__ import annotations
+
+import _thread
+import contextlib
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shown import type_in
+from test_calibrate import DT, PHI, recorded
+from test_compensator import OFFSETS, load, resting
+
+from drake_teleop.robots import udp
+from drake_teleop.robots.streams import POSE, WRENCH, Compensated, Part, Reading
+
+pytestmark = pytest.mark.slow
+TOUCH = np.array([5.0, 0.0, -3.0, 0.0, 0.2, 0.0])
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> None:
+    """Where `identify` has been."""
+    monkeypatch.chdir(tmp_path)
+    Path("out/load").mkdir(parents=True)
+    load().save(Path("out/load/identification.json"))
+
+
+class Peer:
+    """Packets for port 49152, one every `each_s`, from when it is listened to.
+
+    With a socket of answers they begin with the first of those, and end with Ctrl-C.
+    A clock that is late for once is late for good, so that the first packet is of no reading.
+    """
+
+    def __init__(
+        self, packets: list[bytes], each_s: float, answers: socket.socket | None = None
+    ) -> None:
+        self.heard: list[Compensated] = []
+        self._packets, self._each_s, self._answers = packets, each_s, answers
+        self._over, self._thread = threading.Event(), threading.Thread(target=self._play)
+
+    def __enter__(self) -> Peer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _play(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not self._over.wait(0.02) and not self._listens(sender):
+                pass
+            due = time.monotonic()
+            with contextlib.suppress(ConnectionRefusedError):  # it is known before all is sent
+                for packet in self._packets:
+                    due += self._each_s
+                    if self._over.wait(max(0.0, due - time.monotonic())):
+                        return
+                    sender.send(packet)
+                    self._hear()
+        if self._answers is not None and not self._over.wait(0.2):
+            self._hear()
+            _thread.interrupt_main()
+
+    def _listens(self, sender: socket.socket) -> bool:
+        try:
+            sender.connect(("127.0.0.1", 49152))
+            sender.send(b"is anybody there?")
+            time.sleep(0.02)
+            sender.send(b"")  # this machine says now that nobody took the first
+        except ConnectionRefusedError:
+            return False
+        self._hear()
+        return self._answers is None or bool(self.heard)
+
+    def _hear(self) -> None:
+        if self._answers is not None:
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    self.heard.append(udp.unpacked_wrench(self._answers.recv(1000)))
+
+
+@pytest.fixture
+def answers() -> Iterator[socket.socket]:
+    """Where the wrenches go."""
+    with udp.listening(udp.THIS_MACHINE, 49153) as there:
+        there.setblocking(False)
+        yield there
+
+
+def touched(count: int) -> list[Reading]:
+    """Untouched at rest, and then touched."""
+    free, pushed = resting(count, OFFSETS), resting(2 * count, OFFSETS + TOUCH)
+    return [row._replace(t=0.001 * row.number) for row in (*free, *pushed[count:])]
+
+
+def test_a_load_is_found_in_a_stream(here) -> None:
+    rows = recorded(40.0, [0, 1, 2])
+    packets = [udp.packed(Reading(k, DT * k, row)) for k, row in enumerate(rows)]
+    with Peer(packets, 0.1 * DT):
+        type_in("docs/robot.md", "drake-teleop calibrate udp")
+    found = json.loads(Path("out/load/identification.json").read_text())
+    summary = json.loads(Path("out/load/summary.json").read_text())
+    assert summary["all_known"] and summary["seconds"] < 40.0
+    assert found["mass"] == pytest.approx(PHI[0], rel=0.005)
+
+
+def test_a_tool_is_taken_out_of_a_stream(here, answers, capfd) -> None:
+    with Peer([udp.packed(row) for row in touched(800)], 0.001, answers) as peer:
+        type_in("docs/robot.md", "drake-teleop compensate udp")
+    assert "tare" in capfd.readouterr().err
+    last = [row for row in peer.heard if not row.flags][-1]
+    assert last.number >= 1599
+    np.testing.assert_allclose(last.contact, TOUCH, atol=0.01)
+
+
+def test_a_tool_is_taken_out_of_a_stream_with_poses(here, answers) -> None:
+    pose = np.array([1.0, 0.0, 0.0, 0.0, 0.4, 0.1, 0.3])
+    packets = [
+        udp.packed_parts(
+            Part(WRENCH, row.number, row.t, -row.values[:6]), Part(POSE, row.number, row.t, pose)
+        )
+        for row in touched(300)
+    ]
+    with Peer(packets, 0.001, answers) as peer:
+        type_in("docs/robot.md", "drake-teleop compensate posed")
+    last = [row for row in peer.heard if not row.flags][-1]
+    assert last.number >= 539
+    np.testing.assert_allclose(last.contact, TOUCH, atol=0.01)

@@ -1,0 +1,98 @@
+"""What the pages tell people to type into a shell, and typing it.
+
+A block of the language `sh` is typed by a test, which calls `type_in` with its page and how it
+begins; `tests/test_shell_blocks.py` finds the blocks that no test types. What a test cannot do is
+said above the block, in a comment of the page, see `Block`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from drake_teleop.cli import main
+
+ROOT = Path(__file__).parents[1]
+PAGES = (
+    *("README.md", "CONTRIBUTING.md", "benchmarks/README.md"),
+    *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").glob("*.md"))),
+)
+_BLOCK = re.compile(r"((?:^<!-- [^\n]* -->\n)*)^```sh\n(.*?)^```$", re.M | re.S)
+
+
+class Block(NamedTuple):
+    """A block of a page.
+
+    Attributes:
+        page, text: where it stands, and what.
+        said: the comments above it: "not run by the tests: " and why, or "run by the tests in
+            small: " and what is less there than for who types it.
+    """
+
+    page: str
+    text: str
+    said: str
+
+    @property
+    def left_out(self) -> str:
+        """Why no test types it; "" if one does."""
+        return "".join(re.findall(r"not run by the tests: (.*) -->", self.said))
+
+    @property
+    def commands(self) -> list[str]:
+        """One a line; the programs of an environment by their names alone."""
+        lines = self.text.replace("\\\n", " ").replace(".venv/bin/", "").splitlines()
+        return [" ".join(line.split()) for line in lines]
+
+
+def shell_blocks() -> list[Block]:
+    """All that there are."""
+    return [
+        Block(page, text, said)
+        for page in PAGES
+        for said, text in _BLOCK.findall((ROOT / page).read_text(encoding="utf-8"))
+    ]
+
+
+def the_block(page: str, start: str) -> Block:
+    """The one of the page that begins so and that a test may type."""
+    (found,) = (b for b in shell_blocks() if b.page == page and b.text.startswith(start))
+    assert not found.left_out
+    return found
+
+
+def type_in(
+    page: str, start: str, *, status: int = 0, ctrl_c: threading.Event | None = None
+) -> None:
+    """Types a block into this folder, line by line; each command ends with that status.
+
+    What is no `drake-teleop` is a process of its own, and gets a Ctrl-C at the event.
+    """
+    for command in the_block(page, start).commands:
+        text, _, file = command.partition(" > ")
+        program, *words = shlex.split(text)
+        with contextlib.ExitStack() as stack:
+            if file:
+                stack.enter_context(
+                    contextlib.redirect_stdout(stack.enter_context(open(file, "w")))
+                )
+            if program == "drake-teleop":
+                with pytest.raises(SystemExit) as stop:
+                    main(words)
+                assert stop.value.code == status, command
+            else:
+                assert program == "python", command
+                with subprocess.Popen([sys.executable, *words]) as process:
+                    if ctrl_c is not None:
+                        ctrl_c.wait(60.0)
+                        process.send_signal(signal.SIGINT)
+                assert process.returncode == status, command
