@@ -4,7 +4,10 @@ A drive, and the network that changes in contact
 
 What `drake-teleop drive` does with a mouse a script does here: the hand goes down onto the leaf and
 presses; at 1.5 s an internet comes between it and the arm, with a method that keeps it passive, and
-nothing steps; at 2.5 s σ goes to 0.5, and half of the tool hangs on the hand.
+nothing steps; at 2.5 s σ goes to 0.5, and half of the tool hangs on the hand. A film of the page:
+
+.. image:: /figures/drive.webp
+   :alt: A drive in the browser: free motion, a press on the leaf, and σ to 1 and back
 """
 
 import matplotlib.pyplot as plt
@@ -21,8 +24,7 @@ internet = {"network": NETWORKS.index("internet"), "method": METHODS.index("ledg
 while session.ms < 3500:
     t = 1e-3 * session.ms
     wanted = {"z": round(-7500 * min(t, 1.0))}  # in steps of 10 um
-    wanted |= internet if t >= 1.5 else {}
-    wanted |= {"sigma": 50} if t >= 2.5 else {}
+    wanted |= (internet if t >= 1.5 else {}) | ({"sigma": 50} if t >= 2.5 else {})
     session.apply(session.inputs.changed(wanted))
     session.advance()  # 5 ms
 log = session.log()

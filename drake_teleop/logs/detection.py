@@ -219,8 +219,9 @@ def _print_detection(summary: dict[str, Any], out: Path) -> None:
         )  # fmt: skip
     if not summary["contacts"]:
         table.add_row("none", *[""] * 4)
+    said = {"raw": "measured", "gravity_only": "without the weight", "eliminated": "contact"}
     shares = ", ".join(
-        f"{name.replace('_', ' ')} {100 * share:.3g}%"
+        f"{said[name]} {100 * share:.2g} %"
         for name, share in summary["above_force_threshold"].items()
         if share is not None
     )
@@ -228,6 +229,6 @@ def _print_detection(summary: dict[str, Any], out: Path) -> None:
         f"above the threshold ({summary['statistic']} {summary['threshold']:.3g})"
         f" {100 * summary['above_threshold']:.2g} % of the time, in contact"
         f" {100 * summary['in_contact']:.2g} %\n"
-        f"with {summary['force_threshold']:.3g} N for all motions: {shares}"
+        f"|F| above {summary['force_threshold']:.3g} N, of the time: {shares}"
     )
     print_results(table, figures, summary, out)
