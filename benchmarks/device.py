@@ -4,7 +4,8 @@
 
 `link_`: a virtual device in a process of its own at 1 kHz over UDP, and here a wall by the same
 handlers as a drive's: time from taking a packet to having sent the force, and at the device how
-late its force is. `silent_`: the force at the device 50 ms after the station falls silent.
+late its force is; Python's garbage waits, as in the server. `silent_`: the force at the device 50
+ms after the station falls silent.
 `leaf_` and `wall_`: the device's client with and without its passivity observer in simulated time,
 at the leaf (291 N/m at the hand) and a wall of 6 kN/m, up to five samples late, and as late as was
 measured just now: least energy of the port [J]; how far the resting hand moves to and fro [m].
@@ -33,6 +34,7 @@ from drake_teleop.live.device_packets import DeviceState, packed_state, unpacked
 from drake_teleop.live.external_master import with_device
 from drake_teleop.live.haply import read_message
 from drake_teleop.live.live import Live
+from drake_teleop.live.pace import without_collections
 from drake_teleop.live.session import Session, live_scenario
 from drake_teleop.live.virtual_device import VirtualDevice, tapping
 from drake_teleop.operator.operator import GRIPS
@@ -248,7 +250,8 @@ def main() -> None:
     parser.add_argument("--drive", action="store_true", help="the whole station too")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    figures, late = linked(options.seconds)
+    with without_collections():  # as in the server
+        figures, late = linked(options.seconds)
     figures |= silent() | passive(late) | fuzzed()
     for grip in GRIPS:
         for observe, word in ((True, "observed"), (False, "bare")):

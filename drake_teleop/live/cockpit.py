@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop._compiled import njit
 from drake_teleop.fault import MEANINGS, Fault
 from drake_teleop.identification import slave_arm
 from drake_teleop.live.inputs import RANGES, Inputs
@@ -23,6 +25,28 @@ _HAND_PULLS = 59.0  # N of the 60 that a hand can
 _SILENT = 0.05  # s
 
 
+@njit(cache=True)
+def _go_on(table, t, states, contact_S, hand_E, twist, before, energy):
+    """Adds the work of some rows to `energy` (2,), as of `Cockpit.frame` [J].
+
+    `before` (4,) is the time and p_WS of the row before them, nan if there is none; then of the
+    last of them.
+    """
+    R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+    for row in range(len(t)):
+        forward_kinematics(table, states[row, : table.shape[0] - 1], R_WS, p_WS)
+        if not math.isnan(before[0]):
+            power = 0.0
+            for i in range(6):
+                power += hand_E[row, i] * twist[row, i]
+            energy[0] += (t[row] - before[0]) * power
+            for i in range(3):
+                for k in range(3):
+                    energy[1] += R_WS[i, k] * contact_S[row, k] * (p_WS[i] - before[1 + i])
+        before[0] = t[row]
+        before[1:] = p_WS
+
+
 class Cockpit:
     """Makes frames for the page out of the rows of the log.
 
@@ -35,7 +59,7 @@ class Cockpit:
         self._peak = scenario.master.device(0.0, 0.0).peak_force
         self._joints = self._arm.num_joints
         self._energy = np.zeros(2)
-        self._before: tuple[float, Array] | None = None
+        self._before = np.full(4, np.nan)  # t, p_WS of the last row
         self._forces = np.zeros((3, 2))
 
     def frame(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
@@ -53,13 +77,22 @@ class Cockpit:
         scale = inputs.scales["force_scale"]
         offset = rows["load_estimate"][:, :3]
         measured = np.linalg.norm(rows["measured_wrench_S"][:, :3] - offset, axis=1)
-        contact_S = rows.get("contact_wrench_S", np.zeros((len(measured), 6)))[:, :3]
-        contact = np.linalg.norm(contact_S, axis=1)
+        contact_S = rows.get("contact_wrench_S", np.zeros((len(measured), 6)))
+        contact = np.linalg.norm(contact_S[:, :3], axis=1)
         felt = np.linalg.norm(rows["force_to_master"][:, :3], axis=1)
         if len(measured):
             curves = np.stack([scale * measured, scale * contact, felt])
             self._forces = np.stack([curves.min(axis=1), curves.max(axis=1)], axis=1)
-            self._add_energy(rows, contact_S)
+            _go_on(
+                self._arm.table,
+                rows["t"],
+                rows["slave_state"],
+                contact_S,
+                rows["hand_wrench_E"],
+                rows["twist_master"],
+                self._before,
+                self._energy,
+            )
         noticed = (
             rows["contact"][:, 0].any() if "contact" in rows else contact.max(initial=0.0) > CONTACT
         )
@@ -69,26 +102,14 @@ class Cockpit:
             "energy": _numbers(self._energy, 5),
             "words": list(self._words(rows, inputs)) if len(measured) else [],
         }
-        if self._before is not None:
+        if not math.isnan(self._before[0]):
             frame |= {
-                "t": round(self._before[0], 3),
-                "tool": _numbers(self._before[1], 5),
+                "t": round(float(self._before[0]), 3),
+                "tool": _numbers(self._before[1:], 5),
             }
         if len(measured):
             frame["stylus"] = _numbers(rows["pose_master"][-1, 4:], 5)
         return frame
-
-    def _add_energy(self, rows: dict[str, Array], contact_S: Array) -> None:
-        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
-        hand = np.einsum("ij,ij->i", rows["hand_wrench_E"], rows["twist_master"])
-        for t, q, f_S, power in zip(
-            rows["t"], rows["slave_state"][:, : self._joints], contact_S, hand, strict=True
-        ):
-            forward_kinematics(self._arm.table, q, R_WS, p_WS)
-            if self._before is not None:
-                moved = p_WS - self._before[1]
-                self._energy += (t - self._before[0]) * power, (R_WS @ f_S) @ moved
-            self._before = (float(t), p_WS.copy())
 
     def _words(self, rows: dict[str, Array], inputs: Inputs) -> list[str]:
         words = []

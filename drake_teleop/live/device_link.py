@@ -6,7 +6,6 @@ repeats an earlier one or was overtaken by a later one changes nothing but a cou
 
 from __future__ import annotations
 
-import contextlib
 import ipaddress
 from collections import deque
 from collections.abc import Mapping
@@ -110,9 +109,11 @@ class DeviceLink:
         """Answers the newest state with the wrench (6,) that the hand shall feel [N, N m]."""
         if self._state is None or self._peer is None:
             return
-        command = ForceCommand(self._state.number, self._state.t, tuple(map(float, wrench)))
-        with contextlib.suppress(OSError):  # what cannot be sent now is too old later
+        command = ForceCommand(self._state.number, self._state.t, tuple(wrench.tolist()))
+        try:
             self._socket.sendto(packed_force(command), self._peer)
+        except OSError:  # what cannot be sent now is too old later
+            return
 
     def begin_anew(self, now: float) -> None:
         """Where the device is next is where the station's device starts."""

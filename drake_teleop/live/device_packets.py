@@ -70,21 +70,26 @@ def unpacked_state(packet: bytes) -> DeviceState | None:
     if len(packet) != _STATE.size or packet[:4] != _FROM_DEVICE:
         return None
     _, flags, number, t, *numbers = _STATE.unpack(packet)
-    return believable(DeviceState(number, t, (0.0, 0.0, 0.0), flags=flags), numbers)
+    return believable(number, t, flags, numbers)
 
 
-def believable(state: DeviceState, numbers: Sequence[float]) -> DeviceState | None:
+def believable(number: int, t: float, flags: int, numbers: Sequence[float]) -> DeviceState | None:
     """The state with position, orientation and `behind` (8), None if no device can be there."""
-    if not (math.isfinite(state.t) and all(map(math.isfinite, numbers))):
+    x, y, z, w, i, j, k, behind = numbers
+    length = math.sqrt(w * w + i * i + j * j + k * k)
+    # So written that what is not a number is refused; infinite is the length of what is.
+    if not (
+        -_FARTHEST <= x <= _FARTHEST
+        and -_FARTHEST <= y <= _FARTHEST
+        and -_FARTHEST <= z <= _FARTHEST
+        and 0.5 < length < 2.0
+        and -1e12 <= t <= 1e12
+        and math.isfinite(behind)
+    ):
         return None
-    x, y, z, *turn, behind = map(float, numbers)
-    length = math.hypot(*turn)
-    if max(abs(x), abs(y), abs(z)) > _FARTHEST or not 0.5 < length < 2.0 or abs(state.t) > 1e12:
-        return None
-    w, i, j, k = (part / length for part in turn)
-    flags = state.flags & CLUTCH_OPEN
+    orientation = (w / length, i / length, j / length, k / length)
     behind = min(max(behind, 0.0), 1.0)
-    return state._replace(position=(x, y, z), orientation=(w, i, j, k), behind=behind, flags=flags)
+    return DeviceState(number, t, (x, y, z), orientation, flags & CLUTCH_OPEN, behind)
 
 
 def packed_force(command: ForceCommand) -> bytes:

@@ -22,7 +22,6 @@ from drake_teleop.live.device_packets import CLUTCH_OPEN, DeviceState, Place, be
 
 _LONGEST, _TIMEOUT = 65536, 0.5  # bytes of a message, s
 _GRIPS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
-_NOWHERE = DeviceState(0, 0.0, (0.0, 0.0, 0.0))
 
 
 class Heard(NamedTuple):
@@ -53,9 +52,8 @@ def read_message(text: Any) -> Heard | None:
         return None
     if not isinstance(name, str):
         return None
-    state = believable(
-        _NOWHERE._replace(flags=CLUTCH_OPEN if pressed else 0), (-y, x, z, w, -j, i, k, 0.0)
-    )
+    flags = CLUTCH_OPEN if pressed else 0
+    state = believable(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
     return None if state is None else Heard(name, state)
 
 

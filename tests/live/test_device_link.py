@@ -82,8 +82,13 @@ def test_messages_that_are_none_change_nothing_but_a_counter(link):
     )
     odd = [b"", b"DTD1", good[:-1], good + b"x", b"DTD2" + good[4:], b"DTF1" + good[4:]]
     for place in range(16, 88, 8):
-        for value in (np.nan, np.inf, -np.inf, 1e308, 1e30):
+        for value in (1e308, 1e30, np.nan, np.inf, -np.inf):
             odd.append(good[:place] + np.array([value], "<f8").tobytes() + good[place + 8 :])
+            # `behind`, the last one, is for a page alone: any number is brought into its range.
+            assert unpacked_state(odd[-1]) is None or (place == 80 and np.isfinite(value))
+    far = DeviceState(1, 0.0, (0.0, 0.0, 0.0), (0.0, 1.8, 0.0, 0.0), 7, 1e9)
+    near = far._replace(orientation=(0.0, 1.0, 0.0, 0.0), flags=CLUTCH_OPEN, behind=1.0)
+    assert unpacked_state(packed_state(far)) == near
     for places, values in zip(
         random.integers(0, 88, (500, 6)), random.integers(0, 256, (500, 6)), strict=True
     ):
