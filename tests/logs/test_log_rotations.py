@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.logs.read.jackknife import solve
-from drake_teleop.logs.read.rotations import rotation_matrices
+from drake_teleop.logs.read.orientations import Orientations
+from drake_teleop.logs.read.rotations import WIDTHS, rotation_matrices
 
 VECTORS = np.vstack([np.zeros((1, 3)), 3 * np.random.default_rng(2).uniform(-1, 1, (50, 3))])
 
@@ -34,3 +37,27 @@ def test_what_leaves_no_residual_at_all_is_solved() -> None:
     noise = np.random.default_rng(3).normal(size=(200, 3))
     x, _ = solve(lambda x: np.hstack([x[:1] - noise, np.full((200, 3), x[1])]), np.ones(2))
     np.testing.assert_allclose(x, [noise.mean(), 0.0], atol=1e-9)  # half leaves nothing
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+@pytest.mark.parametrize("form", WIDTHS)
+def test_some_rows_in_any_form_and_their_inverses(form: str, inverse: bool) -> None:
+    turns = Rotation.from_rotvec(VECTORS[:5])
+    columns = {
+        "matrix": turns.as_matrix().reshape(-1, 9),
+        "quaternion_wxyz": turns.as_quat()[:, [3, 0, 1, 2]],
+        "quaternion_xyzw": turns.as_quat(),
+        "rotation_vector": np.degrees(turns.as_rotvec()),
+    }[form]
+    orientations = Orientations(
+        SimpleNamespace(scale=lambda unit: np.radians(1.0)),
+        SimpleNamespace(columns=[], form=form, unit="deg", inverse=inverse),
+        SimpleNamespace(numbers=lambda *_: columns.copy()),
+        5,
+        "log.yaml:pose.orientation",
+    )
+    rows = np.array([3, 1])
+    wanted = (turns.inv() if inverse else turns).as_matrix()[rows]
+    np.testing.assert_allclose(orientations.rotations(rows), wanted, atol=1e-12)
+    found = orientations.quaternions(rows)
+    np.testing.assert_allclose(rotation_matrices(found, "quaternion_wxyz"), wanted, atol=1e-12)
