@@ -38,6 +38,7 @@ RUNS = {
     ),
     "realistic_sensor": "benchmarks/realistic_sensor.py --json FILE",
     "recovery": "benchmarks/recovery.py --networks 300 --json FILE",
+    "repeated": "benchmarks/repeated.py --json FILE",
     "replayed": "benchmarks/replayed.py --json FILE",
     "reproduce": "drake-teleop reproduce --quiet --out FOLDER",
     "shortest": "benchmarks/shortest.py --json FILE",
@@ -507,6 +508,11 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(LIVE, "A drive is as fast as the clock"),
         *("60 s, sensor at 8 kHz, 60 frames/s", "live.md", "live"),
         *(lambda f: f["factor"], "", 0.999),
+    ),
+    Claim(
+        *(LIVE, "A drive in which everything changes is repeated; numbers that differ"),
+        *("60 s, all inputs, slices of 1, 7, 1000 ms", "live.md", "repeated"),
+        *(lambda f: sum(f[f"differ_{k}_ms"] for k in (1, 7, 1000)), "numbers", 0.0, 0.0),
     ),
     NotShown(
         LIVE, "`compensate` on a robot", "all its sources were tried with recordings and mock peers"

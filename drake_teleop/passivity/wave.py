@@ -254,7 +254,8 @@ def _stand(received, wrench, T, p, memory):
     What comes is not played but made up to what stands: a filter that has been playing the wave of
     `wrench` for long is behind by its time constant of it, and a step more when the next has come:
     a store of half of that lets it. So the line begins with the energy of a contact that stood
-    before there was a line.
+    before there was a line, which nobody has put in: once, f^2 / 4 b for as long as a round trip
+    and both filters take, and no end can get more of it.
     """
     wave, ledger, accounted = memory[_WAVE], memory[LEDGER], memory[RECEIVED]
     played, integral = memory[_PLAYED], memory[_INTEGRAL]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.passivity.memory import FILLS, LIMIT
+from drake_teleop.passivity.memory import FILLS, LEDGER, LIMIT, RECEIVED
 from drake_teleop.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -14,7 +14,7 @@ from drake_teleop.passivity.methods import (
     parameters,
     slave_step,
 )
-from drake_teleop.passivity.packet import INTEGRAL, PACKET_SIZE, POSE
+from drake_teleop.passivity.packet import ENERGY, INTEGRAL, PACKET_SIZE, POSE
 from drake_teleop.passivity.wave import WaveConfig
 
 T, STEPS = 1e-3, 1200
@@ -99,6 +99,50 @@ def test_a_line_that_filled_in_contact_holds_it(delay):
     f, x = line(WaveConfig(), np.zeros(400), lambda u, x: -5.0, delay, delay, fills=2 * delay + 100)
     assert np.abs(x).max() < 1e-12
     np.testing.assert_allclose(f[-200:], -5.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("delay", [1, 40, 300])
+def test_a_line_that_filled_in_contact_gives_out_no_more_than_stood_on_it(delay):
+    """f^2 (T + filter) / 2 b for a round trip of 2 T: to a wall that is matched, and a hand that
+    gives way as fast as takes the most from it."""
+    config, force, begin, steps = WaveConfig(), 5.0, 2 * delay + 100, 3 * delay + 300
+    b = config.impedance[0]
+    given = []
+    for speed in (0.05, 0.2, 0.4):
+        motion = -speed * T * np.maximum(np.arange(begin + steps) - begin + 1, 0)
+        pushes: list[float] = []
+
+        def contact(u, x, pushes=pushes):
+            pushes.append(-force if len(pushes) < begin else -np.sqrt(b / 2.0) * u)
+            return pushes[-1]
+
+        f, x = line(config, motion, contact, delay, delay, fills=begin)
+        work = f * np.diff(motion, prepend=0.0) - np.array(pushes) * np.diff(x, prepend=0.0)
+        given.append(np.cumsum(work).max())
+    stood = force**2 / (2.0 * b) * (delay * T + config.filter)
+    assert 0.3 * stood < max(given) <= stood
+
+
+def test_what_fills_a_line_is_accounted_for_once():
+    """f^2 / 4 b goes back, in store is what the filter lags, and what has come is spent."""
+    config, force, n = WaveConfig(), 5.0, 100
+    p = parameters(PassivityConfig(method="wave", wave=config))
+    start, zero, f_e = (
+        np.array([1.0, 0, 0, 0, 0, 0, 0]),
+        np.zeros(6),
+        np.array([-force, *[0.0] * 5]),
+    )
+    memory, received = initial_memory("wave", p, start), np.zeros(PACKET_SIZE)
+    memory[FILLS], packet, command = (n - 0.5) * T, np.zeros(PACKET_SIZE), np.zeros(13)
+    for k in range(n):
+        received[ENERGY] = 0.01 * k
+        slave_step(
+            WAVE, received, True, start, zero, zero, f_e, T, p, memory, command, packet
+        )  # fmt: skip
+    power = force**2 / (4.0 * config.impedance[0])
+    np.testing.assert_allclose(packet[ENERGY], [n * T * power, 0.0], rtol=1e-9)
+    np.testing.assert_allclose(memory[LEDGER], [(T + config.filter) * power, 0.0], rtol=1e-9)
+    np.testing.assert_allclose(memory[RECEIVED], 0.01 * (n - 1))
 
 
 @pytest.mark.parametrize("missing", [1, 40, 90])
