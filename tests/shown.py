@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,6 +71,26 @@ def the_block(page: str, start: str) -> Block:
     return found
 
 
+def press_ctrl_c() -> None:
+    """In this process, as a terminal does: for the main thread, which it wakes."""
+    main_thread = threading.main_thread().ident
+    assert main_thread is not None
+    signal.pthread_kill(main_thread, signal.SIGINT)
+
+
+@contextlib.contextmanager
+def hearing_ctrl_c() -> Iterator[None]:
+    """A worker of the tests, and what a shell runs in the background, ignore Ctrl-C otherwise."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def type_in(
     page: str, start: str, *, status: int = 0, ctrl_c: threading.Event | None = None
 ) -> None:
@@ -81,6 +102,7 @@ def type_in(
         text, _, file = command.partition(" > ")
         program, *words = shlex.split(text)
         with contextlib.ExitStack() as stack:
+            stack.enter_context(hearing_ctrl_c())
             if file:
                 stack.enter_context(
                     contextlib.redirect_stdout(stack.enter_context(open(file, "w")))

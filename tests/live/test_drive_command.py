@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import json
 import re
 import threading
@@ -12,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from shown import type_in
+from shown import press_ctrl_c, type_in
 from websockets.sync.client import connect
 
 from drake_teleop.live.session import read_drive
@@ -48,7 +47,7 @@ def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
                             does()
                         frames.extend([said["frame"]] if "frame" in said else [])
             finally:
-                _thread.interrupt_main()
+                press_ctrl_c()
 
         monkeypatch.setattr(
             webbrowser, "open", lambda url: threading.Thread(target=visit, args=(url,)).start()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import _thread
 import contextlib
+import fcntl
 import json
+import os
 import socket
 import threading
 import time
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shown import type_in
+from shown import press_ctrl_c, type_in
 from test_calibrate import DT, PHI, recorded
 from test_compensator import OFFSETS, load, resting
 
@@ -25,11 +26,14 @@ TOUCH = np.array([5.0, 0.0, -3.0, 0.0, 0.2, 0.0])
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch) -> None:
-    """Where `identify` has been."""
+def here(tmp_path, monkeypatch) -> Iterator[None]:
+    """Where `identify` has been; one test at a time, since the page's ports are typed."""
     monkeypatch.chdir(tmp_path)
     Path("out/load").mkdir(parents=True)
     load().save(Path("out/load/identification.json"))
+    with Path(os.environ["DRAKE_TELEOP_CACHE_DIR"], "ports").open("w") as ports:
+        fcntl.flock(ports, fcntl.LOCK_EX)
+        yield
 
 
 class Peer:
@@ -68,7 +72,7 @@ class Peer:
                     self._hear()
         if self._answers is not None and not self._over.wait(0.2):
             self._hear()
-            _thread.interrupt_main()
+            press_ctrl_c()
 
     def _listens(self, sender: socket.socket) -> bool:
         try:
@@ -89,7 +93,7 @@ class Peer:
 
 
 @pytest.fixture
-def answers() -> Iterator[socket.socket]:
+def answers(here) -> Iterator[socket.socket]:
     """Where the wrenches go."""
     with udp.listening(udp.THIS_MACHINE, 49153) as there:
         there.setblocking(False)
