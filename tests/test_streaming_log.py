@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from shown import hearing_ctrl_c
 
 from drake_teleop import simulation
 from drake_teleop.errors import DrakeTeleopError
@@ -166,13 +167,14 @@ def start_and(kill: signal.Signals, folder: Path) -> tuple[str, int]:
     (folder / "endless.yaml").write_text(ENDLESS)
     command = "from drake_teleop import cli, simulation; simulation._PART_ROWS = 500; cli.main()"
     arguments = ["run", "endless.yaml", "--out", "out", "--quiet"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", command, *arguments],
-        cwd=folder,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": str(Path(simulation.__file__).parents[1])},
-    )
+    with hearing_ctrl_c():
+        process = subprocess.Popen(
+            [sys.executable, "-c", command, *arguments],
+            cwd=folder,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONPATH": str(Path(simulation.__file__).parents[1])},
+        )
     while process.poll() is None and len(list((folder / "out").glob("log.parquet/*"))) < 3:
         time.sleep(0.02)
     process.send_signal(kill)
