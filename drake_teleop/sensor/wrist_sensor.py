@@ -230,7 +230,7 @@ def sample_step(
     between, between_dot, wrench_W = np.empty(full), np.empty(2 * half), np.empty(6)
     start_dot, end_dot = np.empty(2 * half), now_dot
     joined(state, around, now)
-    put(between, 0, now, 0, full)  # for what is not interpolated: the arm's part of the plant
+    put(between, 2 * half, now, 2 * half, extra)  # for what is not interpolated of it: the arm
     _torque_at(held, 0.0, tau)
     if until_now:
         none, sheet, plant = physics[2][:0], around[:2], around[2:]
