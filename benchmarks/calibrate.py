@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from posed_hand import COLOURS, HZ, NOISE, posed
 from scipy.signal import lfilter
 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -38,10 +39,8 @@ from drake_teleop.robots.streams import Reading
 
 Array = NDArray[np.float64]
 
-HZ, SECONDS = 500.0, 40.0
-NOISE = np.repeat([0.25, 0.012], 3) / np.sqrt(2.0)  # the density of 1 kHz
+SECONDS = 40.0
 MOTION_NOISE = np.repeat([0.05, 0.002, 0.2], 3)
-COLOURS = (0.0, 0.5, 0.9)
 Motion = tuple[Array, Array, Array]
 
 
@@ -155,8 +154,6 @@ def judged(at: Look, tolerance: Tolerance, phi: Array) -> dict[str, Any]:
 
 def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
     """Figures of one motion."""
-    from posed_hand import posed
-
     tolerance, t = read_tolerance(until), np.arange(round(SECONDS * HZ)) / HZ
     motion = excited(t) if name == "excite" else None
     stops: list[dict[str, Any]] = []

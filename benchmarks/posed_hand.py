@@ -8,7 +8,6 @@ sensor is turned and shifted in the frame that is posed.
 from __future__ import annotations
 
 import numpy as np
-from calibrate import COLOURS, HZ, NOISE
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
@@ -20,6 +19,9 @@ from drake_teleop.robots.streams import POSE, WRENCH, Part
 
 Array = NDArray[np.float64]
 
+HZ = 500.0
+NOISE = np.repeat([0.25, 0.012], 3) / np.sqrt(2.0)  # N, N m, of the density of 1 kHz
+COLOURS = (0.0, 0.5, 0.9)
 POSE_HZ, POSE_NOISE = 250.0, np.repeat([1e-4, 2e-4], 3)  # m, rad
 CLOCK_S, STEP_S = 5e3, 1e-5
 UP = np.array([0.0, 0.0, 9.81])
