@@ -88,9 +88,8 @@ class Simulation:
     settle: float = quantity(0.5, "s", 0.0, 60.0, "time before the log starts, at t < 0")
     integrator: str = choice(
         "runge_kutta3",
-        ("runge_kutta3", "radau3", "runge_kutta2", "semi_explicit_euler"),
-        "Drake's name of the integration scheme; radau3, which is implicit, takes half of the time"
-        " where a tool rests on something hard, whose friction is stiff, and more in free motion",
+        ("runge_kutta3", "runge_kutta2", "semi_explicit_euler"),
+        "Drake's name of the integration scheme",
     )
     max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
     accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "of error-controlled integrators")
@@ -105,11 +104,6 @@ class Simulation:
         ("continue", "stop"),
         "after a fault (docs/station.md) the run goes on in its safe state, or ends with an error",
     )
-
-    @property
-    def controls_error(self) -> bool:
-        """Whether the integrator finds its own steps, for `accuracy`."""
-        return self.integrator in ("runge_kutta3", "radau3")
 
 
 @settings
@@ -303,8 +297,8 @@ def _check_task(scenario: Scenario, where: str) -> None:
 
 def _check_steps(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
-    controls = simulation.controls_error
-    if scenario.surroundings is not None and not controls and simulation.max_step > _CONTACT_STEP:
+    controlled = simulation.integrator == "runge_kutta3"
+    if scenario.surroundings is not None and not controlled and simulation.max_step > _CONTACT_STEP:
         raise DrakeTeleopError(
             f"steps of {simulation.max_step:g} s are too long for contact",
             where=f"{where}:simulation.max_step",

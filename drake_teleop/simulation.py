@@ -182,7 +182,7 @@ def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
     diagram.SetRandomContext(context, RandomGenerator(simulation.seed))
     simulator = Simulator(diagram, context)
     ResetIntegratorFromFlags(simulator, simulation.integrator, simulation.max_step)
-    if simulation.controls_error:
+    if simulation.integrator == "runge_kutta3":  # the one with error control
         simulator.get_mutable_integrator().set_target_accuracy(simulation.accuracy)
     return simulator
 

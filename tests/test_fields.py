@@ -103,4 +103,4 @@ def test_help_tells_units_ranges_and_meanings() -> None:
     text = Simulation.__doc__ or ""
     assert text.startswith("How long, and with which integrator.")
     assert "    duration: logged time (0.001 to 36000 s; default 1)" in text.splitlines()
-    assert "(runge_kutta3, radau3," in " ".join(text.split())
+    assert "(runge_kutta3, runge_kutta2," in " ".join(text.split())

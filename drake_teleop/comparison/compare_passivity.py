@@ -183,8 +183,6 @@ def station_run(
     setup, task = delayed_contact(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
     )
-    # A tip that rests on the leaf needs 10,000 to 30,000 explicit steps a second: its friction.
-    setup = replace(setup, simulation__integrator="radau3")
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
         result = simulate(station, setup.simulation, progress=False)
