@@ -71,6 +71,7 @@ def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
             {
                 "sheet_spring": SheetSpring(position=[0.55, 0.0, 0.246]),
                 "rates__hand_hz": 1000.0,
+                "slave__friction": [11.1, 16.7, 7.0, 0.84, 0.84, 0.28],
             },
             1,
         ),

@@ -227,10 +227,11 @@ def measured_figures(
 ) -> dict[str, Any]:
     """What the hand feels in free motion, simulated with all of the sensor's noise.
 
-    The device's Coulomb friction is left out here too: what it does depends on the amplitude.
+    Coulomb friction of device and arm is left out here too: what it does depends on the amplitude.
     """
     frictionless = scenario.master.without_coulomb_friction()
-    smooth = replace(scenario.without_environment(), master=frictionless)
+    free = scenario.without_environment()
+    smooth = replace(free, master=frictionless, slave__friction=[])
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     if scenario.wrist_sensor.ideal:
         estimate[:6] = 0.0

@@ -643,6 +643,7 @@ def _smooth(scenario: Scenario) -> Scenario:
         passivity=PassivityConfig(),
         wrist_sensor=without(scenario.wrist_sensor, *parts),
         master=scenario.master.without_coulomb_friction(),
+        slave__friction=[],
         load_estimator__enabled=False,
         # For an arm that has a closed form, which leads to the same angles and remembers nothing.
         slave__inverse_kinematics=AUTOMATIC,

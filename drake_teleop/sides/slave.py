@@ -26,17 +26,21 @@ from drake_teleop.slave.forward_kinematics import ForwardKinematics
 from drake_teleop.slave.ik_methods import METHODS, method_of
 from drake_teleop.slave.joint_control import MakeJointControl
 from drake_teleop.slave.joint_follower import JointFollower
+from drake_teleop.slave.joint_friction import FRICTION_SPEED
 from drake_teleop.slave.joint_trajectory import JointTrajectory
 from drake_teleop.slave.monitor import SlaveMonitor
 from drake_teleop.slave.moving_pose import MovingPose
 from drake_teleop.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.slave.sampled_servo import SampledServo, samples_within
+from drake_teleop.slave.servo import mass_matrix
 from drake_teleop.slave.tool_contact import ToolContact
 
 Array = NDArray[np.float64]
 
 #: How often the monitor looks [s]; an event at 2 kHz would cost time.
 MONITOR_PERIOD = 0.01
+# See `_check_friction`.
+_LARGEST_FRICTION_STEP = 2.0
 
 
 def MakeSlaveSide(
@@ -197,6 +201,7 @@ def _add_body(
         else MakeJointControl(arm, scenario.joint_control, 1 / rates.joint_control_hz, start),
     )
     held = samples / rates.joint_control_hz
+    _check_friction(slave, min(held, scenario.simulation.max_step))
     torque = control.GetOutputPort("joint_torque")
     builder.Connect(state, control.GetInputPort("slave_state"))
     builder.Connect(torque, plant.get_actuation_input_port(slave.instance))
@@ -263,6 +268,29 @@ def _samples_within(scenario: Scenario, slave: SlavePlant) -> int:
     if contact.beyond or contact.plant_size or interface is not None:
         return 1
     return samples_within(scenario.rates.joint_control_hz, scenario.rates.hand_hz)
+
+
+def _check_friction(slave: SlavePlant, step: float) -> None:
+    """Refuses friction that stops a joint within less than a step [s] of the plant: it would shake.
+
+    A step of Runge and Kutta is stable up to 2.5 for (friction's slope / inertia) * step.
+
+    Raises:
+        DrakeTeleopError: if it does, about where the arm starts.
+    """
+    if not slave.friction.any():
+        return
+    mass = mass_matrix(slave.arm, slave.start)
+    slope = np.diag(slave.friction / FRICTION_SPEED)
+    rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
+    if rate * step > _LARGEST_FRICTION_STEP:
+        shorter = 0.9 * _LARGEST_FRICTION_STEP / rate
+        raise DrakeTeleopError(
+            f"the friction stops a joint within {1e3 / rate:.2g} ms, too fast for steps of "
+            f"{1e3 * step:g} ms",
+            where="slave.friction",
+            remedy=f"choose less, or a simulation.max_step of {shorter:.2g} s",
+        )
 
 
 def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputPort) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop._compiled import njit
+from drake_teleop.slave.joint_friction import dry_friction
 from drake_teleop.vectors import (
     add_into,
     apply,
@@ -35,7 +36,8 @@ from drake_teleop.vectors import (
 Array = NDArray[np.float64]
 
 # Columns of ArmModel.table.
-ROTATION, TRANSLATION, PHI, ROTOR, DAMPING, SLIDES, WIDTH = 0, 9, 12, 22, 23, 25, 26
+ROTATION, TRANSLATION, PHI, ROTOR, DAMPING, FRICTION, SLIDES = 0, 9, 12, 22, 23, 24, 25
+WIDTH = 26
 # In the last row, which has no joint, gravity stands from here on.
 GRAVITY = 22
 
@@ -58,8 +60,9 @@ class ArmModel:
             columns 0-8 rotation from the joint's frame to the previous link's (by rows), 9-11 its
             origin in the previous link's frame [m], 12-21 phi of the link about the origin of L_j
             in L_j (row n: of the load, in S), ordered [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz],
-            22 reflected rotor inertia [kg m^2], 23 damping [N m s/rad], 25 is 1 where the joint
-            slides; in row n columns 22-24 are gravity in the world [m/s^2].
+            22 reflected rotor inertia [kg m^2], 23 damping [N m s/rad], 24 dry friction [N m],
+            which `forward_dynamics` alone knows, 25 is 1 where the joint slides; in row n columns
+            22-24 are gravity in the world [m/s^2].
         lower: (n,) joint limits [rad].
         upper: (n,) joint limits [rad].
         velocity_limit: (n,) [rad/s], inf where the model gives none.
@@ -412,7 +415,8 @@ def forward_dynamics(
     """Accelerations under joint torques and a wrench on what is beyond S.
 
     With rotor inertia, joint damping and gravity, as `inverse_dynamics`, of which it is the
-    inverse: M(q) vdot = tau + J^T F - h(q, v).
+    inverse but for dry friction, which a controller does not know:
+    M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
 
     Args:
         table: `ArmModel.table`.
@@ -440,5 +444,7 @@ def forward_dynamics(
     _to_the_joints(table, link, vdot_out)
     for row in range(n):
         vdot_out[row] = tau[row] - vdot_out[row] - table[row, DAMPING] * v[row]
+        if table[row, FRICTION] != 0.0:
+            vdot_out[row] += dry_friction(table[row, FRICTION], v[row])
     _mass_matrix(table, link, inertia, M)
     solve_spd(M, vdot_out)

@@ -76,7 +76,7 @@ def check_model(root: Element, where: str) -> list[str]:
             ("no inertia of", without),
             ("1 kg, as SDF has it, for", one_kg),
             ("an inertia of rounded numbers made a body's for", rounded),
-            ("no dry friction of", rough),
+            ("not the model's own dry friction of", rough),
         )
         if names
     ]

@@ -18,11 +18,12 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.environment.environment import Environment
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.slave.arm import SLIDES, ArmModel, inverse_dynamics
+from drake_teleop.slave.arm import FRICTION, SLIDES, ArmModel, inverse_dynamics
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.assumed_limits import with_all_limits
 from drake_teleop.slave.forward_kinematics import pose_into
 from drake_teleop.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
+from drake_teleop.slave.joint_friction import AddJointFriction, friction_of_joints
 from drake_teleop.slave.model_check import check_size
 from drake_teleop.slave.models import ParseModel, drakes_errors_said
 from drake_teleop.slave.numeric_inverse_kinematics import find_posture
@@ -83,11 +84,18 @@ class SlavePlant:
     def physics(self) -> tuple[NDArray[np.float64], ...]:
         """For `plant_rates`: the arm's table, phi in it, pairs, leaf, joints; nothing is told.
 
-        A copy, because something may be grasped; the joint control knows nothing of that.
+        A copy, because of what the joint control does not know: something may be grasped, and dry
+        friction.
         """
         carried = self.arm.with_load(self.arm.phi_load)
+        carried.table[:-1, FRICTION] = self.friction
         contact = self.contact.pairs, self.contact.leaf, self.contact.joints
         return carried.table, carried.load, *contact, np.zeros((0, 0))
+
+    @property
+    def friction(self) -> NDArray[np.float64]:
+        """(n,) of the joints, dry [N m]."""
+        return friction_of_joints(self.config.friction, self.arm.joint_names)
 
     @property
     def sheet(self) -> ModelInstanceIndex | None:
@@ -195,6 +203,9 @@ def AddSlavePlant(
     start = start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
         check_strength(arm, start)
+    friction = friction_of_joints(slave.friction, arm.joint_names)
+    if friction.any():
+        AddJointFriction(builder, plant, instance, friction, arm.velocity_index)
     plant.SetDefaultPositions(instance, start)
     X_WS_start = np.empty(7) if slave.home else start_pose(slave)
     if slave.home:

@@ -47,6 +47,11 @@ class Slave:
     home: list[float] = plain(
         [], "joint positions to start at [rad, m]; by default found for position"
     )
+    friction: list[float] = plain(
+        [],
+        "dry friction of the joints [N m, N], one for all or each, which joint control does not"
+        " know; by default none",
+    )
     tool: Tool | None = field(
         default_factory=Tool,
         metadata={"doc": "what hangs on the sensor; null: what the model has beyond its frame"},
@@ -84,6 +89,10 @@ class Slave:
         Raises:
             DrakeTeleopError: for numbers that are none, or a tool that cannot be.
         """
+        if not np.isfinite(self.friction).all() or min(self.friction, default=0.0) < 0.0:
+            raise DrakeTeleopError(
+                "has to be a list of finite numbers from 0 on", where=f"{where}.friction"
+            )
         for name, length in (("home", len(self.home)), ("tip", 3)):
             values = getattr(self, name)
             if values and (len(values) != length or not all(np.isfinite(values))):

@@ -228,7 +228,8 @@ ASSUMED = {
     "a finger": (arm(beyond=FINGER), "held: j9"),
     "a base that floats": (arm(l0=WORLD + joint(1, "floating", "", "world", "l0", "free")),
                            "welded to the world, where it may float: l0"),
-    "dry friction": (arm(j3=joint(3, inside='<dynamics friction="2"/>')), "no dry friction of j3"),
+    "dry friction": (arm(j3=joint(3, inside='<dynamics friction="2"/>')),
+                     "not the model's own dry friction of j3"),
     "four joints": (arm(4).replace('"l4"', '"l6"'), "with 4 joints the tool follows as far as"),
     "nine joints": (arm(9).replace('"l6"', '"x"').replace('"l9"', '"l6"'), "acceleration limits"),
 }  # fmt: skip

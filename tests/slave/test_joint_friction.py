@@ -1,0 +1,131 @@
+"""Dry friction in the arm's joints: the plant has it, the compiled dynamics too, no controller."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.slave.arm import forward_dynamics, inverse_dynamics
+from drake_teleop.slave.joint_friction import FRICTION_SPEED
+from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.slave_config import Slave
+from drake_teleop.station import MakeTeleopStation
+
+FRICTION = [11.1, 16.7, 7.0, 0.84, 0.9, 0.28]  # N m, about 30 N at the tool
+
+
+class Arm:
+    """The plant by itself, with motors that hold a torque."""
+
+    def __init__(self, friction):
+        builder = DiagramBuilder()
+        self.slave = AddSlavePlant(builder, Slave(friction=friction), None)
+        self.plant = self.slave.plant
+        self.simulator = Simulator(builder.Build())
+        self.context = self.plant.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
+        self.simulator.get_mutable_integrator().set_target_accuracy(1e-9)
+
+    def put(self, q, v, torque):
+        self.plant.get_actuation_input_port().FixValue(self.context, torque)
+        self.plant.SetPositionsAndVelocities(self.context, np.concatenate([q, v]))
+
+    def acceleration(self):
+        port = self.plant.get_generalized_acceleration_output_port()
+        return port.Eval(self.context).copy()
+
+    def state(self):
+        return np.split(self.plant.GetPositionsAndVelocities(self.context).copy(), 2)
+
+    def energy(self):
+        kinetic = self.plant.CalcKineticEnergy(self.context)
+        return kinetic + self.plant.CalcPotentialEnergy(self.context)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return Arm(FRICTION)
+
+
+@pytest.mark.parametrize("speed", [0.3 * FRICTION_SPEED, 0.4])
+def test_plant_and_compiled_dynamics_have_it_and_computed_torque_does_not(arm, speed):
+    """What computed torque means to be a motion lacks the friction, of which it is not told."""
+    random, table = np.random.default_rng(3), arm.slave.arm.table
+    torque, compiled = np.empty(6), np.empty(6)
+    for _ in range(10):
+        q = arm.slave.start + 0.3 * random.normal(size=6)
+        v, wanted = speed * random.normal(size=6), random.normal(size=6)
+        inverse_dynamics(table, q, v, wanted, torque)
+        arm.put(q, v, torque)
+        forward_dynamics(arm.slave.physics[0], q, v, torque, np.zeros(6), compiled)
+        found = arm.acceleration()
+        np.testing.assert_allclose(compiled, found, atol=1e-11 * np.abs(found).max())
+        missing = np.empty(6)
+        inverse_dynamics(table, q, v, found, missing)
+        slip = -np.array(FRICTION) * np.tanh(v / 2e-3)
+        np.testing.assert_allclose(missing - torque, slip, atol=1e-10)
+
+
+def test_a_steady_joint_takes_all_of_it_from_the_motor(arm):
+    q, v, torque = arm.slave.start, np.array([0.1, -0.1, 0.1, -0.1, 0.1, -0.1]), np.empty(6)
+    inverse_dynamics(arm.slave.arm.table, q, v, np.zeros(6), torque)
+    arm.put(q, v, torque + np.sign(v) * FRICTION)
+    np.testing.assert_allclose(arm.acceleration(), 0.0, atol=1e-9)
+
+
+def test_less_torque_than_friction_moves_a_joint_by_creeping_alone(arm):
+    weight, share = np.empty(6), np.array([0.5, -0.5, 0.9, 0.2, 0.0, -0.7])
+    still = np.zeros(6)
+    inverse_dynamics(arm.slave.arm.table, arm.slave.start, still, still, weight)
+    arm.put(arm.slave.start, still, weight + share * FRICTION)
+    arm.simulator.get_mutable_context().SetTime(0.0)
+    arm.simulator.Initialize()
+    arm.simulator.AdvanceTo(0.1)
+    q, v = arm.state()
+    # Gravity's torque changes on the way, by N m a rad.
+    np.testing.assert_allclose(v, 2e-3 * np.arctanh(share), atol=3e-5)
+    assert (np.abs(q - arm.slave.start) <= 0.1 * 2e-3 * np.arctanh(np.abs(share)) + 1e-5).all()
+
+
+def test_it_takes_energy_and_never_gives_any(arm):
+    """The arm swings on with no torque but its friction: what is lost is friction's work."""
+    v = np.array([1.0, -0.8, 0.9, -2.0, 1.5, 3.0])
+    arm.put(arm.slave.start, v, np.zeros(6))
+    arm.simulator.get_mutable_context().SetTime(0.0)
+    arm.simulator.Initialize()
+    times = np.arange(1, 101) * 1e-3
+    energies, powers = [arm.energy()], [-np.abs(v) @ FRICTION]
+    for time in times:
+        arm.simulator.AdvanceTo(time)
+        powers.append(-np.array(FRICTION) * np.tanh(arm.state()[1] / 2e-3) @ arm.state()[1])
+        energies.append(arm.energy())
+    assert (np.diff(energies) < 0.0).all()
+    lost = np.trapezoid(powers, dx=1e-3)
+    assert lost < -3.0  # J
+    assert energies[-1] - energies[0] == pytest.approx(lost, rel=1e-3)
+
+
+def test_one_number_is_for_all_and_none_adds_nothing():
+    for friction, expected in (([2.0], 6 * [2.0]), ([], 6 * [0.0])):
+        builder = DiagramBuilder()
+        slave = AddSlavePlant(builder, Slave(friction=friction), None)
+        np.testing.assert_array_equal(slave.physics[0][:-1, 24], expected)
+        assert len(builder.GetSystems()) == (2 if friction else 1)
+
+
+@pytest.mark.parametrize(
+    ("friction", "expected"),
+    [
+        ([1.0, 2.0], "slave.friction: has 2 numbers, the arm has 6 joints"),
+        ([-1.0], "slave.friction: has to be a list of finite numbers from 0 on"),
+        ([float("nan")], "slave.friction: has to be a list"),
+        ([4.0], "slave.friction: the friction stops a joint within 0.0.. ms, too fast for steps"),
+    ],
+)
+def test_what_cannot_be_is_one_line(friction, expected):
+    scenario = replace(
+        LoadScenario("free_motion_force"), slave__friction=friction, force_scaling__sigma=1.0
+    )
+    with pytest.raises(DrakeTeleopError, match=expected):
+        MakeTeleopStation(scenario)
