@@ -92,13 +92,10 @@ class Page:
     def heard(self, event: str, params: Any) -> None:
         """What the browser says unasked."""
 
-    def begin(self, script: str) -> int:
-        return self.send(
-            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
-        )
-
     def run(self, script: str) -> Any:
-        return self.answer(self.begin(script))
+        return self.answer(
+            self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        )
 
     def mouse(self, kind: str, x: int) -> None:
         self.answer(
@@ -146,7 +143,7 @@ def latencies(page: Page, trials: int) -> dict[str, list[float | None]]:
             time.sleep(1.5)
             if kind == "pointer":
                 page.mouse("Pressed", 300)
-            waiting = page.begin("moved()")
+            page.run("window.until = moved(); 1")  # before the input, which is heard out of turn
             sign = 1 - 2 * (trial % 2)
             if kind == "pointer":
                 page.mouse("Moved", 300 + 20 * sign)
@@ -155,7 +152,7 @@ def latencies(page: Page, trials: int) -> dict[str, list[float | None]]:
                 page.send("Input.dispatchKeyEvent", type="keyDown", code=code, key=code[-1])
             else:
                 page.send("Runtime.evaluate", expression=STICK.replace("SIGN", str(sign)))
-            times.append(page.answer(waiting))
+            times.append(page.run("until"))
             page.mouse("Released", 300)
             page.send("Input.dispatchKeyEvent", type="keyUp", code="KeyE", key="E")
             page.send("Input.dispatchKeyEvent", type="keyUp", code="KeyQ", key="Q")

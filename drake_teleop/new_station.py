@@ -19,7 +19,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master.data_sheets import FIGURES, PHANTOM
+from drake_teleop.master.data_sheets import FIGURES, LEADER, PHANTOM
 from drake_teleop.master.phantom import FORCE_LIMIT
 from drake_teleop.run import run_command
 from drake_teleop.scenario import LoadScenario
@@ -128,10 +128,11 @@ def new_command(
         ("sensor", sensor, (None, *PRESETS)),
     ):
         if name not in known:
+            later = "; a leader arm is written into the station afterwards, as master.leader"
             raise DrakeTeleopError(
                 f"{name!r} is none that is known",
                 where=f"--{kind}",
-                remedy=f"one of {', '.join(filter(None, known))}",
+                remedy=f"one of {', '.join(filter(None, known))}{later if name == LEADER else ''}",
             )
     plan = plan_station(arm, sensor_frame, package_paths, tool, device)
     make_folder(folder)

@@ -85,6 +85,7 @@ def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():
     ("options", "says"),
     [
         ({"device": "omega_5"}, r"--device: 'omega_5' is none.*omega_6"),
+        ({"device": "leader"}, r"--device: .leader. is none.*; one of phantom.*master.leader"),
         ({"sensor": "ati"}, r"--sensor: 'ati' is none.*ati_gamma"),
         ({"frame": "wrist"}, "wrist"),
     ],
