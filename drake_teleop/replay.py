@@ -237,12 +237,11 @@ class ReplayScene:
         # The device's base stands along the world's axes here, whatever its alignment in the run.
         alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
         self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
-        kinds = [("measured", "wrist", BLUE)]
-        if "contact_wrench_S" in recorded:
-            kinds.append(("contact", "tip", VERMILION))
+        kinds = (("measured", "wrist", BLUE), ("contact", "tip", VERMILION))
         self._arrows = [
             (force, place, Arrow(meshcat, f"{force}_at_{place}", colour))
             for force, at_slave, colour in kinds
+            if f"{force}_wrench_S" in recorded
             for place in ((at_slave,) if self._master is None else (at_slave, "stylus"))
         ]
 
@@ -261,6 +260,8 @@ class ReplayScene:
             if name in signals:
                 self._move(body, signals[name][sample])
         self._diagram.ForcedPublish(self._root)
+        if not self._arrows:
+            return
         forces, places = self._forces(signals, sample), self._places()
         for force, place, arrow in self._arrows:
             f_W = forces[force]

@@ -49,7 +49,7 @@ class ExperimentDrive(LiveDrive):
     def _make(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> Any:
         def shows(scenario: Scenario) -> Show:
             self._meshcat.Delete()
-            return show_in(self._meshcat, scenario)
+            return show_in(self._meshcat, scenario, forces=False)  # which eyes would tell
 
         link = None if self._device is None else self._device.link
         setup = (self._procedure, self._stations, self._scenarios, self._store, shows)

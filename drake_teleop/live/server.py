@@ -276,10 +276,10 @@ def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
     return Response(status.value, status.phrase, headers, body)
 
 
-def show_in(meshcat: Meshcat, scenario: Scenario) -> Show:
-    """What shows the newest rows of a log in Meshcat, as a film does."""
-    recorded = ("slave_state", "master_state", "measured_wrench_S", "load_estimate")
-    scene = ReplayScene(meshcat, scenario, (*recorded, "contact_wrench_S"))
+def show_in(meshcat: Meshcat, scenario: Scenario, forces: bool = True) -> Show:
+    """What shows the newest rows of a log in Meshcat, as a film does, with or without `forces`."""
+    arrows = ("measured_wrench_S", "contact_wrench_S") if forces else ()
+    scene = ReplayScene(meshcat, scenario, ("slave_state", "master_state", *arrows))
 
     def show(rows: dict[str, np.ndarray]) -> None:
         scene.show(float(rows["t"][-1]), rows, -1)

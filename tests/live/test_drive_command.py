@@ -14,6 +14,7 @@ import pytest
 from shown import press_ctrl_c, type_in
 from websockets.sync.client import connect
 
+from drake_teleop import replay
 from drake_teleop.live.session import read_drive
 
 pytestmark = pytest.mark.slow
@@ -94,7 +95,8 @@ def test_a_virtual_device_is_the_hand(page, capfd):
     assert json.loads(figures)["largest_force_n"] > 0.0
 
 
-def test_an_experiment_asks_for_consent_first(page, capsys):
+def test_an_experiment_asks_for_consent_first_and_shows_no_force(page, capsys, monkeypatch):
+    monkeypatch.setattr(replay, "Arrow", None)  # eyes would tell, were it called
     frames = page('{"go": true}', lambda frame: frame["study"]["phase"] == "task")
     type_in("docs/experiment.md", "drake-teleop drive --study", status=130)
     assert [frame["study"]["phase"] for frame in (frames[0], frames[-1])] == ["consent", "task"]
