@@ -37,6 +37,7 @@ class SheetSpring(Environment):
     youngs_modulus: float = quantity(210e9, "Pa", 1e9, 500e9, "Young's modulus, spring steel")
     density: float = quantity(7850.0, "kg/m^3", 500.0, 20000.0, "density, spring steel")
     damping_ratio: float = quantity(0.03, "1", 0.0, 1.0, "damping ratio of the first mode")
+    slip: float = quantity(1e-4, "m/s", 1e-6, 1.0, "at which friction is complete (E)")
 
     @property
     def stiffness(self) -> float:
@@ -53,11 +54,6 @@ class SheetSpring(Environment):
     def damping(self) -> float:
         """Viscous damping of the mode [N s/m]."""
         return 2 * self.damping_ratio * np.sqrt(self.stiffness * self.effective_mass)
-
-    @property
-    def slip(self) -> float:
-        """At which friction between ball and leaf is complete [m/s] (E)."""
-        return 1e-4
 
     @property
     def largest_small_deflection(self) -> float:

@@ -7,6 +7,7 @@ import json
 import re
 from types import SimpleNamespace
 
+import numpy as np
 import polars as pl
 import pytest
 from shown import type_in
@@ -16,6 +17,7 @@ from drake_teleop.comparison import compare_passivity as study
 from drake_teleop.comparison import delayed_contact
 from drake_teleop.comparison.one_dof import OneDof, Task
 from drake_teleop.comparison.report import COLUMNS, cells
+from drake_teleop.environment.wall import Wall
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identified_load import identified_load
 from drake_teleop.scenario import LoadScenario
@@ -94,7 +96,10 @@ def test_unknown_names_are_one_clear_error(tmp_path, arguments, message):
 def test_the_station_may_be_ones_own(monkeypatch, tmp_path):
     """With its tool and its grip; at the study's rates, and with nothing but the study's leaves."""
     mine = tmp_path / "mine.yaml"
-    mine.write_text("{slave: {payload: {mass: 0.3}}, sheet_spring: {}, contact_detection: {}}")
+    mine.write_text(
+        "{slave: {payload: {mass: 0.3}}, sheet_spring: {}, contact_detection: {},"
+        " simulation: {integrator: runge_kutta2, max_step: 1.0e-4}}"
+    )
     bases = []
     monkeypatch.setattr(study, "identified_load", lambda base, stage: SimpleNamespace(estimate=0))
     monkeypatch.setattr(
@@ -104,6 +109,24 @@ def test_the_station_may_be_ones_own(monkeypatch, tmp_path):
     base = bases[0]
     assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (0.3, 3, study._RATES)
     assert base.surroundings is None and base.contact_detection is None
+    # Its events cut the steps: those that a step of their period leaves over by rounding cost 20 %.
+    assert base.simulation.integrator == "runge_kutta3"
+    assert base.simulation.max_step > 1.5 / base.rates.hand_hz
+
+
+def test_a_tip_rubs_on_the_leaf_as_on_all_other_surroundings(monkeypatch):
+    """A tenth of that slip takes seven times the steps in a hold."""
+    asked = []
+
+    def refuse(scenario, load_estimate):
+        asked.append(scenario)
+        raise DrakeTeleopError("no", where="here", remedy="none")
+
+    monkeypatch.setattr(study, "MakeTeleopStation", refuse)
+    base = study.station_base("contact_transition", 0)
+    row, shown = study.station_run(base, "tdpa", "lan", "stiff contact", np.zeros(16))
+    assert asked[0].sheet_spring.slip == Wall().slip
+    assert (row["stable"], shown) == (False, {}) and "no" in row["error"]
 
 
 def test_presets_reach_around_the_earth_and_to_the_moon():
