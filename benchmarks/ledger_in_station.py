@@ -4,7 +4,8 @@
 (`drake_teleop.comparison.delayed_contact`): 4 networks, 2 leaves, 3 grips, sigma 0 and 1, 48 runs,
 each with the station's noisy sensor and its identified load, or with an ideal sensor and the true
 load (`--ideal`). `--network`, `--leaf`, `--grip`, `--sigma` choose some, `--method` another method.
-Of each, in the last second of the hold and at the end:
+`--friction` is that of the arm's joints at the tool [N], by `--damping` the leaf damps [N s/m]. Of
+each, in the last second of the hold and at the end:
 
 stable    at rest, within 0.5 mm peak to peak, and turning as little
 felt      what the hand feels of the contact, the load's weight taken away, over the scaled
@@ -13,6 +14,8 @@ left      how far the slave is from the hand, 2 s after contact
 energy    the least of hand and actual motion, E_act + E_0, contact and load together, by
           translation and rotation apart
 chatter   standard deviation of the force felt along the vertical
+motors    the least of hand and motors, E_mot + E_0 and the work that friction has taken from them
+friction  that work, as the hand's force counts it
 """
 
 from __future__ import annotations
@@ -27,17 +30,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.comparison.compare_passivity import station_base
 from drake_teleop.comparison.delayed_contact import LEAVES, delayed_contact, station_figures
-from drake_teleop.comparison.one_dof import ACTUAL, HAND
+from drake_teleop.comparison.one_dof import ACTUAL, HAND, MOTOR
 from drake_teleop.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.identification import true_load
 from drake_teleop.identified_load import identified_load
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
-from drake_teleop.scenario import replace
+from drake_teleop.result import SimulationResult
+from drake_teleop.scenario import Scenario, replace
 from drake_teleop.simulation import simulate
+from drake_teleop.slave.arm import jacobian
+from drake_teleop.slave.joint_friction import FRICTION_SPEED
+from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.slave.slave_config import Slave
 from drake_teleop.station import MakeTeleopStation
 
 NETWORKS = ("lan", "internet", "geostationary", "lunar")
@@ -57,6 +67,8 @@ class Cell:
     felt_error: float
     left_m: float
     energy_J: tuple[float, float]
+    motors_J: float
+    friction_J: float
     chatter_N: float
     hunting_m: float
     turning_rad: float
@@ -74,30 +86,61 @@ class Cell:
         return [name for name, well in kept.items() if not well]
 
 
-def cell(
-    network: str, leaf: str, grip: str, sigma: float, method: str, seed: int, ideal: bool
-) -> Cell:
+def friction_at_tool(slave: Slave, force: float) -> list[float]:
+    """(n,) of the joints [N m], in proportion to their motors, that take `force` [N] in all.
+
+    That is at the start, where the tool moves vertically and does not turn.
+    """
+    nominal = NominalSlave(slave)
+    J = np.empty((6, nominal.arm.num_joints))
+    jacobian(nominal.arm.table, nominal.start, J)
+    motors, speeds = nominal.arm.effort_limit, np.abs(np.linalg.pinv(J)[:, 2])
+    return (force / (motors @ speeds) * motors).tolist()
+
+
+def friction_work(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
+    """(N,) that the joints' dry friction has taken up to each row [J], of the slave's own."""
+    v = np.split(result["slave_state"], 2, axis=1)[1]
+    coulomb = np.broadcast_to(scenario.slave.friction or [0.0], v.shape)
+    power = coulomb * np.tanh(v / FRICTION_SPEED) * v
+    return cumulative_trapezoid(power.sum(axis=1), result.t, initial=0.0)
+
+
+def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Namespace) -> Cell:
     """Runs one."""
     base = replace(
-        station_base("contact_transition", seed),
+        station_base("contact_transition", asked.seed),
         operator__grip=grip,
         force_scaling__sigma=sigma,
-        wrist_sensor__ideal=ideal,
+        wrist_sensor__ideal=asked.ideal,
     )
-    estimate = true_load(base) if ideal else identified_load(base, False).estimate
-    passivity = PassivityConfig(method=method)
+    estimate = true_load(base) if asked.ideal else identified_load(base, False).estimate
+    passivity = PassivityConfig(method=asked.method)
     scenario, task = delayed_contact(base, Channel(network=network), passivity, leaf)
+    if asked.friction > 0.0:
+        # Friction stops a joint within 0.4 ms.
+        scenario = replace(
+            scenario,
+            slave__friction=friction_at_tool(base.slave, asked.friction),
+            simulation__max_step=5e-4,
+        )
+    if asked.damping is not None:
+        sheet = scenario.sheet_spring
+        ratio = asked.damping / (2 * np.sqrt(sheet.stiffness * sheet.effective_mass))
+        scenario = replace(scenario, sheet_spring__damping_ratio=float(ratio))
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     began = time.thread_time()
     result = simulate(station, scenario.simulation, progress=False)
     spent = time.thread_time() - began
     found = station_figures(result, scenario, task)
     accounts = station_accounts(result, scenario)
-    inside = accounts[:, HAND] + accounts[:, ACTUAL] + start_energy(scenario)
+    accounts[:, HAND] += start_energy(scenario)
     if sigma > 0.0:
-        inside += load_work(result, scenario)
-    held = (result.t >= task.release - task.judged) & (result.t < task.release)
+        accounts[:, HAND] += load_work(result, scenario)
+    inside, at_motors = (accounts[:, HAND] + accounts[:, place] for place in (ACTUAL, MOTOR))
     scale = scenario.force_scaling.force_scale
+    rubbed = scale * friction_work(result, scenario)
+    held = (result.t >= task.release - task.judged) & (result.t < task.release)
     weight = sigma * scale * float(true_load(scenario)[6]) * 9.81
     contact = scale * float(result["true_contact_wrench_W"][held, 2].mean())
     felt = float(result["force_to_master"][held, 2].mean()) + weight
@@ -110,6 +153,8 @@ def cell(
         felt_error=felt / contact - 1.0,
         left_m=abs(found.drift),
         energy_J=(float(inside[:, 0].min()), float(inside[:, 1].min())),
+        motors_J=float((at_motors.sum(axis=1) + rubbed).min()),
+        friction_J=float(rubbed[-1]),
         chatter_N=found.chatter,
         hunting_m=found.hunting,
         turning_rad=found.turning,
@@ -122,7 +167,8 @@ def print_cell(one: Cell) -> None:
     name = f"{one.network}, {one.leaf}, {one.grip}, sigma {one.sigma:g}"
     print(
         f"{name:<48}{'yes' if one.stable else 'NO':>4}{100 * one.felt_error:8.1f} %"
-        f"{1e3 * one.left_m:8.2f}{one.energy_J[0]:9.4f}{one.energy_J[1]:9.4f}{one.chatter_N:9.4f}"
+        f"{1e3 * one.left_m:8.2f}{one.energy_J[0]:9.4f}{one.energy_J[1]:9.4f}{one.motors_J:9.4f}"
+        f"{one.friction_J:9.4f}{one.chatter_N:9.4f}"
         f"{1e3 * one.hunting_m:9.3f}{np.rad2deg(one.turning_rad):9.3f}{one.cpu_s:7.1f}"
         f"  {' '.join(one.missed())}",
         flush=True,
@@ -140,14 +186,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of sensor and networks")
     parser.add_argument("--method", choices=METHODS, default="ledger")
     parser.add_argument("--ideal", action="store_true", help="an ideal sensor, the true load")
+    parser.add_argument(
+        "--friction", type=float, default=0.0, help="of the joints, at the tool [N]"
+    )
+    parser.add_argument("--damping", type=float, help="of the leaf [N s/m]; by default 3 %%")
     asked = parser.parse_args(arguments)
     print(
-        f"{'':<48}{'rest':>4}{'felt':>10}{'left mm':>8}{'E tr J':>9}{'E rot J':>9}{'chat N':>9}"
+        f"{'':<48}{'rest':>4}{'felt':>10}{'left mm':>8}{'E tr J':>9}{'E rot J':>9}{'motors J':>9}"
+        f"{'fric. J':>9}{'chat N':>9}"
         f"{'hunt mm':>9}{'turn deg':>9}{'CPU s':>7}  missed"
     )
     cells = []
     for case in itertools.product(asked.network, asked.leaf, asked.grip, asked.sigma):
-        cells.append(cell(*case, asked.method, asked.seed, asked.ideal))
+        cells.append(cell(*case, asked))
         print_cell(cells[-1])
     missed = {name: 0 for name in ("stable", "felt", "left", "energy", "chatter")}
     for one in cells:

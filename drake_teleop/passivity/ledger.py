@@ -55,8 +55,9 @@ At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
 
         h' = -k_h v_m + (w - w_n n - h) / tau,    |h| <= h_m u_n / w_n,
 
-    at rest what is measured too; k_h = 2.5 kN/m, h_m is the largest |w - w_n n| of about a second
-    or of tau, tau thirty round trips, but 0.6 s at least: friction that fades while the hand rests
+    at rest what is measured too; as n turns, what comes to lie along it is dropped. k_h is
+    2.5 kN/m, h_m the largest |w - w_n n| of about a second or of tau, tau thirty round trips,
+    but 0.6 s at least: friction that fades while the hand rests
     lets it move, and a round trip later the tip slips. Both means are so slow because what they
     pass on of the slave's friction, a round trip late, moves the hand, and that turns the friction
     round: with 0.8 s and ten round trips the tip stuck and slipped on for good over 100 ms. Of w_n,
@@ -351,7 +352,10 @@ def _predict(received, dx, T, p, memory, ahead, wrench):
     pressed = min(max(force, 0.0) / max(size, 1e-12), 1.0)
     for g in range(2):
         _rub(g, T, size, pressed, shown, received, dx, p, memory)
+    # As n turns, some of what was across it comes to lie along it, where `force` is all there is.
+    within = along(memory[_RUBBING], normal, p)
     for i in range(6):
+        memory[_RUBBING][i] -= within * normal[i]
         wrench[i] = force * normal[i] + memory[_RUBBING][i]
     if k > _SOFTEST:
         memory[_WALL], memory[_DEPTH] = k, deep

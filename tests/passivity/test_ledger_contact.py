@@ -111,6 +111,21 @@ def test_friction_does_not_fade_under_a_hand_that_rests():
     assert hand.rest(1500)[1] == pytest.approx(held, rel=0.2)
 
 
+@pytest.mark.parametrize("way", [1e-3, -1e-3])
+def test_friction_stays_across_a_direction_that_turns(way):
+    """An arm that rubs presses aslant at first. What was shown of friction then was 0.2 N along."""
+    hand = Hand(np.array([0.0, -1.2, 3.0, 0.0, 0.0, 0.0]), 200.0)
+    hand.packet[TRIP] = 0.6
+    hand.rest(1500)
+    hand.packet[WRENCH][1] = 0.0
+    for _ in range(20):
+        hand.step([0.0, 0.0, way / 20, 0.0, 0.0, 0.0])
+    hand.packet[POSE] = hand.pose
+    felt = hand.rest(9000)
+    assert felt[2] == pytest.approx(3.0, abs=0.03)
+    assert abs(felt[1]) > 0.4, "friction is still shown"
+
+
 def test_a_tip_that_sticks_and_slips_does_not_drive_the_hand():
     """Three times a second to and fro on what is touched, as before a stiff leaf over `internet`.
 
