@@ -27,6 +27,10 @@ RUNS = {
     "intervals": "benchmarks/intervals.py --json FILE",
     "inverse_kinematics": "benchmarks/inverse_kinematics.py --json FILE",
     "ledger_in_station": "benchmarks/ledger_in_station.py --json FILE",
+    "ledger_with_friction": (
+        "benchmarks/ledger_in_station.py --grip medium --sigma 0 --friction 30 --damping 300"
+        " --json FILE"
+    ),
     "live": "benchmarks/live.py --json FILE",
     "load_change": "benchmarks/load_change.py --json FILE",
     "mujoco_wrench": "benchmarks/mujoco_wrench.py --json FILE",
@@ -338,6 +342,11 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(NETWORK, "and creates no energy at hand and actual motion"),
         *("least of translation and rotation, the same runs", "delay.md", "ledger_in_station"),
         *(lambda f: min(min(row["energy_J"]) for row in f["rows"]), "J", -1e-6),
+    ),
+    Claim(
+        *(NETWORK, "An arm that rubs and a leaf that damps break none of its promises"),
+        *("30 N at the tool, 300 N s/m; medium grip, σ = 0", "delay.md", "ledger_with_friction"),
+        *(lambda f: f["cells"] - sum(f["missed"].values()), "of 8", 8.0),
     ),
     NotShown(
         NETWORK, "That a person feels any of it", "no person has tried it; the hand is simulated"
