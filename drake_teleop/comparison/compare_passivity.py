@@ -13,8 +13,9 @@ decision  list: method, network, verdict (`decision`); felt_N, and pressed_N tha
           before each leaf; leaked_J: all of it null or empty if unstable
 station   list of runs: method, network, leaf, and the figures of `one_dof.Figures`, the energy
           between hand and actual motion; pressed_force: what should be felt [N]; felt_share of it;
-          left_behind [m]; leaked [J], these three never negative; `error` says why a run ended
-          early (its other figures are then null)
+          left_behind [m]; leaked [J], these three never negative. A run that is not at rest in its
+          hold ends there (left_behind and drift are null); `error` says why one ended earlier (its
+          other figures are then null)
 hands     list: method, network, and the figures of `hands.Hands`
 one_dof   list: method, wall_N_per_m, jitter, loss, longest_s: the longest round trip of the grid up
           to which every one was stable (0: none was), and grid_s, the round trips tried
@@ -34,6 +35,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.framework import Diagram
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.channel.network import PRESETS, NetworkConfig
@@ -46,13 +48,14 @@ from drake_teleop.comparison.delayed_contact import (
     vertical_traces,
 )
 from drake_teleop.comparison.hands import hands
-from drake_teleop.comparison.one_dof import ACTUAL, Figures, OneDof, figures, run_one_dof
+from drake_teleop.comparison.one_dof import ACTUAL, Figures, OneDof, Task, figures, run_one_dof
 from drake_teleop.errors import DrakeTeleopError, meant
 from drake_teleop.identified_load import identified_load
 from drake_teleop.pages.progress import Stage, show_progress
 from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Rates, Scenario, Simulation, replace
-from drake_teleop.simulation import simulate
+from drake_teleop.simulation import MakeSimulator, advance, read_log
 from drake_teleop.station import MakeTeleopStation
 from drake_teleop.writing import make_folder, output_folder, write_json, write_table
 
@@ -192,10 +195,10 @@ def station_run(
     setup = replace(setup, sheet_spring__slip=_SLIP)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
-        result = simulate(station, setup.simulation, progress=False)
+        result, found = _as_far_as_it_holds(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
-    found, shown = station_figures(result, setup, task), vertical_traces(result, setup)
+    shown = vertical_traces(result, setup)
     held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
     own = {
         "pressed_force": abs(float(shown["pressed"][held].mean())),
@@ -204,6 +207,24 @@ def station_run(
         "leaked": max(-found.least_energy, 0.0),
     }
     return row | _plain(dataclasses.asdict(found) | own) | {"error": None}, shown
+
+
+def _as_far_as_it_holds(
+    station: Diagram, scenario: Scenario, task: Task
+) -> tuple[SimulationResult, Figures]:
+    """The run and its figures; to the end of the hold alone if it is not at rest there."""
+    settle = scenario.simulation.settle
+    simulator = MakeSimulator(station, scenario.simulation)
+    simulator.Initialize()
+    hold = dataclasses.replace(task, end=task.release)
+    for part in (hold, task):
+        advance(simulator, 1e-3 * round(1e3 * (settle + part.end)))  # to the event's own instant
+        result = read_log(simulator, settle)
+        found = station_figures(result, scenario, part)
+        if not found.stable:
+            break
+    # After a hold that is not at rest nobody looks what is left behind.
+    return result, found if part is task else dataclasses.replace(found, drift=float("nan"))
 
 
 def _one_dof_study(

@@ -52,9 +52,12 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
         assert row["error"] is None
         assert row["felt_share"] == pytest.approx(1.0, abs=0.01)
         assert row["felt_force"] == pytest.approx(row["pressed_force"], rel=0.01)
-        assert 0.0 <= row["left_behind"] == abs(row["drift"]) < 0.5e-3
         assert row["rise_delay"] is None or row["rise_delay"] >= 0.0
         assert row["leaked"] == max(-row["least_energy"], 0.0)
+    assert 0.0 <= runs["tdpa"]["left_behind"] == abs(runs["tdpa"]["drift"]) < 0.5e-3
+    # What is not at rest in its hold ends there.
+    assert runs["none"]["left_behind"] is None is runs["none"]["drift"]
+    assert cells(runs["none"])[[key for key, *_ in COLUMNS].index("left_behind")] == "–"
     assert runs["none"]["leaked"] > 0.3 > 100 * runs["tdpa"]["leaked"]
     # The press alone leaks nothing worth the word; taps do.
     assert [cell["verdict"] for cell in summary["decision"]] == ["unstable", "leaks"]
