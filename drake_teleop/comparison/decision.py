@@ -16,6 +16,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from drake_teleop.comparison.one_dof import TIP
+
 UNSTABLE, BEHIND, LEAKS, HOLDS = "unstable", "left behind", "leaks", "holds"
 FAR, LEAST = 5e-3, 1e-3  #: m; J
 
@@ -28,11 +30,13 @@ class Cell:
         verdict: one of the four words.
         forces: for each leaf, on average while holding it: on the hand, and the scaled force of the
             contact [N]; none if unstable.
+        unrest: for each leaf, in words, how the hold is not at rest; none if it is before all.
         leaked: the most that came out in any run [J]; None if unstable.
     """
 
     verdict: str
     forces: tuple[tuple[float, float], ...] = ()
+    unrest: tuple[str, ...] = ()
     leaked: float | None = None
 
     @property
@@ -41,7 +45,7 @@ class Cell:
         if self.verdict != LEAKS or self.leaked is None:
             return self.verdict
         number, unit = (1e3 * self.leaked, "mJ") if self.leaked < 1.0 else (self.leaked, "J")
-        return f"leaks {float(f'{number:.2g}'):g} {unit}"
+        return f"leaks {_two_digits(number)} {unit}"
 
     @property
     def share(self) -> str:
@@ -68,9 +72,24 @@ def decide(summary: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
 def _cell(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> Cell:
     """Of the runs of the station before its leaves."""
     if not all(run["stable"] for run in runs):
-        return Cell(UNSTABLE)
+        return Cell(UNSTABLE, unrest=tuple(map(_unrest, runs)))
     leaked = max(leaked_by_hands, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > FAR:
-        return Cell(BEHIND, forces, leaked)
-    return Cell(LEAKS if leaked > LEAST else HOLDS, forces, leaked)
+        return Cell(BEHIND, forces, leaked=leaked)
+    return Cell(LEAKS if leaked > LEAST else HOLDS, forces, leaked=leaked)
+
+
+def _unrest(run: Mapping[str, Any]) -> str:
+    """How a run is not at rest in its hold: by what is larger at the tool's tip."""
+    if run["stable"]:
+        return "at rest"
+    if run["hunting"] is None:
+        return "ended early"
+    if TIP * run["turning"] > run["hunting"]:
+        return f"turns by {_two_digits(1e3 * run['turning'])} mrad"
+    return f"moves by {_two_digits(1e3 * run['hunting'])} mm"
+
+
+def _two_digits(number: float) -> str:
+    return f"{float(f'{number:.2g}'):g}"

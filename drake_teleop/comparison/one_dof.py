@@ -54,7 +54,8 @@ _FRICTION_SPEED = 5e-3  # m/s, below it the device's Coulomb friction fades
 _SLAVES_FRICTION_SPEED = 1e-3  # m/s, likewise of the slave
 HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: of the accounts
 
-_QUIET, _TIP = 0.5e-3, 0.2  # m, peak to peak at rest; from the wrist to the tool's tip
+_QUIET = 0.5e-3  # m, peak to peak at rest
+TIP = 0.2  #: m, from the wrist to the tool's tip
 _FREE, _DEPTH = -0.04, 0.02  # m, from the wall: where the operator rests, and how deep he presses
 
 
@@ -317,7 +318,7 @@ def figures_of(
     after = min(round((task.released + 2.0) / dt), len(t) - 1)
     start = round(task.press / dt)
     return Figures(
-        stable=bool(hunting < _QUIET and turning < _QUIET / _TIP),
+        stable=bool(hunting < _QUIET and turning < _QUIET / TIP),
         hunting=hunting,
         turning=turning,
         felt_force=abs(steady),

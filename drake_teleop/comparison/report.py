@@ -88,6 +88,7 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
             mark, colour, ink = VERDICTS[cell.verdict]
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
             lines = [f"feels {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.forces]
+            lines += cell.unrest
             up = 0.12 * len(lines)
             axes.text(
                 x, y - up, f"{mark} {cell.words}", color=ink, size=9.5, weight="bold", **_MIDDLE

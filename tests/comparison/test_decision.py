@@ -13,6 +13,7 @@ def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, objec
     """One method over one network before two leaves, good but for what is said of the second."""
     good = {"method": "tdpa", "network": "lan", "stable": True, "felt_force": 3.9}
     good |= {"pressed_force": 4.0, "left_behind": 1e-3, "leaked": 0.0}
+    good |= {"hunting": 1e-5, "turning": 1e-4}
     return {
         "methods": ["tdpa"],
         "networks": ["lan"],
@@ -33,7 +34,8 @@ def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, objec
         ({"stable": False, "left_behind": 1.0, "leaked": 1.0}, "unstable", ""),
         # A run that ended early.
         (
-            {"stable": False, "felt_force": None, "left_behind": None, "leaked": None},
+            {"stable": False, "felt_force": None, "left_behind": None, "leaked": None}
+            | {"hunting": None, "turning": None},
             "unstable",
             "",
         ),
@@ -44,7 +46,20 @@ def test_a_cell_says_the_first_that_is_so(changes, words, share):
     assert (cell.words, cell.share) == (words, share)
     (axes,) = draw_decision(summary(**changes)).axes
     written = [text.get_text() for text in axes.texts]
-    assert words in written[0] and len(written) == (3 if share else 1)
+    assert words in written[0] and len(written) == 3
+
+
+@pytest.mark.parametrize(
+    ("figures", "words"),
+    [
+        ({"hunting": 0.0517, "turning": 0.1}, "moves by 52 mm"),
+        ({"hunting": 1e-5, "turning": 0.1083}, "turns by 110 mrad"),
+        ({"hunting": None, "turning": None}, "ended early"),
+    ],
+)
+def test_what_is_unstable_says_before_which_leaf_and_how(figures, words):
+    (axes,) = draw_decision(summary(stable=False, **figures)).axes
+    assert [text.get_text() for text in axes.texts][1:] == ["at rest", words]
 
 
 def test_a_hand_that_lets_go_is_thrown_without_a_method_and_taps_are_felt():
