@@ -171,7 +171,7 @@ def test_a_load_is_known_by_a_box_and_the_arms_joints(
             there = f"netft://127.0.0.1:{port}?counts=100000,100000&rate=500"
             source = [there, "--motion", *source]
         command = ["calibrate", *source, "--model", str(model), "--sensor-frame", "tool"]
-        command += ["--until", "mass 2 %, com 2 mm", "--seconds", "15", "--out", str(tmp_path)]
+        command += ["--until", "mass 2 %, com 2 mm", "--seconds", "28", "--out", str(tmp_path)]
         known = CliRunner().invoke(cli, command, standalone_mode=False)
     assert known.return_value == 0, known.output
     asked = read_tolerance("mass 2 %, com 2 mm")
