@@ -45,7 +45,7 @@ from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import jacobian
-from drake_teleop.slave.joint_friction import FRICTION_SPEED
+from drake_teleop.slave.joint_friction import dry_friction
 from drake_teleop.slave.plant import NominalSlave
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.station import MakeTeleopStation
@@ -102,8 +102,8 @@ def friction_work(result: SimulationResult, scenario: Scenario) -> NDArray[np.fl
     """(N,) that the joints' dry friction has taken up to each row [J], of the slave's own."""
     v = np.split(result["slave_state"], 2, axis=1)[1]
     coulomb = np.broadcast_to(scenario.slave.friction or [0.0], v.shape)
-    power = coulomb * np.tanh(v / FRICTION_SPEED) * v
-    return cumulative_trapezoid(power.sum(axis=1), result.t, initial=0.0)
+    power = -(dry_friction(coulomb, v) * v).sum(axis=1)
+    return cumulative_trapezoid(power, result.t, initial=0.0)
 
 
 def cell(network: str, leaf: str, grip: str, sigma: float, asked: argparse.Namespace) -> Cell:
