@@ -27,8 +27,8 @@ m, K, D mass and servo as they are believed, all in the master's power units:
     the wall what was paid since the onset, Q, and c F_u^2 / 2 k that nobody paid. With A at its end
     they brake. Standing still may always hold. It is done through the command, x + (f + D v) / K.
 :S6: Sent: w, L_s, z and z' = the servo's model of the received pose, k_c = rho k / (1 + k / K)
-    along n, b, R; and l, smoothed over R and the servo's lag: inertia that is felt late drives
-    a hand.
+    along n, or 0 once it was the wall that went, see M3; b, R; and l, smoothed over R and the
+    servo's lag: inertia that is felt late drives a hand.
 """
 
 from __future__ import annotations
@@ -94,6 +94,7 @@ _STRETCH, _LONG = 2e-4, 2e-3  # m, way for a stiffness; likewise in fast motion
 _LEARN, _KNOWN = 1e-3, 1e-2  # m, way that a stiffness is the mean of at least, and at most
 _SLOW = 0.15  # m/s; an impact's wrench says less of the stiffness
 _SMOOTH = 0.02  # s, of the wall's place and of rho
+_FALLS = 0.3  # N, felt: from this on, what ends within a step may be a wall that goes
 _SURE = 0.1  # of rho, by which it is not changed: it moves the slave, which changes k
 _DIRECTION = 3.0  # s, of the contact's direction at least: a tip that sticks and slips turns it
 _TILTED, _RUBBED = 0.6, 1.0  # s, in which friction's step along n is shown; of the largest one
@@ -305,10 +306,12 @@ def _shown_at_most(received, T, p, memory):
 @njit(cache=True)
 def _learn(received, touched, dx, wrench, T, p, memory):
     """S3 but for the target: direction, stiffness, damping, share, how deep the slave is."""
+    normal, k, velocity = memory[NORMAL], memory[_STIFFNESS], memory[VELOCITY_HERE]
     if not touched:
+        if memory[TOUCHED] > 0.0 and _goes(dx, memory):
+            memory[_SHARE] = 0.0
         memory[TOUCHED] = memory[_SMOOTHED] = memory[_ACROSS] = 0.0
         return
-    normal, k, velocity = memory[NORMAL], memory[_STIFFNESS], memory[VELOCITY_HERE]
     size = find_direction(wrench, memory[_ROUND_TRIP], T, p, memory)
     most = _shown_at_most(received, T, p, memory)
     turned = _turns(wrench, size, T, p, memory)
@@ -351,6 +354,15 @@ def _learn(received, touched, dx, wrench, T, p, memory):
     rate = T / _TILTED + abs(inward) / _LEARN
     memory[_PUSH] = steadied(memory[_PUSH], size, explained, rate, turned)
     memory[_BEFORE] = speed
+
+
+@njit(cache=True)
+def _goes(dx, memory):
+    """Whether it is the wall that goes, not the slave, of a contact that ends with the way dx."""
+    normal = memory[NORMAL]
+    faster = over_way(normal, memory[VELOCITY_HERE]) + memory[_BEFORE]
+    explained = abs(memory[_STIFFNESS] * over_way(normal, dx)) + abs(memory[_DAMPER] * faster)
+    return memory[_PUSH] > max(_FALLS, 2.0 * explained)
 
 
 @njit(cache=True)
