@@ -67,7 +67,8 @@ POSE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 # What `_run` finds for each group: least energy at either pair, how much stronger than f_e the hand
 # felt it, least energy in the tank of an end.
 BACKWARD, TRUE, STRONGER, TANK, FIGURES = range(5)
-WAVE_HOLD = -1
+WAVE_HOLD = "wave_hold"  # written here, no method of the package
+_OWN_STEPS = (0, 0, 0)
 _STEP = own_memory().vector(6)
 # These run over every network, the rest over every tenth: what has no bound is found out sooner,
 # and `charged_tdpa` has the ledger of `tdpa`.
@@ -131,7 +132,7 @@ def _size(a, g):
 
 
 @njit
-def _run(method, at_motor, p, memories, newest, motion, poses, wrenches, T, sent, figures):
+def _run(steps, at_motor, p, memories, newest, motion, poses, wrenches, T, sent, figures):
     """Least energies of one method over one network; `figures` (2, FIGURES) is written.
 
     `motion` (2, N, 6) and `poses` (2, N, 7) are those of both ends, `wrenches` (N, 6) are the
@@ -154,11 +155,11 @@ def _run(method, at_motor, p, memories, newest, motion, poses, wrenches, T, sent
             received = nothing if now < 0 else sent[1 - end, now % slots]
             fresh = now >= 0 and (k == 0 or now != newest[1 - end, k - 1])
             if end == 0:
-                _master(method, received, fresh, poses[0, k], twists[0], motion[0, k], hand,
+                _master(steps, received, fresh, poses[0, k], twists[0], motion[0, k], hand,
                         p[LIMIT], T, p, memories[0], wrench, sent[0, k % slots])  # fmt: skip
                 felt[:] = received[WRENCH]
             else:
-                _slave(method, received, fresh, poses[1, k], twists[1], motion[1, k], f_e, T, p,
+                _slave(steps, received, fresh, poses[1, k], twists[1], motion[1, k], f_e, T, p,
                        memories[1], command, sent[1, k % slots])  # fmt: skip
         for g in range(2):
             work[0, g] += dot(before, motion[0, k], g)
@@ -189,10 +190,10 @@ def _run(method, at_motor, p, memories, newest, motion, poses, wrenches, T, sent
 
 
 @njit
-def _master(method, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    if method != WAVE_HOLD:
+def _master(steps, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
+    if steps != _OWN_STEPS:
         methods.master_step(
-            method, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
+            steps, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         return
     for i in range(6):
@@ -206,10 +207,10 @@ def _master(method, received, fresh, pose, twist, dx, hand, limits, T, p, memory
 
 
 @njit
-def _slave(method, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    if method != WAVE_HOLD:
+def _slave(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
+    if steps != _OWN_STEPS:
         methods.slave_step(
-            method, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
+            steps, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
         return
     step = memory[_STEP]
@@ -221,7 +222,7 @@ def _slave(method, received, fresh, pose, twist, dx, wrench, T, p, memory, comma
     command[:] = memory[COMMAND]
 
 
-def cases() -> dict[str, tuple[int, Array]]:
+def cases() -> dict[str, tuple[str, Array]]:
     """Name -> (method, its parameters with a device that does not saturate)."""
     # A soft servo, no damper that fills the tanks and no limit but theirs: energy is short.
     soft: dict[str, Any] = {
@@ -231,9 +232,9 @@ def cases() -> dict[str, tuple[int, Array]]:
     }
     found = {}
     for name in METHODS:
-        found[name] = METHODS.index(name), parameters(PassivityConfig(method=name, **soft))
+        found[name] = name, parameters(PassivityConfig(method=name, **soft))
     tank = PassivityConfig(method="two_layer", **soft)
-    found["two_layer_no_margin"] = METHODS.index("two_layer"), parameters(tank)
+    found["two_layer_no_margin"] = "two_layer", parameters(tank)
     found["two_layer_no_margin"][1][two_layer.ACCELERATION] = 0.0
     found["wave_hold"] = WAVE_HOLD, parameters(PassivityConfig(method="wave"))
     return found
@@ -285,13 +286,15 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
             p = p.copy()
             if saturates:
                 p[LIMIT] = 0.5, 0.01
-            at_motor = METHODS[method] in AT_THE_MOTOR and method != WAVE_HOLD
-            start = initial_memory("none" if method == WAVE_HOLD else METHODS[method], p, POSE)
+            own = method == WAVE_HOLD
+            steps_of = _OWN_STEPS if own else methods.steps_of(method)
+            start = initial_memory("none" if own else method, p, POSE)
             initial = start[LEDGER]
             memories = np.stack([start, start])
             began = time.thread_time()
             _run(
-                method, at_motor, p, memories, newest, motion, poses, wrench, PERIOD, sent, figures
+                steps_of, method in AT_THE_MOTOR, p, memories, newest, motion, poses, wrench,
+                PERIOD, sent, figures,
             )  # fmt: skip
             seconds[name] += time.thread_time() - began
             figures[:, STRONGER] *= -1.0

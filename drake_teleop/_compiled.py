@@ -32,9 +32,11 @@ from uuid import uuid4
 
 import numba
 import numpy as np
+from numba.core import cgutils, types
 from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
+from numba.extending import intrinsic
 
 _PLAIN = (int, float, complex, str, bytes, slice, type(None), type(...), np.dtype, np.generic)
 
@@ -51,6 +53,46 @@ def njit(**options: Any) -> Callable[[Any], Any]:
         return dispatcher
 
     return compiled
+
+
+def call_at(arguments: tuple[types.Type, ...]) -> Any:
+    """For compiled code: calls a function without result by its `address_of`, then its arguments.
+
+    numba makes what is called by name a part of the caller, and optimises it there once more, at
+    every level of a tree of calls. What is called like this is compiled once, by itself.
+
+    Args:
+        arguments: their types.
+    """
+
+    @intrinsic
+    def call(_typing_context: Any, _address: Any, *_arguments: Any) -> Any:
+        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            address, given = values
+            pairs = zip(cgutils.unpack_tuple(builder, given), signature.args[1], strict=True)
+            cast = [
+                context.cast(builder, value, kind, wanted)
+                for (value, kind), wanted in zip(pairs, arguments, strict=True)
+            ]
+            kind = context.call_conv.get_function_type(types.void, arguments).as_pointer()
+            function = builder.inttoptr(address, kind)
+            status, _ = context.call_conv.call_function(
+                builder, function, types.void, arguments, cast
+            )
+            with cgutils.if_unlikely(builder, status.is_error):
+                context.call_conv.return_status_propagate(builder, status)
+            return context.get_dummy_value()
+
+        return types.void(types.int64, types.StarArgTuple(_arguments)), code
+
+    call.__qualname__ = f"call_at{arguments}"  # as the caller's fingerprint has it
+    return call
+
+
+def address_of(function: Dispatcher, arguments: tuple[types.Type, ...]) -> int:
+    """Where the code of a compiled function begins; it stays there as long as the function."""
+    code = function.get_compile_result(types.void(*arguments))
+    return code.library.get_pointer_to_function(code.fndesc.llvm_func_name)
 
 
 class _Cache(FunctionCache):

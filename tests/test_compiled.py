@@ -149,8 +149,45 @@ def test_what_cannot_be_followed_is_refused(tmp_path, monkeypatch):
         import_module("reads_a_list").f()
 
 
+_call = _compiled.call_at((numba.float64[::1],))
+_call_other = _compiled.call_at((numba.float64[::1], numba.float64))
+
+
+@_compiled.njit()
+def _doubles(x):
+    x[0] *= 2.0
+
+
+@_compiled.njit()
+def _refuses(x):
+    raise ValueError("x")
+
+
+@_compiled.njit()
+def _calls(address, x):
+    _call(address, x)
+    x[0] += 1.0
+
+
+def test_a_function_is_called_by_its_address_and_so_is_one_that_fails():
+    doubles, refuses = (
+        _compiled.address_of(function, (numba.float64[::1],)) for function in (_doubles, _refuses)
+    )
+    x = np.array([3.0])
+    _calls(doubles, x)
+    assert x[0] == 7.0
+    with pytest.raises(ValueError, match=r"^x$"):
+        _calls(refuses, x)
+    assert x[0] == 7.0
+    assert len(_calls.signatures) == 1, "the caller was compiled for each of them"
+
+
+def test_for_other_arguments_the_caller_is_compiled_again():
+    assert _compiled._text(_call) != _compiled._text(_call_other)
+
+
 def test_the_package_compiles_through_this_cache_only():
-    own = re.compile(r"^from drake_teleop\._compiled import njit$", re.MULTILINE)
+    own = re.compile(r"^from drake_teleop\._compiled import .*\bnjit$", re.MULTILINE)
     for path in Path(drake_teleop.__file__).parent.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         if path.name != "_compiled.py" and "@njit" in text:

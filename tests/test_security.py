@@ -40,8 +40,8 @@ EXPLAINED = {
     # Processes that this one starts: what they say to each other goes through pipes.
     ("studies/processes.py", "joblib"), ("comparison/compare_passivity.py", "joblib"),
     ("studies/runs.py", "pickled"),
-    # An `if` for each of the package's own methods, and a module of the package by its name.
-    ("passivity/methods.py", "exec"), ("passivity/methods.py", "import_module"),
+    # A module of the package by its name.
+    ("passivity/methods.py", "import_module"),
     ("__init__.py", "import_module"),
     # A child of this package's own code, with a host's name as its argument.
     ("robots/rtde.py", "subprocess"),

@@ -30,7 +30,7 @@ from drake_teleop.fields import settings
 from drake_teleop.lifetime import ONE_DICT, weak_callback
 from drake_teleop.passivity import methods
 from drake_teleop.passivity.memory import FILLS, LIMIT, MEMORY, OF_LOAD, Slots
-from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.passivity.packet import (
     CONTACT,
     HEALTHY,
@@ -158,7 +158,7 @@ def initial_ends(
 
 @njit(cache=True)
 def channel_step(
-    method,
+    steps,
     pose_command,
     wrench_B,
     load_B,
@@ -182,7 +182,7 @@ def channel_step(
     """One step of both ends and of the lines between them.
 
     Args:
-        method: index in `METHODS`.
+        steps: of the method, `methods.steps_of(method)`.
         pose_command: (7,) X_WS before the channel.
         wrench_B: (6,) F_E_B, what the hand should feel of the slave's wrench [N, N m].
         load_B: (6,) its load's share of that: weight and inertia.
@@ -230,7 +230,7 @@ def channel_step(
     fault = (fresh and not alive) or not good
     master_limits_into(alive, fault, T, timeout, parameters[LIMIT], held_M, watch_M, limits)
     methods.master_step(
-        method, received, fresh, before_M[:7], twist, dx, hand, limits, T, parameters, memory_M,
+        steps, received, fresh, before_M[:7], twist, dx, hand, limits, T, parameters, memory_M,
         held_M, packet,
     )  # fmt: skip
     if not good:
@@ -265,7 +265,7 @@ def channel_step(
     _, fresh = network.receive(forward_parameters, forward, k + 1, received)
     alive = fresh and received[HEALTHY] > 0.5
     methods.slave_step(
-        method, received, fresh, before_S[:7], twist, dx, wrench, T, parameters, memory_S, command,
+        steps, received, fresh, before_S[:7], twist, dx, wrench, T, parameters, memory_S, command,
         packet,
     )  # fmt: skip
     if not good:
@@ -274,7 +274,7 @@ def channel_step(
     network.send(backward_parameters, backward, k, packet)
     fault, wanted = (fresh and not alive) or not good, command[:7]
     slave_command_into(alive, fault, T, timeout, wanted, watch_S, pose_received)
-    methods.command_left(method, wanted, pose_received, before_S[:7], twist, parameters, memory_S)
+    methods.command_left(steps, wanted, pose_received, before_S[:7], twist, parameters, memory_S)
     difference_into(pose_received, left, dx)
     for g in range(2):
         ports[_WORK_C][g] += dot(held_S, dx, g)
@@ -391,7 +391,7 @@ class TeleopChannel(LeafSystem):
             for line, direction in zip(channel.lines(), _DIRECTIONS, strict=True)
         ]
         parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
-        self._method = METHODS.index(passivity.method)
+        self._steps = methods.steps_of(passivity.method)
         self._tells_apart = passivity.method == "ledger"
         self._constants = (
             *(
@@ -462,7 +462,7 @@ class TeleopChannel(LeafSystem):
         if self._tells_apart and self._load.HasValue(context):  # to work it out takes time
             load = self._load.Eval(context)
         channel_step(
-            self._method,
+            self._steps,
             self._pose.Eval(context),
             self._wrench.Eval(context),
             load,

@@ -44,7 +44,7 @@ from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.noise import random_normal
 from drake_teleop.passivity import methods
 from drake_teleop.passivity.memory import LEDGER
-from drake_teleop.passivity.methods import AT_THE_MOTOR, METHODS, PassivityConfig
+from drake_teleop.passivity.methods import AT_THE_MOTOR, PassivityConfig
 from drake_teleop.passivity.packet import PACKET_SIZE
 from drake_teleop.vectors import put
 
@@ -243,7 +243,7 @@ def run_one_dof(
     # the others the command is interpolated over it.
     held = passivity.method in AT_THE_MOTOR and not model.ideal_servo
     rows = _simulate(
-        METHODS.index(passivity.method), tuple(map(float, numbers)), held, p, *lines, *states,
+        methods.steps_of(passivity.method), tuple(map(float, numbers)), held, p, *lines, *states,
         ends, start, timeout, np.concatenate(course, axis=1),
     )  # fmt: skip
     t = np.arange(len(intent), dtype=np.float64) * PERIOD
@@ -355,7 +355,7 @@ def _rise_delay(felt: NDArray[np.float64], pressed: NDArray[np.float64], steady:
 
 @njit(cache=True)
 def _simulate(
-    method, model, held, p, forward_line, backward_line, forward, backward, ends, start, timeout,
+    steps, model, held, p, forward_line, backward_line, forward, backward, ends, start, timeout,
     course,
 ):  # fmt: skip
     """(N, 13) rows [master, slave, command, felt, wall, energy (2), silence (2), accounts (4)]."""
@@ -387,7 +387,7 @@ def _simulate(
         before, x_before = received[4], x
         # No literal False: for that the whole channel would be compiled once more.
         channel_step(
-            method, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD, timeout,
+            steps, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD, timeout,
             frame, p, forward_line, backward_line, forward, backward, ends, received, ports, felt,
         )  # fmt: skip
         command, accounts[COMMAND] = received[4], ports[6]

@@ -14,14 +14,15 @@ channel, the environment f . dx; what comes out of a passive channel never excee
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from functools import cache
 from importlib import import_module
-from inspect import signature
 from typing import Any
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
-from drake_teleop._compiled import njit
+from drake_teleop._compiled import address_of, call_at, njit
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fields import settings
 from drake_teleop.passivity import none
@@ -186,30 +187,30 @@ def initial_memory(
     return memory
 
 
-def _one_of(steps: Sequence[Any]) -> Any:
-    """A compiled function that takes one of several steps: `take(which, ...)`.
-
-    It is written here as by hand, one `if` for each: numba has no table of functions, and to put
-    one function around the other doubles the time to compile a channel.
-    """
-    names = ", ".join(signature(steps[0].py_func).parameters)
-    cases = "\n    el".join(
-        f"if which == {n}:\n        step_{n}({names})" for n in range(len(steps))
-    )
-    scope = {"__name__": __name__} | {f"step_{n}": step for n, step in enumerate(steps)}
-    exec(f"def take(which, {names}):\n    {cases}", scope)
-    return njit()(scope["take"])
-
-
 @njit(cache=True)
 def _as_wanted(wanted, command, pose, twist, p, memory):
     """What a method does that need not know which command has left."""
 
 
-_master_step = _one_of([file.master_step for file in _FILES.values()])
-_slave_step = _one_of([file.slave_step for file in _FILES.values()])
-#: Tells a method which command has left: `command_left(method, wanted, ...)`, see `Methods`.
-command_left = _one_of([getattr(file, "command_left", _as_wanted) for file in _FILES.values()])
+_ROW = types.Array(types.float64, 1, "C")
+_MASTER = (_ROW, types.boolean, *[_ROW] * 5, types.float64, *[_ROW] * 4)
+_SLAVE = (_ROW, types.boolean, *[_ROW] * 4, types.float64, *[_ROW] * 4)
+_LEFT = (_ROW,) * 6
+_master_step, _slave_step, _command_left = map(call_at, (_MASTER, _SLAVE, _LEFT))
+
+
+@cache
+def steps_of(method: str) -> tuple[int, int, int]:
+    """By what the compiled steps of a method are called; they are compiled here.
+
+    Not by name: the channel would contain all methods then, and take nine times as long to compile.
+    """
+    file = _FILES[method]
+    return (
+        address_of(file.master_step, _MASTER),
+        address_of(file.slave_step, _SLAVE),
+        address_of(getattr(file, "command_left", _as_wanted), _LEFT),
+    )
 
 
 @njit(cache=True)
@@ -227,12 +228,12 @@ def _finish(healthy, memory, packet):
 
 @njit(cache=True)
 def master_step(
-    method, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
+    steps, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
 ):  # fmt: skip
     """One step of the master's end, allocation-free: what the hand feels, and what is sent.
 
     Args:
-        method: index in `METHODS`.
+        steps: of the method, `steps_of(method)`.
         received: (PACKET_SIZE,) the newest packet of the slave; zeros before the first.
         fresh: whether it is seen for the first time.
         pose: (7,) X_WS of the command, after kinematic scaling, before the channel.
@@ -254,18 +255,18 @@ def master_step(
         wrench[:] = 0.0
     else:
         _master_step(
-            method, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
+            steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         retreat(twist, T, p, memory, wrench)
     _finish(healthy, memory, packet)
 
 
 @njit(cache=True)
-def slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
+def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """One step of the slave's end, allocation-free: where the slave shall go, and what is sent.
 
     Args:
-        method, received, fresh, T, p, memory, packet: as for `master_step`; the newest packet is
+        steps, received, fresh, T, p, memory, packet: as for `master_step`; the newest packet is
             the master's.
         pose: (7,) X_WS of the slave, actual.
         twist: (6,) its twist [v; omega], in W.
@@ -280,5 +281,13 @@ def slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, c
         memory[COMMAND_TWIST] = 0.0
         put(command, 0, memory, COMMAND.start, 13)
     else:
-        _slave_step(method, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)
+        _slave_step(
+            steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
+        )
     _finish(healthy, memory, packet)
+
+
+@njit(cache=True)
+def command_left(steps, wanted, command, pose, twist, p, memory):
+    """Tells a method which command has left; see `Methods`."""
+    _command_left(steps[2], wanted, command, pose, twist, p, memory)

@@ -11,7 +11,7 @@ from drake_teleop.channel import network
 from drake_teleop.channel.channel import MEMORY_S, channel_step, initial_ends
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.passivity.memory import DAMPING, HELD, STIFFNESS
-from drake_teleop.passivity.methods import METHODS, PassivityConfig, parameters
+from drake_teleop.passivity.methods import METHODS, PassivityConfig, parameters, steps_of
 from drake_teleop.passivity.packet import PACKET_SIZE
 from drake_teleop.passivity.safe_state import RESUME, STOP
 
@@ -77,7 +77,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
         if now and fault == "saturated":
             inputs["slave_wrench"][:] = 1e3
         channel_step(
-            METHODS.index(method), *inputs.values(), now and fault == "saturated",
+            steps_of(method), *inputs.values(), now and fault == "saturated",
             float(wall < 0.0), T, TIMEOUT, frame, p, *lines, *states, ends, received, ports, felt,
         )  # fmt: skip
         found.touched[k] = wall < 0.0

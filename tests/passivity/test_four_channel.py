@@ -7,16 +7,16 @@ import numpy as np
 from drake_teleop.passivity.four_channel import FourChannelConfig
 from drake_teleop.passivity.memory import DAMPING, LIMIT, STIFFNESS
 from drake_teleop.passivity.methods import (
-    METHODS,
     PassivityConfig,
     initial_memory,
     master_step,
     parameters,
     slave_step,
+    steps_of,
 )
 from drake_teleop.passivity.packet import PACKET_SIZE, difference_into, moved_into
 
-T, FOUR = 1e-3, METHODS.index("four_channel")
+T = 1e-3
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
 
 
@@ -37,7 +37,7 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
     moved_into(START, moved, pose)  # the hand's; the slave is at the start
 
     slave_step(
-        FOUR,
+        steps_of("four_channel"),
         np.zeros(PACKET_SIZE),
         False,
         START,
@@ -51,7 +51,7 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
         packets[1],
     )
     master_step(
-        FOUR,
+        steps_of("four_channel"),
         packets[1],
         True,
         pose,
@@ -72,8 +72,9 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
     np.testing.assert_allclose(wrench, expected, rtol=1e-12)
 
     slave_step(
-        FOUR, packets[0], True, START, twist[1], zero, contact, T, p, memory[1], command, packets[1]
-    )
+        steps_of("four_channel"), packets[0], True, START, twist[1], zero, contact, T, p, memory[1],
+        command, packets[1],
+    )  # fmt: skip
     K, D = (np.repeat(p[x], 3) for x in (STIFFNESS, DAMPING))
     shift = np.empty(6)
     difference_into(command[:7], pose, shift)

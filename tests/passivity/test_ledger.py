@@ -26,12 +26,12 @@ from drake_teleop.passivity.ledger import LedgerConfig
 from drake_teleop.passivity.ledger_slave import _ACCOUNT
 from drake_teleop.passivity.memory import LEDGER, LIMIT, LOST, RECEIVED, SENT
 from drake_teleop.passivity.methods import (
-    METHODS,
     PassivityConfig,
     initial_memory,
     master_step,
     parameters,
     slave_step,
+    steps_of,
 )
 from drake_teleop.passivity.packet import PACKET_SIZE
 
@@ -123,7 +123,7 @@ def test_a_servo_that_is_not_as_told_and_a_slow_motor_cost_nothing(servo, dampin
 
 def test_a_ledger_is_what_came_less_what_went_and_carries_its_debt():
     """At every step, of hand and slave: with a hand that is pushed and pays for nothing, too."""
-    p, method = parameters(CHARGED_BY_DRAG), METHODS.index("ledger")
+    p, method = parameters(CHARGED_BY_DRAG), steps_of("ledger")
     start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     ends = [initial_memory("ledger", p, start) for _ in range(2)]
     packets, still = [np.zeros(PACKET_SIZE) for _ in range(2)], np.zeros(6)
@@ -161,7 +161,7 @@ def test_motors_may_not_spend_what_the_slave_moves_with():
     twist = np.array([0.06, 0.08, 0.0, 0.0, 0.0, 0.5])
     held = memory[LEDGER].copy()
     slave_step(
-        METHODS.index("ledger"), np.zeros(PACKET_SIZE), False, start, twist, PERIOD * twist, zero,
+        steps_of("ledger"), np.zeros(PACKET_SIZE), False, start, twist, PERIOD * twist, zero,
         PERIOD, p, memory, np.zeros(13), np.zeros(PACKET_SIZE),
     )  # fmt: skip
     moving = 1.05 * 0.5 * np.array([4.0 * 0.01, 0.02 * 0.25])

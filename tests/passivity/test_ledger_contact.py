@@ -19,17 +19,16 @@ from drake_teleop.passivity.ledger_slave import (
 )
 from drake_teleop.passivity.memory import LEDGER, LIMIT, LOST, OF_LOAD, SENT
 from drake_teleop.passivity.methods import (
-    METHODS,
     PassivityConfig,
     initial_memory,
     master_step,
     parameters,
     slave_step,
+    steps_of,
 )
 from drake_teleop.passivity.packet import GENTLE, LOAD, PACKET_SIZE, POSE, SEQUENCE, WRENCH
 
 T = 1e-3
-METHOD = METHODS.index("ledger")
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 RICH = PassivityConfig(
     method="ledger", ledger=LedgerConfig(initial=[2.0, 2.0], drag=[0.0, 0.0]), torque_limit=1.0
@@ -55,8 +54,8 @@ class Hand:
         self.packet[SEQUENCE] += 1.0
         sent, still = np.zeros(PACKET_SIZE), np.zeros(6)
         master_step(
-            METHOD, self.packet, True, self.pose, dx / T, dx, still, self.p[LIMIT], T, self.p,
-            self.memory, self.felt, sent,
+            steps_of("ledger"), self.packet, True, self.pose, dx / T, dx, still, self.p[LIMIT], T,
+            self.p, self.memory, self.felt, sent,
         )  # fmt: skip
         return self.felt.copy()
 
@@ -193,7 +192,10 @@ def test_friction_that_changes_its_sign_does_not_soften_the_wall():
         received[POSE] = pose
         received[POSE][6] -= 0.005
         received[SEQUENCE] += 1.0
-        slave_step(METHOD, received, True, pose, dx / T, dx, wrench, T, p, memory, command, packet)
+        slave_step(
+            steps_of("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory, command,
+            packet,
+        )  # fmt: skip
         before[:] = pose
     assert 180.0 < packet[CONTACT_STIFFNESS] < 350.0, "too stiff is stable, too soft is not"
 
@@ -215,7 +217,10 @@ def test_a_tip_that_slips_once_is_no_step_of_what_is_pressed_and_a_wall_that_giv
         force = 200.0 * depth - (k >= 2500)
         wrench = np.array([rubs, 0.0, force, 0.0, 0.1 * rubs, 0.0])
         received[SEQUENCE] += 1.0
-        slave_step(METHOD, received, True, pose, dx / T, dx, wrench, T, p, memory, command, packet)
+        slave_step(
+            steps_of("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory, command,
+            packet,
+        )  # fmt: skip
         hand.packet[WRENCH], hand.packet[TRIP] = packet[WRENCH], packet[TRIP]
         felt.append(hand.step()[2])
     assert felt[1999] == pytest.approx(4.0, abs=0.05)
@@ -258,7 +263,10 @@ def test_the_loads_weight_is_no_contact_and_is_felt_beside_one():
         memory[OF_LOAD] = load + 0.5 * np.sin(0.3 * k) * np.eye(6)[1]
         wrench = contact + memory[OF_LOAD]
         received[SEQUENCE] += 1.0
-        slave_step(METHOD, received, True, pose, dx / T, dx, wrench, T, p, memory, command, packet)
+        slave_step(
+            steps_of("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory, command,
+            packet,
+        )  # fmt: skip
         np.testing.assert_allclose(packet[WRENCH], contact, atol=1e-15)
         np.testing.assert_allclose(packet[LOAD], load, atol=0.15)
         assert k > 400 or not memory[TOUCHED], "nothing is touched yet"

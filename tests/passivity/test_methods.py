@@ -22,6 +22,7 @@ from drake_teleop.passivity.methods import (
     master_step,
     parameters,
     slave_step,
+    steps_of,
 )
 from drake_teleop.passivity.packet import (
     ENERGY,
@@ -73,7 +74,7 @@ def run(method, config, master_poses, slave_poses, f_e, newest):
     sent = np.zeros((2, steps, PACKET_SIZE))
     wrench, command, dx = np.zeros((steps, 6)), np.zeros((steps, 13)), np.zeros((2, steps, 6))
     nothing = np.zeros(PACKET_SIZE)
-    m = METHODS.index(method)
+    m = steps_of(method)
     for k in range(steps):
         for end, pose in enumerate((master_poses, slave_poses)):
             difference_into(pose[k], pose[max(k - 1, 0)], dx[end, k])
@@ -159,7 +160,7 @@ def test_what_is_not_finite_gives_no_force_and_leaves_the_ledgers_alone(method, 
     memory = initial_memory(method, p, START)
     received, zero = np.zeros(PACKET_SIZE), np.zeros(6)
     wrench, command, packet = np.ones(6), np.zeros(13), np.zeros(PACKET_SIZE)
-    m = METHODS.index(method)
+    m = steps_of(method)
     master_step(m, received, False, START, zero, zero, zero, p[LIMIT], T, p, memory, wrench, packet)
     before = memory.copy()
     received[20] = bad
@@ -175,7 +176,7 @@ def test_what_is_not_finite_gives_no_force_and_leaves_the_ledgers_alone(method, 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_step_stays_within_what_it_is_given(method):
     """Compiled code does not notice the end of an array: here each lies between other numbers."""
-    rng, m = np.random.default_rng(4), METHODS.index(method)
+    rng, m = np.random.default_rng(4), steps_of(method)
     around = []
 
     def guarded(values):
@@ -262,7 +263,7 @@ def test_a_wrench_falls_by_a_blow_only_if_nothing_pays_for_less(stored, left):
     memory[LEDGER][0] = stored
     dx = np.array([0.1e-3, 0.3e-3, 0.0, 0.0, 0.0, 0.0])
     master_step(
-        METHODS.index("tdpa"), received, True, START, dx / T, dx, np.zeros(6), p[LIMIT], T, p,
+        steps_of("tdpa"), received, True, START, dx / T, dx, np.zeros(6), p[LIMIT], T, p,
         memory, wrench, packet,
     )  # fmt: skip
     np.testing.assert_allclose(wrench, [0.0, left, 0.0, 0.0, 0.0, 0.0], rtol=1e-12, atol=0.0)

@@ -10,11 +10,11 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.passivity.energy import created, in_flight, ledger, port_work
 from drake_teleop.passivity.memory import LEDGER, LIMIT, MEMORY
 from drake_teleop.passivity.methods import (
-    METHODS,
     PassivityConfig,
     initial_memory,
     master_step,
     parameters,
+    steps_of,
 )
 from drake_teleop.passivity.packet import OTHER_ENERGY, PACKET_SIZE, POSE
 
@@ -68,7 +68,7 @@ def test_the_drag_is_felt_only_while_an_end_holds_less_than_the_reserve(short):
     received[OTHER_ENERGY] = 0.0 if short == "slave" else 1.0
     memory[LEDGER] = 0.0 if short == "master" else 1.0
     master_step(
-        METHODS.index("charged_tdpa"), received, True, received[POSE], dx / T, dx, np.zeros(6),
+        steps_of("charged_tdpa"), received, True, received[POSE], dx / T, dx, np.zeros(6),
         p[LIMIT], T, p, memory, wrench, packet,
     )  # fmt: skip
     if short is None:

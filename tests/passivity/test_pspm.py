@@ -8,12 +8,12 @@ import pytest
 from drake_teleop.passivity import pspm
 from drake_teleop.passivity.memory import COMMAND_POSE, HELD, LEDGER, LIMIT, LOST, RECEIVED, SENT
 from drake_teleop.passivity.methods import (
-    METHODS,
     PassivityConfig,
     initial_memory,
     master_step,
     parameters,
     slave_step,
+    steps_of,
 )
 from drake_teleop.passivity.packet import PACKET_SIZE, WRENCH, difference_into, moved_into
 
@@ -45,7 +45,7 @@ def test_stored_energy_is_what_was_put_in(end):
         servo_damping=[2.0, 0.02],
         retreat=[1e3, 1e3],  # else the wrench does not tell the spring
     )
-    p, m = parameters(config), METHODS.index("pspm")
+    p, m = parameters(config), steps_of("pspm")
     memory = initial_memory("pspm", p, START)
     first, work = memory[LEDGER].copy(), np.zeros(2)
     other = initial_memory("pspm", p, START)
@@ -102,7 +102,7 @@ def test_a_wrench_beyond_the_limit_is_shortened_before_the_spring_is_wound():
     """So the damper is felt on top of the limit, and what is not shown costs no energy."""
     p, m, rng = (
         parameters(PassivityConfig(method="pspm")),
-        METHODS.index("pspm"),
+        steps_of("pspm"),
         np.random.default_rng(2),
     )
     memory, packet, wrench = initial_memory("pspm", p, START), np.zeros(PACKET_SIZE), np.empty(6)

@@ -26,6 +26,7 @@ from drake_teleop.passivity.methods import (
     master_step,
     parameters,
     slave_step,
+    steps_of,
 )
 from drake_teleop.passivity.packet import PACKET_SIZE
 from drake_teleop.passivity.safe_state import RESUME, STOP
@@ -184,7 +185,7 @@ def test_a_packet_holds_nothing_that_was_in_its_memory_before(method):
     """What is sent is finite whatever lay where the packet is written."""
     p = parameters(PassivityConfig(method=method))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
-    number, still = METHODS.index(method), np.zeros(6)
+    number, still = steps_of(method), np.zeros(6)
     for step, limits, out in (
         (master_step, [p[LIMIT]], np.zeros(6)),
         (slave_step, [], np.zeros(13)),

@@ -7,18 +7,17 @@ import pytest
 
 from drake_teleop.passivity.memory import FILLS, LEDGER, LIMIT, RECEIVED
 from drake_teleop.passivity.methods import (
-    METHODS,
     PassivityConfig,
     initial_memory,
     master_step,
     parameters,
     slave_step,
+    steps_of,
 )
 from drake_teleop.passivity.packet import ENERGY, INTEGRAL, PACKET_SIZE, POSE
 from drake_teleop.passivity.wave import WaveConfig
 
 T, STEPS = 1e-3, 1200
-WAVE = METHODS.index("wave")
 
 
 def line(config, motion, contact, forward, backward, missing=range(0), fills=0):
@@ -41,16 +40,17 @@ def line(config, motion, contact, forward, backward, missing=range(0), fills=0):
         if k not in missing:
             at_hand = sent[1, k - backward] if k >= backward else nothing
         master_step(
-            WAVE, at_hand, k not in missing, pose, dx / T, dx, zero, p[LIMIT], T, p, memory[0],
-            wrench[k], sent[0, k],
+            steps_of("wave"), at_hand, k not in missing, pose, dx / T, dx, zero, p[LIMIT], T, p,
+            memory[0], wrench[k], sent[0, k],
         )  # fmt: skip
         u[k] = (sent[0, k, INTEGRAL][0] - (sent[0, k - 1, INTEGRAL][0] if k else 0.0)) / T
         received = sent[0, k - forward] if k >= forward else nothing
         f_e = zero.copy()
         f_e[0] = contact(u[k - forward] if k >= forward else 0.0, command[k - 1, 4])
         slave_step(
-            WAVE, received, True, start, zero, zero, f_e, T, p, memory[1], command[k], sent[1, k]
-        )
+            steps_of("wave"), received, True, start, zero, zero, f_e, T, p, memory[1], command[k],
+            sent[1, k],
+        )  # fmt: skip
     return wrench[:, 0], command[:, 4]
 
 
@@ -137,7 +137,7 @@ def test_what_fills_a_line_is_accounted_for_once():
     for k in range(n):
         received[ENERGY] = 0.01 * k
         slave_step(
-            WAVE, received, True, start, zero, zero, f_e, T, p, memory, command, packet
+            steps_of("wave"), received, True, start, zero, zero, f_e, T, p, memory, command, packet
         )  # fmt: skip
     power = force**2 / (4.0 * config.impedance[0])
     np.testing.assert_allclose(packet[ENERGY], [n * T * power, 0.0], rtol=1e-9)
@@ -172,10 +172,12 @@ def test_a_drift_fades_at_its_rate_unless_that_presses(touch, rest):
     aside = np.array([0.01, -0.02, 0.03])
     for _ in range(200):
         master_step(
-            WAVE, nothing, True, start, zero, zero, zero, p[LIMIT], T, p, memory[0], zero.copy(),
-            sent,
+            steps_of("wave"), nothing, True, start, zero, zero, zero, p[LIMIT], T, p, memory[0],
+            zero.copy(), sent,
         )  # fmt: skip
         sent[POSE][4:] = aside
         f_e = np.array([*(-touch * aside), 0.0, 0.0, 0.0])
-        slave_step(WAVE, sent, True, start, zero, zero, f_e, T, p, memory[1], command, packet)
+        slave_step(
+            steps_of("wave"), sent, True, start, zero, zero, f_e, T, p, memory[1], command, packet
+        )
     np.testing.assert_allclose(aside - command[4:7], rest * aside, rtol=1e-6)
