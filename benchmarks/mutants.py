@@ -210,8 +210,6 @@ def tested(
     """The record of each mutant, from the file of records or new."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # ends the forks too, see below
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
-    # Byte code goes by whole seconds and length: what is changed and changed back would be old.
-    os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
     for library in _LIBRARIES.split():
         import_module(library)
     tree, path = folder / "tree", folder / "records.jsonl"
@@ -429,6 +427,11 @@ class _Watch:
     def __init__(self, found: Path) -> None:
         self._found = found
         self._notes = json.loads(found.read_text()) if found.exists() else {"durations": {}}
+
+    def pytest_sessionstart(self) -> None:
+        # Byte code goes by whole seconds and length: what is changed and changed back would be old.
+        # tests/conftest.py lets it be written.
+        os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         self._spent = sum(os.times()[:4])  # of its children too; others do not lengthen it

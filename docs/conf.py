@@ -18,6 +18,8 @@ _EXT = str(Path(__file__).parent / "_ext")
 sys.path.insert(0, _EXT)
 # Of the processes that run the gallery, too.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (_EXT, os.environ.get("PYTHONPATH"))))
+# They and the notebooks' kernels do not compile the libraries again, whatever the surroundings say.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 project = "drake_teleop"
 author = "The drake_teleop authors"

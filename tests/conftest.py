@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -17,6 +18,11 @@ from sockets import open_to_others
 # One thread of BLAS in each process: the matrices are small, and threads that wait for a core which
 # another worker has take longer than the work. numpy is not imported yet, so it will see this.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Libraries are installed as sources. What one process has compiled of them the others need not,
+# even if the surroundings forbid to keep it: to import drake_teleop.run takes 2.6 s then, not 7.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # Cyclic garbage is looked for seldom: with Python's thresholds that took 11 % of the tests' time
 # and a quarter of that of their collection.
