@@ -76,21 +76,22 @@ At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
 :M6: Drag on the hand, from where a reserve is below 0.3 of itself (in contact: L_m below R_m) until
     both are full; what was sent counts as there. A wall that goes keeps what was put into it, and
     is to be felt no longer than the news takes. Drag, too, on a hand that was pushed since it last
-    rested, while it is fast, by more than makes a device so fast.
+    rested, while it is fast.
 :M7: What L_m has beyond its reserve R_m (in contact R_m + 0.7 R_s) is sent.
 
 Translation and rotation are two groups with a ledger each; what is touched is one for both. Where
-packets were missing, or something else is touched, the wrench goes over gradually; where contact
-ends it does not, or a wall that goes would be felt for longer than the news takes. A wrench
-against n is another contact. In a station the mass is that of its arm at the start, see
-`slave.servo`. It is 54 kg in its heaviest direction and counts as 79 kg, since it may
-turn too: with R_s = 0.1 J it goes no faster than 0.2 m/s. A task at v needs R_s = k_f m v^2 / 2.
-With sigma > 0 weight and inertia of the slave's load are felt as well, and are no contact: what is
-touched, its direction, stiffness and prediction are of the contact's wrench w alone. The load's is
-sent beside it, smoothed over a round trip, and added to u after M3. The ledgers take the work
-of both, so that E_act is that of contact and load, which gives back what was put into it. A hand
-that lowers the load is paid by L_m until the slave has done so too, and feels it fade when that is
-spent: after 11 mm, of 1.75 N and R_m = 20 mJ. M4 fades it where the hand goes down fast.
+packets were missing, or it has changed, the wrench goes over gradually. Not for a wall that goes:
+that would be felt for longer than the news takes, and a hand that falls into it is not braked for
+what pushed it before. A wrench against n is another contact. In a station the mass is that of its
+arm at the start, see `slave.servo`. It is 54 kg in its heaviest direction and counts as 79 kg,
+since it may turn too: with R_s = 0.1 J it goes no faster than 0.2 m/s. A task at v needs
+R_s = k_f m v^2 / 2. With sigma > 0 weight and inertia of the slave's load are felt as well, and are
+no contact: what is touched, its direction, stiffness and prediction are of the contact's wrench w
+alone. The load's is sent beside it, smoothed over a round trip, and added to u after M3. The
+ledgers take the work of both, so that E_act is that of contact and load, which gives back what was
+put into it. A hand that lowers the load is paid by L_m until the slave has done so too, and feels
+it fade when that is spent: after 11 mm, of 1.75 N and R_m = 20 mJ. M4 fades it where the hand goes
+down fast.
 The account is behind the safe state, on whose command the motors' clamp has the last word, and
 behind whatever else changes a command: it uses what the slave did. The packet's pose is z.
 """
@@ -185,9 +186,7 @@ _FADING = 0.02  # m/s, below it drag fades
 _RESTED = 0.1  # s at rest, after which nothing is braked for what was given before
 # Of a reserve: without contact drag begins below the one, and ends at the other, but for rounding.
 _LOW, _FULL = 1.0 - PASSED, 1.0 - 1e-9
-# N and m/s: what was pushed is braked with so much, down to this speed; J: less was no push, for it
-# makes no device as fast.
-_BRAKE, _BRAKED, _NOTHING = 0.5, 0.1, 1e-4
+_BRAKE, _BRAKED = 0.5, 0.1  # N and m/s: what was pushed is braked with so much, down to this speed
 
 # Memory as at the head of `ledger_slave`: filtered velocity, whether something is touched, what it
 # pushes with and its direction. Way between hand and slave at the onset; the remembered wall's
@@ -313,13 +312,18 @@ def _predict(received, dx, T, p, memory, ahead, wrench):
     shown, normal, inward = received[WRENCH], memory[NORMAL], memory[_INWARD]
     k = min(_OVER * received[CONTACT_STIFFNESS], _STIFFEST)
     if not touches(shown, p):
+        if memory[TOUCHED] > 0.0:
+            memory[_MISSING][:] = 1.0
         memory[TOUCHED] = 0.0
         gone = min(_GONE, max(_EXPECTED / max(memory[_WALL], 1.0), _SURE))
         slaves = memory[_DEPTH] - over_way(inward, ahead)
         memory[_MISSED] += T * memory[_WALL] * (slaves - _SLIGHT)
         if slaves <= _SLIGHT:
             memory[_MISSED] = 0.0
-        if received[CONTACT_STIFFNESS] == 0.0 or slaves > gone or memory[_MISSED] > _UNMET:
+        if memory[_WALL] > 0.0 and received[CONTACT_STIFFNESS] == 0.0:
+            memory[_WALL] = 0.0
+            memory[_MISSING][:] = memory[_GIVEN][:] = 0.0
+        if slaves > gone or memory[_MISSED] > _UNMET:
             memory[_WALL] = 0.0
         inside = min(memory[_WALL] * max(memory[_DEPTH], 0.0), _REMEMBERED)
         for i in range(6):
@@ -449,7 +453,7 @@ def _drag(g, received, dx, T, p, memory, wrench):
         drag = p[DRAG][g]
     if speed < _FADING * ARM[g]:
         memory[_GIVEN][g] *= 1.0 - min(T / _RESTED, 1.0)
-    if memory[_GIVEN][g] > _NOTHING and speed > _BRAKED * ARM[g]:
+    if memory[_GIVEN][g] > 0.0 and speed > _BRAKED * ARM[g]:
         drag = max(drag, _BRAKE * LEVER[g])
     drag *= _earning(g, dx, T, p, memory)
     for i in range(3 * g, 3 * g + 3):
