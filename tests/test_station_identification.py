@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from drake_teleop import identification
 from drake_teleop.identification import batch_identification, slave_arm
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.scenario import Scenario, replace
+from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
+from drake_teleop.slave.payload import Payload
+from drake_teleop.slave.slave_config import Slave
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 400.0])
@@ -29,3 +35,29 @@ def test_how_far_the_offsets_have_wandered_does_not_depend_on_the_rate(rate_hz):
     expected = np.repeat([0.5, 0.03], 3) * np.sqrt(duration / 3)
     # The load takes up a little of it.
     np.testing.assert_allclose(found.standard_deviations[:6], expected, rtol=0.05)
+
+
+def test_a_motion_is_designed_once_for_all_seeds_and_anew_for_another_sensor(monkeypatch):
+    designs = []
+
+    def excite(robot, *, period, **_):
+        designs.append(period)
+        found = FourierTrajectory(np.zeros(6), *np.full((2, 6, 3), len(designs)), 1 / period)
+        return SimpleNamespace(trajectory=found)
+
+    monkeypatch.setattr(identification, "_DESIGNS", {})
+    monkeypatch.setattr(identification, "excite", excite)
+    monkeypatch.setattr(identification, "RobotFromScenario", lambda scenario: None)
+    monkeypatch.setattr(identification, "criteria_of", lambda *_: {"kappa_w10": 4.0})
+
+    def designed(**changes) -> float:
+        scenario = replace(LoadScenario("identification"), **changes)
+        trajectory, _ = identification._designed(scenario, lambda _: None)
+        trajectory.rho[1:] = 99.0  # who has one may change it
+        return trajectory.rho[0, 0]
+
+    assert designed() == designed(simulation__seed=3) == designed(rates__log_hz=500.0) == 1.0
+    assert designed(wrist_sensor__bandwidth_hz=200.0) == 2.0
+    assert designed(simulation__duration=7.0) == 3.0 and designs == [6.0, 6.0, 7.0]
+    assert designed(slave=Slave(payload=Payload(mass=1.0))) == 4.0
+    assert designed() == 1.0
