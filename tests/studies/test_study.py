@@ -19,7 +19,9 @@ from shown import type_in
 from sockets import THIS_MACHINE, listening
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from drake_teleop import run as runs_of_scenarios
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario
 from drake_teleop.signals import SIGNALS
@@ -110,7 +112,17 @@ def serial(files):
 
 @pytest.fixture
 def two_runs(monkeypatch):
-    """A study has one seed and two points, and this process alone."""
+    """A study has one seed and two points, and this process alone; one load serves all.
+
+    That each slave, sensor and seed has its own is tested in test_identified_load.py.
+    """
+    loads: list[IdentifiedLoad] = []
+
+    def identified(*arguments, **options):
+        loads[:] = loads or [identified_load(*arguments, **options)]
+        return loads[0]
+
+    monkeypatch.setattr(runs_of_scenarios, "identified_load", identified)
     load, command = studies.LoadStudy, studies.study_command
 
     def small(path):
