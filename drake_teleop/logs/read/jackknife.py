@@ -6,41 +6,57 @@ It leaves out one of 20 blocks of time after the other, so that residuals may be
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
+
 _BLOCKS = 20
 # Singular values of the scaled Jacobian below this share of the largest: nothing determines them.
 RANK = 1e-5
-_STEPS = 100  # of the solver at most; most records take fewer than ten
+_STEPS = 15  # of the solver at most: records that make sense take six, hopeless ones a hundred
 
 
 def solve(
-    residual: Callable[[NDArray[np.float64]], NDArray[np.float64]], x: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    residual: Callable[[Array], Array], x: Array, linear: Array | None = None
+) -> tuple[Array, Array]:
     """Least squares of (N, 3 k) residuals, every three channels weighted by their own.
+
+    Args:
+        residual: of x (n,).
+        x: where to begin.
+        linear: (N, 3 k, m) what a unit of each of the last m of x adds to the residuals, whatever
+            the others are. No differences need be taken of these.
 
     Returns:
         the solution (n,), and its standard deviations (n,), inf for what is not determined.
     """
-    from scipy.optimize import least_squares
+    from scipy.optimize import approx_fprime, least_squares
 
+    linear = np.empty((*residual(x).shape, 0)) if linear is None else linear
+    others = len(x) - linear.shape[2]
     for _ in range(2):
         errors = residual(x)
         power = errors.reshape(len(errors), -1, 3).var(axis=(0, 2))
         sigma = np.repeat(np.sqrt(power + 1e-12 * power.max() + 1e-30), 3)
-        found = least_squares(
-            lambda z, s=sigma: (residual(z) / s).ravel(), x, x_scale="jac", max_nfev=_STEPS
-        )
+        known = (linear / sigma[:, None]).reshape(errors.size, linear.shape[2])
+
+        def weighted(z: Array, s: Array = sigma) -> Array:
+            return (residual(z) / s).ravel()
+
+        def slopes(z: Array, f: Any = weighted, known: Array = known) -> Array:
+            found = approx_fprime(z[:others], lambda y: f(np.append(y, z[others:])))
+            return np.hstack([found, known])
+
+        found = least_squares(weighted, x, jac=slopes, x_scale="jac", max_nfev=_STEPS)
         x = found.x
     width = len(sigma) * (len(errors) // _BLOCKS)
     return x, jackknife(found.jac, found.fun, width)
 
 
-def jackknife(
-    jacobian: NDArray[np.float64], residual: NDArray[np.float64], width: int
-) -> NDArray[np.float64]:
+def jackknife(jacobian: Array, residual: Array, width: int) -> Array:
     """(n,) standard deviations of a least-squares solution, leaving out blocks of `width` rows."""
     size = np.linalg.norm(jacobian, axis=0) + 1e-300
     _, singular, Vt = np.linalg.svd(jacobian / size, full_matrices=False)

@@ -176,7 +176,10 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     first = np.zeros(7 + 3 * len(pairs))
     first[3] = middle
     first[7:] = -residual(first).mean(axis=0)
-    x, deviations = solve(residual, first)
+    linear = np.zeros((len(t), 3 * len(pairs), len(first) - 4))
+    linear[:, :3, :3] = -K
+    linear[:, :, 3:] = np.eye(3 * len(pairs))
+    x, deviations = solve(residual, first, linear)
     lever = None
     if position:
         lever = LeverArm(
