@@ -28,8 +28,7 @@ RUNS = {
     "inverse_kinematics": "benchmarks/inverse_kinematics.py --json FILE",
     "ledger_in_station": "benchmarks/ledger_in_station.py --json FILE",
     "ledger_with_friction": (
-        "benchmarks/ledger_in_station.py --grip medium --sigma 0 --friction 30 --damping 300"
-        " --json FILE"
+        "benchmarks/ledger_in_station.py --friction 30 --damping 300 --json FILE"
     ),
     "live": "benchmarks/live.py --json FILE",
     "load_change": "benchmarks/load_change.py --json FILE",
@@ -137,6 +136,13 @@ def _rows(figures: Any, key: str, **such: Any) -> list[Any]:
         if row[key] is not None and all(row[name] == is_ for name, is_ in such.items())
     ]
     return found or [math.nan]
+
+
+def _well_by_medium_grip(row: Any) -> bool:
+    """Whether a hold by a medium grip keeps what `ledger_in_station.py` asks of each."""
+    at_rest = row["stable"] and row["left_m"] <= 5e-3 and min(row["energy_J"]) >= -1e-6
+    good = abs(row["felt_error"]) <= 0.1 and row["chatter_N"] <= 0.05
+    return row["grip"] == "medium" and at_rest and good
 
 
 def _of_domain(method: str, what: str) -> Callable[[Any], float]:
@@ -344,9 +350,14 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: min(min(row["energy_J"]) for row in f["rows"]), "J", -1e-6),
     ),
     Claim(
-        *(NETWORK, "An arm that rubs and a leaf that damps break none of its promises"),
-        *("30 N at the tool, 300 N s/m; medium grip, σ = 0", "delay.md", "ledger_with_friction"),
-        *(lambda f: f["cells"] - sum(f["missed"].values()), "of 8", 8.0),
+        *(NETWORK, "It is at rest with an arm that rubs on a leaf that damps"),
+        *("30 N at the tool, 300 N s/m; the same 48 holds", "delay.md", "ledger_with_friction"),
+        *(lambda f: f["cells"] - f["missed"]["stable"], "of 48", 44.0),
+    ),
+    Claim(
+        *(NETWORK, "and keeps all of that, and the force within 0.05 N, by a medium grip"),
+        *("4 networks, 2 leaves, σ 0 and 1", "delay.md", "ledger_with_friction"),
+        *(lambda f: sum(map(_well_by_medium_grip, f["rows"])), "of 16", 16.0),
     ),
     NotShown(
         NETWORK, "That a person feels any of it", "no person has tried it; the hand is simulated"

@@ -57,7 +57,7 @@ myst_heading_anchors = 4
 
 # What is run
 nb_execution_mode = "force"
-nb_execution_timeout = 240
+nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_merge_streams = True
