@@ -91,8 +91,8 @@ def call_at(arguments: tuple[types.Type, ...]) -> Any:
 
 def address_of(function: Dispatcher, arguments: tuple[types.Type, ...]) -> int:
     """Where the code of a compiled function begins; it stays there as long as the function."""
-    code = function.get_compile_result(types.void(*arguments))
-    return code.library.get_pointer_to_function(code.fndesc.llvm_func_name)
+    code = function.get_compile_result(types.void(*arguments))._asdict()
+    return code["library"].get_pointer_to_function(code["fndesc"].llvm_func_name)
 
 
 class _Cache(FunctionCache):
