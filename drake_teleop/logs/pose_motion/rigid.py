@@ -101,11 +101,12 @@ class RigidFit:
 
     @property
     def inflation(self) -> float:
-        """By which deviations are larger than noise alone makes them.
+        """By which deviations are larger than noise alone makes them; 1 if stated gains explain it.
 
         Noise alone has a misfit of up to 1.5 times its degrees, because bands hold few numbers.
         """
-        return float(np.sqrt(max(1.0, self.misfit / (_NOISE * self.degrees))))
+        left = self.misfit - _BY_GAINS * self.misfit_of_gains
+        return float(np.sqrt(max(1.0, left / (_NOISE * self.degrees))))
 
 
 def motion_map(R: Array, r: Array) -> Array:
