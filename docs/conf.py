@@ -6,6 +6,7 @@ does; any warning is an error. Nothing is loaded from elsewhere: the site can be
 
 from __future__ import annotations
 
+import gc
 import os
 import re
 import sys
@@ -20,6 +21,10 @@ sys.path.insert(0, _EXT)
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (_EXT, os.environ.get("PYTHONPATH"))))
 # They and the notebooks' kernels do not compile the libraries again, whatever the surroundings say.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# One thread of BLAS in each of them: the matrices are small, and the cores have other work.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Pages are trees with links to and fro, among which to look for garbage takes long.
+gc.set_threshold(20_000, 20, 50)
 
 project = "drake_teleop"
 author = "The drake_teleop authors"

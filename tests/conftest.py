@@ -34,7 +34,8 @@ settings.register_profile("drake_teleop", deadline=None, derandomize=True)
 settings.load_profile("drake_teleop")
 
 
-#: What compiles little of what the notebooks and the stations do, in the order in which it is run.
+TESTS = Path(__file__).parent
+#: What compiles little of what the stations do, in the order in which it is run.
 COMPILE_LITTLE = (
     *("load", "logs"),
     *("cli", "house", "malformed_input", "master", "passivity", "theory", "vectors"),
@@ -42,11 +43,16 @@ COMPILE_LITTLE = (
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """One cache of identified loads for all workers and their processes; never the user's."""
+    """One cache of identified loads for all workers and their processes; never the user's.
+
+    The second worker collects from the other end: what both import is compiled by one of them.
+    """
     if not hasattr(config, "workerinput"):
         folder = tempfile.TemporaryDirectory(prefix="drake_teleop-")
         config.add_cleanup(folder.cleanup)
         os.environ["DRAKE_TELEOP_CACHE_DIR"] = folder.name
+    elif config.workerinput["workerid"] == "gw1" and [*map(Path, config.args)] == [TESTS]:
+        config.args[:] = sorted(map(str, TESTS.iterdir()), reverse=True)
 
 
 def pytest_collection_finish() -> None:
@@ -75,6 +81,23 @@ def nothing_listens_to_other_machines() -> Iterator[None]:
     assert not found
 
 
+@pytest.fixture(autouse=True)
+def pictures_in_outline(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are made but not painted, which takes longer than most tests; see `pictures`.
+
+    What tests share is made before, and painted.
+    """
+    from matplotlib.figure import Figure  # not before OPENBLAS_NUM_THREADS is set
+
+    if request.node.get_closest_marker("pictures") is None:
+        painted = Figure.savefig
+
+        def outline(_: Figure, target: Any, **options: Any) -> None:
+            painted(Figure(figsize=(0.1, 0.1)), target, **options)
+
+        monkeypatch.setattr(Figure, "savefig", outline)
+
+
 @pytest.fixture
 def meshcat() -> Iterator[Any]:
     """One that is unmade here: by the garbage collection of another thread it ends the process."""
@@ -86,20 +109,18 @@ def meshcat() -> Iterator[Any]:
 
 @pytest.hookimpl(trylast=True)  # what is not run shall not count
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The first worker begins with the notebooks, the second with what compiles little.
+    """One worker begins with what compiles little: both shall not compile the same at one time.
 
-    What takes longest must not be what the other one waits for at the end, and both shall not
-    compile the same at the same time. Two workers get one half of the list each.
+    Two workers get one half of the list each, and have the same list, see `pytest_configure`.
     """
 
-    def place(item: pytest.Item) -> int:
-        if item.path.name == "test_notebooks.py":
-            return -2
-        room = item.path.relative_to(Path(__file__).parent).parts[0]
-        room = room.removeprefix("test_").removesuffix(".py")
-        return COMPILE_LITTLE.index(room) if room in COMPILE_LITTLE else -1
+    def room(item: pytest.Item) -> str:
+        first = item.path.relative_to(TESTS).parts[0]
+        return first.removeprefix("test_").removesuffix(".py")
 
-    much = sorted((item for item in items if place(item) < 0), key=place)
-    little = sorted((item for item in items if place(item) >= 0), key=place)
+    items.sort(key=lambda item: item.path.parts)
+    much = [item for item in items if room(item) not in COMPILE_LITTLE]
+    little = [item for item in items if room(item) in COMPILE_LITTLE]
+    little.sort(key=lambda item: COMPILE_LITTLE.index(room(item)))
     half = len(items) // 2
     items[:] = [*much[:half], *little, *much[half:]]

@@ -14,6 +14,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_the_python_example_runs(tmp_path, monkeypatch):
     (example,) = re.findall("```python\n(.*?)```", README, re.S)
     monkeypatch.chdir(tmp_path)

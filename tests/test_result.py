@@ -210,5 +210,6 @@ def test_repr_lists_signals_with_units():
     assert "no samples" in repr(SimulationResult([], {}, []))
 
 
+@pytest.mark.pictures
 def test_a_notebook_can_show_the_plot():
     assert make_result().plot("sigma")._repr_png_().startswith(b"\x89PNG")

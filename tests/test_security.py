@@ -76,7 +76,7 @@ WRITES = re.compile(
 )
 WRITING = {
     # To memory.
-    ("pages/html.py", ".savefig"), ("pages/style.py", ".savefig"),
+    ("pages/style.py", ".savefig"),
     # What is kept for the next time, whole or not at all; and a temporary folder.
     ("_compiled.py", ".touch"), ("_compiled.py", ".write_bytes"), ("_compiled.py", "os.replace"),
     ("identified_load.py", 'open("wb'), ("identified_load.py", "np.savez"),

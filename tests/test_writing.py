@@ -74,6 +74,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.pictures
 def test_a_file_that_has_no_room_is_one_line_and_the_earlier_one_stays(tmp_path, name):
     path = tmp_path / name
     path.write_text("earlier")

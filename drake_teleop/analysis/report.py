@@ -69,13 +69,13 @@ def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
         "maps": draw_maps(curves, summary["grip"]),
     }
     for name, figure in pictures.items():
-        write_picture(out / f"{name}.png", figure)
+        write_picture(out / f"{name}.png", figure, dpi=160)
     page = render(
         "drake_teleop.analysis",
         "report.html.j2",
         s=summary,
         wall=curves.wall[0],
-        pictures={name: embedded(figure) for name, figure in pictures.items()},
+        pictures={name: embedded(out / f"{name}.png") for name in pictures},
         axis_rows=axis_rows(summary["axis"]),
         margin_rows=[margin_cells(row, summary["delay_s"]) for row in summary["margins"]],
     )

@@ -55,7 +55,7 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         "limits": draw_limits(summary["one_dof"]),
     }
     for name, figure in pictures.items():
-        write_picture(out / f"{name}.png", figure)
+        write_picture(out / f"{name}.png", figure, dpi=160)
     page = render(
         "drake_teleop.comparison",
         "report.html.j2",
@@ -63,7 +63,7 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         columns=[heading for _, heading, _, _ in COLUMNS],
         station=[(row, cells(row)) for row in summary["station"]],
         covering=summary["covering"],
-        pictures={name: embedded(figure) for name, figure in pictures.items()},
+        pictures={name: embedded(out / f"{name}.png") for name in pictures},
     )
     write_text(out / "report.html", page)
 

@@ -13,7 +13,7 @@ from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.pictures import VERDICT_WORDS
 from drake_teleop.logs.processing import IdentifiedLog
-from drake_teleop.pages.html import embedded_png, render
+from drake_teleop.pages.html import embedded, render
 from drake_teleop.writing import write_text
 
 # Eq. (7): symbol, index, unit as printed, and how many of it an SI unit has.
@@ -121,12 +121,12 @@ def write_report(
         figures=[
             (
                 "Fit",
-                embedded_png(path.parent / "fit.png"),
+                embedded(path.parent / "fit.png"),
                 "Measured wrench and V φ without the offsets, and what is left between them.",
             ),
             (
                 "Residual, intervals and identifiability",
-                embedded_png(path.parent / "knowledge.png"),
+                embedded(path.parent / "knowledge.png"),
                 f"Top: the residual at {spectrum}. Below: each parameter with its interval, and "
                 "its standard deviation, as shares of what is natural for a load of this mass and "
                 "size: up to 5 % it is identified, up to 50 % weakly, beyond that not.",

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import base64
-import io
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import jinja2
-from matplotlib.figure import Figure
 
 
 def render(package: str, template: str, **values: Any) -> str:
@@ -35,17 +33,6 @@ def render(package: str, template: str, **values: Any) -> str:
     return environment.get_template(template).render(**values)
 
 
-def embedded(figure: Figure) -> str:
-    """The figure as a PNG in a data: URL."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=160)
-    return _data(buffer.getvalue())
-
-
-def embedded_png(path: Path) -> str:
+def embedded(path: Path) -> str:
     """A PNG file in a data: URL."""
-    return _data(path.read_bytes())
-
-
-def _data(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from drake_teleop.pages.html import embedded, render
@@ -82,7 +81,7 @@ class ReportFigure:
     """A figure with its title and the sentences below it."""
 
     title: str
-    figure: Figure
+    png: Path
     caption: str
 
 
@@ -251,7 +250,7 @@ def write_report(
         versions=versions(),
         tiles=_tiles(summary),
         comparisons=compare_with_paper(summary),
-        figures=[(item, embedded(item.figure)) for item in figures],
+        figures=[(item, embedded(item.png)) for item in figures],
         parameters=parameters,
         summary=summary,
         replay=replay,

@@ -407,7 +407,7 @@ def _write(
     write_table(out / "logs" / "identification_sensor_log.parquet", load.result.sensor_log())
     load.identification.save(out / "identification.json")
     for name, picture in pictures.items():
-        write_picture(out / f"{name}.png", picture)
+        write_picture(out / f"{name}.png", picture, dpi=160)
     write_replay(out / "replay.html", contact.touched, contact.scenario, slow_motion=_SLOW_MOTION)
     figures = flat(summary)
     write_text(out / "table.md", _markdown(compare_with_paper(figures)))
@@ -415,7 +415,7 @@ def _write(
         out / "report.html",
         setup=_setup(seed, force.scenario, load),
         summary=figures,
-        figures=_captioned(pictures, figures),
+        figures=_captioned(out, figures),
         parameters=parameter_rows(
             _truth(force.scenario), load.estimate, load.batch.standard_deviations
         ),
@@ -423,14 +423,14 @@ def _write(
     )
 
 
-def _captioned(pictures: dict[str, Figure], figures: Figures) -> list[ReportFigure]:
+def _captioned(out: Path, figures: Figures) -> list[ReportFigure]:
     titles = {
         "fig6": "Fig. 6: scaling and elimination of non-contact forces",
         "fig7": "Fig. 7: scaling and elimination of non-contact torques",
         "fig8": "Fig. 8: contact transition",
     }
     words = captions(figures)
-    return [ReportFigure(titles[name], picture, words[name]) for name, picture in pictures.items()]
+    return [ReportFigure(title, out / f"{name}.png", words[name]) for name, title in titles.items()]
 
 
 def _setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str, str]:

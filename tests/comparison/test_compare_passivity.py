@@ -24,6 +24,7 @@ from drake_teleop.scenario import LoadScenario
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "WALLS", (5100.0,))
     monkeypatch.setattr(study, "IMPAIRMENTS", ((0.0, 0.0),))

@@ -30,6 +30,7 @@ def test_thresholds_come_back_through_order_store_and_table(tmp_path):
         assert over.low < 2.0 < over.high < 2.0 * over.low
 
 
+@pytest.mark.pictures
 def test_the_folder_has_table_trials_and_picture(tmp_path):
     store = Store(tmp_path)
     assert write_results(SMALL, store).is_empty()

@@ -3,24 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
-from matplotlib.figure import Figure
 
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data"
-
-
-@pytest.fixture(autouse=True)
-def _pictures_in_outline(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures are made but not painted, which takes longer than most tests; see `pictures`."""
-    if request.node.get_closest_marker("pictures") is None:
-        painted = Figure.savefig
-
-        def outline(_: Figure, target: Any, **options: Any) -> None:
-            painted(Figure(figsize=(0.1, 0.1)), target, **options)
-
-        monkeypatch.setattr(Figure, "savefig", outline)
 
 
 def _records(name: str) -> Path:

@@ -46,6 +46,7 @@ def test_all_subplots_have_the_same_scale_and_show_everything():
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_the_right_hand_axis_is_the_masters():
     figure = scaling()
     render(figure)  # secondary axes get their limits when they are drawn
@@ -94,6 +95,7 @@ def test_no_contact_at_all_is_drawn_without_its_mark():
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_the_same_data_draw_the_same_picture():
     assert render(scaling()) == render(scaling())
     assert render(contact()) != render(contact(detected_s=0.3))

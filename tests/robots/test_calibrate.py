@@ -131,6 +131,7 @@ def test_bad_readings_are_left_out_and_a_set_clock_begins_anew(tmp_path: Path) -
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_the_command_says_by_its_status_that_it_is_not_known(tmp_path: Path) -> None:
     looked_at(recorded(2.0, [0, 1, 2]), "mass 1 %", tmp_path / "log.csv")
     out = tmp_path / "out"

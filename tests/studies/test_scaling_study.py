@@ -118,6 +118,7 @@ def test_they_are_a_thousand_runs_over_the_same_scales():
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_the_answer_of_a_folder(tmp_path, monkeypatch):
     """The studies are not run here; their rows are made up."""
 

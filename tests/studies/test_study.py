@@ -140,6 +140,7 @@ def two_runs(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_what_the_pages_show(two_runs, tmp_path, monkeypatch):
     """Down to two runs each, they come to their end."""
     monkeypatch.chdir(tmp_path)

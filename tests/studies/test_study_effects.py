@@ -95,6 +95,7 @@ def test_points_with_failures_are_not_on_the_front():
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_pictures_are_those_that_mean_something(tmp_path):
     (tmp_path / "old.png").touch()
     names = sorted(path.stem for path in write_pictures(STUDY, table(), tmp_path))
