@@ -51,8 +51,9 @@ def pytest_configure(config: pytest.Config) -> None:
         folder = tempfile.TemporaryDirectory(prefix="drake_teleop-")
         config.add_cleanup(folder.cleanup)
         os.environ["DRAKE_TELEOP_CACHE_DIR"] = folder.name
-    elif config.workerinput["workerid"] == "gw1" and [*map(Path, config.args)] == [TESTS]:
-        config.args[:] = sorted(map(str, TESTS.iterdir()), reverse=True)
+    elif config.workerinput["workerid"] == "gw1" and config.args == ["tests"]:
+        rooms = [path for path in TESTS.glob("[a-z]*") if path.is_dir() or path.match("test_*.py")]
+        config.args[:] = sorted(map(str, rooms), reverse=True)
 
 
 def pytest_collection_finish() -> None:
