@@ -14,20 +14,12 @@ and by the measured one. No baseline: the figures are times.
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
-import shutil
-import subprocess
-import tempfile
 import time
-from collections.abc import Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-from urllib.request import urlopen
 
 import numpy as np
-from websockets.sync.client import ClientConnection, connect
+from browser import CHROMIUM, Page, opened
 
 from drake_teleop.identified_load import identified_load
 from drake_teleop.live.live import TOUCH, Live
@@ -35,12 +27,6 @@ from drake_teleop.live.server import LiveDrive, drive
 from drake_teleop.live.session import live_scenario
 from drake_teleop.scenario import LoadScenario
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-OPTIONS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--enable-unsafe-swiftshader",
-)  # fmt: skip
 SPY = """window.effects = []; window.axes = [0, 0, 0, 0];
 navigator.getGamepads = () => [{connected: true, id: "spy", axes, buttons: [],
   vibrationActuator: {playEffect: () => {
@@ -67,73 +53,6 @@ window.moved = () => new Promise((done) => {
   setTimeout(() => done(null), 10000); });"""
 
 
-class Page:
-    """A page, through the browser's own debugging socket."""
-
-    def __init__(self, socket: ClientConnection) -> None:
-        self._socket, self._numbers = socket, itertools.count()
-        self._answers: dict[int, Any] = {}
-
-    def send(self, method: str, **params: Any) -> int:
-        number = next(self._numbers)
-        self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
-        return number
-
-    def answer(self, number: int) -> Any:
-        while number not in self._answers:
-            message = json.loads(self._socket.recv(60.0))
-            if "id" in message:
-                value = message.get("result", {}).get("result", {}).get("value")
-                self._answers[message["id"]] = value
-            else:
-                self.heard(message["method"], message["params"])
-        return self._answers.pop(number)
-
-    def heard(self, event: str, params: Any) -> None:
-        """What the browser says unasked."""
-
-    def run(self, script: str) -> Any:
-        return self.answer(
-            self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
-        )
-
-    def mouse(self, kind: str, x: int) -> None:
-        self.answer(
-            self.send(
-                "Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=300, button="left",
-                buttons=int(kind != "Released"), clickCount=1,
-            )
-        )  # fmt: skip
-
-
-@contextmanager
-def opened(url: str, script: str, page: type[Page] = Page, more: Sequence[str] = ()) -> Any:
-    """A page that headless Chromium has open; the script runs before any of its own does."""
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        process = subprocess.Popen(
-            [CHROMIUM or "", *OPTIONS, *more, f"--user-data-dir={folder}"],
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        try:
-            assert process.stderr is not None
-            said = next(line for line in process.stderr if "DevTools listening" in line)
-            port = said.rpartition(":")[2].partition("/")[0]
-            tabs = json.load(urlopen(f"http://127.0.0.1:{port}/json"))
-            address = next(tab["webSocketDebuggerUrl"] for tab in tabs if tab["type"] == "page")
-            with connect(address, max_size=None, origin=None) as socket:
-                shown = page(socket)
-                for domain in ("Runtime", "Page"):
-                    shown.answer(shown.send(f"{domain}.enable"))
-                shown.answer(shown.send("Emulation.setFocusEmulationEnabled", enabled=True))
-                shown.answer(shown.send("Page.addScriptToEvaluateOnNewDocument", source=script))
-                shown.answer(shown.send("Page.navigate", url=url))
-                yield shown
-        finally:
-            process.kill()
-            process.communicate()
-
-
 def latencies(page: Page, trials: int) -> dict[str, list[float | None]]:
     """Times from what is done until the tool has moved [ms], by what is done."""
     found: dict[str, list[float | None]] = {"pointer": [], "key": [], "stick": []}
@@ -142,18 +61,18 @@ def latencies(page: Page, trials: int) -> dict[str, list[float | None]]:
             page.run("Object.assign(target, {x: 0, y: 0, z: 0}); 1")
             time.sleep(1.5)
             if kind == "pointer":
-                page.mouse("Pressed", 300)
+                page.mouse("Pressed", 300, 300)
             page.run("window.until = moved(); 1")  # before the input, which is heard out of turn
             sign = 1 - 2 * (trial % 2)
             if kind == "pointer":
-                page.mouse("Moved", 300 + 20 * sign)
+                page.mouse("Moved", 300 + 20 * sign, 300)
             elif kind == "key":
                 code = "KeyE" if sign > 0 else "KeyQ"
                 page.send("Input.dispatchKeyEvent", type="keyDown", code=code, key=code[-1])
             else:
                 page.send("Runtime.evaluate", expression=STICK.replace("SIGN", str(sign)))
             times.append(page.run("until"))
-            page.mouse("Released", 300)
+            page.mouse("Released", 300, 300)
             page.send("Input.dispatchKeyEvent", type="keyUp", code="KeyE", key="E")
             page.send("Input.dispatchKeyEvent", type="keyUp", code="KeyQ", key="Q")
             page.run("axes[0] = 0; 1")
@@ -192,9 +111,8 @@ def in_the_browser(trials: int) -> dict[str, float]:
     """Figures of a page in headless Chromium."""
     driven = drive("touch")
     try:
-        with opened(driven.url, SPY) as page:
-            while not page.run("!!(window.place && typeof target !== 'undefined' && target)"):
-                time.sleep(0.1)
+        with opened(driven.url, SPY, Page) as page:
+            page.until("window.place && typeof target !== 'undefined' && target")
             figures = {}
             for kind, times in (
                 *latencies(page, trials).items(),

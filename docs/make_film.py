@@ -23,7 +23,7 @@ from drake_teleop.live.server import drive
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
-import live_page  # noqa: E402
+from browser import Page, opened  # noqa: E402
 
 FILM = ROOT / "docs" / "figures" / "drive.webp"
 WIDTH, HEIGHT = 1000, 640
@@ -49,7 +49,7 @@ setInterval(() => {
 }, 10); 1"""
 
 
-class Filmed(live_page.Page):
+class Filmed(Page):
     """A page that keeps what it shows: (seconds, PNG)."""
 
     def __init__(self, socket: Any) -> None:
@@ -58,6 +58,7 @@ class Filmed(live_page.Page):
 
     def heard(self, event: str, params: Any) -> None:
         """Keeps a picture, and asks for the next."""
+        super().heard(event, params)
         if event == "Page.screencastFrame":
             self.pictures.append((params["metadata"]["timestamp"], b64decode(params["data"])))
             self.send("Page.screencastFrameAck", sessionId=params["sessionId"])
@@ -67,11 +68,10 @@ def filmed(url: str) -> list[tuple[float, bytes]]:
     """Pictures of a drive, each with the station's time [s]."""
     clocks = []  # the browser's, and the station's
     drawing = ("--use-angle=swiftshader", f"--window-size={WIDTH},{HEIGHT}")
-    with live_page.opened(url, "", Filmed, drawing) as page:
+    with opened(url, "", Filmed, drawing) as page:
         size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
-        page.answer(page.send("Emulation.setDeviceMetricsOverride", **size))
-        while not page.run("!!(typeof target !== 'undefined' && target && frame && frame.tool)"):
-            time.sleep(0.1)
+        page.call("Emulation.setDeviceMetricsOverride", **size)
+        page.until("typeof target !== 'undefined' && target && frame && frame.tool")
         time.sleep(3.0)  # until all of the scene has come
         page.run(f"at('slow').value = {SLOW}; at('slow').dispatchEvent(new Event('change')); 1")
         time.sleep(2.0)
