@@ -81,7 +81,8 @@ def main(arguments: list[str] | None = None) -> None:
         method: dict(zip(places, rows[n * len(places) :], strict=False))
         for n, method in enumerate(asked.method)
     }
-    print(f"| method | stable of {len(places)} | good | strong | felt of undelayed, good ones |")
+    felt = "felt of undelayed, median of good ones"
+    print(f"| method | stable of {len(places)} | good | strong | {felt} |")
     print("|---|---|---|---|---|")
     for method, table in found.items():
         counts = [sum(row[key] for row in table.values()) for key in ("stable", "good", "strong")]

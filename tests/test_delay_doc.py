@@ -1,9 +1,11 @@
-"""docs/delay.md: its scenarios load, and its table is what its script prints."""
+"""docs/delay.md: its scenarios load; its tables, and those of its readers, say what was found."""
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,3 +53,63 @@ def test_its_table_is_what_its_script_prints(capsys):
         (unstable, said), (is_unstable, found) = figures(row), figures(expected)
         assert unstable == is_unstable
         np.testing.assert_allclose(said, found, atol=0.02)
+
+
+def table(page: str, head: str) -> dict[str, list[str]]:
+    """First cell -> the others, of the rows under the row that begins so."""
+    _, _, below = (ROOT / page).read_text(encoding="utf-8").partition(f"\n{head}")
+    rows = below.partition("\n\n")[0].splitlines()[2:]
+    cells = ([cell.strip() for cell in row.split("|")[1:-1]] for row in rows)
+    return {first.strip("`"): rest for first, *rest in cells}
+
+
+def figures_of_record(name: str) -> Any:
+    text = (ROOT / "benchmarks" / "records" / f"{name}.json").read_text(encoding="utf-8")
+    return json.loads(text)["figures"]
+
+
+def test_the_table_of_holds_is_what_the_record_says():
+    written = table("docs/delay.md", "| method | stable of 162 |")
+    found = {}
+    for method, holds in figures_of_record("domain").items():
+        counts = [sum(row[what] for row in holds.values()) for what in ("stable", "good", "strong")]
+        felt = np.median([row["felt"] for row in holds.values() if row["good"]])
+        found[method] = [*map(str, counts), f"{felt:.2f}"]
+    assert written == found
+
+
+def test_what_an_adversary_left_of_ledgers_energy_is_what_the_record_says():
+    found = figures_of_record("adversary")["ledger"]
+    least = ", ".join(f"{found[part]['actual']:.4f}" for part in ("random", "searched"))
+    assert table("docs/delay.md", "| method | between the hand and |")["ledger"][-1] == least
+
+
+def test_how_to_choose_is_told_the_same_figures():
+    holds = table("docs/delay.md", "| method | stable of 162 |")
+    least = table("docs/delay.md", "| method | between the hand and |")
+    assert table("docs/choose.md", "| method | stable |") == {
+        method: [stable, good, felt, least[method][-1].rpartition(" ")[2]]
+        for method, (stable, good, _, felt) in holds.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "head"),
+    [("ledger_in_station", "| cells (two leaves"), ("ledger_with_friction", "| cells | at rest")],
+)
+def test_what_is_said_of_ledger_in_the_station_is_what_its_record_says(name, head):
+    rows = figures_of_record(name)["rows"]
+    for network, written in table("benchmarks/README.md", head).items():
+        held = [row for row in rows if row["network"] == network]
+        errors = [abs(row["felt_error"]) for row in held]
+        found = [
+            *(sum(row["stable"] for row in held), len(held)),
+            *(sum(error <= 0.1 for error in errors), 100.0 * max(errors)),
+            1e3 * max(row["left_m"] for row in held),
+            *np.min([row["energy_J"] for row in held], axis=0),
+            max(row["chatter_N"] for row in held),
+        ]
+        words = re.findall(r"\d+(?:\.\d+)?", " ".join(written))
+        assert words == [
+            f"{x:.{len(word.partition('.')[2])}f}" for x, word in zip(found, words, strict=True)
+        ]
