@@ -71,7 +71,7 @@ def test_ci_runs_the_readmes_test_commands(tmp_path):
     (commands,) = re.findall("<!-- the test command -->\n```sh\n(.*?)\n```", README, re.S)
     assert answer.stderr == commands + "\n"  # as it says what it runs
     assert answer.stdout.splitlines() == [
-        "python3 -m venv .venv-test",
+        "python3 -m venv --upgrade-deps .venv-test",
         "pip install -q --no-compile -e .[test,docs]",
         "pytest -n 2 --dist worksteal",
         "python benchmarks/fuzz.py --seconds 20 --seed 1",
