@@ -34,6 +34,7 @@ _SLOWER = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # speeds that the player has
 
 _SHAFT, _HEAD = 0.006, 0.03  # radius of an arrow's shaft, length of its head [m]
 _METRES_PER_NEWTON = 0.003
+_BACK = RotationMatrix.MakeXRotation(np.pi)
 
 
 @dataclass(frozen=True)
@@ -198,7 +199,7 @@ class Arrow:
         along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()
         R = along.matrix()
         middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _HEAD) * R[:, 2]
-        back = along @ RotationMatrix.MakeXRotation(np.pi)
+        back = along @ _BACK
         put = self._meshcat.SetTransform
         put(f"{self._path}/shaft", RigidTransform(along, middle), film_time)
         put(f"{self._path}/head", RigidTransform(back, tip), film_time)

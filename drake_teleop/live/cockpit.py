@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,29 @@ CONTACT = 2.0
 _AT_LIMIT = 0.999
 _HAND_PULLS = 59.0  # N of the 60 that a hand can
 _SILENT = 0.05  # s
+
+
+@njit(cache=True)
+def _least_and_most(vectors, origins, out):
+    """Writes the least and the largest length of vectors (n, 3 or more) from `origins` to `out`."""
+    least, most = math.inf, 0.0
+    for row in range(len(vectors)):
+        square = 0.0
+        for k in range(3):
+            square += (vectors[row, k] - origins[row, k]) ** 2
+        least, most = min(least, square), max(most, square)
+    out[0], out[1] = math.sqrt(least), math.sqrt(most)
+
+
+@njit(cache=True)
+def _at_limits(values, limits):
+    """Which columns of (n, k) `values` get to `limits` (k,): their bits are set."""
+    found = 0
+    for row in range(len(values)):
+        for k in range(len(limits)):
+            if abs(values[row, k]) >= limits[k]:
+                found |= 1 << k
+    return found
 
 
 @njit(cache=True)
@@ -50,14 +74,21 @@ def _go_on(table, t, states, contact_S, hand_E, twist, before, energy):
 class Cockpit:
     """Makes frames for the page out of the rows of the log.
 
+    It is called between two slices, when nothing of it is in the processor's caches any more: there
+    each call of numpy takes several times as long as in a loop.
+
     Args:
         scenario: of the station.
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._arm = slave_arm(scenario)
+        arm = slave_arm(scenario)
+        self._table, n = arm.table, arm.num_joints
+        self._limits = (
+            ("speed", "slave_state", slice(n, None), _AT_LIMIT * arm.velocity_limit),
+            ("torque", "joint_torque", slice(None), _AT_LIMIT * arm.effort_limit),
+        )
         self._peak = scenario.master.device(0.0, 0.0).peak_force
-        self._joints = self._arm.num_joints
         self._energy = np.zeros(2)
         self._before = np.full(4, np.nan)  # t, p_WS of the last row
         self._forces = np.zeros((3, 2))
@@ -66,7 +97,7 @@ class Cockpit:
         """Numbers of the newest rows, for JSON: every one of them is finite.
 
         Args:
-            rows: as `Session.news` gives them.
+            rows: as `Session.news` gives them, one at least.
             inputs: that hold.
 
         Returns:
@@ -74,72 +105,60 @@ class Cockpit:
             "contact"; "energy": of the hand into the device, of the tool into what it touches [J];
             "tool" and "stylus" [m]; "words": what is clipped or in a safe state.
         """
-        scale = inputs.scales["force_scale"]
-        offset = rows["load_estimate"][:, :3]
-        measured = np.linalg.norm(rows["measured_wrench_S"][:, :3] - offset, axis=1)
-        contact_S = rows.get("contact_wrench_S", np.zeros((len(measured), 6)))
-        contact = np.linalg.norm(contact_S[:, :3], axis=1)
-        felt = np.linalg.norm(rows["force_to_master"][:, :3], axis=1)
-        if len(measured):
-            curves = np.stack([scale * measured, scale * contact, felt])
-            self._forces = np.stack([curves.min(axis=1), curves.max(axis=1)], axis=1)
-            _go_on(
-                self._arm.table,
-                rows["t"],
-                rows["slave_state"],
-                contact_S,
-                rows["hand_wrench_E"],
-                rows["twist_master"],
-                self._before,
-                self._energy,
-            )
-        noticed = (
-            rows["contact"][:, 0].any() if "contact" in rows else contact.max(initial=0.0) > CONTACT
+        nothing = np.zeros((len(rows["t"]), 6))
+        contact_S = rows.get("contact_wrench_S", nothing)
+        measured, contact, felt = self._forces
+        _least_and_most(rows["measured_wrench_S"], rows["load_estimate"], measured)
+        _least_and_most(contact_S, nothing, contact)
+        _least_and_most(rows["force_to_master"], nothing, felt)
+        noticed = rows["contact"].any() if "contact" in rows else contact[1] > CONTACT
+        self._forces[:2] *= inputs.scales["force_scale"]
+        _go_on(
+            self._table,
+            rows["t"],
+            rows["slave_state"],
+            contact_S,
+            rows["hand_wrench_E"],
+            rows["twist_master"],
+            self._before,
+            self._energy,
         )
-        frame = {
-            "f": _numbers(self._forces, 4),
+        return {
+            "f": [_numbers(pair, 4) for pair in self._forces],
             "contact": bool(noticed),
             "energy": _numbers(self._energy, 5),
-            "words": list(self._words(rows, inputs)) if len(measured) else [],
+            "words": list(dict.fromkeys(self._words(rows, inputs, nothing))),
+            "t": round(float(self._before[0]), 3),
+            "tool": _numbers(self._before[1:], 5),
+            "stylus": _numbers(rows["pose_master"][-1, 4:], 5),
         }
-        if not math.isnan(self._before[0]):
-            frame |= {
-                "t": round(float(self._before[0]), 3),
-                "tool": _numbers(self._before[1:], 5),
-            }
-        if len(measured):
-            frame["stylus"] = _numbers(rows["pose_master"][-1, 4:], 5)
-        return frame
 
-    def _words(self, rows: dict[str, Array], inputs: Inputs) -> list[str]:
-        words = []
+    def _words(self, rows: dict[str, Array], inputs: Inputs, nothing: Array) -> Iterator[str]:
         for name in ("fault", "fault_at_hand"):
-            faults = set(rows[name][:, 0]) - {0.0} if name in rows else set()
-            words += [MEANINGS[Fault(int(fault))] for fault in sorted(faults)]
-        if (rows["ik_status"] >= IkStatus.OUT_OF_REACH).any():
-            words.append("the arm cannot get where the hand wants it")
-        if (rows["saturated"] > 0).any():
-            words.append("the wrist sensor is saturated")
+            if name in rows and rows[name].any():
+                faults = set(rows[name][:, 0]) - {0.0}
+                yield from (MEANINGS[Fault(int(fault))] for fault in sorted(faults))
+        if rows["ik_status"].max() >= IkStatus.OUT_OF_REACH:
+            yield "the arm cannot get where the hand wants it"
+        if rows["saturated"].max() > 0:
+            yield "the wrist sensor is saturated"
         if self._forces[2, 1] >= _AT_LIMIT * self._peak:
-            words.append(f"the device gives all that it can, {self._peak:g} N")
-        if np.linalg.norm(rows["hand_wrench_E"][:, :3], axis=1).max() > _HAND_PULLS:
-            words.append("the hand pulls as hard as it can")
-        n = self._joints
-        for what, used, limit in (
-            ("speed", rows["slave_state"][:, n:], self._arm.velocity_limit),
-            ("torque", rows["joint_torque"], self._arm.effort_limit),
-        ):
-            full = np.flatnonzero((np.abs(used) >= _AT_LIMIT * limit).any(axis=0)) + 1
-            if len(full):
-                words.append(f"joint {', '.join(map(str, full))} at the limit of its {what}")
-        if "ports" in rows and (rows["ports"][:, 4:6] > _SILENT).any():
-            words.append("the network is silent")
-        edge = [name for name in ("x", "y", "z") if abs(getattr(inputs, name)) == RANGES[name][1]]
-        if edge:
-            words.append("the hand is as far out as it may go")
-        return list(dict.fromkeys(words))
+            yield f"the device gives all that it can, {self._peak:g} N"
+        hand = np.empty(2)
+        _least_and_most(rows["hand_wrench_E"], nothing, hand)
+        if hand[1] > _HAND_PULLS:
+            yield "the hand pulls as hard as it can"
+        for what, name, part, limits in self._limits:
+            full = _at_limits(rows[name][:, part], limits)
+            if full:
+                joints = [str(k + 1) for k in range(len(limits)) if full >> k & 1]
+                yield f"joint {', '.join(joints)} at the limit of its {what}"
+        if "ports" in rows and rows["ports"][:, 4:6].max() > _SILENT:
+            yield "the network is silent"
+        if any(abs(getattr(inputs, name)) == RANGES[name][1] for name in ("x", "y", "z")):
+            yield "the hand is as far out as it may go"
 
 
-def _numbers(values: Array, digits: int) -> Any:
+def _numbers(values: Array, digits: int) -> list[float]:
     """Rounded, for JSON; what is not finite is 0 (and a fault, which has its words)."""
-    return np.round(np.nan_to_num(values, posinf=0.0, neginf=0.0), digits).tolist()
+    return [round(x, digits) if math.isfinite(x) else 0.0 for x in values.tolist()]

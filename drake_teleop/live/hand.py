@@ -27,6 +27,7 @@ from drake_teleop.operator.operator import (
 from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.scenario import Scenario
 from drake_teleop.sides.master import MakeMasterSide
+from drake_teleop.vectors import cross, plus, plus_cross, put, three, times
 
 Array = NDArray[np.float64]
 
@@ -77,15 +78,28 @@ def _wanted_into(path, time, pose, out):
         out[10 + k] = rate[k] + a * across + b * (r[k] * along - square * rate[k])
 
 
-def _rate_of(r: Array, omega: Array) -> Array:
-    """(3,) the rate of a rotation vector r (3,) [rad] that turns with omega (3,) [rad/s]."""
-    angle = float(np.linalg.norm(r))
-    if angle < 1e-6:
-        return omega
-    across = np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
-    a = (1.0 - math.cos(angle)) / angle**2
-    b = (angle - math.sin(angle)) / angle**3
-    return np.linalg.solve(np.eye(3) + a * across + b * across @ across, omega)
+@njit(cache=True)
+def _rate_of(r, omega):
+    """The rate of a rotation vector r [rad] that turns with omega [rad/s], three numbers each."""
+    square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+    c = 1.0 / 12.0 + square / 720.0
+    if square > 1e-4:
+        angle = math.sqrt(square)
+        c = 1.0 / square - math.sin(angle) / (2.0 * angle * (1.0 - math.cos(angle)))
+    across = cross(r, omega)
+    return plus_cross(plus(omega, times(-0.5, across)), times(c, r), across)
+
+
+@njit(cache=True)
+def _led_into(path, time, now, target):
+    """Writes the path to `target` (7,), which begins at `time` as what is wanted `now` (13,)."""
+    path[_HELD], path[_START] = 1.0, time
+    put(path, _TARGET, target, 0, 7)
+    turned = logarithm(multiply(now, conjugate(target)))
+    rate = _rate_of(turned, three(now, 10))
+    for k in range(3):
+        path[_AWAY + k], path[_AWAY + 3 + k] = now[4 + k] - target[4 + k], now[7 + k]
+        path[_TURNED + k], path[_TURNED + 3 + k] = turned[k], rate[k]
 
 
 @njit(cache=True)
@@ -131,14 +145,9 @@ class LiveHand(Operator):
         The way begins where it is, as fast as it is. A hand that lets go pulls nowhere; only its
         damping is left.
         """
-        now = self._wants(context).copy()
         path = np.zeros(_PATH)
         if target is not None:
-            path[_HELD], path[_START], path[_TARGET:_AWAY] = 1.0, context.get_time(), target
-            path[_AWAY : _AWAY + 3] = now[4:7] - target[4:]
-            path[_AWAY + 3 : _TURNED] = now[7:10]
-            r = np.array(logarithm(multiply(tuple(now[:4]), conjugate(tuple(target[:4])))))
-            path[_TURNED : _TURNED + 3], path[_TURNED + 3 :] = r, _rate_of(r, now[10:])
+            _led_into(path, context.get_time(), self._wants(context), target)
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def Hold(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:

@@ -274,8 +274,8 @@ class Session:
         What was not recorded is forgotten. Call it at least once a second.
         """
         sink, seen = self._now.sink, self._seen
-        data, times = sink.data()[:, seen:], sink.sample_times()[seen:]
-        found = {name: data[part].T.copy() for name, part in self._now.columns.items()}
+        data, times = sink.data()[:, seen:].T.copy(), sink.sample_times()[seen:]
+        found = {name: data[:, part] for name, part in self._now.columns.items()}
         found["t"] = times.copy()
         self._seen += len(times)
         if self._on_disk is None:

@@ -179,7 +179,7 @@ def test_lost_time_is_caught_up_with_or_given_up():
     assert pace.wait(0.09) == pytest.approx(-0.035) and pace.given_up == 0.0
     pace.begin(0.3)
     assert pace.given_up == pytest.approx(0.245) and pace.wait(0.3) == pytest.approx(5e-3)
-    assert pace.factor < 0.2 and pace.lateness(100) == pytest.approx(0.245)
+    assert pace.factor < 0.2 and pace.lateness() == pytest.approx(0.245)
     pace.slow = 4.0
     pace.begin(0.305)
     assert pace.wait(0.305) == pytest.approx(0.02)
