@@ -59,10 +59,14 @@ def call_at(arguments: tuple[types.Type, ...]) -> Any:
     """For compiled code: calls a function without result by its `address_of`, then its arguments.
 
     numba makes what is called by name a part of the caller, and optimises it there once more, at
-    every level of a tree of calls. What is called like this is compiled once, by itself.
+    every level of a tree of calls. What is called like this is compiled once, by itself. What it
+    raises comes to the caller.
 
     Args:
-        arguments: their types.
+        arguments: their types; what is given is cast to them.
+
+    Returns:
+        a function of the address, an integer, and the arguments.
     """
 
     @intrinsic
@@ -90,7 +94,12 @@ def call_at(arguments: tuple[types.Type, ...]) -> Any:
 
 
 def address_of(function: Dispatcher, arguments: tuple[types.Type, ...]) -> int:
-    """Where the code of a compiled function begins; it stays there as long as the function."""
+    """Where the code of a compiled function begins; it stays there as long as the function.
+
+    Args:
+        function: without result; it is compiled here, if it is not yet.
+        arguments: the types for which.
+    """
     code = function.get_compile_result(types.void(*arguments))._asdict()
     return code["library"].get_pointer_to_function(code["fndesc"].llvm_func_name)
 

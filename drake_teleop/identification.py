@@ -43,6 +43,7 @@ Array = NDArray[np.float64]
 
 # The trajectory belongs to the arm, not to the run's seed.
 _DESIGN_SEED = 0
+#: By all that a design depends on: the trajectory and its kappa; half of the time of a first run.
 _DESIGNS: dict[str, tuple[FourierTrajectory, float]] = {}
 
 
@@ -148,7 +149,8 @@ def identify_load(
         scenario: whose load estimator learns: the shipped "identification", or that with the slave
             and the sensor of another one (`identification_scenario`).
         progress: whether bars are shown, or where: see `pages/progress.py`.
-        trajectory: to run, of the scenario's duration; a new one is designed if there is none.
+        trajectory: to run, of the scenario's duration; if there is none, one is designed, once in
+            each process for all seeds.
         log: as `simulate` has it.
 
     Raises:
@@ -217,7 +219,10 @@ def batch_identification(
 
 
 def _designed(scenario: Scenario, stage: Stage) -> tuple[FourierTrajectory, float]:
-    """The trajectory of a scenario and its kappa: each process designs it once for all seeds."""
+    """The trajectory of a scenario and its kappa; who has it may change it.
+
+    Nor do the rows of the log change it: where contact is detected there are more of them.
+    """
     same = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.files()]
     key = sha256(repr((dataclasses.asdict(same), models)).encode()).hexdigest()

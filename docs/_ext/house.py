@@ -9,7 +9,7 @@ import matplotlib as mpl
 from matplotlib import pyplot as plt
 from sphinx_gallery.scrapers import figure_rst
 
-from drake_teleop.pages.style import house_style
+from drake_teleop.pages.style import PAGE_DPI, house_style
 
 with house_style():
     _HOUSE = dict(mpl.rcParams)
@@ -25,7 +25,7 @@ def picture(_block: Any, names: dict[str, Any], settings: dict[str, Any]) -> str
     """What a script has made as `figure`, whether it is pyplot's or not."""
     path = Path(next(names["image_path_iterator"]))
     figure = names["example_globals"]["figure"]
-    figure.savefig(path, dpi=160)
+    figure.savefig(path, dpi=PAGE_DPI)
     plt.close("all")
     return figure_rst([str(path)], settings["src_dir"], Path(names["src_file"]).stem)
 

@@ -24,7 +24,15 @@ from drake_teleop.analysis.two_port import (
     transmitted_impedance,
 )
 from drake_teleop.pages.html import embedded, render
-from drake_teleop.pages.style import BLACK, COLOURS, GREY, VERMILION, Picture, house_style
+from drake_teleop.pages.style import (
+    BLACK,
+    COLOURS,
+    GREY,
+    PAGE_DPI,
+    VERMILION,
+    Picture,
+    house_style,
+)
 from drake_teleop.writing import write_picture, write_text
 
 _GRIP_COLOURS = {"light": COLOURS[3], "medium": COLOURS[4], "firm": COLOURS[1]}
@@ -69,7 +77,7 @@ def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
         "maps": draw_maps(curves, summary["grip"]),
     }
     for name, figure in pictures.items():
-        write_picture(out / f"{name}.png", figure, dpi=160)
+        write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
     page = render(
         "drake_teleop.analysis",
         "report.html.j2",

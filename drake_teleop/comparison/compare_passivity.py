@@ -52,7 +52,7 @@ from drake_teleop.comparison.one_dof import ACTUAL, Figures, OneDof, Task, figur
 from drake_teleop.errors import DrakeTeleopError, meant
 from drake_teleop.identified_load import identified_load
 from drake_teleop.pages.progress import Stage, show_progress
-from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.passivity.methods import METHODS, PassivityConfig, steps_of
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Rates, Scenario, Simulation, replace
 from drake_teleop.simulation import MakeSimulator, advance, read_log
@@ -231,8 +231,10 @@ def _one_dof_study(
     methods: Sequence[str], seed: int, jobs: int, stage: Stage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(methods, WALLS, IMPAIRMENTS))
-    # The first run compiles; side by side, processes would do that twice.
+    # What is compiled here, processes side by side need not compile each for itself.
     longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
+    for method in methods:
+        steps_of(method)
     seeds = range(seed, seed + 2)
     found = _each(
         longest_round_trip,

@@ -15,7 +15,7 @@ from drake_teleop.channel.network import PRESETS
 from drake_teleop.comparison.decision import BEHIND, HOLDS, LEAKS, UNSTABLE, decide
 from drake_teleop.comparison.hands import RATES
 from drake_teleop.pages.html import embedded, render
-from drake_teleop.pages.style import BLACK, COLOURS, GREY, Picture, house_style
+from drake_teleop.pages.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, house_style
 from drake_teleop.writing import write_picture, write_text
 
 #: Columns of the station's table: key of the row, heading, factor, decimals.
@@ -55,7 +55,7 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         "limits": draw_limits(summary["one_dof"]),
     }
     for name, figure in pictures.items():
-        write_picture(out / f"{name}.png", figure, dpi=160)
+        write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
     page = render(
         "drake_teleop.comparison",
         "report.html.j2",

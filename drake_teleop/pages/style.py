@@ -18,9 +18,11 @@ BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 PURPLE, SKY, BLACK, GREY = "#CC79A7", "#56B4E9", "#1A1A1A", "#6B7280"
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 
+#: Pixels an inch of a picture that a page shows: it is larger there than alone.
+PAGE_DPI = 160
+
 _STYLE: dict[Any, Any] = {
     "figure.dpi": 110,
-    "savefig.dpi": 160,
     "figure.constrained_layout.use": True,
     "font.family": "sans-serif",
     "font.size": 9.5,
@@ -46,7 +48,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def house_style() -> AbstractContextManager[None]:
-    """A context in which figures get the house's fonts, colours, grid and resolution."""
+    """A context in which figures get the house's fonts, colours and grid."""
     return mpl.rc_context({**_STYLE, "axes.prop_cycle": cycler(color=COLOURS)})
 
 

@@ -201,9 +201,13 @@ _master_step, _slave_step, _command_left = map(call_at, (_MASTER, _SLAVE, _LEFT)
 
 @cache
 def steps_of(method: str) -> tuple[int, int, int]:
-    """By what the compiled steps of a method are called; they are compiled here.
+    """The addresses of a method's `master_step`, `slave_step` and `command_left`, compiled here.
 
-    Not by name: the channel would contain all methods then, and take nine times as long to compile.
+    By these a channel calls them. By name it would contain all methods, and take nine times as long
+    to compile.
+
+    Args:
+        method: one of `METHODS`.
     """
     file = _FILES[method]
     return (

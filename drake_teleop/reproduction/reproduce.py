@@ -42,6 +42,7 @@ from drake_teleop.identification import (
 )
 from drake_teleop.load.compensation import scaled_wrench
 from drake_teleop.pages.progress import Progress, Stage, show_progress
+from drake_teleop.pages.style import PAGE_DPI
 from drake_teleop.replay import write_replay, write_scenario
 from drake_teleop.reproduction.figures import contact_figure, scaling_figure
 from drake_teleop.reproduction.reaction import eliminated_reaction
@@ -407,7 +408,7 @@ def _write(
     write_table(out / "logs" / "identification_sensor_log.parquet", load.result.sensor_log())
     load.identification.save(out / "identification.json")
     for name, picture in pictures.items():
-        write_picture(out / f"{name}.png", picture, dpi=160)
+        write_picture(out / f"{name}.png", picture, dpi=PAGE_DPI)
     write_replay(out / "replay.html", contact.touched, contact.scenario, slow_motion=_SLOW_MOTION)
     figures = flat(summary)
     write_text(out / "table.md", _markdown(compare_with_paper(figures)))

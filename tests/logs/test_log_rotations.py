@@ -39,6 +39,20 @@ def test_what_leaves_no_residual_at_all_is_solved() -> None:
     np.testing.assert_allclose(x, [noise.mean(), 0.0], atol=1e-9)  # half leaves nothing
 
 
+def test_what_is_linear_needs_no_differences() -> None:
+    rng, calls = np.random.default_rng(4), []
+    maps, readings = rng.normal(size=(200, 6, 5)), rng.normal(size=(200, 6))
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        calls.append(x)
+        return np.sin(maps[:, :, :2] @ x[:2]) + maps[:, :, 2:] @ x[2:] - readings
+
+    found = solve(residual, np.zeros(5))
+    differenced = len(calls)
+    np.testing.assert_allclose(solve(residual, np.zeros(5), maps[:, :, 2:]), found, rtol=1e-5)
+    assert len(calls) - differenced < 0.7 * differenced
+
+
 @pytest.mark.parametrize("inverse", [False, True])
 @pytest.mark.parametrize("form", WIDTHS)
 def test_some_rows_in_any_form_and_their_inverses(form: str, inverse: bool) -> None:

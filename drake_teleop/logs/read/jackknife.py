@@ -33,27 +33,30 @@ def solve(
     Returns:
         the solution (n,), and its standard deviations (n,), inf for what is not determined.
     """
+    linear = np.empty((*residual(x).shape, 0)) if linear is None else linear
+    rows, channels, _ = linear.shape
+    found = _fitted(residual, x, linear)
+    found = _fitted(residual, found.x, linear)  # with the weights that the residuals have there
+    return found.x, jackknife(found.jac, found.fun, channels * (rows // _BLOCKS))
+
+
+def _fitted(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
+    """scipy's solution from x on, with the weights that the residuals have at x."""
     from scipy.optimize import approx_fprime, least_squares
 
-    linear = np.empty((*residual(x).shape, 0)) if linear is None else linear
-    others = len(x) - linear.shape[2]
-    for _ in range(2):
-        errors = residual(x)
-        power = errors.reshape(len(errors), -1, 3).var(axis=(0, 2))
-        sigma = np.repeat(np.sqrt(power + 1e-12 * power.max() + 1e-30), 3)
-        known = (linear / sigma[:, None]).reshape(errors.size, linear.shape[2])
+    errors, others = residual(x), len(x) - linear.shape[2]
+    power = errors.reshape(len(errors), -1, 3).var(axis=(0, 2))
+    sigma = np.repeat(np.sqrt(power + 1e-12 * power.max() + 1e-30), 3)
+    known = (linear / sigma[:, None]).reshape(errors.size, linear.shape[2])
 
-        def weighted(z: Array, s: Array = sigma) -> Array:
-            return (residual(z) / s).ravel()
+    def weighted(z: Array) -> Array:
+        return (residual(z) / sigma).ravel()
 
-        def slopes(z: Array, f: Any = weighted, known: Array = known) -> Array:
-            found = approx_fprime(z[:others], lambda y: f(np.append(y, z[others:])))
-            return np.hstack([found, known])
+    def slopes(z: Array) -> Array:
+        found = approx_fprime(z[:others], lambda y: weighted(np.append(y, z[others:])))
+        return np.hstack([found, known])
 
-        found = least_squares(weighted, x, jac=slopes, x_scale="jac", max_nfev=_STEPS)
-        x = found.x
-    width = len(sigma) * (len(errors) // _BLOCKS)
-    return x, jackknife(found.jac, found.fun, width)
+    return least_squares(weighted, x, jac=slopes, x_scale="jac", max_nfev=_STEPS)
 
 
 def jackknife(jacobian: Array, residual: Array, width: int) -> Array:

@@ -164,29 +164,14 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     turned = resample(t, pose.t, smooth.angular_velocity)
     K = lever_matrix(turned, resample(t, pose.t, smooth.angular_acceleration))
 
-    known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
-
-    def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        turning, at = _turned(R, x[:3]), t + x[3] + drift * (t - centre)
-        seen = resample(at, imu.t, moving).reshape(-1, 3) @ turning.T
-        left = seen.reshape(known.shape) - known
-        left[:, 0] -= K @ x[4:7]
-        return left.reshape(len(t), -1) + x[7:]
-
-    first = np.zeros(7 + 3 * len(pairs))
-    first[3] = middle
-    first[7:] = -residual(first).mean(axis=0)
-    linear = np.zeros((len(t), 3 * len(pairs), len(first) - 4))
-    linear[:, :3, :3] = -K
-    linear[:, :, 3:] = np.eye(3 * len(pairs))
-    x, deviations = solve(residual, first, linear)
+    x, deviations, left = _refined(t, drift * (t - centre), imu.t, pairs, K, R, middle)
     lever = None
     if position:
         lever = LeverArm(
             x[4:7], np.where(shown_axes(K, pose, cutoff), deviations[4:7], np.inf), "pose"
         )
-    left = residual(x).reshape(len(t), -1, 3).var(axis=0).sum(axis=1)
-    shares = [float(part / y.var(axis=0).sum()) for part, (y, _) in zip(left, pairs, strict=True)]
+    powers = left.reshape(len(t), -1, 3).var(axis=0).sum(axis=1)
+    shares = [float(part / y.var(axis=0).sum()) for part, (y, _) in zip(powers, pairs, strict=True)]
     speeds = [float(np.linalg.norm(log.angular_velocity, axis=1).std()) for log in (imu, pose)]
     return Mounting(
         R_SI=_turned(R, x[:3]),
@@ -201,6 +186,48 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
         deviations_deg=np.degrees(deviations[:3]),
         lever=lever,
     )
+
+
+def _refined(
+    t: NDArray[np.float64],
+    later: NDArray[np.float64],
+    t_imu: NDArray[np.float64],
+    pairs: list[tuple[NDArray[np.float64], NDArray[np.float64]]],
+    K: NDArray[np.float64],
+    R: NDArray[np.float64],
+    lag: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """The least squares of `find_mounting`.
+
+    Args:
+        t: (N,) times on the clock of the pose [s].
+        later: (N,) what a drift of the clocks adds to the lag by then [s].
+        t_imu: (M,) times of the IMU's samples, on its own clock [s].
+        pairs: specific force [m/s^2] and, with a gyroscope, angular velocity [rad/s]: (N, 3) of the
+            pose and (M, 3) of the IMU.
+        K: (N, 3, 3) of the module docstring.
+        R, lag: R_SI and the lag [s] to begin with.
+
+    Returns:
+        (7 + 3 k,) rotation vector on top of R in S [rad], lag [s], p [m] and the k constants b;
+        their standard deviations; (N, 3 k) what is left. k is the number of pairs.
+    """
+    known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
+
+    def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        seen = resample(t + x[3] + later, t_imu, moving).reshape(-1, 3) @ _turned(R, x[:3]).T
+        left = seen.reshape(known.shape) - known
+        left[:, 0] -= K @ x[4:7]
+        return left.reshape(len(t), -1) + x[7:]
+
+    first = np.zeros(7 + 3 * len(pairs))
+    first[3] = lag
+    first[7:] = -residual(first).mean(axis=0)
+    linear = np.zeros((len(t), 3 * len(pairs), len(first) - 4))
+    linear[:, :3, :3] = -K
+    linear[:, :, 3:] = np.eye(3 * len(pairs))
+    x, deviations = solve(residual, first, linear)
+    return x, deviations, residual(x)
 
 
 def _kabsch(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
