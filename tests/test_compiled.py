@@ -186,6 +186,35 @@ def test_for_other_arguments_the_caller_is_compiled_again():
     assert _compiled._text(_call) != _compiled._text(_call_other)
 
 
+def test_what_borrows_fills_arrays_and_what_it_calls_may_make_some():
+    @_compiled.njit()
+    def makes(x, out):
+        new = np.full(out.shape[0], 2.0)
+        for k in range(out.shape[0]):
+            out[k] = new[k] * x[k]
+
+    @_compiled.njit(borrows=True)
+    def borrows(pair, out):
+        for row in range(len(out)):
+            makes(pair[0][1:], out[row])
+
+    x, out = np.arange(4.0), np.zeros((2, 3))
+    before = sys.getrefcount(x), sys.getrefcount(out)
+    for _ in range(3):
+        borrows((x, x), out)
+    assert out.tolist() == [[2.0, 4.0, 6.0]] * 2
+    assert (sys.getrefcount(x), sys.getrefcount(out)) == before
+
+
+def test_what_borrows_makes_no_array_itself():
+    @_compiled.njit(borrows=True)
+    def makes(x):
+        x[:] = np.zeros(x.shape[0])
+
+    with pytest.raises(numba.NumbaError, match="No implementation of function"):
+        makes(np.ones(3))
+
+
 def test_the_package_compiles_through_this_cache_only():
     own = re.compile(r"^from drake_teleop\._compiled import .*\bnjit$", re.MULTILINE)
     for path in Path(drake_teleop.__file__).parent.rglob("*.py"):

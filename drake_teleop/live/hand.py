@@ -102,7 +102,7 @@ def _led_into(path, time, now, target):
         path[_TURNED + k], path[_TURNED + 3 + k] = turned[k], rate[k]
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _wrench_into(path, time, impedance, pose, twist, wanted, wrench):
     """Writes what the hand wants now (13,), and the wrench (6,) of the hand on the stylus."""
     _wanted_into(path, time, pose, wanted)

@@ -20,7 +20,7 @@ _LARGEST_PERIOD = 1e-3  # s, slower than any haptic device
 _LARGEST_FRICTION_STEP = 2.0
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _advance(state, pose, twist, display, hand_wrench, drive, device, period, work, stages):
     """`step`, and the pose and twist that follow: one call of compiled code instead of three.
 

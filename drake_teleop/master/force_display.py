@@ -89,7 +89,7 @@ def motor_torque_into(displayed, q, numbers, J, torque):
             torque[i] += J[k, i] * displayed[k]
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def display_into(wrench, device, numbers, period, J, drive):
     """One period of the display; see `ForceDisplay` for its safe state.
 

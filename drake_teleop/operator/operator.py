@@ -244,7 +244,7 @@ def _wanted_into(packed, start, moving, memory, time, pose, twist):
         add_plan_into(memory, time, pose, twist)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _wrench_now(
     packed, start, moving, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench
 ):  # fmt: skip

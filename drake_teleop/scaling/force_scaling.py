@@ -134,7 +134,7 @@ def _scaled_now_into(sample, estimate, gripper, change, time, out):
     _scaled_into(sample, estimate, gripper, scales, out)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _all_into(sample, estimate, gripper, change, time, elimination, believed, out):
     """F' with the scales of this time, the contact wrench, and the fault."""
     _scaled_now_into(sample, estimate, gripper, change, time, out[:6])

@@ -69,7 +69,7 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
         out[4 + k] = command[4 + k] + translation_scale * offset[k]
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _command_into(pose, references, alignment, translation_scale, rotation_scale, out):
     """The commanded X_WS (7,), see the state of `KinematicScaling`."""
     if references[14] > 0.5:

@@ -188,10 +188,10 @@ def _torque_at(held, after, torque):
         torque[i] += after * held[1][i]
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def sample_step(
     physics, sensor, period, time, state, around, held, applied_W, noise, memory, until_now,
-    touching_W, result,
+    touching_W, scratch, result,
 ):  # fmt: skip
     """Takes the samples that have become due in the steps since the last call.
 
@@ -214,11 +214,12 @@ def sample_step(
         touching_W: (6,) what contacts exert on the tool now, as the plant says, about the world's
             origin, in W; used if `until_now`. A stiff contact multiplies the last digit of a
             position by 2e5 N/m: what has the plant's own penetration is the plant's to 1e-12 N.
+        scratch: (9, 2 n + 6 + size of the plant's state), whatever it holds.
         result: filled: [last sample before now (16 + n) | when that was taken [s] | memory, its
             queue now's end alone].
     """
     n = state.shape[0] // 2
-    size, half, tau, joints = BEFORE_JOINTS + n, n + 1, np.empty(n), physics[4]
+    size, half, tau, joints = BEFORE_JOINTS + n, n + 1, scratch[7, :n], physics[4]
     extra = around.shape[0] - 2
     full = 2 * half + extra
     width = 1 + full
@@ -226,9 +227,10 @@ def sample_step(
     put(after, 0, memory, 0, memory.shape[0])
     tail = after[sensor[3] :]
     count, queued = tail[0], int(tail[1])
-    now, now_dot, now_wrench_W = np.empty(full), np.empty(2 * half), np.empty(6)
-    between, between_dot, wrench_W = np.empty(full), np.empty(2 * half), np.empty(6)
-    start_dot, end_dot = np.empty(2 * half), now_dot
+    now, between = scratch[0, :full], scratch[1, :full]
+    now_dot, between_dot = scratch[2, : 2 * half], scratch[3, : 2 * half]
+    start_dot, end_dot = scratch[4, : 2 * half], now_dot
+    now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
     joined(state, around, now)
     put(between, 2 * half, now, 2 * half, extra)  # for what is not interpolated of it: the arm
     _torque_at(held, 0.0, tau)
@@ -246,7 +248,7 @@ def sample_step(
         until, end, end_dot = time, now, now_dot
         if k < queued - 1:
             following = tail[2 + (k + 1) * width :][:width]
-            until, end, end_dot = following[0], following[1:], np.empty(2 * half)
+            until, end, end_dot = following[0], following[1:], scratch[8, : 2 * half]
         if (count + _SAME) * period >= until:
             continue
         _torque_at(held, start[0] - time, tau)
@@ -378,6 +380,7 @@ class WristSensor(LeafSystem):
         self.DeclareDiscreteState(memory)
         self._result = np.zeros(len(first) + 1 + len(memory))
         self._remains = slice(len(first) + 1, None)  # of a step: the memory
+        self._scratch = np.empty((9, 2 * n + 6 + contact.plant_size))
         # Not the acceleration: whatever changes in the plant would be passed on twice.
         pushes = (self._torque, self._rate, self._applied)
         around = (self._sheet, self._plant, self._contacts)
@@ -505,7 +508,7 @@ class WristSensor(LeafSystem):
         """`sample_step`, with Drake's contact at each instant if the tool is watched."""
         inputs = self._inputs(context)
         if near != WATCHED:
-            sample_step(*inputs, until_now, touching_W, result)
+            sample_step(*inputs, until_now, touching_W, self._scratch, result)
             return
         if self._twin is None:
             self._twin = ContactTwin(*self._twins)
@@ -516,7 +519,7 @@ class WristSensor(LeafSystem):
         # The state of each wrench that is asked for follows from those before.
         for k in range(self._most_told):
             told[0, :2] = k, 0.0
-            sample_step(physics, *inputs[1:], until_now, touching_W, result)
+            sample_step(physics, *inputs[1:], until_now, touching_W, self._scratch, result)
             if told[0, 1] <= k:
                 return
             asked = told[0, 2:]

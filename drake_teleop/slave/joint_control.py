@@ -94,7 +94,7 @@ class JointControlConfig:
             )
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def joint_control_torque(
     arm, command, state, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
 ):  # fmt: skip
