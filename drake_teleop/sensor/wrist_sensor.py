@@ -171,7 +171,7 @@ def remember_step(tail, time, state, around):
     tail[1] += 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _postpone(memory, tail, longest, time, state, around):
     """Puts a step's end into the queue in `memory`, see `sample_step`; whether there was room."""
     if memory[tail + 1] >= longest:
@@ -436,7 +436,8 @@ class WristSensor(LeafSystem):
 
     def take_samples(self, context: Context) -> None:
         """Takes the samples before now, for who wants to see the state that results."""
-        self._sample(context, self._near(context), False, self._nothing, self._result)
+        seen = self._seen(context)
+        self._sample(context, seen, self._near(*seen), False, self._nothing, self._result)
         context.SetDiscreteState(self._result[self._remains])
 
     def bring_up_to_date(self, context: Context) -> None:
@@ -447,7 +448,11 @@ class WristSensor(LeafSystem):
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
         tail, time = memory[self._sensor[3] :], context.get_time()
         tail[0], tail[1] = np.ceil(time / self._period - _SAME), 0.0
-        remember_step(tail, time, self._state.Eval(context), self._surroundings(context))
+        remember_step(tail, time, *self._seen(context))
+
+    def _seen(self, context: Context) -> tuple[Array, Array]:
+        """[q; v] of the arm, and `_surroundings`."""
+        return self._state.Eval(context), self._surroundings(context)
 
     def _surroundings(self, context: Context) -> Array:
         """[Deflection, rate] of the leaf, or [0, 0, the plant's state]."""
@@ -458,14 +463,14 @@ class WristSensor(LeafSystem):
     def _applied_W(self, context: Context) -> Array:
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._nothing
 
-    def _near(self, context: Context) -> int:
+    def _near(self, state: Array, around: Array) -> int:
         """See `nearness`."""
         if self._contacts is None:
             return FAR
         if self._beyond:
             return TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
-        q, around = self._state.Eval(context)[: self._n], self._surroundings(context)
+        q = state[: self._n]
         return nearness(arm, pairs, self._watched, joints, q, around[:2], around[2:])
 
     def _touching_W(self, context: Context) -> Array:
@@ -480,14 +485,13 @@ class WristSensor(LeafSystem):
         wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
         return wrench_W
 
-    def _inputs(self, context: Context) -> tuple[object, ...]:
+    def _inputs(self, context: Context, seen: tuple[Array, Array]) -> tuple[object, ...]:
         return (
             self._physics,
             self._sensor,
             self._period,
             context.get_time(),
-            self._state.Eval(context),
-            self._surroundings(context),
+            *seen,
             (
                 self._torque.Eval(context),
                 self._no_rate if self._rate is None else self._rate.Eval(context),
@@ -498,15 +502,22 @@ class WristSensor(LeafSystem):
         )
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
-        near = self._near(context)
+        seen = self._seen(context)
+        near = self._near(*seen)
         touching_W = self._nothing if near == FAR else self._touching_W(context)
-        self._sample(context, near, True, touching_W, output.get_mutable_value())
+        self._sample(context, seen, near, True, touching_W, output.get_mutable_value())
 
     def _sample(
-        self, context: Context, near: int, until_now: bool, touching_W: Array, result: Array
+        self,
+        context: Context,
+        seen: tuple[Array, Array],
+        near: int,
+        until_now: bool,
+        touching_W: Array,
+        result: Array,
     ) -> None:
         """`sample_step`, with Drake's contact at each instant if the tool is watched."""
-        inputs = self._inputs(context)
+        inputs = self._inputs(context, seen)
         if near != WATCHED:
             sample_step(*inputs, until_now, touching_W, self._scratch, result)
             return
@@ -527,11 +538,10 @@ class WristSensor(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._longest > 1 and not self._is_due(context.get_time()):
-            watched = len(self._watched) > 0 and self._near(context) == WATCHED
-            if not watched:
+            seen = self._seen(context)
+            if not self._watched.size or self._near(*seen) != WATCHED:
                 memory, time = discrete_state.get_mutable_value(0), context.get_time()
-                state, around = self._state.Eval(context), self._surroundings(context)
-                if _postpone(memory, self._sensor[3], self._longest, time, state, around):
+                if _postpone(memory, self._sensor[3], self._longest, time, *seen):
                     return
         discrete_state.set_value(0, self._step.Eval(context)[self._remains])
 
@@ -545,14 +555,14 @@ class WristSensor(LeafSystem):
 
     def _check(self, context: Context) -> EventStatus:
         n = self._n
-        around = self._surroundings(context)
+        state, around = self._seen(context)
         x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
-        joined(self._state.Eval(context), around, x)
+        joined(state, around, x)
         if not np.isfinite(x).all():  # nothing is known; the samples say so
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)
         physics = self._physics
-        if self._beyond or self._near(context) == WATCHED:
+        if self._beyond or self._near(state, around) == WATCHED:
             applied = applied + self._touching_So_W(context)
             physics = (*physics[:2], physics[2][:0], *physics[3:])
         plant_rates(physics, x, torque, applied, np.empty(6), xdot)
