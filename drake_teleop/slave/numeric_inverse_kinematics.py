@@ -343,6 +343,28 @@ def turn_length(arm: ArmModel) -> float:
     return float(np.linalg.norm(arm.table[:, TRANSLATION:PHI], axis=1).sum()) / 5.0
 
 
+@njit(cache=True)
+def _follow_command(
+    table, L, lower, upper, speed, posture, pull, pose, position, last, time, q
+):  # fmt: skip
+    """`follow_pose` from the `last` command and when it was (n + 1,); `position` is the encoders'.
+
+    `speed` (n,) are the joints' limits, `pull` is `NumericInverseKinematics.PULL`.
+    """
+    n = q.shape[0]
+    put(q, 0, last, 0, n)
+    if not sound(position):
+        return _BAD_POSE
+    reference, max_step, since = q.copy(), np.zeros(n), max(time - last[n], 0.0)
+    if since > 0.0:  # nothing moves in no time, not even a joint without a limit
+        for i in range(n):
+            max_step[i] = speed[i] * since
+    return follow_pose(
+        table, L, pose, reference, lower, upper, max_step, posture, min(pull * since, 1.0),
+        SINGULAR, STEPS, q,
+    )  # fmt: skip
+
+
 class NumericInverseKinematics(LeafSystem):
     """Turns a commanded pose of the sensor frame into joint positions, for any serial arm.
 
@@ -374,11 +396,12 @@ class NumericInverseKinematics(LeafSystem):
     def __init__(self, arm: ArmModel, q_start: Array, period: float) -> None:
         super().__init__()
         n = arm.num_joints
-        self._arm, self._length = arm, turn_length(arm)
-        self._posture = np.array(q_start, dtype=np.float64)
+        self._joints, posture = n, np.array(q_start, dtype=np.float64)
+        limits = arm.lower, arm.upper, arm.velocity_limit
+        self._fixed = (arm.table, turn_length(arm), *limits, posture)
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._position = self.DeclareVectorInputPort("joint_position", n)
-        self.DeclareDiscreteState(np.append(self._posture, 0.0))  # and of when it is
+        self.DeclareDiscreteState(np.append(posture, 0.0))  # and of when it is
         self._command = self.DeclareVectorOutputPort(
             "joint_command", n, weak_callback(self._calc_command)
         )
@@ -386,25 +409,18 @@ class NumericInverseKinematics(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _solve(self, context: Context, q: Array) -> int:
-        last = np.array(context.get_discrete_state_vector().value())  # not read-only
-        reference, since = last[:-1], max(context.get_time() - last[-1], 0.0)
-        if not sound(self._position.Eval(context)):
-            q[:] = reference
-            return IkStatus.BAD_POSE
-        arm = self._arm
-        # Nothing moves in no time, not even a joint without a limit.
-        max_step = arm.velocity_limit * since if since > 0.0 else np.zeros(len(q))
-        status: int = follow_pose(
-            arm.table, self._length, self._pose.Eval(context), reference, arm.lower, arm.upper,
-            max_step, self._posture, min(self.PULL * since, 1.0), SINGULAR, STEPS, q,
-        )  # fmt: skip
+        last = context.get_discrete_state_vector().value()
+        time, pose, position = context.get_time(), self._pose, self._position
+        status: int = _follow_command(
+            *self._fixed, self.PULL, pose.Eval(context), position.Eval(context), last, time, q
+        )
         return status
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
         self._solve(context, output.get_mutable_value())
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._solve(context, np.empty(self._arm.num_joints))
+        output[0] = self._solve(context, np.empty(self._joints))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         next_state = discrete_state.get_mutable_value(0)
