@@ -37,8 +37,9 @@ from drake_teleop.simulation import MakeSimulator, advance, columns, read_log
 from drake_teleop.station import GetBlock, MakeTeleopStation
 from drake_teleop.writing import make_folder, naming, write_text
 
-#: Of a log on disk: a second. A longer part takes longer to write, which a driver would notice.
-_PART_ROWS = 1000
+#: Of a log on disk: two seconds. A longer part takes longer to copy, which a driver would notice; a
+#: file of its own takes 10 ms of CPU however short it is.
+_PART_ROWS = 2000
 # Of a change of scales [s]. A slider that is moved changes them 60 times a second, and each ramp
 # begins slowly: with longer ones nothing would happen until it rests.
 _RAMP = 0.05
