@@ -11,13 +11,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import drake_teleop as dt
-from drake_teleop.identification import identification_scenario
+from drake_teleop.identified_load import identified_load
 
 empty = dt.LoadScenario("free_motion_force")
 holding = dt.LoadScenario("free_motion_force")
 holding.slave.payload.mass = 0.8
 loads = {
-    name: dt.identify_load(identification_scenario(scenario, seed=1), progress=False)
+    name: identified_load(scenario, progress=False)
     for name, scenario in (("of the empty tool", empty), ("identified anew", holding))
 }
 figure, axes = plt.subplots(figsize=(7, 3.5))
