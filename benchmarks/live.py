@@ -1,6 +1,6 @@
 """Does a station that is driven keep up with the clock, and how much of a core does that take?
 
-    python benchmarks/live.py [--seconds 60] [--json FILE]
+    python benchmarks/live.py [--seconds 60] [--slices] [--json FILE]
 
 A script taps on the leaf of `contact_transition` at 1 Hz, fast in between, as a driver would: 60
 messages a second, in through the page's handler; 60 frames a second out, made into JSON, with the
@@ -8,6 +8,10 @@ messages a second, in through the page's handler; 60 frames a second out, made i
 Real time: the factor of simulated over elapsed time, lateness of slices, lost time that was given
 up, CPU of the process over elapsed time.
 Baseline: the CPU time of the same drive by `repeat`, without clock, page and scene.
+
+With --slices instead: the same taps with each method on each preset of a network, as fast as they
+go, without page and scene, and the CPU time of a slice of 5 ms: its 99th percentile and the most, after
+the first second of each.
 """
 
 from __future__ import annotations
@@ -17,17 +21,22 @@ import json
 import sys
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 
+from drake_teleop.channel.network import PRESETS as NETWORK_PRESETS
 from drake_teleop.identified_load import identified_load
+from drake_teleop.live.choice_names import NETWORKS
+from drake_teleop.live.inputs import SLICE_MS
 from drake_teleop.live.live import FRAME, Live
 from drake_teleop.live.pace import without_collections
 from drake_teleop.live.server import show_in
-from drake_teleop.live.session import live_scenario, read_drive, repeat
+from drake_teleop.live.session import Session, live_scenario, read_drive, repeat
 from drake_teleop.pages.progress import silent
+from drake_teleop.passivity.methods import METHODS
 from drake_teleop.scenario import LoadScenario
 
 
@@ -81,12 +90,46 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
     }
 
 
+def slices(seconds: float) -> dict[str, float]:
+    """CPU time of a slice [ms] of each method on each network: 99th percentile and the most."""
+    scenario = live_scenario(LoadScenario("contact_transition"))
+    load, figures = identified_load(scenario), {}
+    for (line, network), (law, method) in product(enumerate(NETWORKS), enumerate(METHODS)):
+        if network not in NETWORK_PRESETS:
+            continue
+        session, spent = Session(scenario, load), []
+        session.apply(session.inputs.changed({"network": line, "method": law}))
+        while session.ms < 1e3 * (1.0 + seconds):
+            start = time.thread_time()
+            session.apply(session.inputs.changed(wanted(1e-3 * session.ms)))
+            session.advance()
+            spent.append(1e3 * (time.thread_time() - start))
+            session.news()  # a page asks for them, too
+        counted = spent[1000 // SLICE_MS :]
+        figures[f"{network}_{method}_p99_ms"] = float(np.percentile(counted, 99))
+        figures[f"{network}_{method}_most_ms"] = max(counted)
+    return figures
+
+
+def finish(figures: dict[str, float], file: Path | None) -> None:
+    """Prints the figures, and writes them if they are wanted."""
+    for name, value in figures.items():
+        print(f"{name:28} {value:.4g}", flush=True)
+    if file is not None:
+        file.write_text(json.dumps(figures, indent=2) + "\n")
+
+
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--slices", action="store_true", help="of each method on each network")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
+    if options.slices:
+        with without_collections():
+            finish(slices(options.seconds), options.json)
+        return
     with tempfile.TemporaryDirectory() as folder:
         with without_collections():
             figures = driven(options.seconds, Path(folder) / "drive")
@@ -100,10 +143,7 @@ def main() -> None:
         figures["repeat_has_the_same_bytes"] = all(
             a.read_bytes() == b.read_bytes() for a, b in zip(parts, again, strict=True)
         )
-    for name, value in figures.items():
-        print(f"{name:28} {value:.4g}")
-    if options.json is not None:
-        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+    finish(figures, options.json)
     sys.exit(not figures["repeat_has_the_same_bytes"])
 
 

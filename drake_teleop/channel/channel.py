@@ -487,4 +487,4 @@ class TeleopChannel(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         for part, group in zip(self._taken(context), self._groups, strict=False):
-            discrete_state.set_value(group, part)
+            discrete_state.get_mutable_value(group)[:] = part  # set_value goes number by number
