@@ -10,8 +10,8 @@ up, CPU of the process over elapsed time.
 Baseline: the CPU time of the same drive by `repeat`, without clock, page and scene.
 
 With --slices instead: the same taps with each method on each preset of a network, as fast as they
-go, without page and scene, and the CPU time of a slice of 5 ms: its 99th percentile and the most, after
-the first second of each.
+go, without page and scene, and the CPU time of a slice of 5 ms: its 99th percentile and the most,
+after the first second of each.
 """
 
 from __future__ import annotations

@@ -411,11 +411,14 @@ class TeleopChannel(LeafSystem):
         self._load = self.DeclareVectorInputPort("load_wrench_B", 6)
         ends = initial_ends(passivity.method, parameters, start)
         carried = np.zeros(PACKET_SIZE if self._tells_apart else LOAD.start)
-        state = [*(network.initial_state(p, carried) for p in lines), ends]
-        state += [np.array(start), np.zeros(PORTS)]
+        receivers, flying = zip(*(network.initial_state(p, carried) for p in lines), strict=True)
+        state = [*receivers, ends, np.array(start), np.zeros(PORTS)]
         self._begin = (passivity.method, parameters)
         received = np.zeros(7)
         self._groups = [self.DeclareDiscreteState(part) for part in state]
+        # What is in flight is part of the context, and cloned with it, but no discrete state: Drake
+        # would copy all of it several times a step, 1.5 MB on the way from the moon.
+        self._flying = [self.DeclareAbstractParameter(AbstractValue.Make(f)) for f in flying]
         self.DeclareStateOutputPort("pose_received", self._groups[3])
         self.DeclareStateOutputPort("ports", self._groups[4])
         # The step is taken once, for the wrench that acts now and for the state after it.
@@ -458,6 +461,9 @@ class TeleopChannel(LeafSystem):
         *state, received = step.get_mutable_value()
         for part, group in zip(state, self._groups, strict=True):
             part[:] = context.get_discrete_state(group).value()
+        # A step that is taken again, with other inputs, writes there at the same places.
+        flying = [context.get_abstract_parameter(k).get_value() for k in self._flying]
+        forward, backward = zip(state[:2], flying, strict=True)
         load = _NO_LOAD
         if self._tells_apart and self._load.HasValue(context):  # to work it out takes time
             load = self._load.Eval(context)
@@ -471,7 +477,9 @@ class TeleopChannel(LeafSystem):
             self._saturated.Eval(context)[0] > 0.5,
             self._contact.Eval(context)[0] if self._contact.HasValue(context) else 0.0,
             *self._constants,
-            *state,
+            forward,
+            backward,
+            *state[2:],
             received,
         )
 
@@ -487,4 +495,4 @@ class TeleopChannel(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         for part, group in zip(self._taken(context), self._groups, strict=False):
-            discrete_state.get_mutable_value(group)[:] = part  # set_value goes number by number
+            discrete_state.set_value(group, part)

@@ -127,8 +127,8 @@ and the way on the ground, RTT 600 ms. lunar: 384 400 km are 1.28 s; with the st
 # The parameters of a line as one array: these, then the trace in steps, -1 where it lost a packet.
 _KEY, _PERIOD, _DELAY, _JITTER, _DISTRIBUTION, _LONGEST, _BAD_SHARE, _BAD_MEMORY = range(8)
 _BURST_LOSS, _DUPLICATE, _RATE, _PLAYOUT, _REDUNDANT, _SLOTS, _POLICY, _LEAST, _TRACE = range(8, 17)
-# The state of a line as one array: these, the slots, the packet received last, the packets sent.
-_BAD, _ARRIVED, _RECEIVED, _SILENT, _FIRST_SLOT = range(5)
+# What a receiver has: these, then the packet received last. In flight: the slots, the packets sent.
+_BAD, _ARRIVED, _RECEIVED, _SILENT, _LAST = range(5)
 
 
 def parameters(
@@ -269,40 +269,40 @@ def _fate(p, k, bad):
     return bad, first, second
 
 
-def initial_state(p: NDArray[np.float64], neutral: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The state of a line before step 0, one flat array.
+def initial_state(
+    p: NDArray[np.float64], neutral: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The state of a line before step 0.
 
     Args:
         p: the line's `parameters`.
         neutral: (N,) what the receiver reads before the first packet arrives. The line carries
             so many numbers of a packet, the first ones.
+
+    Returns:
+        The receiver's (4 + N,), with the packet that it read last, and what is in flight, which is
+        long: step k writes there only what belongs to packet k, and writes the same if it is
+        taken again with the same packet.
     """
     slots = int(p[_SLOTS])
-    header = [p[_BAD_SHARE], -1.0, -1.0, 0.0]
-    return np.concatenate([header, np.full(slots, -1.0), neutral, np.zeros(slots * len(neutral))])
-
-
-@njit(cache=True)
-def _carried(p, state):
-    """How many numbers of a packet the line carries."""
-    slots = int(p[_SLOTS])
-    return (state.shape[0] - _FIRST_SLOT - slots) // (slots + 1)
+    receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])
+    return receiver, np.concatenate([np.full(slots, -1.0), np.zeros(slots * len(neutral))])
 
 
 @njit(cache=True)
 def send(p, state, k, packet):
     """Sends the packet (N,) of step k. Steps count up from 0, none is left out."""
-    slots, size = int(p[_SLOTS]), _carried(p, state)
-    state[_BAD], first, second = _fate(p, k, state[_BAD])
+    receiver, flying = state
+    slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST
+    receiver[_BAD], first, second = _fate(p, k, receiver[_BAD])
     for travel in (first, second):
         if travel >= 0:
             if p[_REDUNDANT] == 0.0:
                 travel = max(travel, int(p[_PLAYOUT]))
             # What the slot held was sent before.
-            state[_FIRST_SLOT + (k + travel) % slots] = k
+            flying[(k + travel) % slots] = k
     # What is lost is written too: a redundant packet after it may bring it.
-    row = _FIRST_SLOT + slots + size * (1 + k % slots)
-    put(state, row, packet, 0, size)
+    put(flying, slots + size * (k % slots), packet, 0, size)
 
 
 @njit(cache=True)
@@ -316,24 +316,23 @@ def receive(p, state, k, packet):
     Returns:
         The step at which the newest packet was sent, -1 before there is one; whether it is new.
     """
-    slots, size = int(p[_SLOTS]), _carried(p, state)
-    slot, last = _FIRST_SLOT + k % slots, _FIRST_SLOT + slots
+    receiver, flying = state
+    slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST
     # What a slot still holds from a round ago is older, and changes nothing.
-    state[_ARRIVED] = max(state[_ARRIVED], state[slot])
-    newest = state[_ARRIVED]
+    receiver[_ARRIVED] = max(receiver[_ARRIVED], flying[k % slots])
+    newest = receiver[_ARRIVED]
     if p[_REDUNDANT] != 0.0:
         newest = min(newest, k - p[_PLAYOUT])
-    fresh = newest > state[_RECEIVED]
+    fresh = newest > receiver[_RECEIVED]
     if fresh:
-        state[_RECEIVED], state[_SILENT] = newest, 0.0
-        row = last + size * (1 + int(newest) % slots)
-        put(state, last, state, row, size)
+        receiver[_RECEIVED], receiver[_SILENT] = newest, 0.0
+        put(receiver, _LAST, flying, slots + size * (int(newest) % slots), size)
     else:
-        state[_SILENT] += 1.0
-    put(packet, 0, state, last, size)
+        receiver[_SILENT] += 1.0
+    put(packet, 0, receiver, _LAST, size)
     if not fresh:
-        _fill_silence(p[_POLICY], state[_SILENT] * p[_PERIOD], packet)
-    return int(state[_RECEIVED]), fresh
+        _fill_silence(p[_POLICY], receiver[_SILENT] * p[_PERIOD], packet)
+    return int(receiver[_RECEIVED]), fresh
 
 
 @njit(cache=True)

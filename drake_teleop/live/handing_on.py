@@ -17,8 +17,8 @@ from drake_teleop.lifetime import ONE_DICT, weak_callback
 
 Array = NDArray[np.float64]
 
-#: The blocks whose numeric parameters change while a station runs.
-_WITH_PARAMETERS = ("live_hand", "force_scaling")
+#: The blocks whose parameters change while a station runs.
+_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
 
 
 def hand_on(
@@ -66,6 +66,8 @@ def _copy(source: Context, target: Context, with_parameters: bool) -> None:
         for k in range(source.num_numeric_parameter_groups()):
             values = source.get_numeric_parameter(k).value()
             target.get_mutable_numeric_parameter(k).SetFromVector(values)
+        for k in range(source.num_abstract_parameters()):
+            target.get_mutable_abstract_parameter(k).SetFrom(source.get_abstract_parameter(k))
 
 
 @njit(cache=True)

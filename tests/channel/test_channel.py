@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
 from drake_teleop.channel import channel
@@ -105,6 +105,35 @@ def test_what_the_load_has_in_the_wrench_is_told_as_the_wrench_is():
     held = ends[MEMORY_S][HELD]
     assert np.linalg.norm(held[:3]) == pytest.approx(np.linalg.norm(wrench[:3]) / 0.5)
     np.testing.assert_allclose(ends[MEMORY_S][OF_LOAD], 0.5 * held, atol=1e-15)
+
+
+def test_what_is_in_flight_belongs_to_the_context():
+    """Two that go on from the same instant, side by side, each receive what each has sent."""
+    block = MakeChannel(moving(channel__delay=0.01)).GetSubsystemByName("channel")
+    pose = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
+
+    def steps(context: Context, number: int, wrench: float) -> None:
+        for name in ("pose_command", "pose_slave"):
+            block.GetInputPort(name).FixValue(context, pose)
+        for name, value in (("hand_wrench_E", 0.0), ("wrench_B", wrench)):
+            block.GetInputPort(name).FixValue(context, np.full(6, value))
+        block.GetInputPort("saturated").FixValue(context, [0.0])
+        for _ in range(number):
+            context.SetDiscreteState(block.EvalUniquePeriodicDiscreteUpdate(context))
+
+    def felt(context: Context) -> np.ndarray:
+        return block.GetOutputPort("wrench_received").Eval(context)
+
+    one, alone = block.CreateDefaultContext(), block.CreateDefaultContext()
+    steps(one, 800, 1.0)
+    other = one.Clone()
+    for _ in range(40):
+        steps(one, 1, 0.6)
+        steps(other, 1, 0.3)
+    steps(alone, 800, 1.0)
+    steps(alone, 40, 0.3)
+    assert felt(one)[0] > 1.2 * felt(alone)[0] > 0.0
+    np.testing.assert_array_equal(felt(other), felt(alone))
 
 
 def test_directions_may_differ():

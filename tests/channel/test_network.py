@@ -440,7 +440,7 @@ def test_a_line_carries_as_many_numbers_as_its_receiver_reads_before_the_first()
     p = parameters(NetworkConfig(), 0, FORWARD, PERIOD)
     packets, received = random_packets(3), np.zeros(PACKET_SIZE)
     state = initial_state(p, np.zeros(LOAD.start))
-    assert len(state) < len(initial_state(p, np.zeros(PACKET_SIZE)))
+    assert len(state[1]) < len(initial_state(p, np.zeros(PACKET_SIZE))[1])
     for k, packet in enumerate(packets):
         send(p, state, k, packet)
         receive(p, state, k, received)
