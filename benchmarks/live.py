@@ -10,8 +10,8 @@ up, CPU of the process over elapsed time.
 Baseline: the CPU time of the same drive by `repeat`, without clock, page and scene.
 
 With --slices instead: the same taps with each method on each preset of a network, as fast as they
-go, without page and scene, and the CPU time of a slice of 5 ms: its 99th percentile and the most,
-after the first second of each.
+go, without page and scene, and the CPU time of a slice of 5 ms, the less of two drives: its 99th
+percentile and the most, after the first second of each.
 """
 
 from __future__ import annotations
@@ -91,24 +91,32 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
 
 
 def slices(seconds: float) -> dict[str, float]:
-    """CPU time of a slice [ms] of each method on each network: 99th percentile and the most."""
+    """CPU time of a slice [ms] of each method on each network: 99th percentile and the most.
+
+    A drive is the same each time: of two, each slice counts at its faster one.
+    """
     scenario = live_scenario(LoadScenario("contact_transition"))
     load, figures = identified_load(scenario), {}
-    for (line, network), (law, method) in product(enumerate(NETWORKS), enumerate(METHODS)):
-        if network not in NETWORK_PRESETS:
-            continue
-        session, spent = Session(scenario, load), []
-        session.apply(session.inputs.changed({"network": line, "method": law}))
-        while session.ms < 1e3 * (1.0 + seconds):
-            start = time.thread_time()
-            session.apply(session.inputs.changed(wanted(1e-3 * session.ms)))
-            session.advance()
-            spent.append(1e3 * (time.thread_time() - start))
-            session.news()  # a page asks for them, too
-        counted = spent[1000 // SLICE_MS :]
+    for network, method in product(NETWORK_PRESETS, METHODS):
+        choice = {"network": NETWORKS.index(network), "method": METHODS.index(method)}
+        drives = [spent(Session(scenario, load), choice, seconds) for _ in range(2)]
+        counted = np.min(drives, axis=0)
         figures[f"{network}_{method}_p99_ms"] = float(np.percentile(counted, 99))
-        figures[f"{network}_{method}_most_ms"] = max(counted)
+        figures[f"{network}_{method}_most_ms"] = float(counted.max())
     return figures
+
+
+def spent(session: Session, choice: dict[str, int], seconds: float) -> list[float]:
+    """CPU time of each slice [ms] after the first second."""
+    session.apply(session.inputs.changed(choice))
+    taken = []
+    while session.ms < 1e3 * (1.0 + seconds):
+        start = time.thread_time()
+        session.apply(session.inputs.changed(wanted(1e-3 * session.ms)))
+        session.advance()
+        taken.append(1e3 * (time.thread_time() - start))
+        session.news()  # a page asks for them, too
+    return taken[1000 // SLICE_MS :]
 
 
 def finish(figures: dict[str, float], file: Path | None) -> None:
