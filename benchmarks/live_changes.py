@@ -4,8 +4,7 @@
 
 The hand of `touch` (firm grip, JR3) presses on the leaf, over no network and without a method. Then
 a method over a network, and back: by how much the slave's command jumps, how far the arm goes away
-from there afterwards, and by how much what the hand feels rises above what it was. Between them it
-taps at 1 Hz: CPU time of each slice of 5 ms, and real-time factor.
+from there afterwards, and by how much what the hand feels rises above what it was.
 Baseline: none over the ideal network, where nothing changes but the station.
 """
 
@@ -13,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +21,11 @@ from drake_teleop.identification import slave_arm
 from drake_teleop.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.choice_names import NAMES
 from drake_teleop.live.choices import chosen, filled_after
-from drake_teleop.live.inputs import SLICE_MS
 from drake_teleop.live.session import Session, live_scenario
 from drake_teleop.scenario import LoadScenario, Scenario
 from drake_teleop.slave.arm import forward_kinematics
 
-PRESSING, AFTER, TAPPING = -9500, 0.7, 1.0  # 10 um, s, s
+PRESSING, AFTER = -9500, 0.7  # 10 um, s
 
 
 class Driven:
@@ -39,20 +36,14 @@ class Driven:
         self.session = Session(scenario, load)
         self.inputs, self._arm = self.session.inputs, slave_arm(scenario)
         self.rows: list[dict[str, np.ndarray]] = []
-        self.cpu: list[float] = []
 
-    def go(self, seconds: float, tap: bool = False, **changes: int) -> None:
+    def go(self, seconds: float, **changes: int) -> None:
         """Goes on for so long, with changed inputs."""
-        self.inputs, self.rows, self.cpu = self.inputs.changed(changes), [], []
+        self.inputs, self.rows = self.inputs.changed(changes), []
         end = self.session.ms + round(1e3 * seconds)
         while self.session.ms < end:
-            if tap:
-                down = 0.5 - 0.5 * np.cos(2e-3 * np.pi * (end - self.session.ms))
-                self.inputs = self.inputs.changed({"z": round(PRESSING * (1.0 - down))})
-            start = time.thread_time()
             self.session.apply(self.inputs)
             self.session.advance()
-            self.cpu.append(time.thread_time() - start)
             self.rows.append(self.session.news())
 
     def signal(self, name: str, instead: str = "") -> np.ndarray:
@@ -92,21 +83,9 @@ def measured(driven: Driven, network: int, method: int) -> dict[str, float]:
     still = driven.inputs.changed({"network": network, "method": method})
     fills = filled_after(chosen(driven.scenario, driven.load, still))
     figures = driven.change(fills + AFTER, network=network, method=method)
-    figures |= tapping(driven)
     driven.go(0.8 + fills, z=PRESSING)  # at rest, with nothing on its way
     back = driven.change(0.8, network=0, method=0)
     return figures | {f"back.{name}": value for name, value in back.items()}
-
-
-def tapping(driven: Driven) -> dict[str, float]:
-    """What slices take while the tool taps."""
-    driven.go(TAPPING, tap=True)
-    cpu = 1e3 * np.array(driven.cpu)
-    return {
-        "slice_cpu_p50_ms": float(np.median(cpu)),
-        "slice_cpu_p99_ms": float(np.percentile(cpu, 99)),
-        "real_time_factor": SLICE_MS * len(cpu) / cpu.sum(),
-    }
 
 
 def main() -> None:
