@@ -359,9 +359,10 @@ def _follow_command(
     if since > 0.0:  # nothing moves in no time, not even a joint without a limit
         for i in range(n):
             max_step[i] = speed[i] * since
+    steps = np.int64(STEPS)  # for the constant itself `follow_pose` would be compiled once more
     return follow_pose(
         table, L, pose, reference, lower, upper, max_step, posture, min(pull * since, 1.0),
-        SINGULAR, STEPS, q,
+        SINGULAR, steps, q,
     )  # fmt: skip
 
 
