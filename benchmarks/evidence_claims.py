@@ -38,7 +38,7 @@ RUNS = {
     "planted_mistakes": "benchmarks/planted_mistakes.py --seed 9000 --json FILE",
     "pose_noise": (
         "benchmarks/pose_noise.py --runs 100 --no-present --only '125 Hz' '0.4 mrad, 500 Hz'"
-        " 'AR 0.9' drift kHz --json FILE"
+        " 'AR 0.9' drift kHz gains TCP --json FILE"
     ),
     "realistic_sensor": "benchmarks/realistic_sensor.py --json FILE",
     "recovery": "benchmarks/recovery.py --networks 300 --json FILE",

@@ -63,6 +63,30 @@ def test_errors_name_file_and_remedy(
         assert word in str(error.value)
 
 
+@pytest.mark.parametrize("row", [0, 2500])
+@pytest.mark.parametrize(
+    "cell", ["2.5", "1e3", " 3", "+5", "nan", "", "Infinity", "1_000", "9" * 25]
+)
+def test_a_cell_is_the_same_number_in_any_row(tmp_path: Path, row: int, cell: str) -> None:
+    """Types are told by the first rows, if they can be; the others are of whole numbers here."""
+    cells = [str(k) for k in range(3000)]
+    cells[row] = cell
+    table = read_table(write(tmp_path / "x.csv", "\n".join(["a,b", *(f"{c},7" for c in cells)])))
+    expected = np.arange(3000.0)
+    expected[row] = float(cell or "nan")
+    np.testing.assert_array_equal(table.single("a", "here"), expected)
+
+
+@pytest.mark.parametrize("row", [1, 2500])
+@pytest.mark.parametrize("cell", ["x7", "2020-01-01", "true", "0x10"])
+def test_a_cell_that_is_no_number_is_named_in_any_row(tmp_path: Path, row: int, cell: str) -> None:
+    cells = ["1.5"] * 3000
+    cells[row] = cell
+    table = read_table(write(tmp_path / "x.csv", "\n".join(["a,b", *(f"{c},7" for c in cells)])))
+    with pytest.raises(DrakeTeleopError, match=rf"'{cell}' in row {row + 2} is not a number"):
+        table.raw("a", "here")
+
+
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(DrakeTeleopError, match=r"none\.csv: no such file"):
         read_table(tmp_path / "none.csv")

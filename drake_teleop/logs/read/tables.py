@@ -275,6 +275,8 @@ def _frame_column(series: pl.Series) -> NDArray:
         series = series.cast(pl.Duration("ns"))
     if series.dtype in (pl.Datetime, pl.Duration):
         return series.to_numpy()
+    if series.dtype == pl.Int128:  # which numpy has not
+        series = series.cast(pl.Float64)
     # Floats keep their empty cells as NaN, which is reported with its row later on.
     return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
 
