@@ -5,10 +5,10 @@
 In headless Chromium, drawing off (without a graphics card it takes longer than all else): from the
 browser's time stamp of a pointer's move of 20 pixels, of a key, and from the moment that a stick is
 pushed, until the tool has moved by 0.2 mm in the page's scene. A key and a stick lead the hand at
-0.1 m/s, so that a part of it is the way. From the slice in which the contact force at the hand gets
-beyond 0.5 N, until `playEffect` of a gamepad that is a spy. Then, without a browser and in virtual
+0.1 m/s: how long hand, device and arm take to move the tool so far is the baseline, in simulated
+time (`way`). From the slice in which the contact force at the hand gets beyond 0.5 N, until `playEffect` of a gamepad that is a spy. Then, without a browser and in virtual
 time, fast free motion up and down: in how many frames a gamepad would vibrate, by the contact force
-and by the measured one. No baseline: the figures are times.
+and by the measured one.
 """
 
 from __future__ import annotations
@@ -21,11 +21,13 @@ from pathlib import Path
 import numpy as np
 from browser import CHROMIUM, Page, opened
 
+from drake_teleop.identification import slave_arm
 from drake_teleop.identified_load import identified_load
-from drake_teleop.live.live import TOUCH, Live
+from drake_teleop.live.live import FRAME, TOUCH, Live
 from drake_teleop.live.server import LiveDrive, drive
-from drake_teleop.live.session import live_scenario
+from drake_teleop.live.session import Session, live_scenario
 from drake_teleop.scenario import LoadScenario
+from drake_teleop.slave.arm import forward_kinematics
 
 SPY = """window.effects = []; window.axes = [0, 0, 0, 0];
 navigator.getGamepads = () => [{connected: true, id: "spy", axes, buttons: [],
@@ -82,6 +84,24 @@ def latencies(page: Page, trials: int) -> dict[str, list[float | None]]:
 STICK = "axes[0] = SIGN; wait.since = performance.now()"
 
 
+def way(speed: float = 0.1) -> float:
+    """How long hand, device and arm take to move the tool by 0.2 mm, led at a speed [m/s]: ms."""
+    scenario = live_scenario(LoadScenario("touch"))
+    session, table = Session(scenario, identified_load(scenario)), slave_arm(scenario).table
+    session.advance(1000)
+    session.news()
+    R_WS, start, place = np.empty((3, 3)), np.full(3, np.nan), np.empty(3)
+    while True:
+        frame = 1e-3 * (session.ms - 1000) // FRAME + 1
+        session.apply(session.inputs.changed({"z": 1e5 * speed * frame * FRAME}))
+        session.advance(1)
+        q = session.news()["slave_state"][-1, : table.shape[0] - 1]
+        forward_kinematics(table, q, R_WS, place)
+        start = place.copy() if np.isnan(start[0]) else start
+        if np.linalg.norm(place - start) > 2e-4:
+            return float(session.ms - 1000)
+
+
 def vibration(page: Page, driven: LiveDrive, trials: int) -> list[float | None]:
     """From the slice with a contact of 0.5 N to the gamepad's effect [ms]."""
     session = driven._live._session
@@ -122,6 +142,7 @@ def in_the_browser(trials: int) -> dict[str, float]:
                 p50, p95 = np.percentile(known, [50, 95])
                 figures |= {f"{kind}_p50_ms": float(p50), f"{kind}_p95_ms": float(p95)}
                 figures[f"{kind}_not_in_10_s"] = trials - len(known)
+            figures["way_of_key_and_stick_ms"] = way()
             figures["real_time_factor"] = page.run("frame.factor")
             return figures
     finally:
