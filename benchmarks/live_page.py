@@ -7,8 +7,9 @@ browser's time stamp of a pointer's move of 20 pixels, of a key, and from the mo
 pushed, until the tool has moved by 0.2 mm in the page's scene. A key and a stick lead the hand at
 0.1 m/s: how long hand, device and arm take to move the tool so far is the baseline, in simulated
 time (`way`). From the slice in which the contact force at the hand gets beyond 0.5 N, until
-`playEffect` of a gamepad that is a spy. Then, without a browser and in virtual time, fast free motion
-up and down: in how many frames a gamepad would vibrate, by the contact force and by the measured one.
+`playEffect` of a gamepad that is a spy. Then, without a browser and in virtual time, fast free
+motion up and down: in how many frames a gamepad would vibrate, by the contact force and by the
+measured one.
 """
 
 from __future__ import annotations
