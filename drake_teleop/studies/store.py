@@ -10,7 +10,7 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,6 +88,8 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
     make_folder(store.folder)
     with claimed(out, identity):
         yield store
+        with suppress(OSError):  # not there, or with marks in it
+            store._marks.rmdir()
 
 
 @contextmanager

@@ -190,6 +190,7 @@ def test_processes_give_the_same_bytes(serial, files):
     summary = study_command(files / "study.yaml", out, jobs=2, quiet=True)
     assert summary == serial[0]
     assert parts(out) == parts(serial[1])
+    assert not (out / "running").exists(), "nothing is under way any more"
 
 
 @pytest.mark.slow
