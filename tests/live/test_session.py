@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from drake_teleop.channel.channel import Channel
 from drake_teleop.cli import main
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs, row
@@ -133,6 +134,25 @@ def test_every_other_choice_goes_on_without_a_jump(scenario, load):
         assert np.abs(np.diff(log["slave_state"][k - 1 : k + 5, :6], axis=0)).max() < 1e-3
     mass = log["load_estimate"][:, 6]
     assert mass[ends[1] + 1] - mass[ends[1]] == pytest.approx(0.8)
+
+
+@pytest.mark.slow
+def test_what_is_on_its_way_arrives_though_the_grip_becomes_another(scenario, load):
+    """100 ms each way: until they are over, the slave is told what was sent to it before."""
+    far = replace(scenario, channel=Channel(delay=0.1))
+    logs = []
+    for grip in (1, 2):
+        session = Session(far, load)
+        session.apply(session.inputs.changed({"x": 1000}))
+        session.advance(150)
+        session.apply(session.inputs.changed({"grip": grip}))
+        session.advance(100)
+        logs.append(session.log())
+    one, other = (log["pose_received"][150:] for log in logs)
+    assert np.ptp(one[:, 4]) > 1e-4
+    np.testing.assert_array_equal(other, one)
+    # For how long master and slave have heard nothing: both hear something at every step.
+    assert logs[1]["ports"][150:, 4:6].max() == 0.0
 
 
 @pytest.mark.slow
