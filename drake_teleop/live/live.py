@@ -21,6 +21,7 @@ from drake_teleop.live.choice_names import NAMES
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.external_master import TICK_MS
+from drake_teleop.live.hand import BEHIND
 from drake_teleop.live.inputs import CHOICES, RANGES, SLICE_MS
 from drake_teleop.live.messages import parse
 from drake_teleop.live.pace import Pace
@@ -33,7 +34,7 @@ Show = Callable[[dict[str, np.ndarray]], None]
 
 #: Frames for the page [s].
 FRAME = 1 / 60
-_SHORTEST = 0.6 * FRAME  # between two of them
+_SHORTEST = 0.25 * FRAME  # between two of them
 #: The contact force at the hand from which a gamepad vibrates [N].
 TOUCH = 0.12
 # How long it goes on when nobody drives [s]; slices in a row before messages are listened to.
@@ -133,6 +134,7 @@ class Live:
             "known": self._load is not None,
             "noise": self._load is not None and self._load.noise_floor is not None,
             "scale": scaling.translation_scale,
+            "behind": BEHIND,
             "alignment": RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix().tolist(),
             "scenes": SCENES,
         }

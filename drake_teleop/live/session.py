@@ -219,7 +219,7 @@ class Session:
         if inputs.station != before.station:
             self._change(inputs)
         self.inputs = inputs
-        if (inputs.target, inputs.grip) != (before.target, before.grip):
+        if inputs.target != before.target:
             hand, context = self._now.block("live_hand")
             hand.Lead(context, inputs.pose(self._start))
         if inputs.clutch != before.clutch or inputs.station != before.station:

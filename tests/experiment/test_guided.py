@@ -81,7 +81,7 @@ def test_a_trial_from_consent_to_the_table_and_its_drives_repeat(tmp_path):
     person.say(set={"z": -1500, "sigma": 300, "gamma": 0})
     person.wait("gap")
     person.wait("interval")
-    person.say(set={"z": -1500})
+    person.say(set={"z": -2500})
     person.wait("answer")
     person.say(client=2, answer=1)  # who only watches
     assert person.procedure.phase == "answer"
