@@ -215,6 +215,21 @@ def test_run_repeats_a_drive_to_the_same_bytes(driven, tmp_path, capsys, monkeyp
         assert "error: " in capsys.readouterr().err
 
 
+@pytest.mark.slow
+def test_of_a_drive_that_is_not_closed_two_seconds_are_lost_and_no_input(scenario, load, tmp_path):
+    """What is in the files is what a process that is killed leaves."""
+    session = Session(scenario, load, log=tmp_path / "log.parquet", record=tmp_path)
+    changes = []
+    while session.ms < 2100:
+        changes.append((session.ms, session.inputs.changed({"x": session.ms})))
+        session.apply(changes[-1][1])
+        session.advance(100)
+    session._on_disk.finish()  # what has been taken, the thread beside has had time to write
+    assert read_inputs(tmp_path / INPUTS)[1:] == changes[1:]
+    log = SimulationResult.read_parquet(tmp_path / "log.parquet")
+    assert log.t[-1] >= 1e-3 * session.ms - 2.0
+
+
 def test_inputs_are_brought_into_their_ranges_and_nonsense_is_left_out():
     wild = {"x": 1e300, "y": -(10**400), "z": np.nan, "rx": "1", "clutch": 7, "sigma": 12.6}
     inputs = Inputs().changed(wild | {"unknown": 1, "gamma": None, "held": False, "rz": np.inf})

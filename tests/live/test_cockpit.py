@@ -1,0 +1,78 @@
+"""What a page is told of rows of the log: forces at the hand, and in words what is not right."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.fault import MEANINGS, Fault
+from drake_teleop.identification import slave_arm
+from drake_teleop.live.cockpit import Cockpit
+from drake_teleop.live.inputs import RANGES, Inputs
+from drake_teleop.live.session import Session
+from drake_teleop.slave.inverse_kinematics import IkStatus
+
+N = 6  # joints
+
+
+@pytest.fixture
+def rows(scenario, load):
+    """Of a station at rest, with nothing to say about it."""
+    session = Session(scenario, load)
+    session.advance()
+    rows = session.news()
+    assert Cockpit(scenario).frame(rows, Inputs())["words"] == []
+    return rows
+
+
+def words(scenario, rows, inputs=Inputs()):  # noqa: B008 (it does not change)
+    return Cockpit(scenario).frame(rows, inputs)["words"]
+
+
+def test_joints_at_their_limits_are_named(scenario, rows):
+    """Either way, in whichever row, each at its own limit, and as many as there are."""
+    arm = slave_arm(scenario)
+    speeds, torques = arm.velocity_limit, arm.effort_limit
+    rows["slave_state"][0, N + 1], rows["slave_state"][2, N + 3] = -speeds[1], speeds[3]
+    rows["joint_torque"][1, 5] = 0.9995 * torques[5]
+    assert torques[5] < torques[0]
+    assert words(scenario, rows) == [
+        "joint 2, 4 at the limit of its speed",
+        "joint 6 at the limit of its torque",
+    ]
+    rows["slave_state"][:, N:] = 0.99 * speeds
+    rows["joint_torque"][:] = -0.99 * torques
+    assert words(scenario, rows) == []
+
+
+def test_all_else_that_is_not_right_is_said(scenario, rows):
+    peak = scenario.master.device(0.0, 0.0).peak_force
+    strongest = f"the device gives all that it can, {peak:g} N"
+    for name, change, said in (
+        ("ik_status", IkStatus.OUT_OF_REACH, "the arm cannot get where the hand wants it"),
+        ("saturated", 1.0, "the wrist sensor is saturated"),
+        ("force_to_master", [0, 0, -peak, 0, 0, 0], strongest),
+        ("hand_wrench_E", [0, 60, 0, 0, 0, 0], "the hand pulls as hard as it can"),
+        ("ports", [0, 0, 0, 0, 0, 0.06, 0, 0], "the network is silent"),
+        ("fault", float(Fault.WRENCH), MEANINGS[Fault.WRENCH]),
+    ):
+        found = {key: values.copy() for key, values in rows.items()}
+        found.setdefault(name, np.zeros((len(rows["t"]), np.size(change))))[1] = change
+        assert words(scenario, found) == [said]
+    edge = Inputs(y=RANGES["y"][0])
+    assert words(scenario, rows, edge) == ["the hand is as far out as it may go"]
+
+
+def test_forces_are_at_the_hand_without_the_sensors_offset(scenario, rows):
+    """Least and largest: measured, of the contact, felt."""
+    n = len(rows["t"])
+    for name, first, last in (
+        ("measured_wrench_S", [13.0, 0.0, 4.0], [10.0, 5.0, 12.0]),
+        ("contact_wrench_S", [0.0, 0.0, 0.0], [0.0, -6.0, 8.0]),
+        ("force_to_master", [0.0, 1.0, 0.0], [2.0, 0.0, 0.0]),
+    ):
+        rows[name] = np.zeros((n, 6))
+        rows[name][0, :3], rows[name][1:, :3] = first, last
+    rows["load_estimate"] = np.tile([10.0, *np.zeros(15)], (n, 1))
+    frame = Cockpit(scenario).frame(rows, Inputs(force_scale=50_000))
+    assert frame["f"] == [[2.5, 6.5], [0.0, 5.0], [1.0, 2.0]] and frame["contact"]
