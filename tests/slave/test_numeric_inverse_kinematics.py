@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -309,6 +310,40 @@ def test_the_system_goes_on_from_its_last_command(rx90):
     assert status.Eval(context) == [IkStatus.BAD_POSE]
     # From ports and states as from arrays: nothing is compiled for them alone.
     assert len(follow_pose.signatures) == 1
+
+
+def test_in_no_time_nothing_moves_not_even_a_joint_without_a_limit(rx90):
+    arm = dataclasses.replace(rx90.arm, velocity_limit=np.full(6, np.inf))
+    system = NumericInverseKinematics(arm, BENT, PERIOD)
+    context = system.CreateDefaultContext()
+    system.GetInputPort("joint_position").FixValue(context, BENT)
+    system.GetInputPort("pose_command").FixValue(context, rx90.pose(BENT + 0.5))
+    command, status = (system.GetOutputPort(name) for name in ("joint_command", "ik_status"))
+    np.testing.assert_array_equal(command.Eval(context), BENT)
+    assert status.Eval(context) == [IkStatus.SPEED_LIMIT]
+    context.SetTime(PERIOD)
+    np.testing.assert_allclose(command.Eval(context), BENT + 0.5, atol=1e-8)
+
+
+@pytest.mark.parametrize(("period", "left"), [(0.01, np.exp(-1.0)), (0.1, 0.9**10), (3.0, 0.0)])
+def test_the_posture_is_neared_by_time_and_not_by_command(seven, period, left):
+    """In a second by all but 1/e of the way, in steps as they come, and never beyond it."""
+    home, J = np.full(7, 0.4), np.empty((6, 7))
+    jacobian(seven.arm.table, home, J)
+    pose, posture = seven.pose(home), home + 0.2 * np.linalg.svd(J)[2][6]
+    away, _ = follow(seven, pose, home, posture=posture, pull=1.0)
+    system = NumericInverseKinematics(seven.arm, home, period)
+    context = system.CreateDefaultContext()
+    context.SetDiscreteState(np.append(away, 0.0))
+    system.GetInputPort("joint_position").FixValue(context, home)
+    system.GetInputPort("pose_command").FixValue(context, pose)
+    for k in range(1, max(round(1.0 / period), 1) + 1):
+        context.SetTime(k * period)
+        context.SetDiscreteState(system.EvalUniquePeriodicDiscreteUpdate(context))
+    q = context.get_discrete_state_vector().value()[:-1]
+    assert max(seven.errors(pose, q)) < 2 * MET
+    assert np.linalg.norm(away - home) > 0.1
+    assert np.linalg.norm(q - home) / np.linalg.norm(away - home) == pytest.approx(left, abs=0.02)
 
 
 def test_methods_have_the_same_ports(rx90):
