@@ -35,6 +35,8 @@ _SLOWER = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # speeds that the player has
 _SHAFT, _HEAD = 0.006, 0.03  # radius of an arrow's shaft, length of its head [m]
 _METRES_PER_NEWTON = 0.003
 _BACK = RotationMatrix.MakeXRotation(np.pi)
+# Meshcat's page has none of the first: a telephone lays it out as if it were 980 pixels wide.
+_TITLE = '<meta name="viewport" content="width=device-width, initial-scale=1"><title>drake_teleop<'
 
 
 @dataclass(frozen=True)
@@ -146,9 +148,7 @@ class Film:
         }
         player = render("drake_teleop.pages", "player.html.j2", film=film)
         head, body, tail = page.rpartition("</body>")
-        return (
-            head.replace("<title>Drake MeshCat<", "<title>drake_teleop<", 1) + player + body + tail
-        )
+        return head.replace("<title>Drake MeshCat<", _TITLE, 1) + player + body + tail
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
