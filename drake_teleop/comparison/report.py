@@ -162,7 +162,7 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
     figure = _grid(summary, traces, draw, "energy [J]")
     figure.suptitle(
-        "Energy between hand and actual motion: below 0 more came out than went in or was stored",
+        "Energy between hand and actual motion:\nbelow 0 more came out than went in or was stored",
         x=0.01,
         ha="left",
     )

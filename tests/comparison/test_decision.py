@@ -6,7 +6,7 @@ import pytest
 
 from drake_teleop.comparison.decision import decide
 from drake_teleop.comparison.hands import hands
-from drake_teleop.comparison.report import draw_decision
+from drake_teleop.comparison.report import draw_decision, draw_energy, draw_runs
 
 
 def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, object]:
@@ -72,3 +72,11 @@ def test_a_hand_that_lets_go_is_thrown_without_a_method_and_taps_are_felt():
     for shown in (none, hands("none", "geostationary")):
         assert shown.tap_shares == pytest.approx((1.0, 1.0), abs=0.02)
     assert ledger.tap_shares == pytest.approx((1.0, 1.0), abs=0.25)
+
+
+@pytest.mark.parametrize("draw", [draw_runs, draw_energy])
+def test_the_words_above_the_runs_of_one_network_are_not_cut_off(draw):
+    figure = draw({"methods": ["none"], "networks": ["lan"]}, {})
+    figure.draw_without_rendering()
+    (title,) = [text for text in figure.texts if text.get_text() == figure.get_suptitle()]
+    assert 0.0 < title.get_window_extent().x1 < figure.bbox.x1
