@@ -219,9 +219,9 @@ def batch_identification(
 
 
 def _designed(scenario: Scenario, stage: Stage) -> tuple[FourierTrajectory, float]:
-    """The trajectory of a scenario and its kappa; who has it may change it.
+    """The trajectory of a scenario and its kappa, a copy; designed once for all seeds.
 
-    Nor do the rows of the log change it: where contact is detected there are more of them.
+    And for all rates of the log: where contact is detected, it has more rows.
     """
     same = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.files()]

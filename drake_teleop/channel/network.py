@@ -291,7 +291,10 @@ def initial_state(
 
 @njit(cache=True)
 def send(p, state, k, packet):
-    """Sends the packet (N,) of step k. Steps count up from 0, none is left out."""
+    """Sends the packet (N,) of step k. Steps count up from 0, none is left out.
+
+    `state` is as `initial_state` makes it, and updated.
+    """
     receiver, flying = state
     slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST
     receiver[_BAD], first, second = _fate(p, k, receiver[_BAD])
@@ -310,6 +313,7 @@ def receive(p, state, k, packet):
     """What the receiver has at step k, after `send` of the same step.
 
     Args:
+        p, state, k: as of `send`.
         packet: (N,) the newest packet, with what the policy `silence` makes of it while nothing
             new comes; written.
 

@@ -24,7 +24,7 @@ _WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
 def hand_on(
     before: Diagram, then: Context, station: Diagram, context: Context, anew: set[str]
 ) -> None:
-    """Sets the states of a station to those of another one.
+    """Sets the states of a station, and what parameters may have changed, to those of another one.
 
     Args:
         before, then: the other station, and its context now.

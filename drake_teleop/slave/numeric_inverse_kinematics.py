@@ -347,9 +347,19 @@ def turn_length(arm: ArmModel) -> float:
 def _follow_command(
     table, L, lower, upper, speed, posture, pull, pose, position, last, time, q
 ):  # fmt: skip
-    """`follow_pose` from the `last` command and when it was (n + 1,); `position` is the encoders'.
+    """`follow_pose` from the last command, as far as the time since then allows.
 
-    `speed` (n,) are the joints' limits, `pull` is `NumericInverseKinematics.PULL`.
+    Args:
+        table, L, lower, upper, posture, pose: as of `follow_pose`.
+        speed: (n,) of the joints, at most [rad/s, m/s]; inf for any.
+        pull: `NumericInverseKinematics.PULL` [1/s].
+        position: (n,) of the encoders; only whether it is one counts.
+        last: (n + 1,) the last command [rad, m], and when it was [s].
+        time: now [s].
+        q: (n,) filled; the last command if `position` is none.
+
+    Returns:
+        The `IkStatus` as a plain integer.
     """
     n = q.shape[0]
     put(q, 0, last, 0, n)

@@ -183,7 +183,7 @@ def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
             ]
             figure.text(1.0, 0.5, "\n".join(lines), fontsize=7.5, va="center")
         left = rows["point"].n_unique() - points.height
-        words = f"; {left} points with failures are left out" if left else ""
+        words = f"; points left out for failures: {left}" if left else ""
         title = f"Pareto front of all three (red){_caption(study, 'of the mean')}{words}"
         figure.suptitle(title, x=0.01, ha="left")
     return figure
