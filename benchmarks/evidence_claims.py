@@ -42,6 +42,8 @@ RUNS = {
     ),
     "realistic_sensor": "benchmarks/realistic_sensor.py --json FILE",
     "recovery": "benchmarks/recovery.py --networks 300 --json FILE",
+    "live_changes": "benchmarks/live_changes.py --json FILE",
+    "live_page": "benchmarks/live_page.py --json FILE",
     "repeated": "benchmarks/repeated.py --json FILE",
     "replayed": "benchmarks/replayed.py --json FILE",
     "reproduce": "drake-teleop reproduce --quiet --out FOLDER",
@@ -159,6 +161,7 @@ def _response(sigma: str, part: str) -> Callable[[Any], float]:
 LOAD, LOGS, PAPER = "The load", "A robot's log", "The paper's figures"
 CONTACT, NETWORK, ANALYSIS = "Contact noticed", "Over networks", "Stability and transparency"
 OWN, SPEED, LIVE = "Stations of one's own", "What it costs", "Live"
+_DRIVEN_BY = ("pointer", "key", "stick")
 
 CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
     # The paper
@@ -544,6 +547,26 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(LIVE, "A drive in which everything changes is repeated; numbers that differ"),
         *("60 s, all inputs, slices of 1, 7, 1000 ms", "live.md", "repeated"),
         *(lambda f: sum(f[f"differ_{k}_ms"] for k in (1, 7, 1000)), "numbers", 0.0, 0.0),
+    ),
+    Claim(
+        *(LIVE, "The page shows what pointer, key and stick do: half of the times within"),
+        *("idle machine, drawing off", "live.md", "live_page"),
+        *(lambda f: max(f[f"{name}_p50_ms"] for name in _DRIVEN_BY), "ms", 0.0, 30.0),
+    ),
+    Claim(
+        *(LIVE, "and 95 % of the times within"),
+        *("idle machine, drawing off", "live.md", "live_page"),
+        *(lambda f: max(f[f"{name}_p95_ms"] for name in _DRIVEN_BY), "ms", 0.0, 60.0),
+    ),
+    Claim(
+        *(LIVE, "A gamepad vibrates by a contact of 0.5 N, 95 % of the times after"),
+        *("idle machine, drawing off", "live.md", "live_page"),
+        *(lambda f: f["vibration_p95_ms"], "ms", 0.0, 20.0),
+    ),
+    Claim(
+        *(LIVE, "Network and method change under a pressing tool; the arm moves"),
+        *("each method on each network, and back", "live.md", "live_changes"),
+        *(lambda f: max(f[name] for name in f if name.endswith("arm_moves_mm")), "mm", 0.0, 1.0),
     ),
     NotShown(
         LIVE, "`compensate` on a robot", "all its sources were tried with recordings and mock peers"
