@@ -1,10 +1,11 @@
 """Does a station that is driven take a step when network and method change under a pressing tool?
 
-    python benchmarks/live_changes.py [--methods A,B] [--networks A,B] [--json FILE]
+    python benchmarks/live_changes.py [--methods A,B] [--networks A,B] [--depth 95] [--json FILE]
 
-The hand of `touch` (firm grip, JR3) presses on the leaf, over no network and without a method. Then
-a method over a network, and back: by how much the slave's command jumps, how far the arm goes away
-from there afterwards, and by how much what the hand feels rises above what it was.
+The hand of `touch` (firm grip, JR3) wants to be `depth` mm below its start and so presses on the
+leaf, over no network and without a method. Then a method over a network, and back: by how much the
+slave's command jumps, how far the arm goes away from there afterwards, and by how much what the
+hand feels rises above what it was.
 Baseline: none over the ideal network, where nothing changes but the station.
 """
 
@@ -25,7 +26,7 @@ from drake_teleop.live.session import Session, live_scenario
 from drake_teleop.scenario import LoadScenario, Scenario
 from drake_teleop.slave.arm import forward_kinematics
 
-PRESSING, AFTER = -9500, 0.7  # 10 um, s
+AFTER = 0.7  # s
 
 
 class Driven:
@@ -78,12 +79,12 @@ class Driven:
         }
 
 
-def measured(driven: Driven, network: int, method: int) -> dict[str, float]:
+def measured(driven: Driven, z: int, network: int, method: int) -> dict[str, float]:
     """Figures of one network and method."""
     still = driven.inputs.changed({"network": network, "method": method})
     fills = filled_after(chosen(driven.scenario, driven.load, still))
     figures = driven.change(fills + AFTER, network=network, method=method)
-    driven.go(0.8 + fills, z=PRESSING)  # at rest, with nothing on its way
+    driven.go(0.8 + fills, z=z)  # at rest, with nothing on its way
     back = driven.change(0.8, network=0, method=0)
     return figures | {f"back.{name}": value for name, value in back.items()}
 
@@ -94,17 +95,18 @@ def main() -> None:
     networks = [name for name in NAMES["network"][1:] if name != "custom"]
     parser.add_argument("--methods", default=",".join(NAMES["method"]))
     parser.add_argument("--networks", default=",".join(networks))
+    parser.add_argument("--depth", type=float, default=95.0, help="of the hand's target [mm]")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
     figures: dict[str, Any] = {}
     scenario = live_scenario(LoadScenario("touch"))
-    load = identified_load(scenario)
+    load, z = identified_load(scenario), round(-100 * options.depth)
     for method in options.methods.split(","):
         for network in options.networks.split(","):
             driven = Driven(scenario, load)
-            driven.go(1.0, z=PRESSING)
+            driven.go(1.0, z=z)
             pair = NAMES["network"].index(network), NAMES["method"].index(method)
-            row = measured(driven, *pair)
+            row = measured(driven, z, *pair)
             figures |= {f"{method}.{network}.{name}": round(x, 4) for name, x in row.items()}
             print(
                 f"{method:13} {network:14}",

@@ -1,4 +1,4 @@
-"""The led hand: whatever turns follow, its way has no jump, and its twist is that of its pose."""
+"""The led hand: whatever turns follow, its way has no jump, and its rates are those of its pose."""
 
 from __future__ import annotations
 
@@ -27,11 +27,10 @@ class Led:
         self.hand.GetInputPort("pose_master").FixValue(self.context, START)
         self.hand.GetInputPort("twist_master").FixValue(self.context, np.zeros(6))
 
-    def wants(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Quaternion (4,), place (3,) [m] and twist [v; omega] (6,) then."""
+    def wants(self, time: float) -> list[np.ndarray]:
+        """Quaternion (4,), place (3,) [m], twist [v; omega] (6,) and acceleration (3,) then."""
         self.context.SetTime(time)
-        wanted = self.hand._wants(self.context).copy()
-        return wanted[:4], wanted[4:7], wanted[7:]
+        return np.split(self.hand._wants(self.context).copy(), [4, 7, 13])
 
     def lead(self, time: float, orientation: tuple[float, ...], place: tuple[float, ...]) -> None:
         self.context.SetTime(time)
@@ -55,7 +54,7 @@ def led() -> Led:
 @pytest.mark.parametrize("angle", [2.5, 0.5, 9e-3, 1e-4])
 def test_to_another_target_it_goes_on_as_it_was(led, angle):
     """About an axis across the one that it turns about."""
-    orientation, place, twist = led.wants(0.11)
+    orientation, place, twist, acceleration = led.wants(0.11)
     across = np.cross(twist[3:], [0.3, -0.2, 0.5])
     turn = exponential(tuple(angle / np.linalg.norm(across) * across))
     led.lead(0.11, multiply(turn, tuple(orientation)), (0.1, 0.1, 0.1))
@@ -64,11 +63,15 @@ def test_to_another_target_it_goes_on_as_it_was(led, angle):
     np.testing.assert_allclose(turned(then[0], orientation), 0.0, atol=1e-12)
     np.testing.assert_allclose(then[1], place, atol=1e-15)
     np.testing.assert_allclose(then[2], twist, rtol=0, atol=1e-9)
+    assert np.linalg.norm(acceleration) > 5.0
+    np.testing.assert_allclose(then[3], acceleration, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("time", [0.09, 0.12, 0.2, 0.4])
 def test_its_twist_is_the_rate_of_its_pose(led, time):
     h = 1e-5
-    (before, start, _), (after, end, _) = led.wants(time - h), led.wants(time + h)
-    rate = np.concatenate([end - start, turned(after, before)]) / (2 * h)
-    np.testing.assert_allclose(rate, led.wants(time)[2], rtol=0, atol=1e-5)
+    before, after, now = led.wants(time - h), led.wants(time + h), led.wants(time)
+    rate = np.concatenate([after[1] - before[1], turned(after[0], before[0])]) / (2 * h)
+    np.testing.assert_allclose(rate, now[2], rtol=0, atol=1e-5)
+    faster = (after[2] - before[2])[:3] / (2 * h)
+    np.testing.assert_allclose(faster, now[3], rtol=1e-5, atol=1e-5)
