@@ -156,6 +156,11 @@ def test_what_is_done_is_shown_at_once(scenario, load, clock):
         clock.now += 1e-3
     assert clock.now - start < 0.013
     assert len(pass_time(live, clock, 0.2)) <= 13
+    frames = []
+    for x in range(101, 121):  # who goes on is shown each slice
+        live.hear(1, json.dumps({"set": {"x": x}}), clock())
+        frames += pass_time(live, clock, 0.005)
+    assert len(frames) >= 15
 
 
 def test_what_stops_a_drive_is_said_and_a_reset_begins_again(scenario, load, clock, monkeypatch):

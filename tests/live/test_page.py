@@ -44,6 +44,11 @@ def test_the_page_drives(page):
     for event in ("keyDown", "keyUp"):
         page.call("Input.dispatchKeyEvent", type=event, code="Space", key=" ")
         page.until(f"frame.inputs.clutch === {int(event == 'keyUp')}")
+    page.call("Input.dispatchKeyEvent", type="keyDown", code="KeyE", key="e")
+    page.until("frame.inputs.z > 500 && ahead[2] > 0")  # the hand hangs back behind what it is led
+    page.call("Input.dispatchKeyEvent", type="keyUp", code="KeyE", key="e")
+    page.until("ahead[2] === 0 && frame.inputs.z === Math.round(target.z)")
+    page.run("Object.assign(target, {x: 0, y: 0, z: 0})")
     page.run("at('sigma').value = 40; at('sigma').dispatchEvent(new Event('input'))")
     page.until("frame.inputs.sigma === 40")
 
