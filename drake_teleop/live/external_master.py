@@ -218,7 +218,7 @@ def MakeExternalMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Di
     builder.Connect(master.GetOutputPort("pose_master"), led.GetInputPort("pose_master"))
     felt = master.GetInputPort("wrench_command")
     if goes_over:
-        block = builder.AddNamedSystem("goes_over", GoesOver())
+        block = builder.AddNamedSystem("goes_over", GoesOver(1 / scenario.rates.hand_hz))
         builder.Connect(block.get_output_port(), felt)
         felt = block.get_input_port()
     builder.ExportInput(felt, "wrench_command")

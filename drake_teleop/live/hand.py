@@ -230,7 +230,7 @@ def MakeLiveMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Diagra
     side = builder.AddNamedSystem("led", MakeMasterSide(scenario, hand))
     felt = side.GetInputPort("wrench_command")
     if goes_over:
-        block = builder.AddNamedSystem("goes_over", GoesOver())
+        block = builder.AddNamedSystem("goes_over", GoesOver(1 / scenario.rates.hand_hz))
         builder.Connect(block.get_output_port(), felt)
         felt = block.get_input_port()
     builder.ExportInput(felt, "wrench_command")

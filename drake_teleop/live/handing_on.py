@@ -6,11 +6,19 @@ with another network or method, which begins at the command of now with its clut
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, Diagram, LeafSystem, System
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    Diagram,
+    DiscreteValues,
+    LeafSystem,
+    System,
+)
 
 from drake_teleop._compiled import njit
 from drake_teleop.lifetime import ONE_DICT, weak_callback
@@ -71,17 +79,32 @@ def _copy(source: Context, target: Context, with_parameters: bool) -> None:
 
 
 @njit(cache=True)
-def _felt_into(wrench, change, time, out):
-    """Writes what is felt (6,) of a wrench (6,); `change` as the parameter of `GoesOver`."""
+def _felt_into(wrench, change, most, time, out):
+    """Writes what is felt (6,) of a wrench (6,); `change` as the parameter of `GoesOver`.
+
+    Its force is no longer than `most` [N], and its torque is less by the same factor.
+    """
     length = change[1]
     u = min(max((time - change[0]) / length, 0.0), 1.0) if length > 0.0 else 1.0
     share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
     for i in range(6):
         out[i] = share * wrench[i] + (1.0 - share) * change[2 + i] if share < 1.0 else wrench[i]
+    force = _force(out)
+    if force > most:
+        for i in range(6):
+            out[i] *= most / force
+
+
+@njit(cache=True)
+def _force(wrench):
+    return math.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
 
 
 class GoesOver(LeafSystem):
     """What the hand feels goes over from what it felt of another station, without a step.
+
+    What the other station had kept from the hand does not come back in a press that the hand has
+    not made: more than `most` is not felt until the wrench has been less than that once.
 
     .. pydrake_system::
 
@@ -90,23 +113,47 @@ class GoesOver(LeafSystem):
         - wrench: (6,) F_E_B that the hand shall feel [N, N m]
         output_ports:
         - felt: (6,) that, at last
+
+    Args:
+        period: in which it looks whether the wrench is less than that [s].
     """
 
     __slots__ = ONE_DICT
 
-    def __init__(self) -> None:
+    def __init__(self, period: float) -> None:
         super().__init__()
         # When it begins [s], its length [s], the wrench that was felt before (6,).
         self._change = self.DeclareNumericParameter(BasicVector(8))
+        self._most = self.DeclareDiscreteState([math.inf])
         self._wrench = self.DeclareVectorInputPort("wrench", 6)
         self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, weak_callback(self._update))
 
     def Begin(self, context: Context, start: float, length: float, felt: Array) -> None:
         """From `start` [s] on and within `length` [s]; until then it is `felt` (6,)."""
         change = np.concatenate([[start, length], felt])
         context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
 
+    def Limit(self, context: Context, most: float) -> None:
+        """The force that is felt is at most `most` [N] until the hand has eased off."""
+        context.SetDiscreteState(self._most, [most])
+
+    def kept_back(self, context: Context) -> float:
+        """What is kept from the hand by that limit now [N]."""
+        most = context.get_discrete_state(self._most).value()[0]
+        return max(_force(self._wrench.Eval(context)) - most, 0.0) if self._over(context) else 0.0
+
+    def _over(self, context: Context) -> bool:
+        start, length = context.get_numeric_parameter(self._change).value()[:2]
+        return bool(context.get_time() >= start + length)
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        most = context.get_discrete_state(self._most).value()[0]
+        if self._over(context) and _force(self._wrench.Eval(context)) <= most:
+            state.get_mutable_value(self._most)[0] = math.inf
+
     def _calc(self, context: Context, output: BasicVector) -> None:
         change = context.get_numeric_parameter(self._change).value()
+        most = context.get_discrete_state(self._most).value()[0]
         wrench = self._wrench.Eval(context)
-        _felt_into(wrench, change, context.get_time(), output.get_mutable_value())
+        _felt_into(wrench, change, most, context.get_time(), output.get_mutable_value())

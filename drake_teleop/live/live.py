@@ -39,6 +39,7 @@ _SHORTEST = 0.25 * FRAME  # between two of them
 TOUCH = 0.12
 # How long it goes on when nobody drives [s]; slices in a row before messages are listened to.
 _ALONE, _IN_A_ROW = 0.25, 4
+_KEPT_BACK = 0.05  # N of which it is said
 _LONGEST_MS = 36_000_000
 _LIMP = {"held": 0, "clutch": 0}
 
@@ -271,6 +272,9 @@ class Live:
         words = self._frame.get("words", [])
         if self._session.filling:
             words = ["another channel fills: the clutch is open until it has", *words]
+        kept = self._session.kept_back()
+        if kept > _KEPT_BACK:
+            words = [f"{kept:.1f} N are kept from the hand until it eases off", *words]
         if self._refusal:
             words = [self._refusal, *words]
         return self._frame | {

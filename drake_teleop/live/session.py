@@ -47,6 +47,8 @@ _RAMP = 0.05
 # A third-order step follows vibrations up to 1.7 / step = 1.1 kHz without exciting them; the ball
 # on a leaf vibrates at up to 700 Hz.
 _SHORTEST_STEP = 2.5e-4
+#: By how much another channel may raise what a pressing hand feels [N].
+_MOST_RISE = 0.9
 _LOAD, _SCENARIO = "load.npz", "scenario.yaml"
 # Where this is, the hand's place in the inputs is that of a device.
 _DEVICE = "device.txt"
@@ -148,7 +150,10 @@ class _Station:
             sensor.bring_up_to_date(context)
         wait = filled_after(self.scenario) if channel_anew else 0.0
         over, context = self.block("goes_over")
-        over.Begin(context, self.context.get_time() + wait, BLEND, other.value("force_to_master"))
+        felt = other.value("force_to_master")
+        over.Begin(context, self.context.get_time() + wait, BLEND, felt)
+        if channel_anew:
+            over.Limit(context, _MOST_RISE + float(np.linalg.norm(felt[:3])))
         grips = other.scenario.operator.hand, self.scenario.operator.hand
         if grips[0] != grips[1]:
             hand, context = self.block("live_hand")
@@ -300,6 +305,13 @@ class Session:
     def force(self) -> NDArray[np.float64]:
         """(6,) what a device shall display now [N, N m]."""
         return self._now.value("force_to_master")
+
+    def kept_back(self) -> float:
+        """What another channel has brought, and the hand does not feel until it eases off [N]."""
+        if self._stations == 1:
+            return 0.0
+        over, context = self._now.block("goes_over")
+        return float(over.kept_back(context))
 
     def keep(self) -> None:
         """Brings everything until now to the disk; the session may go on."""

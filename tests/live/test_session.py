@@ -15,6 +15,7 @@ from drake_teleop.live.hand import BEHIND
 from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs, row
 from drake_teleop.live.session import Drive, Session, read_drive, repeat
 from drake_teleop.pages.progress import silent
+from drake_teleop.passivity.methods import METHODS
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.slave.arm import forward_kinematics
@@ -113,6 +114,30 @@ def test_another_network_and_method_go_on_where_the_station_is(scenario, load):
     assert not session.filling and session.apply(now.changed({"z": -1000})) is None
     session.advance(100)
     assert session.log()["pose_command"][-1, 6] > command[-1, 2] + 1e-3
+
+
+@pytest.mark.slow
+def test_what_a_method_had_hidden_comes_back_to_a_hand_that_has_eased_off(scenario, load):
+    """Without it a press is felt 0.9 N harder at most, and all of it from the next one on."""
+    session, felt = Session(scenario, load), []
+
+    def go(ms, **changes):
+        session.apply(session.inputs.changed(changes))
+        session.advance(ms)
+        felt.append(float(np.linalg.norm(session.force()[:3])))
+        return session.kept_back()
+
+    assert go(500, z=-4000) == 0.0
+    assert go(1000, network=2, method=METHODS.index("force_limit")) == 0.0
+    kept = go(1000, method=0)
+    assert felt[-1] == pytest.approx(felt[-2] + 0.9, abs=1e-9)
+    assert felt[-1] + kept == pytest.approx(felt[0], rel=0.02) and kept > 1.0
+    assert go(400, grip=1) > 0.2  # another station, but no other channel
+    assert felt[-1] == pytest.approx(felt[-2], abs=1e-9)
+    assert go(400, z=-1000) == 0.0 and felt[-1] < 0.1
+    assert go(400, z=-4000) == 0.0 and felt[-1] > felt[1] + 1.0
+    until_it_leaves = np.linalg.norm(session.log()["force_to_master"][1500:3200, :3], axis=1)
+    assert np.abs(np.diff(until_it_leaves)).max() < 0.2
 
 
 def test_a_hand_that_is_led_moves_the_tool_at_once_and_stops_where_it_is_led(scenario, load):
