@@ -79,16 +79,20 @@ def _copy(source: Context, target: Context, with_parameters: bool) -> None:
 
 
 @njit(cache=True)
-def _felt_into(wrench, change, most, time, out):
-    """Writes what is felt (6,) of a wrench (6,); `change` as the parameter of `GoesOver`.
+def _share(change, time):
+    """What of the wrench is felt by now, 0 to 1; `change` as the parameter of `GoesOver`."""
+    u = min(max((time - change[0]) / change[1], 0.0), 1.0)
+    return u * u * u * (10.0 + u * (6.0 * u - 15.0))
+
+
+@njit(cache=True)
+def _felt_into(wrench, before, share, most, out):
+    """Writes what is felt (6,): of a wrench (6,) a share, the rest of what was felt `before` (6,).
 
     Its force is no longer than `most` [N], and its torque is less by the same factor.
     """
-    length = change[1]
-    u = min(max((time - change[0]) / length, 0.0), 1.0) if length > 0.0 else 1.0
-    share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
     for i in range(6):
-        out[i] = share * wrench[i] + (1.0 - share) * change[2 + i] if share < 1.0 else wrench[i]
+        out[i] = share * wrench[i] + (1.0 - share) * before[i] if share < 1.0 else wrench[i]
     force = _force(out)
     if force > most:
         for i in range(6):
@@ -115,7 +119,7 @@ class GoesOver(LeafSystem):
         - felt: (6,) that, at last
 
     Args:
-        period: in which it looks whether the wrench is less than that [s].
+        period: in which it goes on, and looks whether the wrench is less than that [s].
     """
 
     __slots__ = ONE_DICT
@@ -124,36 +128,39 @@ class GoesOver(LeafSystem):
         super().__init__()
         # When it begins [s], its length [s], the wrench that was felt before (6,).
         self._change = self.DeclareNumericParameter(BasicVector(8))
-        self._most = self.DeclareDiscreteState([math.inf])
+        # The share of the wrench that is felt, and the most [N]. Were it the time that the output
+        # asks for, each of the integrator's steps would ask several times.
+        self._state = self.DeclareDiscreteState([1.0, math.inf])
         self._wrench = self.DeclareVectorInputPort("wrench", 6)
-        self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc))
+        asked = {self._wrench.ticket(), self.xd_ticket(), self.pn_ticket()}
+        self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc), asked)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, weak_callback(self._update))
 
     def Begin(self, context: Context, start: float, length: float, felt: Array) -> None:
         """From `start` [s] on and within `length` [s]; until then it is `felt` (6,)."""
         change = np.concatenate([[start, length], felt])
         context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
+        context.get_mutable_discrete_state(self._state)[0] = 0.0
 
     def Limit(self, context: Context, most: float) -> None:
         """The force that is felt is at most `most` [N] until the hand has eased off."""
-        context.SetDiscreteState(self._most, [most])
+        context.get_mutable_discrete_state(self._state)[1] = most
 
     def kept_back(self, context: Context) -> float:
         """What is kept from the hand by that limit now [N]."""
-        most = context.get_discrete_state(self._most).value()[0]
-        return max(_force(self._wrench.Eval(context)) - most, 0.0) if self._over(context) else 0.0
-
-    def _over(self, context: Context) -> bool:
-        start, length = context.get_numeric_parameter(self._change).value()[:2]
-        return bool(context.get_time() >= start + length)
+        share, most = context.get_discrete_state(self._state).value()
+        return max(_force(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        most = context.get_discrete_state(self._most).value()[0]
-        if self._over(context) and _force(self._wrench.Eval(context)) <= most:
-            state.get_mutable_value(self._most)[0] = math.inf
+        share, most = context.get_discrete_state(self._state).value()
+        if share < 1.0:
+            change = context.get_numeric_parameter(self._change).value()
+            state.get_mutable_value(self._state)[0] = _share(change, context.get_time())
+        elif most < math.inf and _force(self._wrench.Eval(context)) <= most:
+            state.get_mutable_value(self._state)[1] = math.inf
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        change = context.get_numeric_parameter(self._change).value()
-        most = context.get_discrete_state(self._most).value()[0]
+        before = context.get_numeric_parameter(self._change).value()[2:]
+        share, most = context.get_discrete_state(self._state).value()
         wrench = self._wrench.Eval(context)
-        _felt_into(wrench, change, most, context.get_time(), output.get_mutable_value())
+        _felt_into(wrench, before, share, most, output.get_mutable_value())

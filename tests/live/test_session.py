@@ -6,12 +6,14 @@ import json
 
 import numpy as np
 import pytest
+from pydrake.systems.analysis import Simulator
 
 from drake_teleop.channel.channel import Channel
 from drake_teleop.cli import main
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import slave_arm
 from drake_teleop.live.hand import BEHIND
+from drake_teleop.live.handing_on import GoesOver
 from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs, row
 from drake_teleop.live.session import Drive, Session, read_drive, repeat
 from drake_teleop.pages.progress import silent
@@ -114,6 +116,26 @@ def test_another_network_and_method_go_on_where_the_station_is(scenario, load):
     assert not session.filling and session.apply(now.changed({"z": -1000})) is None
     session.advance(100)
     assert session.log()["pose_command"][-1, 6] > command[-1, 2] + 1e-3
+
+
+def test_what_is_felt_goes_over_though_the_wrench_stays():
+    simulator = Simulator(GoesOver(1e-3))
+    over, context = simulator.get_system(), simulator.get_mutable_context()
+    wrench = np.array([3.0, 0.0, 4.0, 0.1, 0.2, 0.3])
+    over.get_input_port().FixValue(context, wrench)
+    felt = over.get_output_port()
+    np.testing.assert_array_equal(felt.Eval(context), wrench)
+    over.Begin(context, 0.1, 0.2, np.ones(6))
+    np.testing.assert_array_equal(felt.Eval(context), np.ones(6))
+    simulator.AdvanceTo(0.1995)
+    np.testing.assert_allclose(felt.Eval(context), (1.0 + wrench) / 2, atol=0.05)
+    over.Limit(context, 2.5)
+    simulator.AdvanceTo(0.4)
+    np.testing.assert_allclose(felt.Eval(context), wrench / 2, rtol=1e-12)
+    over.get_input_port().FixValue(context, wrench / 2)
+    simulator.AdvanceTo(0.402)
+    over.get_input_port().FixValue(context, wrench)
+    np.testing.assert_array_equal(felt.Eval(context), wrench)
 
 
 @pytest.mark.slow
