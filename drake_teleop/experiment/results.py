@@ -159,6 +159,8 @@ def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> N
 
 
 def _draw(axes: Axes, names: list[str], found: list[Result]) -> None:
+    from matplotlib.ticker import LogLocator
+
     from drake_teleop.pages.style import BLUE, VERMILION
 
     people = sorted({r.participant for r in found} - {0})
@@ -175,5 +177,8 @@ def _draw(axes: Axes, names: list[str], found: list[Result]) -> None:
             axes.plot([r.low, r.high], [place, place], color=colour, linewidth=thick)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("")
+    # There may be no power of ten among what is shown.
+    least, most = axes.get_xlim()
+    axes.xaxis.set_minor_locator(LogLocator(subs=(2, 3, 4, 6) if most < 30 * least else (3,)))
+    axes.xaxis.set_minor_formatter("{x:g}")
     axes.grid(axis="y", visible=False)

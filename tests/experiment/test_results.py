@@ -11,8 +11,9 @@ from test_procedure import SMALL, go_through
 from drake_teleop.experiment.command import whose_turn
 from drake_teleop.experiment.design import Condition, ContactDetection, Experiment
 from drake_teleop.experiment.procedure import Procedure, trials_of
-from drake_teleop.experiment.results import results, write_results
+from drake_teleop.experiment.results import Result, _draw, results, write_results
 from drake_teleop.experiment.store import Store
+from drake_teleop.pages.style import Picture
 
 CONTACT = "threshold of contact [N at the tool]"
 
@@ -42,6 +43,16 @@ def test_the_folder_has_table_trials_and_picture(tmp_path):
     assert share["low"] == pytest.approx(2.0 / (2.0 + 1.959964**2)) and share["high"] == 1.0
     time = table.filter(quantity="time to the floor [s]", condition="a").row(0, named=True)
     assert math.isclose(time["value"], 1.0)
+
+
+@pytest.mark.parametrize("least, most", [(27.0, 42.0), (0.03, 0.11), (0.4, 5.0), (0.1, 40.0)])
+def test_the_axis_of_a_quantity_has_numbers(least, most):
+    axes = Picture(figsize=(2.9, 2.0)).subplots()
+    _draw(axes, ["a"], [Result("t", "a", 1, 9, CONTACT, (least * most) ** 0.5, least, most)])
+    low, high = axes.get_xlim()
+    told = [*axes.xaxis.get_majorticklabels(), *axes.xaxis.get_minorticklabels()]
+    told = [label for label in told if low <= label.get_position()[0] <= high]
+    assert 2 <= sum(bool(label.get_text()) for label in told) <= 7
 
 
 def test_whose_turn_it_is(tmp_path):
