@@ -125,6 +125,15 @@ def test_a_station_that_there_is_not_is_refused_and_the_drive_goes_on(
     assert frame["words"] == ["there is no such station"]
 
 
+def test_what_is_kept_from_the_hand_is_said(scenario, load, clock, monkeypatch):
+    live = make(scenario, load, clock)
+    live.join(1, clock())
+    assert pass_time(live, clock, FRAME)[-1]["words"] == []
+    monkeypatch.setattr(Session, "kept_back", lambda session: 1.234)
+    said = "1.2 N are kept from the hand until it eases off"
+    assert pass_time(live, clock, FRAME)[-1]["words"] == [said]
+
+
 def test_another_scene_is_another_drive_and_its_record_another_folder(
     scenario, load, clock, tmp_path
 ):
