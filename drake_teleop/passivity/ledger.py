@@ -186,7 +186,9 @@ _FADING = 0.02  # m/s, below it drag fades
 _RESTED = 0.1  # s at rest, after which nothing is braked for what was given before
 # Of a reserve: without contact drag begins below the one, and ends at the other, but for rounding.
 _LOW, _FULL = 1.0 - PASSED, 1.0 - 1e-9
-_BRAKE, _BRAKED = 0.5, 0.1  # N and m/s: what was pushed is braked with so much, down to this speed
+# N, m/s, m/s: what was pushed is braked with so much above the one speed, with nothing below the
+# other; between them by share, as the edge of a brake would be felt.
+_BRAKE, _BRAKED, _UNBRAKED = 0.5, 0.1, 0.05
 
 # Memory as at the head of `ledger_slave`: filtered velocity, whether something is touched, what it
 # pushes with and its direction. Way between hand and slave at the onset; the remembered wall's
@@ -453,8 +455,9 @@ def _drag(g, received, dx, T, p, memory, wrench):
         drag = p[DRAG][g]
     if speed < _FADING * ARM[g]:
         memory[_GIVEN][g] *= 1.0 - min(T / _RESTED, 1.0)
-    if memory[_GIVEN][g] > 0.0 and speed > _BRAKED * ARM[g]:
-        drag = max(drag, _BRAKE * LEVER[g])
+    if memory[_GIVEN][g] > 0.0:
+        share = (speed / ARM[g] - _UNBRAKED) / (_BRAKED - _UNBRAKED)
+        drag = max(drag, _BRAKE * LEVER[g] * min(share, 1.0))
     drag *= _earning(g, dx, T, p, memory)
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= drag * velocity[i] / max(speed, _FADING * ARM[g])
