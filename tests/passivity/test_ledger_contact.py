@@ -125,6 +125,21 @@ def test_friction_stays_across_a_direction_that_turns(way):
     assert abs(felt[1]) > 0.4, "friction is still shown"
 
 
+@pytest.mark.parametrize("turns", [0.6e-3, -0.6e-3])
+def test_friction_whose_torque_hides_a_force_is_no_press(turns):
+    """A point 40 mm off is touched, then one on the other side; 2.6 and 3.4 N of 3 were felt."""
+    hand = Hand(np.array([0.0, -1.2, 3.0, 0.12, 0.0, 0.0]), 200.0)
+    hand.packet[TRIP] = 0.6
+    hand.rest(1500)
+    hand.packet[WRENCH][:4] = [0.0, 0.0, 3.0, -0.12]
+    for _ in range(20):
+        hand.step([0.0, 0.0, 0.0, turns, 0.0, 0.0])
+    hand.packet[POSE] = hand.pose
+    felt = hand.rest(9000)
+    assert felt[2] == pytest.approx(3.0, abs=0.05)  # but for what the direction still has to turn
+    assert felt[1] > 0.05, "friction is still shown"
+
+
 def test_a_tip_that_sticks_and_slips_does_not_drive_the_hand():
     """Three times a second to and fro on what is touched, as before a stiff leaf over `internet`.
 
