@@ -5,7 +5,8 @@ run its usual task over a constant delay: a hand presses 20 mm into a wall, hold
 Grips are light, medium and firm, walls 0.5 to 50 kN/m, round trips 1 ms to 2.6 s (there the hold is
 10 s longer); nothing is told of the hand. Stable is a run at rest within 0.5 mm, holding and
 afterwards; good is one that is also quiet (the force's standard deviation below 5 %) and shows what
-is pressed within 1 %; strong one that is good and shows 95 % of what would be felt without delay.
+is pressed within 1 %; strong one that is good and shows 95 % of what would be felt without delay;
+prompt one that is felt within 10 % of that two round trips and 0.5 s after the hand has pressed.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ GRIPS = {"light": (0.1, 2.0, 50.0), "medium": (0.25, 8.0, 250.0), "firm": (0.5, 
 WALLS = (500.0, 2500.0, 5100.0, 10e3, 20e3, 50e3)  # N/m
 ROUND_TRIPS = (0.001, 0.01, 0.05, 0.1, 0.15, 0.3, 0.6, 1.0, 2.6)  # s
 QUIET, EXACT, STRONG, DEPTH = 0.05, 0.01, 0.95, 0.02
+SOON, NEAR = 0.5, 0.1  # s, 1
+COUNTED = ("stable", "good", "strong", "prompt")
 
 
 def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
@@ -54,7 +57,15 @@ def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
     quiet = found.chatter < QUIET * found.felt_force
     good = found.stable and quiet and abs(found.force_error) < EXACT
     share = found.felt_force / undelayed
-    return {"stable": found.stable, "good": good, "strong": good and share > STRONG, "felt": share}
+    holds = (run.t >= task.pressed + 2 * round_trip + SOON) & (run.t < task.release)
+    at_last = np.mean(run.felt[holds & (run.t >= task.release - task.judged)])
+    return {
+        "stable": found.stable,
+        "good": good,
+        "strong": good and share > STRONG,
+        "felt": share,
+        "prompt": bool(np.all(np.abs(run.felt[holds] / at_last - 1.0) < NEAR)),
+    }
 
 
 def reach(table: dict[tuple[str, float, float], dict[str, float]], grip: str, wall: float) -> str:
@@ -82,13 +93,13 @@ def main(arguments: list[str] | None = None) -> None:
         for n, method in enumerate(asked.method)
     }
     felt = "felt of undelayed, median of good ones"
-    print(f"| method | stable of {len(places)} | good | strong | {felt} |")
-    print("|---|---|---|---|---|")
+    print(f"| method | stable of {len(places)} | good | strong | prompt | {felt} |")
+    print("|---|---|---|---|---|---|")
     for method, table in found.items():
-        counts = [sum(row[key] for row in table.values()) for key in ("stable", "good", "strong")]
+        counts = [sum(row[key] for row in table.values()) for key in COUNTED]
         shares = [row["felt"] for row in table.values() if row["good"]]
         share = f"{np.median(shares):.2f}" if shares else "-"
-        print(f"| `{method}` | {counts[0]} | {counts[1]} | {counts[2]} | {share} |")
+        print(f"| `{method}` | {' | '.join(map(str, counts))} | {share} |")
     print("\nLongest round trip [ms] up to which every one is stable / good:\n")
     print("| method, grip | " + " | ".join(f"{wall / 1e3:g} kN/m" for wall in WALLS) + " |")
     print("|---" * (len(WALLS) + 1) + "|")

@@ -72,7 +72,8 @@ def test_the_table_of_holds_is_what_the_record_says():
     written = table("docs/delay.md", "| method | stable of 162 |")
     found = {}
     for method, holds in figures_of_record("domain").items():
-        counts = [sum(row[what] for row in holds.values()) for what in ("stable", "good", "strong")]
+        told = ("stable", "good", "strong", "prompt")
+        counts = [sum(row[what] for row in holds.values()) for what in told]
         felt = np.median([row["felt"] for row in holds.values() if row["good"]])
         found[method] = [*map(str, counts), f"{felt:.2f}"]
     assert written == found
@@ -89,7 +90,7 @@ def test_how_to_choose_is_told_the_same_figures():
     least = table("docs/delay.md", "| method | between the hand and |")
     assert table("docs/choose.md", "| method | stable |") == {
         method: [stable, good, felt, least[method][-1].rpartition(" ")[2]]
-        for method, (stable, good, _, felt) in holds.items()
+        for method, (stable, good, _, _, felt) in holds.items()
     }
 
 
