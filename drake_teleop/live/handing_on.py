@@ -130,11 +130,11 @@ class GoesOver(LeafSystem):
         self._change = self.DeclareNumericParameter(BasicVector(8))
         # The share of the wrench that is felt, and the most [N]. Were it the time that the output
         # asks for, each of the integrator's steps would ask several times.
-        self._state = self.DeclareDiscreteState([1.0, math.inf])
+        self._state = int(self.DeclareDiscreteState([1.0, math.inf]))
         self._wrench = self.DeclareVectorInputPort("wrench", 6)
         asked = {self._wrench.ticket(), self.xd_ticket(), self.pn_ticket()}
         self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc), asked)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, weak_callback(self._update))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def Begin(self, context: Context, start: float, length: float, felt: Array) -> None:
         """From `start` [s] on and within `length` [s]; until then it is `felt` (6,)."""
@@ -152,7 +152,7 @@ class GoesOver(LeafSystem):
         return max(_force(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        share, most = context.get_discrete_state(self._state).value()
+        share, most = state.value(self._state)
         if share < 1.0:
             change = context.get_numeric_parameter(self._change).value()
             state.get_mutable_value(self._state)[0] = _share(change, context.get_time())
@@ -160,7 +160,10 @@ class GoesOver(LeafSystem):
             state.get_mutable_value(self._state)[1] = math.inf
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        before = context.get_numeric_parameter(self._change).value()[2:]
         share, most = context.get_discrete_state(self._state).value()
         wrench = self._wrench.Eval(context)
+        if share == 1.0 and most == math.inf:  # most of the time; the rest takes as long again
+            output.SetFromVector(wrench)
+            return
+        before = context.get_numeric_parameter(self._change).value()[2:]
         _felt_into(wrench, before, share, most, output.get_mutable_value())

@@ -28,6 +28,7 @@ from drake_teleop.live.hand import MakeLiveMasterSide
 from drake_teleop.live.handing_on import hand_on
 from drake_teleop.live.inputs import INPUTS, SLICE_MS, Inputs, header, read_inputs, row
 from drake_teleop.live.log_beside import LogBeside
+from drake_teleop.live.steps import take_short_steps_in_contact
 from drake_teleop.pages.progress import Progress
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, replace
@@ -115,10 +116,8 @@ class _Station:
         )
         seeded = dataclasses.replace(scenario.simulation, seed=scenario.simulation.seed + number)
         self.simulator = MakeSimulator(self.station, seeded)
-        integrator = self.simulator.get_mutable_integrator()
         if scenario.simulation.integrator == "runge_kutta3":  # the one with error control
-            integrator.set_requested_minimum_step_size(_SHORTEST_STEP)
-            integrator.set_throw_on_minimum_step_size_violation(False)
+            take_short_steps_in_contact(self.simulator, _SHORTEST_STEP)
         self.context = self.simulator.get_mutable_context()
         self.sink = self.station.GetSubsystemByName(LOG).FindMutableLog(self.context)
         self.columns = columns(self.station)
