@@ -92,6 +92,8 @@ _LONGEST = 16
 _CHECK_PERIOD, _ALIKE = 0.1, 1e-6
 #: For so many samples a lost one shows, so that no log misses it.
 _SHOWS = 40
+#: Instead of a wrench that the plant tells, see `sample_step`.
+_BY_LAW = np.zeros(0)
 
 
 @njit(cache=True)
@@ -212,8 +214,8 @@ def sample_step(
             samples taken, length of the queue, time and x of each step's end in it].
         until_now: whether the sample that may be due this very instant is taken.
         touching_W: (6,) what contacts exert on the tool now, as the plant says, about the world's
-            origin, in W; used if `until_now`. A stiff contact multiplies the last digit of a
-            position by 2e5 N/m: what has the plant's own penetration is the plant's to 1e-12 N.
+            origin, in W, or (0,), as `physics` says. A stiff contact multiplies the last digit of
+            a position by 2e5 N/m: what has the plant's own penetration is the plant's to 1e-12 N.
         scratch: (9, 2 n + 6 + size of the plant's state), whatever it holds.
         result: filled: [last sample before now (16 + n) | when that was taken [s] | memory, its
             queue now's end alone].
@@ -234,7 +236,7 @@ def sample_step(
     joined(state, around, now)
     put(between, 2 * half, now, 2 * half, extra)  # for what is not interpolated of it: the arm
     _torque_at(held, 0.0, tau)
-    if until_now:
+    if touching_W.shape[0] > 0:
         none, sheet, plant = physics[2][:0], around[:2], around[2:]
         environment_wrench(
             physics[0], none, joints, applied_W, state[:n], state[n:], sheet, plant, now_wrench_W
@@ -338,6 +340,8 @@ class WristSensor(LeafSystem):
             first[WRENCH] += config.offset
         # Contact takes many steps for one torque, and to work off the queue takes longer than them.
         self._beyond = contact.beyond
+        # To ask the plant takes as long as two samples. Noise is 1e9 times what that would tell.
+        self._exact = config.ideal or bool(contact.beyond)
         self._longest = _LONGEST if slave.can_touch and not contact.beyond else 1
         self._around = np.zeros(2 + contact.plant_size)
         tail = np.zeros(2 + self._longest * (2 * n + 1 + len(self._around)))
@@ -437,7 +441,7 @@ class WristSensor(LeafSystem):
     def take_samples(self, context: Context) -> None:
         """Takes the samples before now, for who wants to see the state that results."""
         seen = self._seen(context)
-        self._sample(context, seen, self._near(*seen), False, self._nothing, self._result)
+        self._sample(context, seen, self._near(*seen), False, _BY_LAW, self._result)
         context.SetDiscreteState(self._result[self._remains])
 
     def bring_up_to_date(self, context: Context) -> None:
@@ -504,7 +508,12 @@ class WristSensor(LeafSystem):
     def _calc_step(self, context: Context, output: BasicVector) -> None:
         seen = self._seen(context)
         near = self._near(*seen)
-        touching_W = self._nothing if near == FAR else self._touching_W(context)
+        if near == FAR:
+            touching_W = self._nothing
+        elif near == WATCHED or self._exact:
+            touching_W = self._touching_W(context)
+        else:
+            touching_W = _BY_LAW
         self._sample(context, seen, near, True, touching_W, output.get_mutable_value())
 
     def _sample(

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import BasicVector, DiagramBuilder
 
+from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.operator.operator import MinimumJerk
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
+from drake_teleop.sensor import wrist_sensor
 from drake_teleop.sensor.sensor_chain import (
     NOISE_BLOCK,
     WristSensorConfig,
@@ -21,9 +24,9 @@ from drake_teleop.sensor.sensor_chain import (
 )
 from drake_teleop.sensor.wrist_sensor import WristSensor
 from drake_teleop.simulation import simulate
-from drake_teleop.slave.plant import AddSlavePlant
+from drake_teleop.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.slave.slave_config import Slave
-from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
+from drake_teleop.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
 
 QUIET = without(
     WristSensorConfig(), "place", "noise", "random_walk", "offset", "drift", "quantisation"
@@ -201,3 +204,38 @@ def test_samples_wait_in_contact_until_the_torque_or_the_noise_changes():
     sensor: Any = SimpleNamespace(_period=period, _holds=(5 * period, NOISE_BLOCK * period))
     due = [WristSensor._is_due(sensor, time) for time in k * period / 3]
     np.testing.assert_array_equal(due, (k % 15 == 0) | (k % (3 * NOISE_BLOCK) == 0))
+
+
+def test_a_noisy_sensor_need_not_ask_the_plant_in_contact(monkeypatch):
+    """The tip is in a leaf; what the plant says differs by rounding from what the samples know."""
+    asked, of_plant = [], wrist_sensor.contact_wrench_W
+
+    def counted(*of_results):
+        asked.append(of_plant(*of_results))
+        return asked[-1]
+
+    def on_a_leaf(ideal: bool, asks: bool) -> tuple[np.ndarray, int]:
+        x, y, z = NominalSlave(Slave()).start_tip
+        scenario = replace(
+            Scenario(),
+            sheet_spring=SheetSpring(position=[x, y, z - 1e-3]),
+            wrist_sensor__ideal=ideal,
+            force_scaling__sigma=1.0,
+            operator__intent=[MinimumJerk(duration=0.1, translation=[0.0, 0.0, -0.02])],
+            simulation__settle=0.0,
+            simulation__duration=0.15,
+        )
+        station, before = MakeTeleopStation(scenario), len(asked)
+        sensor = GetBlock(station, "wrist_sensor")
+        assert sensor._exact == ideal
+        sensor._exact = asks
+        result = simulate(station, scenario.simulation)
+        assert np.abs(result["true_contact_wrench_W"][-20:, 2]).min() > 1.0
+        return result["measured_wrench_S"], len(asked) - before
+
+    monkeypatch.setattr(wrist_sensor, "contact_wrench_W", counted)
+    told, times = on_a_leaf(True, True)
+    by_law, no_times = on_a_leaf(True, False)
+    assert times > 100 and no_times == 0
+    assert 0.0 < np.abs(told - by_law).max() < 1e-6
+    assert on_a_leaf(False, False)[1] == 0
