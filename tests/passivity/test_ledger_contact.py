@@ -125,6 +125,22 @@ def test_friction_stays_across_a_direction_that_turns(way):
     assert abs(felt[1]) > 0.4, "friction is still shown"
 
 
+def test_the_brake_on_a_hand_that_was_pushed_fades_with_its_speed():
+    """0.5 N above 0.1 m/s, nothing below 0.05, and no edge that would be felt between."""
+    hand = Hand(np.array([0.0, 0.0, 6.0, 0.0, 0.0, 0.0]), 200.0)
+    hand.rest(1500)
+    up = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    for k in range(120):
+        hand.step(0.15 * T * up)
+        if k == 100:
+            hand.packet[WRENCH] = 0.0  # until then the contact pushed it out
+    speeds = np.linspace(0.15, 0.03, 100)
+    felt = np.array([hand.step(v * T * up)[2] for v in speeds])
+    np.testing.assert_allclose(felt[speeds > 0.11], -0.5, rtol=1e-6)
+    np.testing.assert_allclose(felt[speeds < 0.04], 0.0, atol=1e-9)
+    assert np.abs(np.diff(felt)).max() < 0.03
+
+
 @pytest.mark.parametrize("turns", [0.6e-3, -0.6e-3])
 def test_friction_whose_torque_hides_a_force_is_no_press(turns):
     """A point 40 mm off is touched, then one on the other side; 2.6 and 3.4 N of 3 were felt."""
