@@ -170,6 +170,25 @@ def test_a_tip_that_sticks_and_slips_does_not_drive_the_hand():
     assert (np.ptp(felt[700:], axis=0)[1:4] < [0.1, 0.07, 0.02]).all()
 
 
+@pytest.mark.parametrize("turning", [False, True])
+def test_friction_that_is_held_over_a_step_does_not_shake_a_light_hand(turning):
+    """Its spring gives out k T / 2; a hand that rubs over `lan` shook at 58 Hz by what it felt."""
+    hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
+    axis, inertia, rubs = (4, 2e-4, 0.05) if turning else (1, 0.02, 0.5)
+    hand.rest(1500)
+    hand.packet[WRENCH][axis] = rubs
+    shown = hand.rest(20)[axis]
+    v, way = 0.02 * rubs / (inertia * 360.0), []
+    for _ in range(400):
+        a = (hand.felt[axis] - shown) / inertia
+        dx = np.zeros(6)
+        dx[axis] = v * T + 0.5 * a * T**2
+        v += a * T
+        hand.step(dx)
+        way.append(dx[axis])
+    assert np.ptp(way[-100:]) < 0.1 * np.ptp(way[:50])
+
+
 def test_a_hand_that_lets_go_gets_no_more_than_what_its_ledger_keeps():
     """R_m + 0.7 R_s in contact, and what its drag has cost, though the wall follows with 3 N."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
