@@ -95,6 +95,8 @@ def test_friction_is_of_the_hands_own_motion_and_at_rest_what_is_measured():
     np.testing.assert_allclose(hand.rest(7000)[:3], [0.0, -0.6, 3.0], atol=0.01)
     hand.packet[POSE][6] = -0.1  # the hand is far out again, before the slave's news are
     np.testing.assert_allclose(hand.rest(400), np.zeros(6), atol=1e-9)
+    still = hand.step([0.0, 5e-5, 0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(still, np.zeros(6), atol=1e-9, err_msg="nor where it moves there")
 
 
 def test_friction_does_not_fade_under_a_hand_that_rests():
@@ -187,6 +189,24 @@ def test_friction_that_is_held_over_a_step_does_not_shake_a_light_hand(turning):
         hand.step(dx)
         way.append(dx[axis])
     assert np.ptp(way[-100:]) < 0.1 * np.ptp(way[:50])
+
+
+def test_friction_is_not_of_the_way_along_the_contact():
+    """A point 40 mm off: the hand goes and turns along n, and feels the wall as without any."""
+    normal = np.array([0.0, 0.0, 1.0, 0.04, 0.0, 0.0])
+    way = 2e-5 * np.array([0.0, 0.0, 1.0, 0.04 / 0.1**2, 0.0, 0.0])
+    felt = []
+    for rubs in (0.6, 0.0):
+        hand = Hand(3.0 * normal, 200.0)
+        hand.rest(1500)
+        hand.packet[WRENCH][1], hand.packet[WRENCH][4] = rubs, 0.05 * rubs
+        hand.rest(20)
+        hand.packet[WRENCH] = 3.0 * normal
+        shown = hand.rest(20)
+        felt.append(np.array([hand.step(way) for _ in range(40)]) - shown)
+    np.testing.assert_allclose(felt[0][:, 2], felt[1][:, 2], atol=0.01)
+    np.testing.assert_allclose(felt[0][:, 3], felt[1][:, 3], atol=1e-3)
+    assert abs(felt[1][-1, 2]) > 0.1, "the wall is felt"
 
 
 def test_a_hand_that_lets_go_gets_no_more_than_what_its_ledger_keeps():
