@@ -57,8 +57,8 @@ At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
 
     at rest what is measured too. What is shown is led by a step, h - k_h dx, for the same reason as
     x_m: a light hand that turned by 0.5 mrad kept itself shaking at 58 Hz. As n turns, what of h's
-    force comes to lie along n's is dropped, of the force alone: a press that a torque hides in n .
-    h would else be felt for as long as h lasts. k_h is 2.5 kN/m, h_m the largest |w - w_n n| of
+    force comes to lie along n's is dropped, of the force alone: a press that a torque hides in
+    n . h would else be felt for as long as h lasts. k_h is 2.5 kN/m, h_m the largest |w - w_n n| of
     about a second or of tau, tau thirty round trips, but 0.6 s at least: friction that fades while
     the hand rests lets it move, and a round trip later the tip slips. Both means are so slow
     because what they pass on of the slave's friction, a round trip late, moves the hand, and that
