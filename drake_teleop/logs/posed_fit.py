@@ -77,7 +77,7 @@ def fit_posed(
     inside = (moved.t >= moved.t[0] + margin) & (moved.t <= moved.t[-1] - margin)
     shown = shown.only(measured(moved, cutoff_hz) & inside)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
-    fit = _fit(shown, found, found.rejected[at], method, log.posed.gain_std)
+    fit = _fit(shown, found, found.rejected[at], method, log.gain_std)
     # Gains that are wrong are no rigid load's; what stated ones explain is in the deviations.
     if finding is not None or not found.fit.explained:  # then nothing of the load is what it seems
         flags = fit.identification.identifiable & np.repeat([True, False], [6, 10])
@@ -98,7 +98,7 @@ def _estimate(log: Log, delay: float | None) -> PoseEstimate:
         log.posed.poses,
         log.posed.gravity_W,
         delay=delay,
-        gain=log.posed.gain_std,
+        gain=log.gain_std,
         lost=log.bridged,
         imu=log.posed.imu,
     )

@@ -157,7 +157,11 @@ def _identified(
         log = undelayed(log, delay_s)
         log = low_passed(log, cutoff_hz).only(measured(log, cutoff_hz))
         fit = identify_batch(
-            log.wrench, *log.motion, method=method, shared_noise=log.static, delay_s=delay_s
+            *(log.wrench, *log.motion),
+            method=method,
+            shared_noise=log.static,
+            delay_s=delay_s,
+            gain_std=log.gain_std,
         )
     result = fit.identification
     loads = () if log.static else tuple(segments(log.wrench, *log.motion, log.dt))

@@ -13,6 +13,7 @@ from load_cases import OFFSETS, TOOL, rich_motion, rotations
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.batch.consistent import Prior
+from drake_teleop.load.batch.covariance import ARM
 from drake_teleop.load.batch.methods import METHODS, _loss, identify_batch
 from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.batch.record import Options, Record
@@ -283,6 +284,43 @@ def test_known_offsets():
     assert (np.abs(known.identification.phi - TOOL) / deviations[6:]).max() < 4.5
 
 
+@pytest.mark.parametrize("offsets", [True, False])
+@pytest.mark.parametrize("method", ["ordinary", "whitened"])
+def test_the_covariance_by_gains_is_what_each_of_them_does(method, offsets):
+    F, *motion = record(300)
+    F -= 0.0 if offsets else OFFSETS
+    noise = Noise(1e-6 * WRENCH_NOISE)
+
+    def solved(F, **stated):
+        return identify_batch(F, *motion, method=method, noise=noise, offsets=offsets, **stated)
+
+    expected, length = np.zeros((16, 16)), np.repeat([1.0, ARM], 3)
+    for d in range(6):
+        for k in range(6):
+            wrong = F.copy()
+            wrong[:, d] += 0.01 * length[d] / length[k] * F[:, k]
+            effect = estimate(solved(wrong)) - estimate(solved(F))
+            expected += np.outer(effect, effect)
+    exact, stated = (solved(F, gain_std=std).identification.covariance for std in (0.0, 0.01))
+    size = np.sqrt(np.diag(expected)) + 1e-12
+    np.testing.assert_allclose(
+        (stated - exact) / np.outer(size, size), expected / np.outer(size, size), atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_intervals_hold_with_gains_as_wrong_as_stated(method):
+    rng, within, length = np.random.default_rng(4), [], np.repeat([1.0, ARM], 3)
+    exact, *motion = record()
+    for seed in range(60):
+        gains = np.eye(6) + 0.01 * rng.normal(size=(6, 6)) * np.outer(length, 1.0 / length)
+        F = (exact - OFFSETS) @ gains.T + record(noise=0.3, seed=seed)[0] - exact
+        load = identify_batch(F, *motion, method=method, gain_std=0.01).identification
+        within.append(np.abs(load.phi - TOOL) < 1.96 * load.standard_deviations[6:])
+    share = np.mean(within, axis=0)
+    assert (share > 0.85).all() and share.mean() > 0.93
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_static_poses_say_nothing_of_the_inertia(method):
     s = record(50)[1]
@@ -357,6 +395,8 @@ def test_bad_input_is_named():
         identify_batch(*arrays, method="guess")
     with pytest.raises(DrakeTeleopError, match=r"^method: 'robust' takes no prior"):
         identify_batch(*arrays, method="robust", prior=Prior(TOOL, 1.0))
+    with pytest.raises(DrakeTeleopError, match=r"^gain_std: is negative"):
+        identify_batch(*arrays, gain_std=-0.01)
     with pytest.raises(DrakeTeleopError, match="2 samples cannot determine"):
         identify_batch(*(x[:2] for x in arrays))
     with pytest.raises(DrakeTeleopError, match="no mass can be told"):

@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 import yaml
 from known_motion import motion_at
+from planted import good, written
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
@@ -88,6 +89,18 @@ def test_identify_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "mass" in printed and "3.13" in printed
     identify_command(log, out, quiet=True)
     assert capsys.readouterr().out == ""
+
+
+def test_gains_that_are_stated_widen_the_deviations_of_an_imus_log(tmp_path: Path) -> None:
+    path = written(tmp_path, good(), pose=False)
+    exact = identify_log(path).identification
+    described = yaml.safe_load(path.read_text())
+    described["wrench"]["gain_std"] = 0.01
+    path.write_text(yaml.safe_dump(described))
+    stated = identify_log(path).identification
+    np.testing.assert_array_equal(stated.phi, exact.phi)
+    assert exact.standard_deviations[6] < 1e-3 * exact.mass
+    assert 5e-3 * exact.mass < stated.standard_deviations[6] < 3e-2 * exact.mass
 
 
 @pytest.mark.slow

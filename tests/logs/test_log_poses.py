@@ -110,9 +110,10 @@ def test_stamps_need_not_be_exact(whole, folder, tmp_path, bursts):
     assert any("pose.time.scale (1 by default) by 0.9996" in x for x in found.log.notes) != bursts
 
 
-def test_gains_that_are_stated_widen_the_deviations(folder):
+@pytest.mark.parametrize("method", ["consistent", "ordinary"])
+def test_gains_that_are_stated_widen_the_deviations(folder, method):
     path = described(folder, "own", wrench={"gain_std": 0.01})
-    load = identify_log(path).identification
+    load = identify_log(path, method=method).identification
     assert 0.005 * load.mass < load.standard_deviations[6] < 0.03 * load.mass
 
 

@@ -363,9 +363,10 @@ def test_static_poses_from_gravity_or_orientation(tmp_path: Path) -> None:
     ):
         stream = {"file": "x.npz", "force": {"columns": [force]}, "torque": {"columns": ["tau"]}}
         path = tmp_path / "log.yaml"
-        path.write_text(yaml.safe_dump({"static": stream | extra}), encoding="utf-8")
+        described = {"static": stream | extra | {"gain_std": 0.01}}
+        path.write_text(yaml.safe_dump(described), encoding="utf-8")
         log = read_log(path)
-        assert log.static
+        assert log.static and log.gain_std == 0.01
         np.testing.assert_allclose(log.specific_force, -gravity, atol=1e-9)
         np.testing.assert_allclose(log.wrench[:, :3], -2 * gravity, atol=1e-9)
         assert not log.angular_velocity.any() and not log.angular_acceleration.any()

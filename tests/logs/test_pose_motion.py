@@ -35,11 +35,11 @@ from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
 from drake_teleop.logs.pose_motion.rigid import (
     State,
     _columns,
+    _gain_effects,
     _moved,
     _Record,
     _solve,
     fit_rigid,
-    gain_effects,
     motion_map,
 )
 from drake_teleop.logs.pose_motion.saturated import best_delay, saturated, spectra_of, wandering
@@ -369,7 +369,7 @@ def test_gains_enter_as_they_move_the_estimate():
     none, start = np.zeros_like(Z), State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     power = spectra.fit().power
     solution = _solve(_Record(Z, none, levels, free, power), start)
-    effects = gain_effects(solution.B, Z, solution.W, solution.inverse).reshape(23, 6, 6)
+    effects = _gain_effects(solution.B, Z, solution.W, solution.inverse).reshape(23, 6, 6)
     size = np.sqrt(np.sum(effects**2, axis=(1, 2)))
     for d, k in ((0, 2), (2, 2), (4, 0), (1, 5)):
         A = np.eye(38)

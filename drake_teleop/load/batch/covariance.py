@@ -11,6 +11,9 @@ variables enlarge the covariance: with G theta_LS = b and (G - lambda C) theta =
 K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of `consistent` is of the same fit
 without the constraint, which is cautious. A prior adds its information to that of the record, and
 parameters that it says most about are named.
+
+Errors of the sensor's gains, if some are stated, are no noise: a record of any length has the same
+ones. What each of the 36 does to the solution is added up (`gain_effects`).
 """
 
 from __future__ import annotations
@@ -19,12 +22,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.load.arrays import Array
-from drake_teleop.load.batch.moments import excited_columns, inverse_root, normal_equations
+from drake_teleop.load.batch.moments import (
+    coefficients,
+    excited_columns,
+    inverse_root,
+    normal_equations,
+)
 from drake_teleop.load.batch.record import CHUNK, Fit, Record
 from drake_teleop.load.batch.total_least_squares import NormalForm
 from drake_teleop.load.batch.uncertainty import prior_dominated
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
+
+ARM = 0.06
+"""Length that compares an error of a force's gain with one of a torque's [m]."""
 
 
 def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -103,6 +114,32 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
         covariance += np.einsum("nci,cd,ndj->ij", sums, steps, sums, optimize=True)
     inverse = _inverse_gram(fit)
     return inverse @ covariance @ inverse
+
+
+def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
+    """(n, 36) what an error of 1 in each of the sensor's gains does to least squares.
+
+    A gain from force to torque counts as 1 at `ARM` [m], one from torque to force at 1 / `ARM`.
+
+    Args:
+        products: (bands, 6, n, 6) moments of column j in channel c with channel k of the wrench.
+        W: (bands, 6, 6) weights between the channels.
+        inverse: (n, n) of the Gram matrix of the same moments.
+    """
+    right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # of gain d, k
+    length = np.repeat([1.0, ARM], 3)
+    effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
+    return np.asarray(effect.reshape(len(inverse), 36))
+
+
+def gain_covariance(fit: Fit, offsets: bool) -> Array:
+    """(16, 16) of the form's solution by errors of the gains of standard deviation 1."""
+    Z, W = fit.moments.mean, fit.form.weights
+    used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
+    root = inverse_root(normal_equations(Z, W)[0], used)
+    products = (coefficients() @ Z)[:, :, 1:7]
+    effects = fit.form.transfer @ gain_effects(products[None], W[None], root @ root.T)
+    return np.asarray(effects @ effects.T)
 
 
 def covariance_of(plain: Array, form: NormalForm, offsets: bool) -> Array:

@@ -42,10 +42,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.errors import DrakeTeleopError, expect
-from drake_teleop.load.arrays import Array, checked_rows
+from drake_teleop.load.arrays import Array, checked_rows, number
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
 from drake_teleop.load.batch.covariance import (
     covariance_of,
+    gain_covariance,
     walk_covariance,
     white_covariance,
     with_prior,
@@ -210,6 +211,7 @@ def identify_batch(
     prior: Prior | None = None,
     ellipsoid: Ellipsoid | None = None,
     delay_s: float = 0.0,
+    gain_std: float = 0.0,
 ) -> BatchResult:
     """Load and sensor offsets of a free motion by any of `METHODS`.
 
@@ -225,13 +227,19 @@ def identify_batch(
             as is right for averages over poses at rest (module docstring).
         prior, ellipsoid: what is known of the load, for "consistent".
         delay_s: the delay that was taken out of the motion, for the record [s].
+        gain_std: standard deviation of each of the sensor's 36 gains, such as 0.01, of one between
+            force and torque as at `drake_teleop.load.batch.covariance.ARM`; it enters the
+            covariance.
 
     Raises:
         DrakeTeleopError: for an unknown method, arrays of another shape, numbers that are not
-            finite, fewer than 3 samples, or a wrench that is zero throughout.
+            finite, a negative `gain_std`, fewer than 3 samples, or a wrench that is zero
+            throughout.
     """
     check_method(method)
     expect((Noise, type(None)), noise, "noise")
+    if not number("gain_std", gain_std) >= 0.0:
+        raise DrakeTeleopError("is negative", where="gain_std")
     if method != "consistent" and (prior, ellipsoid) != (None, None):
         raise DrakeTeleopError(
             f"{method!r} takes no prior and no ellipsoid", where="method", remedy="use consistent"
@@ -249,6 +257,9 @@ def identify_batch(
     steps = residual_covariance(Moments.walk_covariance(noise or Noise()), theta)
     white = white_covariance(plain.covariance, equations, fit)
     covariance = covariance_of(white + walk_covariance(record, kept, fit, steps), fit.form, offsets)
+    if gain_std > 0.0:
+        known = np.isfinite(np.diag(covariance))
+        covariance += np.outer(known, known) * gain_std**2 * gain_covariance(fit, offsets)
     dominated = np.zeros(16, bool)
     if prior is not None:
         covariance, dominated = with_prior(covariance, prior.information(plain.samples))

@@ -86,7 +86,6 @@ class Posed:
     Attributes:
         poses: of the sensor's frame S, as far as the description is right.
         gravity_W: (3,) in the world [m/s^2].
-        gain_std: standard deviation of the sensor's gains, as stated.
         p_SoPo_S: (3,) where the recorded frame was said to be [m].
         R_SP: (3, 3) how it was said to be turned.
         imu: what an IMU beside them tells.
@@ -94,7 +93,6 @@ class Posed:
 
     poses: Poses
     gravity_W: Array
-    gain_std: float = 0.0
     p_SoPo_S: Array = field(default_factory=lambda: np.zeros(3))
     R_SP: Array = field(default_factory=lambda: np.eye(3))
     imu: Inertial | None = None

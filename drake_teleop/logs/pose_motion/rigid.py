@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.arrays import Array
+from drake_teleop.load.batch.covariance import ARM, gain_effects
 from drake_teleop.load.batch.moments import coefficients
 from drake_teleop.logs.pose_motion.levels import Levels
 from drake_teleop.logs.pose_motion.saturated import Saturated, least_power
@@ -48,8 +49,6 @@ from drake_teleop.vectors import cross_matrix
 PARAMETERS = 23
 """[offsets; phi] (16), tau, r (3), rho (3)."""
 LOAD, DELAY, LEVER, TURN = slice(0, 16), slice(16, 17), slice(17, 20), slice(20, 23)
-ARM = 0.06
-"""Length that compares an error of a force's gain with one of a torque's [m]."""
 _STEPS, _CONVERGED = 40, 1e-4
 _RIGID, _BY_GAINS, _NOISE = 4.0, 1.5, 1.5
 _LIMITS = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
@@ -246,7 +245,7 @@ def _covariance(record: _Record, solution: _Solution, inflation: float, gain: fl
     covariance *= np.outer(*2 * [_by_weights(record, solution)])
     larger = covariance * inflation**2
     if gain:
-        effects = gain * gain_effects(B, record.Z - record.Q, W, inverse)
+        effects = gain * _gain_effects(B, record.Z - record.Q, W, inverse)
         covariance = covariance + effects @ effects.T
         ratio = np.diag(larger) / np.maximum(np.diag(covariance), 1e-300)
         scale = np.sqrt(np.maximum(1.0, ratio))
@@ -357,13 +356,10 @@ def _shares(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
     return np.asarray(np.clip(gram * diagonal, 0.0, None))
 
 
-def gain_effects(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
+def _gain_effects(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
     """(23, 36) what an error of 1 in each of the sensor's gains does, of a torque's as at `ARM`."""
     BF = (B.reshape(-1, WIDTH) @ Z)[:, :, FORCES].reshape(len(Z), 6, PARAMETERS, 6)
-    right = np.einsum("bcd,bcjk->jdk", W, BF, optimize=True)  # of gain d, k
-    length = np.repeat([1.0, ARM], 3)
-    effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
-    return np.asarray(effect.reshape(PARAMETERS, 36))
+    return gain_effects(BF, W, inverse)
 
 
 def _misfit_of_gains(record: _Record, solution: _Solution, gain: float) -> float:
@@ -371,7 +367,7 @@ def _misfit_of_gains(record: _Record, solution: _Solution, gain: float) -> float
     if gain == 0.0:
         return 0.0
     B, levels = solution.B, record.levels
-    effects = gain_effects(B, record.Z, solution.W, solution.inverse)
+    effects = _gain_effects(B, record.Z, solution.W, solution.inverse)
     left = -np.einsum("cjk,ji->cik", B, effects)
     length = np.repeat([1.0, ARM], 3)
     left = left.reshape(6, 6, 6, WIDTH)  # of channel c by gain d, k

@@ -70,6 +70,7 @@ class Log:
         notes: what the reader had to assume, in words.
         source: the file, for messages.
         posed: the poses themselves, on the clock of `t`, where they have positions.
+        gain_std: standard deviation of the sensor's gains, as stated.
 
     Raises:
         DrakeTeleopError: if the arrays do not fit each other, hold NaN or infinity, or `t` does not
@@ -87,6 +88,7 @@ class Log:
     notes: tuple[str, ...] = ()
     source: str = "log"
     posed: Posed | None = None
+    gain_std: float = 0.0
 
     def __post_init__(self) -> None:
         n = len(self.t)

@@ -36,6 +36,7 @@ from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
 from drake_teleop.logs.read.description_fields import (
     Column,
     Frame,
+    GainStd,
     Gravity,
     ImuFrame,
     Number,
@@ -225,13 +226,7 @@ class Wrench(_Recorded):
     torque: Torque
     sign: Literal[1, -1] = 1
     frame: Frame = "sensor"
-    gain_std: Number = Field(
-        default=0.0,
-        ge=0,
-        le=0.2,
-        description="standard deviation of the sensor's gains, 0.01 for 1 %, as its maker or a"
-        " calibration says",
-    )
+    gain_std: GainStd = 0.0
 
 
 class Imu(_Recorded):
@@ -321,6 +316,7 @@ class Static(_Stream):
         default=None, description="what an accelerometer reads at rest, -g_S, in S"
     )
     orientation: Orientation | None = None
+    gain_std: GainStd = 0.0
 
     @model_validator(mode="after")
     def _one_of(self) -> Static:
@@ -375,10 +371,10 @@ class Description(_Strict):
 
     def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
         """Poses of S with what else is described of them, and what an IMU tells of S."""
-        assert self.wrench is not None and self.pose is not None
+        assert self.pose is not None
         place, turn = self.pose.position_in_sensor, self.pose.R_SP
         turn = np.eye(3) if turn is None else turn
-        return Posed(poses, self.gravity_W, self.wrench.gain_std, np.array(place), turn, imu)
+        return Posed(poses, self.gravity_W, np.array(place), turn, imu)
 
     def scale(self, unit: str) -> float:
         """SI value of a unit; "g" is the magnitude of this description's gravity."""

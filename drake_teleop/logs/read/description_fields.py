@@ -55,6 +55,15 @@ Column = str | int
 Number = Annotated[float, Field(strict=True)]  # neither true nor "1"
 Vector = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 Rotation = tuple[Vector, Vector, Vector]
+GainStd = Annotated[
+    Number,
+    Field(
+        ge=0,
+        le=0.2,
+        description="standard deviation of the sensor's gains, 0.01 for 1 %, as its maker or a"
+        " calibration says",
+    ),
+]
 _GRAVITY_SCHEMA = {
     "anyOf": [
         {"type": "number"},

@@ -148,6 +148,7 @@ class _Reader:
         streams = [stream for stream in (imu, pose) if stream is not None]
         t = self._common_time(wrench_t, streams)
         log = self._assembled(t, resample(t, wrench_t, wrench), imu, pose)
+        log = replace(log, gain_std=self._description.wrench.gain_std)
         if pose is not None and pose.raw is not None:
             told = None if imu is None else imu.told
             log = replace(log, posed=self._description.posed(pose.raw, told))
@@ -339,7 +340,8 @@ class _Reader:
         motion = (-gravity, rest, rest)
         notes = tuple(self._notes)
         index = np.arange(float(n))
-        return Log(index, wrench, *motion, gravity, True, notes=notes, source=self._source)
+        log = Log(index, wrench, *motion, gravity, True, notes=notes, source=self._source)
+        return replace(log, gain_std=stream.gain_std)
 
     def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
         """Strictly increasing times of a stream, and the rows of the table that they belong to."""
