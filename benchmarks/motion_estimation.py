@@ -43,8 +43,9 @@ from drake_teleop.sensor.sensor_chain import (
     without,
 )
 from drake_teleop.slave.arm import sensor_motion
+from drake_teleop.slave.home import R_WS_HOME, home_position
 from drake_teleop.slave.inverse_kinematics import nearest_branch
-from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, home_position
+from drake_teleop.slave.plant import AddSlavePlant
 from drake_teleop.slave.slave_config import Slave
 
 Array = NDArray[np.float64]

@@ -11,10 +11,11 @@ import os
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
@@ -24,18 +25,12 @@ from drake_teleop.master.phantom import FORCE_LIMIT
 from drake_teleop.run import run_command
 from drake_teleop.scenario import LoadScenario
 from drake_teleop.sensor.presets import PRESETS
-from drake_teleop.slave.arm import ArmModel
+from drake_teleop.slave.arm import ROTATION, TRANSLATION, ArmModel
 from drake_teleop.slave.forward_kinematics import pose_into
+from drake_teleop.slave.home import R_WS_HOME, tool_down
 from drake_teleop.slave.inverse_kinematics import IkStatus
 from drake_teleop.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.slave.plant import (
-    R_WS_HOME,
-    NominalSlave,
-    ParseSlave,
-    bodies_beyond,
-    finalize,
-    home_position,
-)
+from drake_teleop.slave.plant import NominalSlave, ParseSlave, bodies_beyond, finalize
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.tool import Ball, Tool
 from drake_teleop.writing import make_folder, write_text
@@ -45,19 +40,54 @@ _PHANTOMS = 0.08
 #: A tool to be replaced [kg, m].
 _STAND_IN = Tool(mass=1.0, com=[0.0, 0.0, 0.05], shapes=[Ball(radius=0.012, position=[0, 0, 0.1])])
 _HALVES = (0.3, 0.2, 0.15, 0.1, 0.075, 0.05, 0.03)  # of cubes that are tried [m]
-_POSTURES, _PLACES = 3000, 12  # at random; of them looked at
+_POSTURES, _PLACES = 20_000, 24  # at random; of them looked at
+_TURNS = (0.0, 90.0, -90.0, 180.0)  # of the tool about the vertical that are tried [deg]
+# What turns z onto another axis, as URDF says it.
+_ONTO_Z = {
+    "x": "0 1.5708 0",
+    "-x": "0 -1.5708 0",
+    "y": "-1.5708 0 0",
+    "-y": "1.5708 0 0",
+    "-z": "3.1416 0 0",
+}
+_ROOM = 0.1  # of half a joint's range to its limit, which is enough
 _STEEP = np.cos(np.radians(40.0))  # z_S so far from straight down at most
 _LIKED = np.array([0.6, 0.0, 0.4])  # in reaches: where most arms can go to all sides
 _SWING, _PRESS = 0.04, 0.01  # of the slave: free motion, depth in the wall, at most [m]
-_CONTACT = (
-    30.0  # N, of a hard press, that the device shall still display beside 1.5 times the weight
-)
 # N, of a hard press: the device displays that and 1.5 times the weight.
 _CONTACT = 30.0
 # N/m: the wall, and how stiff the hand may feel it. The paper's station is stable up to 680 N/m
 # with a hand of medium grip; `analyze` says what this one is.
 _WALL, _FELT = 2000.0, 400.0
 _FREQUENCY, _HURRY = 1.0, 0.5  # of the swing [Hz]; share of the joints' speeds that it may take
+
+
+class Place(NamedTuple):
+    """Where an arm can start, the tool down.
+
+    Attributes:
+        position: (3,) p_WS [m].
+        turn: of S about the vertical; at 0, x_S is along x_W [deg].
+        q: (n,) joint positions [rad].
+        half: half the edge of the cube around it that can be reached, so turned [m]; 0: none.
+        room: how far the joint that is nearest to a limit is from it, over half its range.
+    """
+
+    position: NDArray[np.float64]
+    turn: float
+    q: NDArray[np.float64]
+    half: float
+    room: float
+
+    @property
+    def R_WS(self) -> RotationMatrix:
+        """How S is turned."""
+        return RotationMatrix.MakeZRotation(np.radians(self.turn)) @ R_WS_HOME
+
+    @property
+    def home(self) -> list[float]:
+        """What `slave.home` has to be; empty if the position alone says it."""
+        return (np.round(self.q, 4) + 0.0).tolist() if self.turn else []
 
 
 @dataclass(frozen=True)
@@ -68,24 +98,24 @@ class Plan:
         joints: names of the arm's joints up to the sensor.
         tool_mass: what hangs on the sensor [kg].
         own_tool: whether the model has it.
-        position: p_WS to start at, the tool down [m].
-        half: half the edge of the cube around it that the arm can reach [m].
+        place: where it starts.
         translation_scale, force_scale: slave over master; master over slave.
         swing: of the slave in free motion [m]; the wall is 1.5 times as far below the tool.
         lowest: p_W of the tool's lowest point at the start [m].
         assumptions: what the models do not say.
+        about_z: what is odd about the sensor's axes, if anything.
     """
 
     joints: tuple[str, ...]
     tool_mass: float
     own_tool: bool
-    position: NDArray[np.float64]
-    half: float
+    place: Place
     translation_scale: float
     force_scale: float
     swing: float
     lowest: NDArray[np.float64]
     assumptions: tuple[str, ...]
+    about_z: str
 
 
 def new_command(
@@ -166,39 +196,35 @@ def plan_station(
     if own_tool:
         slave.tool = None
         model, assumptions = _read(slave)
-    position, half = find_place(model)
-    slave.position = position.tolist()
+    place = find_place(model)
+    slave.position, slave.home = place.position.tolist(), place.home
     figures = FIGURES.get(device)
     room = _PHANTOMS if figures is None else min(figures.size) / 2.0
     peak = FORCE_LIMIT if figures is None else figures.peak_force
     mass = float(model.phi_load[0])
-    translation_scale = _rounded(min(half / room, 1.0))
+    translation_scale = _rounded(min(place.half / room, 1.0))
     most = min(peak / (1.5 * 9.81 * mass + _CONTACT), _FELT / (_WALL * translation_scale), 1.0)
-    swing = min(_SWING, half / 2.0, room * translation_scale / 2.0)
+    swing = min(_SWING, place.half / 2.0, room * translation_scale / 2.0)
     return Plan(
         joints=tuple(model.joint_names),
         tool_mass=mass,
         own_tool=own_tool,
-        position=position,
-        half=half,
+        place=place,
         translation_scale=translation_scale,
         force_scale=_rounded(most),
-        swing=_rounded(swing * min(1.0, _HURRY / _speed_use(model, position, swing))),
+        swing=_rounded(swing * min(1.0, _HURRY / _speed_use(model, place, swing))),
         lowest=_lowest(slave),
         assumptions=tuple(assumptions),
+        about_z=_about_z(model),
     )
 
 
-def find_place(arm: ArmModel, seed: int = 0) -> tuple[NDArray[np.float64], float]:
-    """Where the arm can hold the tool down and go to all sides.
+def find_place(arm: ArmModel, seed: int = 0) -> Place:
+    """Where the arm can hold the tool down and go to all sides, its position to a centimetre.
 
     Args:
         arm: with limits.
         seed: of the postures that are tried.
-
-    Returns:
-        position: (3,) p_WS [m], rounded to a centimetre.
-        half: half the edge of the cube around it that can be reached, the tool down [m].
 
     Raises:
         DrakeTeleopError: if there is no such place.
@@ -213,18 +239,39 @@ def find_place(arm: ArmModel, seed: int = 0) -> tuple[NDArray[np.float64], float
     reach = np.quantile(np.hypot(poses[:, 4], poses[:, 5]), 0.98)
     places = np.round(poses[down & _before(poses[:, 4:], reach), 4:], 2)
     order = np.argsort(np.linalg.norm(places - reach * _LIKED, axis=1))
-    best = np.zeros(3), 0.0
-    for place in places[order[:: max(len(order) // _PLACES, 1)]]:
-        half = _free_half(arm, place)
-        if half > best[1]:
-            best = place, half
-    if best[1] == 0.0:
+    looked_at = places[order[:: max(len(order) // _PLACES, 1)]]
+    found = [_place(arm, position, turn) for turn in _TURNS for position in looked_at]
+    best = max(found, key=_merit, default=None)
+    if best is None or best.half == 0.0:
         raise DrakeTeleopError(
             "nowhere can the arm hold its sensor with z downwards and move to all sides",
             where="new",
-            remedy="check sensor_frame (its z axis points to the tool) and the joints' limits",
+            remedy=_about_z(arm)
+            or "check the joints' limits; an arm of five joints can hold its tool upright in few"
+            " places: write its station by hand, with slave.home",
         )
     return best
+
+
+def _merit(place: Place) -> tuple[float, bool, float]:
+    """By which places are compared: a joint that leaves its range at once is the worst."""
+    return min(place.room, _ROOM), place.turn == 0.0, place.half
+
+
+def _about_z(arm: ArmModel) -> str:
+    """What to do if another axis of S than z is along the last joint, as tools are; or nothing."""
+    n = arm.num_joints
+    # The axis of the last joint, away from it, in S.
+    along = arm.table[n, ROTATION:TRANSLATION].reshape(3, 3)[2]
+    along = along * (-1.0 if arm.table[n, TRANSLATION + 2] < 0.0 else 1.0)
+    k = int(np.argmax(np.abs(along)))
+    axis = ("-" if along[k] < 0.0 else "") + "xyz"[k]
+    if axis not in _ONTO_Z:
+        return ""
+    return (
+        f"z_S points to the tool, and here {axis}_S is along the last joint: if the tool is, fix a"
+        f' link to sensor_frame by <origin rpy="{_ONTO_Z[axis]}"/>, and name that'
+    )
 
 
 def _before(places: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
@@ -235,31 +282,31 @@ def _before(places: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
     return result
 
 
-def _free_half(arm: ArmModel, place: NDArray[np.float64]) -> float:
-    """Half the edge of the largest cube of `_HALVES` whose corners can be reached; 0: none.
+def _place(arm: ArmModel, position: NDArray[np.float64], turn: float) -> Place:
+    """A place, with the largest of `_HALVES` whose corners can be reached.
 
     It stays away from the base by as much.
     """
-    try:
-        q = home_position(arm, place.tolist())
-    except DrakeTeleopError:
-        return 0.0
-    w = R_WS_HOME.ToQuaternion().wxyz()
-    for half in (half for half in _HALVES if 2.0 * half <= np.hypot(*place[:2])):
-        corners = (place + half * np.array(signs) for signs in product((-1.0, 1.0), repeat=3))
+    none = Place(position, turn, np.zeros(arm.num_joints), 0.0, 0.0)
+    q, status = tool_down(arm, position, none.R_WS)
+    if status != IkStatus.OK:
+        return none
+    room = float((np.minimum(q - arm.lower, arm.upper - q) / (arm.upper - arm.lower)).min() * 2.0)
+    w = none.R_WS.ToQuaternion().wxyz()
+    for half in (half for half in _HALVES if 2.0 * half <= np.hypot(*position[:2])):
+        corners = (position + half * np.array(signs) for signs in product((-1.0, 1.0), repeat=3))
         if all(
             find_posture(arm, np.array([*w, *corner]), q)[1] == IkStatus.OK for corner in corners
         ):
-            return half
-    return 0.0
+            return none._replace(q=q, half=half, room=room)
+    return none
 
 
-def _speed_use(arm: ArmModel, place: NDArray[np.float64], swing: float) -> float:
+def _speed_use(arm: ArmModel, place: Place, swing: float) -> float:
     """The largest share of its speed that a joint takes for the swing up and down."""
-    q = home_position(arm, place.tolist())
-    above = np.array([*R_WS_HOME.ToQuaternion().wxyz(), *place])
+    above = np.array([*place.R_WS.ToQuaternion().wxyz(), *place.position])
     above[6] += swing
-    way = np.abs(find_posture(arm, above, q)[0] - q)
+    way = np.abs(find_posture(arm, above, place.q)[0] - place.q)
     return float((2.0 * np.pi * _FREQUENCY * way / arm.velocity_limit).max())
 
 
@@ -326,6 +373,9 @@ def _text(
         "    shapes: [!Ball {radius: 0.012, position: [0.0, 0.0, 0.1]}]"
     )
     what = "tool: null  # what the model has beyond the sensor" if plan.own_tool else stand_in
+    where = f"position: {_row(plan.place.position)}  # of the sensor at the start, tool down [m]"
+    if plan.place.turn:
+        where = f"home: {plan.place.home}  # joints at the start, tool down [rad, m]"
     lines = [
         "# Made by drake-teleop new. Fields that are not here have their defaults; all, with their",
         "# unit, range and meaning: drake-teleop scenario station.yaml",
@@ -335,13 +385,13 @@ def _text(
         f"  model: {arm}",
         *([f"  package_paths: [{', '.join(package_paths)}]"] if package_paths else []),
         f"  sensor_frame: {sensor_frame}",
-        f"  position: {_row(plan.position)}  # of the sensor at the start, tool down [m]",
+        f"  {where}",
         f"  {what if tool is None else f'tool: {{model: {tool}}}'}",
         "master:",
         f"  model: {device}",
         *(["wrist_sensor:", f"  preset: {sensor}"] if sensor else []),
         "kinematic_scaling:",
-        f"  translation_scale: {s:g}  # the arm can go {1e3 * plan.half:g} mm to all sides",
+        f"  translation_scale: {s:g}  # the arm can go {1e3 * plan.place.half:g} mm to all sides",
         "force_scaling:",
         "  sigma: 0.0  # 1: the hand feels the whole tool",
         f"  force_scale: {plan.force_scale:g}  # for which hands and walls: drake-teleop analyze",
@@ -372,12 +422,13 @@ def _print(plan: Plan, scenario: Path) -> None:
     for name, value in (
         ("Joints", f"{len(plan.joints)}: {', '.join(plan.joints)}"),
         ("Tool", f"{plan.tool_mass:.4g} kg, {tool}"),
-        ("Start", f"sensor at {_row(plan.position)} m, tool down"),
-        ("Room around it", f"{1e3 * plan.half:g} mm to all sides"),
+        ("Start", f"sensor at {_row(plan.place.position)} m, tool down"),
+        ("Room around it", f"{1e3 * plan.place.half:g} mm to all sides"),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):
         table.add_row(name, value)
     console = Console()
     console.print(table)
-    for assumed in plan.assumptions:
-        console.print(f"assumed: {assumed}", highlight=False, markup=False)
+    notes = [f"note: {plan.about_z}"] if plan.about_z else []
+    for line in [*notes, *(f"assumed: {assumed}" for assumed in plan.assumptions)]:
+        console.print(line, highlight=False, markup=False)

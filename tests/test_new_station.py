@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RotationMatrix
 from shown import type_in
 
 from drake_teleop import new_station
@@ -15,9 +17,10 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.new_station import find_place, new_command, plan_station
 from drake_teleop.resources import models_dir
 from drake_teleop.scenario import LoadScenario
+from drake_teleop.slave.home import R_WS_HOME
 from drake_teleop.slave.inverse_kinematics import IkStatus
 from drake_teleop.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.slave.plant import R_WS_HOME, NominalSlave
+from drake_teleop.slave.plant import NominalSlave
 
 ARM = models_dir() / "rx90.sdf"
 
@@ -46,7 +49,7 @@ def test_a_station_is_written_and_run(tmp_path, runs, capsys):
     plan = plan_station(ARM, "sensor", device="omega_6")
     scale = scenario.kinematic_scaling.translation_scale
     # The device's workspace is within what the arm reaches, and the hand's way within the device's.
-    assert 0.055 * scale <= plan.half
+    assert 0.055 * scale <= plan.place.half
     way = 1.5 * plan.swing + 0.01
     assert way / scale <= 0.113 / 2
     # From the tool's lowest point down onto the wall, and no further than a centimetre into it.
@@ -69,7 +72,7 @@ def test_it_is_written_as_the_page_for_beginners_says(tmp_path, runs, monkeypatc
 
 def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():
     arm = NominalSlave(LoadScenario("free_motion_force").slave).arm
-    place, half = find_place(arm)
+    place, _, _, half, _ = find_place(arm)
     assert place[0] > abs(place[1]) and place[2] > 0.1
     w = R_WS_HOME.ToQuaternion().wxyz()
     q = NominalSlave(LoadScenario("free_motion_force").slave).start
@@ -79,6 +82,56 @@ def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():
     stiff = dataclasses.replace(arm, lower=arm.lower * 0.0 - 0.01, upper=arm.upper * 0.0 + 0.01)
     with pytest.raises(DrakeTeleopError, match="nowhere can the arm hold its sensor"):
         find_place(stiff)
+
+
+def test_a_small_cube_is_better_than_a_joint_at_its_limit():
+    place = new_station.Place(np.zeros(3), 0.0, np.zeros(6), half=0.05, room=0.2)
+    worse = [
+        place._replace(half=0.3, room=0.01),
+        place._replace(half=0.3, turn=90.0),
+        place._replace(half=0.03, room=0.9),
+        place._replace(half=0.0, room=0.0),
+    ]
+    assert max([*worse, place], key=new_station._merit) is place
+
+
+def turned(rpy, tmp_path):
+    """The RX90 with a frame on its sensor that is turned."""
+    text = ARM.read_text()
+    frame = f'<frame name="turned" attached_to="sensor"><pose>0 0 0 {rpy}</pose></frame>'
+    path = tmp_path / "turned.sdf"
+    path.write_text(text.replace("</model>", f"{frame}</model>", 1))
+    return path
+
+
+def test_another_axis_than_z_along_the_last_joint_is_said(tmp_path, runs, capsys):
+    for rpy, axis, back in (("0 -1.5708 0", "x", "0 1.5708 0"), ("1.5708 0 0", "y", "-1.5708 0 0")):
+        plan = plan_station(turned(rpy, tmp_path), "turned")
+        assert f"{axis}_S is along" in plan.about_z and f'rpy="{back}"' in plan.about_z
+    new_command(tmp_path / "mine", turned("3.1416 0 0", tmp_path), "turned")
+    assert "note: z_S points to the tool, and here -z_S" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    assert plan_station(ARM, "sensor").about_z == ""
+
+
+def test_an_arm_that_turns_the_tool_elsewhere_gets_its_joints_written(tmp_path, runs):
+    """Its last joint cannot bring x_S forwards, but to a side."""
+    text = ARM.read_text()
+    joint = text.index('name="joint_6"')
+    lower, upper = (text.index(f"<{tag}>", joint) for tag in ("lower", "upper"))
+    end = text.index("</upper>", upper)
+    path = tmp_path / "arm.sdf"
+    path.write_text(text[:lower] + "<lower>1.2</lower><upper>1.9" + text[end:])
+    plan = plan_station(path, "sensor")
+    assert plan.place.turn in (90.0, -90.0)
+    new_command(tmp_path / "mine", path, "sensor")
+    slave = LoadScenario(tmp_path / "mine" / "station.yaml").slave
+    start = NominalSlave(slave)
+    np.testing.assert_allclose(start.X_WS_start[4:], plan.place.position, atol=1e-3)
+    R_WS = RotationMatrix(Quaternion(start.X_WS_start[:4])).matrix()
+    np.testing.assert_allclose(R_WS, plan.place.R_WS.matrix(), atol=1e-3)
+    assert R_WS[2, 2] < -0.999 and abs(R_WS[1, 0]) > 0.999
 
 
 @pytest.mark.parametrize(

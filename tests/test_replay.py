@@ -18,7 +18,7 @@ from drake_teleop.replay import ReplayScene, replay_command, write_replay, write
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import simulate
-from drake_teleop.slave.plant import R_WS_HOME
+from drake_teleop.slave.home import R_WS_HOME
 from drake_teleop.station import MakeTeleopStation
 
 

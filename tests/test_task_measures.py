@@ -16,7 +16,7 @@ from drake_teleop.operator.task import Insert, Press, Reach, Touch
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.signals import SIGNALS
-from drake_teleop.slave.plant import home_position
+from drake_teleop.slave.home import home_position
 from drake_teleop.task_measures import task_failure, task_measures
 
 T = np.arange(0.0, 4.0 + 1e-9, 1e-3)

@@ -115,6 +115,7 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
         scenario.motion_estimation,
         scenario.rates.sensor_hz,
         home=slave.start,
+        stands_there=True,
         points_S=np.array([np.zeros(3), slave.tip] if own else _POINTS_S),
         box=endless if own else box,
         assumptions=["a table at z = 0", *slave.assumptions],
@@ -195,6 +196,7 @@ def RobotFromModel(
         estimation or MotionEstimationConfig(),
         sensor_hz,
         home=(scene.arm.lower + scene.arm.upper) / 2,
+        stands_there=False,
         points_S=np.zeros((1, 3)),
         box=(np.zeros(3), np.full(3, np.inf)),
         assumptions=assumptions + completed,
@@ -210,17 +212,26 @@ def _robot(
     sensor_hz: float,
     *,
     home: Array,
+    stands_there: bool,
     points_S: Array,
     box: tuple[Array, Array],
     assumptions: list[str],
     folders: Sequence[TemporaryDirectory[str]] = (),
 ) -> Robot:
-    """Limits and all else, see `Robot`; `box` is its middle and half size in W [m]."""
+    """Limits and all else, see `Robot`; `box` is its middle and half size in W [m].
+
+    Where the arm is known to stand at home, what touches there may touch.
+    """
     arm = scene.arm
     middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
     postures = middle + half * np.random.default_rng(0).uniform(-1, 1, (_POSTURES, len(half)))
     bodies = scene.rows()
-    candidates = scene.without_neighbours(bodies, postures)
+    start = home if stands_there else None
+    candidates, touching = scene.without_neighbours(bodies, postures, start)
+    if touching:
+        assumptions.append(
+            f"as they touch where the arm starts, not kept apart: {', '.join(touching)}"
+        )
     rows, capsules, pairs, distances = scene.capsules(bodies, candidates, postures)
     phi = arm.phi_load
     limits = Limits(

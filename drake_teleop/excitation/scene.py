@@ -106,11 +106,22 @@ class Scene:
                 rows[body] = row
         return rows
 
-    def without_neighbours(self, rows: dict[BodyIndex, int], postures: Array) -> dict[_Pair, Array]:
+    def without_neighbours(
+        self, rows: dict[BodyIndex, int], postures: Array, start: Array | None
+    ) -> tuple[dict[_Pair, Array], list[str]]:
         """Pairs of shapes that may collide, with their distance in each posture (inf: far).
 
         Those on one link, those that are always near, and those whose distance does not vary no
-        longer count.
+        longer count; nor do those that touch where the arm starts, because there it stands: they
+        are larger than what they stand for, as the convex hull of a mesh is.
+
+        Args:
+            rows: of `rows`.
+            postures: (T, n) random ones.
+            start: (n,) where the arm starts, if that is known.
+
+        Returns:
+            the pairs; and the names of those that touch at the start.
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(rows.values()):
@@ -122,12 +133,13 @@ class Scene:
             ]
             manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(together)))
         candidates = self.scene_graph.model_inspector().GetCollisionCandidates()
-        distances = {pair: np.full(len(postures), np.inf) for pair in candidates}
         context = self.diagram.CreateDefaultContext()
         of_plant = self.plant.GetMyMutableContextFromRoot(context)
         of_scene = self.scene_graph.GetMyContextFromRoot(context)
         q = self.plant.GetPositions(of_plant)
-        for k, posture in enumerate(postures):
+        looked_at = postures if start is None else np.vstack([postures, start])
+        distances = {pair: np.full(len(looked_at), np.inf) for pair in candidates}
+        for k, posture in enumerate(looked_at):
             q[self.arm.position_index] = posture
             self.plant.SetPositions(of_plant, q)
             query = self.scene_graph.get_query_output_port().Eval(of_scene)
@@ -135,13 +147,24 @@ class Scene:
                 distances[found.id_A, found.id_B][k] = found.distance
         # Another one: what a manager from before the context declares, no context gets to know.
         manager = self.scene_graph.collision_filter_manager()
-        for (a, b), of_pair in list(distances.items()):
+        touching = list[str]()
+        for (a, b), of_all in list(distances.items()):
+            of_pair = distances[a, b] = of_all[: len(postures)]
             still = of_pair.max() < of_pair.min() + _STILL
-            if still or np.mean(of_pair < CLEARANCE) >= _NEIGHBOURS:
+            neighbours = still or np.mean(of_pair < CLEARANCE) >= _NEIGHBOURS
+            touch = start is not None and of_all[-1] < CLEARANCE
+            if touch and not neighbours:
+                touching.append(" and ".join(self._body_names(a, b)))
+            if touch or neighbours:
                 exclude = CollisionFilterDeclaration().ExcludeBetween
                 manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
                 del distances[a, b]
-        return distances
+        return distances, sorted(set(touching))
+
+    def _body_names(self, *shapes: GeometryId) -> list[str]:
+        inspector = self.scene_graph.model_inspector()
+        frames = map(inspector.GetFrameId, shapes)
+        return sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
 
     def capsules(
         self,

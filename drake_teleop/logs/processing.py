@@ -156,13 +156,8 @@ def _identified(
         delay_s, source = delay_of(log, cutoff_hz, delay)
         log = undelayed(log, delay_s)
         log = low_passed(log, cutoff_hz).only(measured(log, cutoff_hz))
-        fit = identify_batch(
-            *(log.wrench, *log.motion),
-            method=method,
-            shared_noise=log.static,
-            delay_s=delay_s,
-            gain_std=log.gain_std,
-        )
+        fitted = partial(identify_batch, shared_noise=log.static, gain_std=log.gain_std)
+        fit = fitted(log.wrench, *log.motion, method=method, delay_s=delay_s)
     result = fit.identification
     loads = () if log.static else tuple(segments(log.wrench, *log.motion, log.dt))
     notes = [*_load_notes(log, loads), *([fit.note] if fit.note else [])]

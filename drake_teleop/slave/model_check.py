@@ -3,7 +3,8 @@
 Drake follows a link with two parents or a circle of joints into an abort or for ever, and replaces
 an inertia that no body has by another one without telling, even if only the last digit is wrong.
 Here each is one error with the name of joint or link; what is merely missing is an assumption, and
-what the file's rounding made wrong is made right.
+what the file's rounding made wrong is made right. So is an inertia of what no joint of the arm
+moves, such as its base, on which nothing depends.
 """
 
 from __future__ import annotations
@@ -29,10 +30,16 @@ _SMALLEST, _LONGEST = 0.01, 50.0  # of an arm [m]
 _LARGEST = 1e6  # of these in SI; limits may be larger, where there is none
 # How far principal moments may be from those of a body, for rounding in the file.
 _ROUNDING = 1e-3
+_NONE = 1e-15  # kg m^2: a grain of dust has more
 
 
-def check_model(root: Element, where: str) -> list[str]:
+def check_model(root: Element, where: str, sensor: str = "") -> list[str]:
     """Checks tree, limits and masses of a URDF or SDF.
+
+    Args:
+        root: of the file, in which inertias may be made right.
+        where: for messages.
+        sensor: the arm's last link, or a link fixed to it, if that is what the file is read for.
 
     Returns:
         Assumptions: which links have no mass or no inertia, and what Drake leaves out.
@@ -40,7 +47,8 @@ def check_model(root: Element, where: str) -> list[str]:
     Raises:
         DrakeTeleopError: for a link with two parents, a second root in a URDF, joints that form a
             circle, names that stand twice, limits that are no numbers or the wrong way round, a
-            negative mass, an inertia that no body has, a length or a mass that no arm has.
+            negative mass, an inertia that no body has where something moves it, a length or a mass
+            that no arm has.
     """
     for scope in root.iter():
         _check_scope(scope, where)
@@ -55,15 +63,16 @@ def check_model(root: Element, where: str) -> list[str]:
         for joint in (each for tag in _JOINTS for each in root.iter(tag))
         if joint.get("type") != "fixed"
     }
-    without, rounded, one_kg = list[str](), list[str](), list[str]()
+    unmoved = _unmoved(root, sensor)
+    without, rounded, one_kg, wrong = list[str](), list[str](), list[str](), list[str]()
     for link in root.iter("link"):
         name = link.get("name", "")
         if root.tag == "sdf" and link.find("inertial") is None:
             one_kg.append(name)
         elif _is_massless(link, where, name in moved):
             without.append(name)
-        if _made_right(link, f"{where}: link {name}"):
-            rounded.append(name)
+        if _made_right(link, f"{where}: link {name}", refused=name not in unmoved):
+            (wrong if name in unmoved else rounded).append(name)
     rough = [
         joint.get("name", "")
         for joint in root.iter("joint")
@@ -76,6 +85,7 @@ def check_model(root: Element, where: str) -> list[str]:
             ("no inertia of", without),
             ("1 kg, as SDF has it, for", one_kg),
             ("an inertia of rounded numbers made a body's for", rounded),
+            ("a body's inertia, which no joint of the arm moves, for", wrong),
             ("not the model's own dry friction of", rough),
         )
         if names
@@ -211,13 +221,36 @@ def _is_massless(link: Element, where: str, moves: bool) -> bool:
     return counts and not turns
 
 
-def _made_right(link: Element, where: str) -> bool:
-    """Makes a body's inertia of one that rounding in the file has made none.
+def _unmoved(root: Element, sensor: str) -> set[str]:
+    """The links of a URDF or of an SDF's only model that no joint up to the sensor moves."""
+    joints = {
+        _end(joint, "child"): (_end(joint, "parent"), joint.get("type") != "fixed")
+        for joint in (each for tag in _JOINTS for each in root.iter(tag))
+    }
+    links = [link.get("name", "") for link in root.iter("link")]
+    if sensor not in links or len(set(links)) < len(links):
+        return set()
 
-    By the same addition to each of its moments, at most `_ROUNDING` of the largest.
+    def way(link: str) -> list[str]:
+        passed = [link]
+        while passed[-1] in joints:
+            passed.append(joints[passed[-1]][0])
+        return passed
+
+    moved = [link for link in way(sensor) if joints.get(link, ("", False))[1]]
+    return {link for link in links if moved and moved[-1] not in way(link)}
+
+
+def _made_right(link: Element, where: str, *, refused: bool) -> bool:
+    """Makes a body's inertia of one that no body has, by the same addition to each of its moments.
+
+    Args:
+        link: of which it is.
+        where: for the message.
+        refused: whether more than rounding is an error: `_ROUNDING` of the largest moment, `_NONE`.
 
     Raises:
-        DrakeTeleopError: if it takes more.
+        DrakeTeleopError: if it is one.
     """
     element = link.find("inertial/inertia")
     if element is None:
@@ -226,7 +259,7 @@ def _made_right(link: Element, where: str) -> bool:
     lacking = max(-moments[0], moments[2] - moments[1] - moments[0])
     if lacking <= 0.0:
         return False
-    if lacking > _ROUNDING * abs(moments[2]):
+    if refused and lacking > max(_ROUNDING * abs(moments[2]), _NONE):
         raise DrakeTeleopError(
             "no body has this inertia: its principal moments are "
             f"{moments[0]:.3g}, {moments[1]:.3g}, {moments[2]:.3g} kg m^2",

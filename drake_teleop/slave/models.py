@@ -103,7 +103,7 @@ def ParseModel(
             an arm, see `check_model`, or fastens the base elsewhere than at `X_WBase`.
     """
     before = set(plant.GetJointIndices())
-    read = _read(plant, path, package_paths)
+    read = _read(plant, path, package_paths, sensor=sensor_frame)
     having = [i for i in read.instances if plant.HasFrameNamed(sensor_frame, i)]
     if len(having) != 1:
         frames = [
@@ -213,7 +213,11 @@ class _Read(NamedTuple):
 
 
 def _read(
-    plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], said: _Said = _ROBOT
+    plant: MultibodyPlant,
+    path: Path,
+    package_paths: tuple[Path, ...],
+    said: _Said = _ROBOT,
+    sensor: str = "",
 ) -> _Read:
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path))
@@ -236,7 +240,7 @@ def _read(
     _check_no_loop(path, kind)
     with drakes_errors_said(path, said):
         for file, root in roots.items():
-            assumptions += check_model(root, str(file))
+            assumptions += check_model(root, str(file), sensor)
         if kind in ("urdf", "sdf"):
             root = roots[path]
             lost = without_lost_meshes(root, packages, Path(converted.name))

@@ -18,29 +18,21 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.environment.environment import Environment
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.slave.arm import FRICTION, SLIDES, ArmModel, inverse_dynamics
+from drake_teleop.slave.arm import FRICTION, ArmModel
 from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.slave.assumed_limits import with_all_limits
 from drake_teleop.slave.forward_kinematics import pose_into
-from drake_teleop.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
+from drake_teleop.slave.home import R_WS_HOME, check_strength, start_posture
 from drake_teleop.slave.joint_friction import AddJointFriction, friction_of_joints
 from drake_teleop.slave.model_check import check_size
 from drake_teleop.slave.models import ParseModel, drakes_errors_said
-from drake_teleop.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.slave.payload import AddPayload
-from drake_teleop.slave.servo import mass_matrix
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.surroundings import AddEnvironment, Contact, ContactWith, no_contact
 from drake_teleop.slave.tool import AddTool, shapes_reach
 
-# Of any motion of the joints [kg m^2]: 1e-9 is that of a grain of sand at an arm's length.
-_LEAST_INERTIA = 1e-9
 #: What the arm's model instance is called in a plant, whatever its file says.
 ARM = "arm"
-#: S at home: the tool points down, x_S along x_W.
-R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-#: Elbow up, reaching forward (negative q2 and q3 lean to +x); home is the branch nearest to it.
-_Q_NEAR_HOME = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
 
 @dataclass(frozen=True)
@@ -343,81 +335,6 @@ def _remove_shapes(
         for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
             if index not in carried:
                 scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
-
-
-def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
-    """Joint positions [rad] with S at `position` [m, in W], z_S down; an RX90's elbow bent upwards.
-
-    Raises:
-        DrakeTeleopError: if the arm cannot reach it.
-    """
-    if has_closed_form(arm):
-        q, status = nearest_branch(
-            R_WS_HOME.matrix(), np.array(position), _Q_NEAR_HOME, arm.lower, arm.upper
-        )
-        remedy = "move it nearer to (0.55, 0, 0.45)"
-    else:
-        pose = np.array([*R_WS_HOME.ToQuaternion().wxyz(), *position])
-        q, status = find_posture(arm, pose, (arm.lower + arm.upper) / 2)
-        remedy = "move it, or give slave.home: joint positions of a posture that the arm can take"
-    if status != IkStatus.OK:
-        raise DrakeTeleopError(
-            f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})",
-            where="slave.position",
-            remedy=remedy,
-        )
-    return q
-
-
-def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
-    """(n,) where the arm starts [rad].
-
-    Raises:
-        DrakeTeleopError: if it cannot be there.
-    """
-    if not slave.home:
-        return home_position(arm, slave.position)
-    if len(slave.home) != arm.num_joints:
-        raise DrakeTeleopError(
-            f"{len(slave.home)} joint positions for {arm.num_joints} joints",
-            where="slave.home",
-            remedy=f"give one for each of {', '.join(arm.joint_names)}",
-        )
-    q = np.array(slave.home, dtype=np.float64)
-    outside = (q < arm.lower) | (q > arm.upper)
-    if outside.any():
-        k = int(outside.argmax())
-        raise DrakeTeleopError(
-            f"{arm.joint_names[k]} at {q[k]:g} is outside {arm.lower[k]:.4g} to {arm.upper[k]:.4g}",
-            where="slave.home",
-        )
-    return q
-
-
-def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
-    """Refuses a posture that the motors cannot hold, and an arm without inertia.
-
-    Raises:
-        DrakeTeleopError: naming the joint that cannot; or if a torque could move joints at once.
-    """
-    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _LEAST_INERTIA:
-        raise DrakeTeleopError(
-            "nothing resists a torque: its links have too little inertia for its joints",
-            where="slave.model",
-            remedy="give the links their masses and inertias, or the joints rotor inertias",
-        )
-    still, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
-    inverse_dynamics(arm.table, q, still, still, torque)
-    share = np.abs(torque) / arm.effort_limit
-    k = int(share.argmax())
-    if share[k] > 1.0:
-        unit = "N" if arm.table[k, SLIDES] else "N m"
-        raise DrakeTeleopError(
-            f"the arm cannot hold its {arm.phi_load[0]:.3g} kg at the start: {arm.joint_names[k]} "
-            f"needs {abs(torque[k]):.3g} of its {arm.effort_limit[k]:.3g} {unit}",
-            where="slave.tool",
-            remedy="give a lighter tool or payload, or start nearer to the base",
-        )
 
 
 def _tip(

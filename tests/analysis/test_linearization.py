@@ -27,7 +27,7 @@ from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.simulation import MakeSimulator, read_log
 from drake_teleop.slave.arm import forward_kinematics, inverse_dynamics, jacobian
-from drake_teleop.slave.plant import home_position
+from drake_teleop.slave.home import home_position
 from drake_teleop.station import GetBlock, MakeTeleopStation
 
 PERIOD = 5e-4

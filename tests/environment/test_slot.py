@@ -27,8 +27,9 @@ from drake_teleop.replay import ReplayScene
 from drake_teleop.scenario import LoadScenario, replace
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.arm import forward_kinematics, jacobian
+from drake_teleop.slave.home import R_WS_HOME
 from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
-from drake_teleop.slave.plant import R_WS_HOME, AddSlavePlant, ParseSlave
+from drake_teleop.slave.plant import AddSlavePlant, ParseSlave
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.surroundings import AddEnvironment
 from drake_teleop.slave.tool_contact import environment_wrench

@@ -48,6 +48,7 @@ from drake_teleop.sensor.sensor_chain import (
 )
 from drake_teleop.slave.arm import forward_kinematics
 from drake_teleop.slave.models import ParseModel
+from drake_teleop.slave.slave_config import Slave
 
 
 @pytest.fixture(scope="module")
@@ -259,6 +260,27 @@ def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
         clearance = next(use for use in worst if use.limit == "clearance")
         assert clearance.share > 1
         assert bodies & set(clearance.what.split(" and "))
+
+
+def test_what_touches_where_the_arm_stands_is_not_kept_apart(urdf):
+    """A shape larger than its link, as the convex hull of a mesh is."""
+    text = urdf.read_text()
+    assert text.count('size="0.2 0.2 0.1"') == 1
+    slave = Slave(
+        model=str(urdf),
+        sensor_frame="l6",
+        package_paths=[str(urdf.parent / "somewhere")],
+        home=[0.0, 0.3, 1.4, 0.0, 1.4, 0.0],
+    )
+    free = RobotFromScenario(replace(LoadScenario("free_motion_force"), slave=slave))
+    assert not any("not kept apart" in text for text in free.assumptions)
+    urdf.write_text(text.replace('size="0.2 0.2 0.1"', 'size="0.6 0.6 1.6"'))
+    found = RobotFromScenario(replace(LoadScenario("free_motion_force"), slave=slave))
+    named = next(text for text in found.assumptions if "not kept apart" in text)
+    assert "l0 and l3" in named and "l0 and l6" not in named
+    still = FourierTrajectory(found.home, np.zeros((1, 6)), np.zeros((1, 6)), 1.0)
+    assert all(use.share < 1 for use in check(found, still))
+    assert len(found.limits.pairs) > 0  # of the others
 
 
 @pytest.mark.slow

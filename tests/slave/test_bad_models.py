@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import numpy as np
@@ -9,7 +10,10 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.slave.plant import ParseSlave, check_strength, finalize, start_posture
+from drake_teleop.slave.home import check_strength, home_position, start_posture
+from drake_teleop.slave.inverse_kinematics import IkStatus
+from drake_teleop.slave.numeric_inverse_kinematics import find_posture
+from drake_teleop.slave.plant import NominalSlave, ParseSlave, finalize
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.tool import Tool
 
@@ -165,6 +169,9 @@ ERRORS = {
                                 "link l3: an inertia, but no mass; give both or none"),
     "a negative inertia": ("urdf", with_inertial(('ixx="0.02"', 'ixx="-0.02"')),
                            "link l3: no body has this inertia"),
+    "no triangle of what hangs on the arm": (
+        "urdf", arm(beyond=link("x", INERTIAL.replace('izz="0.01"', 'izz="0.05"'))
+                    + joint(8, parent="l2", child="x")), "link x: no body has this inertia"),
     "no triangle": ("urdf", with_inertial(('izz="0.01"', 'izz="0.05"')),
                     "link l3: no body has this inertia.*0.02, 0.02, 0.05"),
     "massless, without a tool": ("urdf", re.sub("<inertial>.*?</inertial>", "", arm()),
@@ -222,6 +229,14 @@ ASSUMED = {
     "massless": (arm(l3=link("l3", "")), "no inertia of l3"),
     "an inertia of rounded numbers": (with_inertial(('izz="0.01"', 'izz="0.040001"')),
                                       "rounded numbers made a body's for l3"),
+    "a base of an impossible inertia": (arm(l0=link("l0", INERTIAL.replace("0.01", "0.05"))),
+                                        "inertia, which no joint of the arm moves, for l0"),
+    "an impossible inertia beside the arm": (
+        arm(beyond=link("x", INERTIAL.replace('ixx="0.02"', 'ixx="-2"'))
+            + joint(8, parent="l0", child="x")), "which no joint of the arm moves, for x"),
+    "an inertia that is rounding": (
+        with_inertial(('ixx="0.02" ixy="0"', 'ixx="0" ixy="2e-35"'), ('"0.02"', '"0"'),
+                      ('"0.01"', '"0"')), "rounded numbers made a body's for l3"),
     "a mesh missing": (shaped('<mesh filename="package://none/a.stl"/>'),
                        "shapes are missing of l3: meshes were not found .--package-path"),
     "a mesh of no kind": (shaped('<mesh filename="arm.urdf"/>'), ".urdf meshes cannot be read"),
@@ -261,6 +276,24 @@ def test_what_is_missing_is_assumed_and_named(tmp_path, case):
     home = (HOME + 3 * [0.1])[:joints]
     assumed = read(Slave(model=str(path), sensor_frame="l6", home=home, tool=Tool(mass=1.0)))
     assert re.search(ASSUMED[case][1], "; ".join(assumed))
+
+
+def test_an_arm_starts_away_from_its_limits_if_it_can(tmp_path):
+    """Of the same arm with other limits each time, in places that it can reach."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(arm())
+    slave = Slave(model=str(path), sensor_frame="l6", home=HOME, tool=Tool(mass=1.0))
+    model, rng, inside = NominalSlave(slave).arm, np.random.default_rng(0), []
+    for _ in range(60):
+        middle, half = rng.uniform(-1.0, 1.0, 6), rng.uniform(2.2, 3.3, 6)
+        other = dataclasses.replace(model, lower=middle - half, upper=middle + half)
+        position = rng.uniform([0.3, -0.2, 0.2], [0.6, 0.2, 0.7])
+        first, status = find_posture(other, np.array([0.0, 1.0, 0.0, 0.0, *position]), middle)
+        if status == IkStatus.OK:
+            q = home_position(other, position.tolist())
+            inside.append([np.abs((x - middle) / half).max() <= 0.9 for x in (first, q)])
+    of_first, of_home = np.transpose(inside)
+    assert of_home[of_first].all() and of_home.sum() > 1.3 * of_first.sum()
 
 
 def test_an_inertia_of_rounded_numbers_stays_what_it_is(tmp_path):

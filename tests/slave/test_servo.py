@@ -10,7 +10,8 @@ from drake_teleop.passivity.methods import PassivityConfig
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.sides.channel import MakeChannel
 from drake_teleop.slave.arm import inverse_dynamics, jacobian
-from drake_teleop.slave.plant import NominalSlave, home_position
+from drake_teleop.slave.home import home_position
+from drake_teleop.slave.plant import NominalSlave
 from drake_teleop.slave.servo import operational_inertia, servo_at_tool
 
 SCENARIO = Scenario()
