@@ -20,10 +20,10 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master.data_sheets import FIGURES, LEADER, PHANTOM
+from drake_teleop.master.data_sheets import FIGURES, LEADER, PHANTOM, Master
 from drake_teleop.master.phantom import FORCE_LIMIT
 from drake_teleop.run import run_command
-from drake_teleop.scenario import LoadScenario
+from drake_teleop.scenario import LoadScenario, Rates
 from drake_teleop.sensor.presets import PRESETS
 from drake_teleop.slave.arm import ROTATION, TRANSLATION, ArmModel
 from drake_teleop.slave.forward_kinematics import pose_into
@@ -381,6 +381,7 @@ def _text(
         "# unit, range and meaning: drake-teleop scenario station.yaml",
         f"description: {Path(arm).stem} led by {device}",
         "simulation: {duration: 5.0, settle: 0.8}",
+        *_rates(device),
         "slave:",
         f"  model: {arm}",
         *([f"  package_paths: [{', '.join(package_paths)}]"] if package_paths else []),
@@ -407,6 +408,14 @@ def _text(
         f" translation: [0.0, 0.0, {-down / s:.4g}]}}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _rates(device: str) -> list[str]:
+    """Those of a device that is slower than the hand, or `analyze` refuses them."""
+    own = Master(model=device).own_period(Rates().hand_hz)
+    if own is None:
+        return []
+    return [f"rates: {{hand_hz: {1 / own:g}, joint_control_hz: {1 / own:g}}}  # of the device"]
 
 
 def _row(values: Any) -> str:

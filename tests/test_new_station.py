@@ -13,7 +13,9 @@ from pydrake.math import RotationMatrix
 from shown import type_in
 
 from drake_teleop import new_station
+from drake_teleop.analysis.linearization import linearize
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.identification import true_load
 from drake_teleop.new_station import find_place, new_command, plan_station
 from drake_teleop.resources import models_dir
 from drake_teleop.scenario import LoadScenario
@@ -82,6 +84,16 @@ def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():
     stiff = dataclasses.replace(arm, lower=arm.lower * 0.0 - 0.01, upper=arm.upper * 0.0 + 0.01)
     with pytest.raises(DrakeTeleopError, match="nowhere can the arm hold its sensor"):
         find_place(stiff)
+
+
+@pytest.mark.parametrize("device", ["phantom_premium_15", "geomagic_touch", "omega_6", "falcon"])
+def test_hand_and_joints_have_a_rate_that_the_device_has(tmp_path, runs, device):
+    """So that `analyze`, which cuts the loops at their common instants, takes the station."""
+    new_command(tmp_path / "mine", ARM, "sensor", device=device)
+    scenario = LoadScenario(tmp_path / "mine" / "station.yaml")
+    assert scenario.master.own_period(scenario.rates.hand_hz) is None
+    assert scenario.rates.hand_hz == scenario.rates.joint_control_hz
+    linearize(scenario.without_environment(), load_estimate=true_load(scenario))
 
 
 def test_a_small_cube_is_better_than_a_joint_at_its_limit():

@@ -399,6 +399,8 @@ class _Period:
         slave = NominalSlave(smooth.slave)
         self._arm, self._joints = slave.arm.table, slave.arm.num_joints
         self._remembers = method_of(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
+        if self._remembers:  # a slow joint would not follow the displacements
+            GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf
         self._push = ExternallyAppliedSpatialForce()
         self._push.body_index = slave.tool
         self._sensor = self._system("wrist_sensor")
@@ -406,8 +408,10 @@ class _Period:
         servo.check_is_torque("the linearisation")
         scenario.master.check_leads_the_pose("the linearisation")
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
-        largest = _ANGLE if smooth.surroundings is None else _IN_CONTACT
-        self._joint_step = min(largest, _ACCELERATION / gain)
+        # In a period the arm goes a small part of what it is commanded.
+        self._command_step = min(_ANGLE, _ACCELERATION / gain)
+        touches = smooth.surroundings is not None
+        self._joint_step = min(self._command_step, _IN_CONTACT) if touches else self._command_step
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
         self._groups = self._state_groups()
@@ -464,7 +468,7 @@ class _Period:
 
     def _last_command(self) -> list[_States]:
         """From which the numeric inverse kinematics goes on; the closed form remembers nothing."""
-        steps = np.full(self._joints, self._joint_step)
+        steps = np.full(self._joints, self._command_step)
         command = _States("inverse_kinematics", 0, slice(0, self._joints), steps)
         return [command] if self._remembers else []
 
@@ -606,7 +610,7 @@ class _Period:
     def input_derivative(self, x: Array) -> Array:
         """B at the states x."""
         B = np.empty((len(x), 24))
-        pose, tool = np.full(6, self._joint_step), np.full(6, _OTHER)
+        pose, tool = np.full(6, self._command_step), np.full(6, _OTHER)
         for k, step in enumerate(np.concatenate([_AT_THE_HAND, pose, _AT_THE_HAND, tool])):
             ends = []
             for sign in (1.0, -1.0):

@@ -408,7 +408,9 @@ class NumericInverseKinematics(LeafSystem):
         super().__init__()
         n = arm.num_joints
         self._joints, posture = n, np.array(q_start, dtype=np.float64)
-        limits = arm.lower, arm.upper, arm.velocity_limit
+        #: (n,) of the joints; its numbers may be changed [rad/s, m/s].
+        self.speed_limit = arm.velocity_limit.copy()
+        limits = arm.lower, arm.upper, self.speed_limit
         self._fixed = (arm.table, turn_length(arm), *limits, posture)
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._position = self.DeclareVectorInputPort("joint_position", n)

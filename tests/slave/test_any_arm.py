@@ -11,8 +11,10 @@ from pydrake.geometry import Role
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.analysis.linearization import linearize_station
 from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
+from drake_teleop.environment.wall import Wall
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import true_load
 from drake_teleop.resources import models_dir
@@ -20,6 +22,7 @@ from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.signals import SIGNALS
 from drake_teleop.simulation import MakeSimulator, simulate
 from drake_teleop.slave.ik_methods import method_of
+from drake_teleop.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
 from drake_teleop.slave.skeleton import AddSkeleton
 from drake_teleop.slave.slave_config import Slave
@@ -268,3 +271,41 @@ def test_an_edited_model_is_read_again(folder, tmp_path):
 def test_without_an_arm_the_scenario_is_the_papers():
     assert Scenario().slave.path == models_dir() / "rx90.sdf"
     assert NominalSlave(Slave()).assumptions == ()
+
+
+def slowest(scenario):
+    """Of the motions of the linearised station, the multipliers of those that die last."""
+    system = linearize_station(scenario, load_estimate=true_load(scenario))
+    return np.abs(system.multipliers[:20])
+
+
+@pytest.fixture(scope="module")
+def free(scenario):
+    return slowest(scenario)
+
+
+@pytest.mark.slow
+def test_a_redundant_arm_nears_its_posture_by_what_the_kinematics_pull(scenario, free):
+    period = 1.0 / scenario.rates.hand_hz
+    assert free[0] == pytest.approx(np.exp(-NumericInverseKinematics.PULL * period), abs=1e-5)
+    assert free[1] < 0.9990
+
+
+@pytest.mark.slow
+def test_surroundings_that_are_not_touched_change_no_multiplier(scenario, free):
+    """Commands are displaced by more than what the kinematics are solved to, as without them."""
+    beside = replace(scenario, environment=[Wall(position=[0.0, 0.0, -2.0])])
+    beside = replace(beside, slave__tool=Tool(mass=1.0, shapes=[Ball(0.01, [0.0, 0.0, 0.1])]))
+    alone = slowest(replace(beside, environment=[]))
+    np.testing.assert_allclose(slowest(beside), alone, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_slow_joint_changes_no_multiplier(folder, scenario, free):
+    """What a joint may go in a period is no part of small motions."""
+    text = (folder / "arm.urdf").read_text()
+    j4 = text.index('<joint name="j4"')
+    slow = text[:j4] + text[j4:].replace('velocity="3"', 'velocity="0.02"', 1)
+    (folder / "slow.urdf").write_text(slow)
+    slower = replace(scenario, slave__model=str(folder / "slow.urdf"))
+    np.testing.assert_allclose(slowest(slower), free, atol=1e-6)
