@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.master.data_sheets import FIGURES, LEADER, PHANTOM, Master
@@ -30,7 +29,7 @@ from drake_teleop.slave.forward_kinematics import pose_into
 from drake_teleop.slave.home import R_WS_HOME, tool_down
 from drake_teleop.slave.inverse_kinematics import IkStatus
 from drake_teleop.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.slave.plant import NominalSlave, ParseSlave, bodies_beyond, finalize
+from drake_teleop.slave.plant import ParseSlave, finalize, lowest_point
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.tool import Ball, Tool
 from drake_teleop.writing import make_folder, write_text
@@ -213,7 +212,7 @@ def plan_station(
         translation_scale=translation_scale,
         force_scale=_rounded(most),
         swing=_rounded(swing * min(1.0, _HURRY / _speed_use(model, place, swing))),
-        lowest=_lowest(slave),
+        lowest=lowest_point(slave),
         assumptions=tuple(assumptions),
         about_z=_about_z(model),
     )
@@ -308,31 +307,6 @@ def _speed_use(arm: ArmModel, place: Place, swing: float) -> float:
     above[6] += swing
     way = np.abs(find_posture(arm, above, place.q)[0] - place.q)
     return float((2.0 * np.pi * _FREQUENCY * way / arm.velocity_limit).max())
-
-
-def _lowest(slave: Slave) -> NDArray[np.float64]:
-    """p_W (3,) of the lowest point of what hangs on the sensor, at the start [m].
-
-    By the boxes around its shapes; without shapes, of its tip.
-    """
-    nominal = NominalSlave(slave)
-    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
-    parsed = ParseSlave(plant, slave)
-    finalize(plant)
-    context, inspector = plant.CreateDefaultContext(), scene_graph.model_inspector()
-    plant.SetPositions(context, parsed.instance, nominal.start)
-    lowest = nominal.start_tip
-    for body in bodies_beyond(plant, parsed.sensor_frame.body()):
-        for shape in plant.GetCollisionGeometriesForBody(body):
-            box = inspector.GetObbInGeometryFrame(shape)
-            if box is None:  # a half space
-                continue
-            X_WBox = plant.EvalBodyPoseInWorld(context, body) @ (
-                inspector.GetPoseInFrame(shape) @ box.pose()
-            )
-            corners = (np.array(signs) * box.half_width() for signs in product((-1, 1), repeat=3))
-            lowest = min([lowest, *(X_WBox @ corner for corner in corners)], key=lambda p: p[2])
-    return np.array(lowest)
 
 
 def _read(slave: Slave) -> tuple[ArmModel, list[str]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import product
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -31,6 +32,8 @@ from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.surroundings import AddEnvironment, Contact, ContactWith, no_contact
 from drake_teleop.slave.tool import AddTool, shapes_reach
 
+# Shapes that reach as far as others to so much make contact with them, as two fingers do [m].
+_ABREAST = 1e-3
 #: What the arm's model instance is called in a plant, whatever its file says.
 ARM = "arm"
 
@@ -337,6 +340,43 @@ def _remove_shapes(
                 scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
 
+def lowest_point(slave: Slave) -> NDArray[np.float64]:
+    """p_W (3,) of the lowest point of what hangs on the sensor, at the start [m].
+
+    By the boxes around its shapes; without shapes, of its tip.
+    """
+    nominal = NominalSlave(slave)
+    X_WS = nominal.X_WS_start
+    R_WS = RotationMatrix(Quaternion(X_WS[:4] / np.linalg.norm(X_WS[:4]))).matrix()
+    corners = [X_WS[4:] + R_WS @ corner for box in _boxes_on_sensor(slave) for corner in box]
+    return np.array(min([nominal.start_tip, *corners], key=lambda p: p[2]))
+
+
+def _boxes_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
+    """(8, 3) corners in S of a box around each shape that hangs on the sensor [m]."""
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
+    parsed = ParseSlave(plant, slave)
+    finalize(plant)
+    context, inspector = plant.CreateDefaultContext(), scene_graph.model_inspector()
+    boxes = []
+    for body in bodies_beyond(plant, parsed.sensor_frame.body()):
+        X_SBody = plant.CalcRelativeTransform(context, parsed.sensor_frame, body.body_frame())
+        for shape in plant.GetCollisionGeometriesForBody(body):
+            box = inspector.GetObbInGeometryFrame(shape)
+            if box is not None:  # as of a half space
+                X_SBox = X_SBody @ inspector.GetPoseInFrame(shape) @ box.pose()
+                signs = np.array(list(product((-1.0, 1.0), repeat=3)))
+                boxes.append((X_SBox @ (signs * box.half_width()).T).T)
+    return boxes
+
+
+def _farthest(boxes: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """p_S (3,) in the middle of the boxes that reach farthest along z_S, as far as they reach."""
+    reach = max(float(box[:, 2].max()) for box in boxes)
+    middles = [box.mean(axis=0)[:2] for box in boxes if box[:, 2].max() > reach - _ABREAST]
+    return np.array([*np.mean(middles, axis=0), reach])
+
+
 def _tip(
     plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel
 ) -> NDArray[np.float64]:
@@ -353,4 +393,6 @@ def _tip(
         )
         return X_WS.InvertAndCompose(X_WTip).translation()
     reach = None if slave.tool is None else shapes_reach(slave.tool)
+    if slave.tool is None and (boxes := _boxes_on_sensor(slave)):
+        return _farthest(boxes)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)

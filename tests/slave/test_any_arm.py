@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import numpy as np
+import odd_arms
 import pytest
 from odd_arms import other_arm_urdf
 from pydrake.geometry import Role
@@ -271,6 +273,20 @@ def test_an_edited_model_is_read_again(folder, tmp_path):
 def test_without_an_arm_the_scenario_is_the_papers():
     assert Scenario().slave.path == models_dir() / "rx90.sdf"
     assert NominalSlave(Slave()).assumptions == ()
+
+
+def test_contact_is_where_a_models_own_gripper_reaches(folder, scenario):
+    """Between two fingers, each of which is a turned box, and not at the centre of mass."""
+    text = (folder / "arm.urdf").read_text()
+    box = '<collision><geometry><box size="0.06 0.01 0.02"/></geometry></collision></link>'
+    for side in (-1, 1):
+        finger = odd_arms.link(f"f{side}").replace("</link>", box)
+        at = odd_arms.joint(f"to_f{side}", "fixed", "ft", f"f{side}", f"{0.03 * side} 0.02 0.1")
+        turned = at.replace('rpy="0 0 0"', 'rpy="0 1.5707963267948966 0"')
+        text = text.replace("</robot>", f"{finger}{turned}</robot>")
+    (folder / "gripper.urdf").write_text(text)
+    slave = dataclasses.replace(scenario.slave, model=str(folder / "gripper.urdf"))
+    np.testing.assert_allclose(NominalSlave(slave).tip, [0.0, 0.02, 0.13], atol=1e-12)
 
 
 def slowest(scenario):
