@@ -32,6 +32,10 @@ Array = NDArray[np.float64]
 _REPAIRS = (1.0, 0.995, 0.99, 0.98)
 # Of one descent, a candidate at every such factor of the criterion; how many are checked at most.
 _WORSE, _CHECKED = 1.05, 30
+_HULLS = (
+    "; or, if it is the hulls of meshes that touch, excite a station (drake-teleop new): what"
+    " touches where its arm starts is let off"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +142,8 @@ def best_checked(
         "no trajectory was found that respects all limits"
         + (f": the best uses {worst}" if worst else ""),
         where=robot.name,
-        remedy="take more time, a longer period or another seed",
+        remedy="take more time, a longer period or another seed"
+        + (_HULLS if worst is not None and worst.limit == "clearance" else ""),
     )
 
 
