@@ -11,11 +11,15 @@ import planted
 import polars as pl
 import pytest
 import yaml
+from known_motion import quaternions
 from planted import NTNU_FRAME, Columns, findings, good, ntnu_log, written
+from scipy.spatial.transform import Rotation
 
 from drake_teleop.cli import main
 from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.description import load_description
+from drake_teleop.logs.read.reading import read_log
 
 PLANTED: list[tuple[Callable[[Columns], None], str, str, dict[str, bool]]] = [
     (planted.sign, "sign", "wrench.sign: -1", {}),
@@ -133,6 +137,75 @@ def test_an_unknown_table_gets_a_draft(tmp_path: Path, capsys: pytest.CaptureFix
     summary = inspect_command(tmp_path / "draft.yaml", tmp_path / "again", quiet=True)
     assert summary["findings"] == []
     assert json.loads((tmp_path / "again" / "summary.json").read_text()) == summary
+
+
+def as_written(form: str, c: Columns) -> tuple[dict[str, np.ndarray], str]:
+    """A good log as others write it: its columns, and what stands between them."""
+    wrench = np.hstack([c["force"], c["torque"]])
+    R, q = c["R"], quaternions(c["R"])
+    if form == "rtde":  # base axes, the pose as position and rotation vector
+        base = -np.hstack([np.einsum("nij,nj->ni", R, x) for x in (c["force"], c["torque"])])
+        pose = np.hstack([c["p"], Rotation.from_matrix(R).as_rotvec()])
+        parts = {
+            "target_TCP_pose_": pose + 1.0,
+            "actual_TCP_pose_": pose,
+            "actual_TCP_force_": base,
+        }
+        columns = {f"{name}{k}": x[:, k] for name, x in parts.items() for k in range(x.shape[1])}
+        return {"timestamp": 1e5 + c["t"]} | columns, " "
+    if form == "franka":  # 4 x 4, column by column
+        X = np.zeros((len(R), 4, 4))
+        X[:, :3, :3], X[:, :3, 3], X[:, 3, 3] = R, c["p"], 1.0
+        parts = {"O_T_EE": X.transpose(0, 2, 1).reshape(-1, 16), "K_F_ext_hat_K": wrench}
+        columns = {f"{name}[{k}]": x[:, k] for name, x in parts.items() for k in range(x.shape[1])}
+        return {"time [ms]": 1e3 * c["t"]} | columns, ","
+    if form == "units":
+        names = [f"F{a} [N]" for a in "xyz"] + [f"M{a} (Nmm)" for a in "xyz"]
+        columns = dict(zip(names, (wrench * np.repeat([1.0, 1e3], 3)).T, strict=True))
+        columns |= {f"{a.upper()} [mm]": 1e3 * c["p"][:, k] for k, a in enumerate("xyz")}
+        columns |= {f"r{i + 1}{j + 1}": R[:, i, j] for i in range(3) for j in range(3)}
+        return {"Zeit [s]": c["t"]} | columns, ";"
+    topics = {"ft/wrench/force": c["force"], "ft/wrench/torque": c["torque"]}
+    topics |= {"tcp/pose/position": c["p"], "imu/linear_acceleration": c["s"]}
+    topics |= {"imu/angular_velocity": c["omega"]}
+    columns = {f"/{name}/{a}": x[:, k] for name, x in topics.items() for k, a in enumerate("xyz")}
+    columns |= {f"/tcp/pose/orientation/{a}": q[:, (k + 1) % 4] for k, a in enumerate("xyzw")}
+    return {"%time": (1e9 * (1.6e9 + c["t"])).astype(np.int64)} | columns, ","
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("form", "said"), [("rtde", ["sign"]), ("franka", []), ("units", []), ("topics", [])]
+)
+def test_a_draft_of_what_robots_write_is_right_as_it_stands(
+    tmp_path: Path, form: str, said: list[str]
+) -> None:
+    columns, separator = as_written(form, good())
+    pl.DataFrame(columns).write_csv(tmp_path / "table.csv", separator=separator)
+    drafted = inspect_command(tmp_path / "table.csv", tmp_path, quiet=True)
+    assert drafted["findings"] == []
+    found = inspect_command(tmp_path / "draft.yaml", tmp_path / "again", quiet=True)
+    assert [finding["name"] for finding in found["findings"]] == said
+    described = yaml.safe_load((tmp_path / "draft.yaml").read_text())
+    described["wrench"]["sign"] = -1 if said else 1
+    (tmp_path / "draft.yaml").write_text(yaml.safe_dump(described))
+    log = read_log(tmp_path / "draft.yaml")
+    np.testing.assert_allclose(log.wrench[:, 2].mean(), good()["force"][:, 2].mean(), rtol=1e-3)
+    assert identify_log(tmp_path / "draft.yaml").identification.mass == pytest.approx(
+        3.13, rel=2e-3
+    )
+
+
+def test_a_unit_that_is_not_known_is_left_to_fill_in(tmp_path: Path) -> None:
+    t = np.arange(50) * 0.01
+    names = (
+        [f"F{a} [kgf]" for a in "xyz"] + [f"T{a} [Nm]" for a in "xyz"] + ["qw", "qx", "qy", "qz"]
+    )
+    pl.DataFrame({"t": t} | dict.fromkeys(names, t)).write_csv(tmp_path / "table.csv")
+    summary = inspect_command(tmp_path / "table.csv", tmp_path, quiet=True)
+    assert "FILL IN" in summary["findings"][0]["message"]
+    wrench = yaml.safe_load((tmp_path / "draft.yaml").read_text())["wrench"]
+    assert (wrench["force"]["unit"], wrench["torque"]["unit"]) == ("FILL IN", "N m")
 
 
 @pytest.mark.parametrize(

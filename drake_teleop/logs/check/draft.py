@@ -4,24 +4,68 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.logs.read.description import UNITS
 from drake_teleop.logs.read.tables import Table
 
-_NAMES = {
-    "time": r"^(t|time|timestamp|stamp|time_?stamp|sec|secs)(_?(s|ms|us|ns))?$",
-    "force": r"^(f|force|forces?)[._ ]?[xyz]$",
-    "torque": r"^(t|m|tau|torque|moment)[._ ]?[xyz]$",
-    "specific_force": r"^(a|s|acc|accel|acceleration|linear_acceleration)[._ ]?[xyz]$",
-    "angular_velocity": r"^(w|g|omega|gyro|gyr|angular_velocity)[._ ]?[xyz]$",
-    "orientation": r"^(q|quat|quaternion|orientation)[._ ]?[wxyz]$",
-    "position": r"^(p|pos|position)?[._ ]?[xyz]$",
+_TIME = r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?)(_?(s|ms|us|ns))?$"
+# How the names of vectors end, before the axis.
+_VECTORS = {
+    "force": "f|forces?",
+    "torque": "t|m|tau|torques?|moment",
+    "specific_force": "a|s|acc|accel|(?<!angular_)acceleration",
+    "angular_velocity": "w|g|omega|gyro|gyr|angular_velocity",
+    "orientation": "q|quat|quaternion|orientation",
+    "position": "p|pos|position|translation",
 }
+# What the names of numbered columns are, and where in them the components of a vector.
+_NUMBERED: dict[str, dict[str, tuple[int, ...]]] = {
+    r"tcp_force$|f_ext|wrench$|force_torque$|(^|_)ft$": {
+        "force": (0, 1, 2),
+        "torque": (3, 4, 5),
+    },
+    r"tcp_pose$": {"position": (0, 1, 2), "rotation_vector": (3, 4, 5)},  # of Universal Robots
+    r"(^|_)t_ee$": {  # of Franka, column by column
+        "matrix": (0, 4, 8, 1, 5, 9, 2, 6, 10),
+        "position": (12, 13, 14),
+    },
+}
+_MATRIX = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
+_IN_BASE = r"tcp_force$|^o_f_ext"
+_REMARKS = {
+    r"tcp_force$": "The payload that the controller was told is not in the TCP's force any more: tell 0.",
+    r"f_ext": "An external wrench is estimated, and without the load that the robot was told.",
+}
+_SAID = {
+    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*UNITS, "g")},
+    "µs": "us",
+    "°": "deg",
+    "°/s": "deg/s",
+    "m/s²": "m/s^2",
+    "n*m": "N m",
+    "n.m": "N m",
+}
+_UNITS = {
+    "force": ("N", "lbf"),
+    "torque": ("N m", "N mm", "lbf in"),
+    "specific_force": ("m/s^2", "mm/s^2", "g"),
+    "angular_velocity": ("rad/s", "deg/s"),
+    "rotation_vector": ("rad", "deg"),
+    "position": ("m", "mm"),
+    "time": ("s", "ms", "us", "ns"),
+}
+_FILL_IN = "FILL IN"
+
+
+class _Found(NamedTuple):
+    """Columns of one kind, and the unit that stands in their names: "" if none does."""
+
+    columns: list[str]
+    unit: str
 
 
 def draft_description(table: Table, folder: Path) -> str:
@@ -36,57 +80,148 @@ def draft_description(table: Table, folder: Path) -> str:
     """
     import yaml
 
-    columns: dict[str, list[str]] = {
-        key: [name for name in table.columns if re.match(pattern, name, re.IGNORECASE)]
-        for key, pattern in _NAMES.items()
-    }
-    file = os.path.relpath(table.path, folder)
-    time: dict[str, Any] = {"column": "FILL IN"}
-    if columns["time"]:
-        time = {"column": columns["time"][0], "unit": _time_unit(table, columns["time"][0])}
-    wrench = {
-        "file": file,
-        "time": time,
-        "force": {"columns": columns["force"] or ["FILL IN"] * 3},
-        "torque": {"columns": columns["torque"] or ["FILL IN"] * 3},
-        "sign": 1,
-    }
+    plain = {name: _plain(name) for name in table.columns}
+    found = _vectors(plain) | _numbered(plain)
+    time = _time(table, plain)
+
+    def stream(**groups: Any) -> dict[str, Any]:
+        return {"file": os.path.relpath(table.path, folder), "time": dict(time), **groups}
+
+    none = _Found([_FILL_IN] * 3, "")
+    wrench = stream(
+        **{kind: _group(table, kind, found.get(kind, none)) for kind in ("force", "torque")}, sign=1
+    )
+    forces = [_base(plain[name][0]) for name in found.get("force", _Found([], "")).columns[:1]]
+    if any(re.search(_IN_BASE, name) for name in forces):
+        wrench["frame"] = "base"
     draft: dict[str, Any] = {}
-    if columns["force"] or columns["torque"]:
+    if "force" in found or "torque" in found:
         draft["wrench"] = wrench
-    imu: dict[str, Any] = {}
-    if len(columns["specific_force"]) == 3:
-        size = float(np.median(_norm(table, columns["specific_force"])))
-        unit = "g" if size < 3 else "m/s^2"
-        imu["specific_force"] = {"columns": columns["specific_force"], "unit": unit}
-    if len(columns["angular_velocity"]) == 3:
-        size = float(np.nanmax(_norm(table, columns["angular_velocity"])))
-        unit = "deg/s" if size > 15 else "rad/s"
-        imu["angular_velocity"] = {"columns": columns["angular_velocity"], "unit": unit}
+    imu = {
+        kind: _group(table, kind, found[kind])
+        for kind in ("specific_force", "angular_velocity")
+        if len(found.get(kind, _Found([], "")).columns) == 3
+    }
     if imu:
-        draft["imu"] = {"file": file, "time": dict(time)} | imu
-    if len(columns["orientation"]) == 4:
-        first = columns["orientation"][0].lower().endswith("w")
-        form = "quaternion_wxyz" if first else "quaternion_xyzw"
-        pose = {"columns": columns["orientation"], "form": form}
-        draft["pose"] = {"file": file, "time": dict(time), "orientation": pose}
-        if len(columns["position"]) == 3:
-            size = float(np.nanmax(_norm(table, columns["position"])))
-            unit = "mm" if size > 20 else "m"
-            draft["pose"]["position"] = {"columns": columns["position"], "unit": unit}
+        draft["imu"] = stream(**imu)
+    pose = _pose(table, found)
+    if pose:
+        draft["pose"] = stream(**pose)
     if not draft:
         draft["wrench"] = wrench  # to begin with something
-    unused = [n for n in table.columns if not any(n in found for found in columns.values())]
+    groups = [group for stream in draft.values() for group in stream.values()]
+    used = {
+        name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
+    }
+    used |= {time["column"]}
+    unused = [name for name in table.columns if name not in used]
     head = [
         "# DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
         "# above all wrench.sign, units and frames, and inspect it.",
         f"# Columns without a guess: {', '.join(unused) or 'none'}.",
+        *(f"# {text}" for what, text in _REMARKS.items() for n in forces if re.search(what, n)),
     ]
     return "\n".join(head) + "\n" + yaml.safe_dump(draft, sort_keys=False)
 
 
-def _norm(table: Table, names: Sequence[str]) -> NDArray[np.float64]:
-    return np.linalg.norm(np.hstack([table.raw(n, n) for n in names]), axis=1)
+def _plain(name: str) -> tuple[str, str]:
+    """A name in small letters, parts joined by _, and the unit that stands in brackets in it."""
+    unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
+    rest = name[: unit.start()] if unit else name
+    return re.sub(r"[^a-z0-9]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
+
+
+def _base(plain: str) -> str:
+    return re.sub(r"_?\d+$", "", plain)
+
+
+def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
+    """By kind, the columns with x, y, z (w first) at the end of one and the same name."""
+    found: dict[str, _Found] = {}
+    for kind, names in _VECTORS.items():
+        axes = "wxyz" if kind == "orientation" else "xyz"
+        ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
+        groups: dict[str, dict[str, str]] = {}
+        for name, (words, _) in plain.items():
+            if match := re.match(ends, words):
+                groups.setdefault(match[1], {}).setdefault(match[2], name)
+            elif kind == "position" and words in ("x", "y", "z"):
+                groups.setdefault("", {}).setdefault(words, name)
+        whole = [group for group in groups.values() if len(group) == len(axes)]
+        for group in (whole or list(groups.values()))[:1]:
+            columns = [group[axis] for axis in axes if axis in group]
+            found[kind] = _Found(columns, plain[columns[0]][1])
+    return found
+
+
+def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
+    """The same of columns whose names end with numbers; and of a matrix r11, r12 ... r33."""
+    groups: dict[str, list[str]] = {}
+    for name, (words, _) in plain.items():
+        if re.search(r"\d$", words):
+            groups.setdefault(_base(words), []).append(name)
+    found: dict[str, _Found] = {}
+    for start, kinds in _NUMBERED.items():
+        most = max(k for places in kinds.values() for k in places)
+        fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
+        for base in sorted(fit, key=lambda name: "target" in name)[:1]:
+            for kind, places in kinds.items():
+                columns = [groups[base][k] for k in places]
+                found[kind] = _Found(columns, plain[columns[0]][1])
+    by_words = {words: name for name, (words, _) in plain.items()}
+    if all(word in by_words for word in _MATRIX):
+        found["matrix"] = _Found([by_words[word] for word in _MATRIX], "")
+    return found
+
+
+def _group(table: Table, kind: str, found: _Found) -> dict[str, Any]:
+    """Columns and unit of a vector: that of its name, or what its magnitude lets expect."""
+    group: dict[str, Any] = {"columns": found.columns}
+    if found.unit:
+        unit = _SAID.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
+        group["unit"] = unit if unit in _UNITS[kind] else _FILL_IN
+        return group
+    if _FILL_IN in found.columns or kind in ("force", "torque"):
+        return group
+    size = np.linalg.norm(np.hstack([table.raw(n, n) for n in found.columns]), axis=1)
+    usual, other = {
+        "specific_force": ("m/s^2", "g" if float(np.nanmedian(size)) < 3 else ""),
+        "angular_velocity": ("rad/s", "deg/s" if float(np.nanmax(size)) > 15 else ""),
+        "rotation_vector": ("rad", "deg" if float(np.nanmax(size)) > 15 else ""),
+        "position": ("m", "mm" if float(np.nanmax(size)) > 20 else ""),
+    }[kind]
+    group["unit"] = other or usual
+    return group
+
+
+def _pose(table: Table, found: dict[str, _Found]) -> dict[str, Any]:
+    """Orientation, and position if there is one."""
+    if len(found.get("orientation", _Found([], "")).columns) == 4:
+        orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
+    elif "matrix" in found:
+        orientation = {"columns": found["matrix"].columns, "form": "matrix"}
+    elif "rotation_vector" in found:
+        orientation = _group(table, "rotation_vector", found["rotation_vector"])
+        orientation["form"] = "rotation_vector"
+    else:
+        return {}
+    pose: dict[str, Any] = {"orientation": orientation}
+    if len(found.get("position", _Found([], "")).columns) == 3:
+        pose["position"] = _group(table, "position", found["position"])
+    return pose
+
+
+def _time(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, Any]:
+    """The column of time: by its name, or the unit in that."""
+    named = [name for name, (words, _) in plain.items() if re.search(_TIME, words)]
+    named += [name for name, (_, unit) in plain.items() if unit.lower() in _UNITS["time"]]
+    if not named:
+        return {"column": _FILL_IN}
+    unit = _SAID.get(plain[named[0]][1].lower(), "")
+    return {
+        "column": named[0],
+        "unit": unit if unit in _UNITS["time"] else _time_unit(table, named[0]),
+    }
 
 
 def _time_unit(table: Table, column: str) -> str:
