@@ -37,7 +37,7 @@ _NUMBERED: dict[str, dict[str, tuple[int, ...]]] = {
 _MATRIX = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 _IN_BASE = r"tcp_force$|^o_f_ext"
 _REMARKS = {
-    r"tcp_force$": "The payload that the controller was told is not in the TCP's force any more: tell 0.",
+    r"tcp_force$": "The payload that the controller was told is not in the TCP's force: tell it 0.",
     r"f_ext": "An external wrench is estimated, and without the load that the robot was told.",
 }
 _SAID = {
