@@ -49,6 +49,7 @@ _ONTO_Z = {
     "-y": "1.5708 0 0",
     "-z": "3.1416 0 0",
 }
+_ASIDE = 0.1  # of a way: so far beside its end an arm of few joints may come
 _ROOM = 0.1  # of half a joint's range to its limit, which is enough
 _STEEP = np.cos(np.radians(40.0))  # z_S so far from straight down at most
 _LIKED = np.array([0.6, 0.0, 0.4])  # in reaches: where most arms can go to all sides
@@ -65,28 +66,28 @@ class Place(NamedTuple):
     """Where an arm can start, the tool down.
 
     Attributes:
-        position: (3,) p_WS [m].
-        turn: of S about the vertical; at 0, x_S is along x_W [deg].
+        pose: (7,) X_WS [qw qx qy qz px py pz] [-, m].
+        by_position: whether x_S is along x_W, as where a station is told the position alone.
         q: (n,) joint positions [rad].
         half: half the edge of the cube around it that can be reached, so turned [m]; 0: none.
         room: how far the joint that is nearest to a limit is from it, over half its range.
     """
 
-    position: NDArray[np.float64]
-    turn: float
+    pose: NDArray[np.float64]
+    by_position: bool
     q: NDArray[np.float64]
     half: float
     room: float
 
     @property
-    def R_WS(self) -> RotationMatrix:
-        """How S is turned."""
-        return RotationMatrix.MakeZRotation(np.radians(self.turn)) @ R_WS_HOME
+    def position(self) -> NDArray[np.float64]:
+        """(3,) p_WS [m]."""
+        return self.pose[4:]
 
     @property
     def home(self) -> list[float]:
         """What `slave.home` has to be; empty if the position alone says it."""
-        return (np.round(self.q, 4) + 0.0).tolist() if self.turn else []
+        return [] if self.by_position else (np.round(self.q, 4) + 0.0).tolist()
 
 
 @dataclass(frozen=True)
@@ -234,27 +235,30 @@ def find_place(arm: ArmModel, seed: int = 0) -> Place:
     for q, pose in zip(postures, poses, strict=True):
         pose_into(arm.table, q, pose)
     x, y = poses[:, 1], poses[:, 2]
-    down = 1.0 - 2.0 * (x * x + y * y) < -_STEEP  # z_W of z_S
+    down_z = 1.0 - 2.0 * (x * x + y * y)  # z_W of z_S
+    down = down_z < -_STEEP
     reach = np.quantile(np.hypot(poses[:, 4], poses[:, 5]), 0.98)
-    places = np.round(poses[down & _before(poses[:, 4:], reach), 4:], 2)
-    order = np.argsort(np.linalg.norm(places - reach * _LIKED, axis=1))
-    looked_at = places[order[:: max(len(order) // _PLACES, 1)]]
-    found = [_place(arm, position, turn) for turn in _TURNS for position in looked_at]
+    fit = np.flatnonzero(down & _before(poses[:, 4:], reach))
+    away = np.linalg.norm(poses[fit, 4:] - reach * _LIKED, axis=1)
+    if arm.num_joints < 6:  # they turn the tool where they carry it, so each pose is one of a kind
+        steepest = fit[np.argsort(down_z[fit])[:_PLACES]]
+        found = [_of_few(arm, postures[k], poses[k]) for k in steepest]
+    else:
+        looked_at = fit[np.argsort(away)][:: max(len(fit) // _PLACES, 1)]
+        found = [_place(arm, np.round(poses[k, 4:], 2), turn) for turn in _TURNS for k in looked_at]
     best = max(found, key=_merit, default=None)
     if best is None or best.half == 0.0:
         raise DrakeTeleopError(
             "nowhere can the arm hold its sensor with z downwards and move to all sides",
             where="new",
-            remedy=_about_z(arm)
-            or "check the joints' limits; an arm of five joints can hold its tool upright in few"
-            " places: write its station by hand, with slave.home",
+            remedy=_about_z(arm) or "check the joints' limits, and which way sensor_frame points",
         )
     return best
 
 
 def _merit(place: Place) -> tuple[float, bool, float]:
     """By which places are compared: a joint that leaves its range at once is the worst."""
-    return min(place.room, _ROOM), place.turn == 0.0, place.half
+    return min(place.room, _ROOM), place.by_position, place.half
 
 
 def _about_z(arm: ArmModel) -> str:
@@ -286,24 +290,45 @@ def _place(arm: ArmModel, position: NDArray[np.float64], turn: float) -> Place:
 
     It stays away from the base by as much.
     """
-    none = Place(position, turn, np.zeros(arm.num_joints), 0.0, 0.0)
-    q, status = tool_down(arm, position, none.R_WS)
+    R_WS = RotationMatrix.MakeZRotation(np.radians(turn)) @ R_WS_HOME
+    w = R_WS.ToQuaternion().wxyz()
+    q, status = tool_down(arm, position, R_WS)
+    place = Place(np.array([*w, *position]), turn == 0.0, q, 0.0, _room(arm, q))
     if status != IkStatus.OK:
-        return none
-    room = float((np.minimum(q - arm.lower, arm.upper - q) / (arm.upper - arm.lower)).min() * 2.0)
-    w = none.R_WS.ToQuaternion().wxyz()
+        return place._replace(room=0.0)
     for half in (half for half in _HALVES if 2.0 * half <= np.hypot(*position[:2])):
         corners = (position + half * np.array(signs) for signs in product((-1.0, 1.0), repeat=3))
         if all(
             find_posture(arm, np.array([*w, *corner]), q)[1] == IkStatus.OK for corner in corners
         ):
-            return none._replace(q=q, half=half, room=room)
-    return none
+            return place._replace(half=half)
+    return place._replace(room=0.0)
+
+
+def _of_few(arm: ArmModel, q: NDArray[np.float64], pose: NDArray[np.float64]) -> Place:
+    """A posture of an arm of five joints or less as a place: how far its position can go.
+
+    The tool turns on the way, as it has to.
+    """
+    reached = np.empty(7)
+
+    def goes(way: NDArray[np.float64]) -> bool:
+        target = pose + np.append(np.zeros(4), way)
+        pose_into(arm.table, find_posture(arm, target, q)[0], reached)
+        return bool(np.linalg.norm(reached[4:] - target[4:]) < _ASIDE * np.linalg.norm(way))
+
+    ways = [sign * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
+    halves = (half for half in _HALVES if all(goes(half * way) for way in ways))
+    return Place(pose, by_position=False, q=q, half=next(halves, 0.0), room=_room(arm, q))
+
+
+def _room(arm: ArmModel, q: NDArray[np.float64]) -> float:
+    return float((np.minimum(q - arm.lower, arm.upper - q) / (arm.upper - arm.lower)).min() * 2.0)
 
 
 def _speed_use(arm: ArmModel, place: Place, swing: float) -> float:
     """The largest share of its speed that a joint takes for the swing up and down."""
-    above = np.array([*place.R_WS.ToQuaternion().wxyz(), *place.position])
+    above = place.pose.copy()
     above[6] += swing
     way = np.abs(find_posture(arm, above, place.q)[0] - place.q)
     return float((2.0 * np.pi * _FREQUENCY * way / arm.velocity_limit).max())
@@ -348,7 +373,7 @@ def _text(
     )
     what = "tool: null  # what the model has beyond the sensor" if plan.own_tool else stand_in
     where = f"position: {_row(plan.place.position)}  # of the sensor at the start, tool down [m]"
-    if plan.place.turn:
+    if plan.place.home:
         where = f"home: {plan.place.home}  # joints at the start, tool down [rad, m]"
     lines = [
         "# Made by drake-teleop new. Fields that are not here have their defaults; all, with their",

@@ -19,6 +19,7 @@ from drake_teleop.identification import true_load
 from drake_teleop.new_station import find_place, new_command, plan_station
 from drake_teleop.resources import models_dir
 from drake_teleop.scenario import LoadScenario
+from drake_teleop.slave.forward_kinematics import pose_into
 from drake_teleop.slave.home import R_WS_HOME
 from drake_teleop.slave.inverse_kinematics import IkStatus
 from drake_teleop.slave.numeric_inverse_kinematics import find_posture
@@ -74,7 +75,7 @@ def test_it_is_written_as_the_page_for_beginners_says(tmp_path, runs, monkeypatc
 
 def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():
     arm = NominalSlave(LoadScenario("free_motion_force").slave).arm
-    place, _, _, half, _ = find_place(arm)
+    place, half = find_place(arm).position, find_place(arm).half
     assert place[0] > abs(place[1]) and place[2] > 0.1
     w = R_WS_HOME.ToQuaternion().wxyz()
     q = NominalSlave(LoadScenario("free_motion_force").slave).start
@@ -97,10 +98,10 @@ def test_hand_and_joints_have_a_rate_that_the_device_has(tmp_path, runs, device)
 
 
 def test_a_small_cube_is_better_than_a_joint_at_its_limit():
-    place = new_station.Place(np.zeros(3), 0.0, np.zeros(6), half=0.05, room=0.2)
+    place = new_station.Place(np.zeros(7), True, np.zeros(6), half=0.05, room=0.2)
     worse = [
         place._replace(half=0.3, room=0.01),
-        place._replace(half=0.3, turn=90.0),
+        place._replace(half=0.3, by_position=False),
         place._replace(half=0.03, room=0.9),
         place._replace(half=0.0, room=0.0),
     ]
@@ -136,14 +137,31 @@ def test_an_arm_that_turns_the_tool_elsewhere_gets_its_joints_written(tmp_path, 
     path = tmp_path / "arm.sdf"
     path.write_text(text[:lower] + "<lower>1.2</lower><upper>1.9" + text[end:])
     plan = plan_station(path, "sensor")
-    assert plan.place.turn in (90.0, -90.0)
+    assert not plan.place.by_position
     new_command(tmp_path / "mine", path, "sensor")
     slave = LoadScenario(tmp_path / "mine" / "station.yaml").slave
     start = NominalSlave(slave)
     np.testing.assert_allclose(start.X_WS_start[4:], plan.place.position, atol=1e-3)
     R_WS = RotationMatrix(Quaternion(start.X_WS_start[:4])).matrix()
-    np.testing.assert_allclose(R_WS, plan.place.R_WS.matrix(), atol=1e-3)
+    planned = RotationMatrix(Quaternion(plan.place.pose[:4])).matrix()
+    np.testing.assert_allclose(R_WS, planned, atol=1e-3)
     assert R_WS[2, 2] < -0.999 and abs(R_WS[1, 0]) > 0.999
+
+
+def test_an_arm_of_five_joints_starts_with_its_tool_about_down(tmp_path, runs):
+    path = tmp_path / "five.sdf"
+    path.write_text(ARM.read_text().replace('"joint_4" type="revolute"', '"joint_4" type="fixed"'))
+    new_command(tmp_path / "mine", path, "sensor")
+    slave = LoadScenario(tmp_path / "mine" / "station.yaml").slave
+    start = NominalSlave(slave)
+    assert len(slave.home) == start.arm.num_joints == 5
+    assert RotationMatrix(Quaternion(start.X_WS_start[:4])).matrix()[2, 2] < -0.95
+    half, p_WS = plan_station(path, "sensor").place.half, start.X_WS_start[4:]
+    assert half >= 0.03
+    for way in np.vstack([np.eye(3), -np.eye(3)]):
+        target, reached = start.X_WS_start + half * np.append(np.zeros(4), way), np.empty(7)
+        pose_into(start.arm.table, find_posture(start.arm, target, start.start)[0], reached)
+        assert np.linalg.norm(reached[4:] - p_WS - half * way) < 0.11 * half
 
 
 @pytest.mark.parametrize(
