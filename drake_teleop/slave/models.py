@@ -243,6 +243,7 @@ def _read(
             assumptions += check_model(root, str(file), sensor)
         if kind in ("urdf", "sdf"):
             root = roots[path]
+            _drop_idle_mimics(root)
             lost = without_lost_meshes(root, packages, Path(converted.name))
             assumptions += [f"{_MISSING} {', '.join(ls)}: {what}" for what, ls in lost.items()]
             text = ElementTree.tostring(root, encoding="unicode")
@@ -258,6 +259,13 @@ def _read(
             remedy="take them out: what moves the arm are its motors, gravity and what it touches",
         )
     return _Read(instances, list(roots.values()), assumptions, converted)
+
+
+def _drop_idle_mimics(root: ElementTree.Element) -> None:
+    """A joint that is fixed moves with none, which Drake takes for an error."""
+    for joint in root.iter("joint"):
+        for mimic in joint.findall("mimic") if joint.get("type") == "fixed" else ():
+            joint.remove(mimic)
 
 
 def _check_chain(plant: MultibodyPlant, chain: list[JointIndex], where: str) -> None:

@@ -241,6 +241,8 @@ ASSUMED = {
                        "shapes are missing of l3: meshes were not found .--package-path"),
     "a mesh of no kind": (shaped('<mesh filename="arm.urdf"/>'), ".urdf meshes cannot be read"),
     "a finger": (arm(beyond=FINGER), "held: j9"),
+    "a fixed finger that moves with a joint": (arm(beyond=FINGER.replace("revolute", "fixed")),
+                                               "acceleration limits"),
     "a base that floats": (arm(l0=WORLD + joint(1, "floating", "", "world", "l0", "free")),
                            "welded to the world, where it may float: l0"),
     "dry friction": (arm(j3=joint(3, inside='<dynamics friction="2"/>')),
