@@ -243,7 +243,7 @@ def _read(
             assumptions += check_model(root, str(file), sensor)
         if kind in ("urdf", "sdf"):
             root = roots[path]
-            _drop_idle_mimics(root)
+            assumptions += _without_idle(root)
             lost = without_lost_meshes(root, packages, Path(converted.name))
             assumptions += [f"{_MISSING} {', '.join(ls)}: {what}" for what, ls in lost.items()]
             text = ElementTree.tostring(root, encoding="unicode")
@@ -261,11 +261,21 @@ def _read(
     return _Read(instances, list(roots.values()), assumptions, converted)
 
 
-def _drop_idle_mimics(root: ElementTree.Element) -> None:
-    """A joint that is fixed moves with none, which Drake takes for an error."""
+def _without_idle(root: ElementTree.Element) -> list[str]:
+    """Takes out what moves nothing, which Drake takes for an error; says so of motors.
+
+    A joint that is fixed moves with none, and a joint that is not there has no motor.
+    """
     for joint in root.iter("joint"):
         for mimic in joint.findall("mimic") if joint.get("type") == "fixed" else ():
             joint.remove(mimic)
+    joints, idle = {joint.get("name") for joint in root.findall("joint")}, []
+    for motor in root.findall("transmission"):
+        names = [joint.get("name", "") for joint in motor.findall("joint")]
+        if names and not joints.intersection(names):
+            root.remove(motor)
+            idle += names
+    return [f"no motor for joints that are not there: {', '.join(idle)}"] if idle else []
 
 
 def _check_chain(plant: MultibodyPlant, chain: list[JointIndex], where: str) -> None:

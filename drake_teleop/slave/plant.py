@@ -343,37 +343,43 @@ def _remove_shapes(
 def lowest_point(slave: Slave) -> NDArray[np.float64]:
     """p_W (3,) of the lowest point of what hangs on the sensor, at the start [m].
 
-    By the boxes around its shapes; without shapes, of its tip.
+    By the hulls of its meshes and boxes around other shapes; without shapes, of its tip.
     """
     nominal = NominalSlave(slave)
     X_WS = nominal.X_WS_start
     R_WS = RotationMatrix(Quaternion(X_WS[:4] / np.linalg.norm(X_WS[:4]))).matrix()
-    corners = [X_WS[4:] + R_WS @ corner for box in _boxes_on_sensor(slave) for corner in box]
-    return np.array(min([nominal.start_tip, *corners], key=lambda p: p[2]))
+    corners = [X_WS[4:] + hull @ R_WS.T for hull in _hulls_on_sensor(slave)]
+    points = np.vstack([nominal.start_tip, *corners])
+    return np.array(points[np.argmin(points[:, 2])])
 
 
-def _boxes_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
-    """(8, 3) corners in S of a box around each shape that hangs on the sensor [m]."""
+def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
+    """(k, 3) corners in S of each shape that hangs on the sensor, or of a box around it [m]."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize(plant)
     context, inspector = plant.CreateDefaultContext(), scene_graph.model_inspector()
-    boxes = []
+    hulls, signs = [], np.array(list(product((-1.0, 1.0), repeat=3)))
     for body in bodies_beyond(plant, parsed.sensor_frame.body()):
         X_SBody = plant.CalcRelativeTransform(context, parsed.sensor_frame, body.body_frame())
         for shape in plant.GetCollisionGeometriesForBody(body):
-            box = inspector.GetObbInGeometryFrame(shape)
-            if box is not None:  # as of a half space
-                X_SBox = X_SBody @ inspector.GetPoseInFrame(shape) @ box.pose()
-                signs = np.array(list(product((-1.0, 1.0), repeat=3)))
-                boxes.append((X_SBox @ (signs * box.half_width()).T).T)
-    return boxes
+            X_SShape = X_SBody @ inspector.GetPoseInFrame(shape)
+            mesh, box = inspector.GetConvexHull(shape), inspector.GetObbInGeometryFrame(shape)
+            if mesh is not None:
+                corners = np.array([mesh.vertex(k) for k in range(mesh.num_vertices())])
+            elif box is not None:  # as of a half space
+                corners = (box.pose() @ (signs * box.half_width()).T).T
+            else:
+                continue
+            hulls.append((X_SShape @ corners.T).T)
+    return hulls
 
 
-def _farthest(boxes: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """p_S (3,) in the middle of the boxes that reach farthest along z_S, as far as they reach."""
-    reach = max(float(box[:, 2].max()) for box in boxes)
-    middles = [box.mean(axis=0)[:2] for box in boxes if box[:, 2].max() > reach - _ABREAST]
+def _farthest(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """p_S (3,) in the middle of the shapes that reach farthest along z_S, as far as they reach."""
+    reach = max(float(hull[:, 2].max()) for hull in hulls)
+    abreast = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _ABREAST]
+    middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in abreast]
     return np.array([*np.mean(middles, axis=0), reach])
 
 
@@ -393,6 +399,6 @@ def _tip(
         )
         return X_WS.InvertAndCompose(X_WTip).translation()
     reach = None if slave.tool is None else shapes_reach(slave.tool)
-    if slave.tool is None and (boxes := _boxes_on_sensor(slave)):
-        return _farthest(boxes)
+    if slave.tool is None and (hulls := _hulls_on_sensor(slave)):
+        return _farthest(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)

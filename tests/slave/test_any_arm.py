@@ -287,6 +287,15 @@ def test_contact_is_where_a_models_own_gripper_reaches(folder, scenario):
     (folder / "gripper.urdf").write_text(text)
     slave = dataclasses.replace(scenario.slave, model=str(folder / "gripper.urdf"))
     np.testing.assert_allclose(NominalSlave(slave).tip, [0.0, 0.02, 0.13], atol=1e-12)
+    # A mesh reaches as far as its points do: this one between the fingers, with an edge on top.
+    points = [(-0.01, -0.01, 0.0), (0.01, 0.01, 0.0), (-0.01, 0.01, 0.03), (0.01, -0.01, 0.05)]
+    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in points)
+    (folder / "wedge.obj").write_text(corners + "f 1 2 3\nf 1 4 2\nf 2 4 3\nf 1 3 4\n")
+    mesh = '<collision><geometry><mesh filename="wedge.obj"/></geometry></collision></link>'
+    wedge = odd_arms.link("wedge").replace("</link>", mesh)
+    at = odd_arms.joint("to_wedge", "fixed", "ft", "wedge", "0 0.02 0.1")
+    (folder / "gripper.urdf").write_text(text.replace("</robot>", f"{wedge}{at}</robot>"))
+    np.testing.assert_allclose(NominalSlave(slave).tip, [0.0, 0.02, 0.15], atol=1e-9)
 
 
 def slowest(scenario):

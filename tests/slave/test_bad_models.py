@@ -241,6 +241,8 @@ ASSUMED = {
                        "shapes are missing of l3: meshes were not found .--package-path"),
     "a mesh of no kind": (shaped('<mesh filename="arm.urdf"/>'), ".urdf meshes cannot be read"),
     "a finger": (arm(beyond=FINGER), "held: j9"),
+    "a motor of another joint": (arm(beyond=ROTOR.format("").replace("j3", "j33")),
+                                 "no motor for joints that are not there: j33"),
     "a fixed finger that moves with a joint": (arm(beyond=FINGER.replace("revolute", "fixed")),
                                                "acceleration limits"),
     "a base that floats": (arm(l0=WORLD + joint(1, "floating", "", "world", "l0", "free")),
