@@ -399,14 +399,14 @@ class _Period:
         slave = NominalSlave(smooth.slave)
         self._arm, self._joints = slave.arm.table, slave.arm.num_joints
         self._remembers = method_of(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
-        if self._remembers:  # a slow joint would not follow the displacements
-            GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf
         self._push = ExternallyAppliedSpatialForce()
         self._push.body_index = slave.tool
         self._sensor = self._system("wrist_sensor")
         servo = smooth.joint_control
         servo.check_is_torque("the linearisation")
         scenario.master.check_leads_the_pose("the linearisation")
+        if self._remembers:  # a slow joint would not follow the displacements
+            GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
         # In a period the arm goes a small part of what it is commanded.
         self._command_step = min(_ANGLE, _ACCELERATION / gain)
