@@ -111,3 +111,20 @@ def efforts(root: Element) -> dict[str, float]:
         for name, limit in limits
         if name is not None and limit is not None
     }
+
+
+def without_idle(root: Element) -> list[str]:
+    """Takes out what moves nothing, which Drake takes for an error; says so of motors.
+
+    A joint that is fixed moves with none, and a joint that is not there has no motor.
+    """
+    for joint in root.iter("joint"):
+        for mimic in joint.findall("mimic") if joint.get("type") == "fixed" else ():
+            joint.remove(mimic)
+    joints, idle = {joint.get("name") for joint in root.findall("joint")}, []
+    for motor in root.findall("transmission"):
+        names = [joint.get("name", "") for joint in motor.findall("joint")]
+        if names and not joints.intersection(names):
+            root.remove(motor)
+            idle += names
+    return [f"no motor for joints that are not there: {', '.join(idle)}"] if idle else []

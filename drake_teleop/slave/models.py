@@ -39,6 +39,7 @@ from drake_teleop.slave.model_files import (
     floating_links,
     peculiar_joints,
     read_roots,
+    without_idle,
 )
 from drake_teleop.texts import read_text
 
@@ -243,7 +244,7 @@ def _read(
             assumptions += check_model(root, str(file), sensor)
         if kind in ("urdf", "sdf"):
             root = roots[path]
-            assumptions += _without_idle(root)
+            assumptions += without_idle(root)
             lost = without_lost_meshes(root, packages, Path(converted.name))
             assumptions += [f"{_MISSING} {', '.join(ls)}: {what}" for what, ls in lost.items()]
             text = ElementTree.tostring(root, encoding="unicode")
@@ -259,23 +260,6 @@ def _read(
             remedy="take them out: what moves the arm are its motors, gravity and what it touches",
         )
     return _Read(instances, list(roots.values()), assumptions, converted)
-
-
-def _without_idle(root: ElementTree.Element) -> list[str]:
-    """Takes out what moves nothing, which Drake takes for an error; says so of motors.
-
-    A joint that is fixed moves with none, and a joint that is not there has no motor.
-    """
-    for joint in root.iter("joint"):
-        for mimic in joint.findall("mimic") if joint.get("type") == "fixed" else ():
-            joint.remove(mimic)
-    joints, idle = {joint.get("name") for joint in root.findall("joint")}, []
-    for motor in root.findall("transmission"):
-        names = [joint.get("name", "") for joint in motor.findall("joint")]
-        if names and not joints.intersection(names):
-            root.remove(motor)
-            idle += names
-    return [f"no motor for joints that are not there: {', '.join(idle)}"] if idle else []
 
 
 def _check_chain(plant: MultibodyPlant, chain: list[JointIndex], where: str) -> None:
