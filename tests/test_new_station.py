@@ -126,6 +126,11 @@ def test_another_axis_than_z_along_the_last_joint_is_said(tmp_path, runs, capsys
         capsys.readouterr().out.split()
     )
     assert plan_station(ARM, "sensor").about_z == ""
+    behind = tmp_path / "behind.sdf"  # the last joint's origin
+    behind.write_text(
+        turned("0 0 0", tmp_path).read_text().replace("<pose>0 0 0 ", "<pose>0 0 -0.4 ")
+    )
+    assert "-z_S is along" in plan_station(behind, "turned").about_z
 
 
 def test_an_arm_that_turns_the_tool_elsewhere_gets_its_joints_written(tmp_path, runs):
@@ -148,7 +153,8 @@ def test_an_arm_that_turns_the_tool_elsewhere_gets_its_joints_written(tmp_path, 
     assert R_WS[2, 2] < -0.999 and abs(R_WS[1, 0]) > 0.999
 
 
-def test_an_arm_of_five_joints_starts_with_its_tool_about_down(tmp_path, runs):
+def test_an_arm_of_five_joints_starts_with_its_tool_about_down(tmp_path, runs, monkeypatch):
+    monkeypatch.setattr(new_station, "_HALVES", (2.0, *new_station._HALVES))
     path = tmp_path / "five.sdf"
     path.write_text(ARM.read_text().replace('"joint_4" type="revolute"', '"joint_4" type="fixed"'))
     new_command(tmp_path / "mine", path, "sensor")

@@ -13,7 +13,7 @@ from pydrake.geometry import Role
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.analysis.linearization import linearize_station
+from drake_teleop.analysis.linearization import linearize, linearize_station
 from drake_teleop.channel.channel import Channel
 from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.environment.wall import Wall
@@ -293,9 +293,9 @@ def test_contact_is_where_a_models_own_gripper_reaches(folder, scenario):
     (folder / "wedge.obj").write_text(corners + "f 1 2 3\nf 1 4 2\nf 2 4 3\nf 1 3 4\n")
     mesh = '<collision><geometry><mesh filename="wedge.obj"/></geometry></collision></link>'
     wedge = odd_arms.link("wedge").replace("</link>", mesh)
-    at = odd_arms.joint("to_wedge", "fixed", "ft", "wedge", "0 0.02 0.1")
+    at = odd_arms.joint("to_wedge", "fixed", "ft", "wedge", "0.006 0.02 0.1")
     (folder / "gripper.urdf").write_text(text.replace("</robot>", f"{wedge}{at}</robot>"))
-    np.testing.assert_allclose(NominalSlave(slave).tip, [0.0, 0.02, 0.15], atol=1e-9)
+    np.testing.assert_allclose(NominalSlave(slave).tip, [0.006, 0.02, 0.15], atol=1e-9)
 
 
 def slowest(scenario):
@@ -323,6 +323,11 @@ def test_surroundings_that_are_not_touched_change_no_multiplier(scenario, free):
     beside = replace(beside, slave__tool=Tool(mass=1.0, shapes=[Ball(0.01, [0.0, 0.0, 0.1])]))
     alone = slowest(replace(beside, environment=[]))
     np.testing.assert_allclose(slowest(beside), alone, atol=1e-6)
+    with_wall, without = (
+        linearize(station, load_estimate=true_load(station))
+        for station in (beside, replace(beside, environment=[]))
+    )
+    np.testing.assert_allclose(with_wall.B, without.B, rtol=0, atol=1e-6 * np.abs(without.B).max())
 
 
 @pytest.mark.slow

@@ -231,6 +231,9 @@ ASSUMED = {
                                       "rounded numbers made a body's for l3"),
     "a base of an impossible inertia": (arm(l0=link("l0", INERTIAL.replace("0.01", "0.05"))),
                                         "inertia, which no joint of the arm moves, for l0"),
+    "the same of a base that is screwed down": (
+        arm(l0=link("mount", "") + joint(1, "fixed", "", "mount", "l0", "bolts")
+            + link("l0", INERTIAL.replace("0.01", "0.05"))), "joint of the arm moves, for l0"),
     "an impossible inertia beside the arm": (
         arm(beyond=link("x", INERTIAL.replace('ixx="0.02"', 'ixx="-2"'))
             + joint(8, parent="l0", child="x")), "which no joint of the arm moves, for x"),
