@@ -8,6 +8,10 @@ from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.lifetime import ONE_DICT
 from drake_teleop.slave.arm import SLIDES, ArmModel
 
+# Of its range: a joint that is commanded to its limit swings a little beyond it, where arms as they
+# are sold have not come to their stops yet.
+_BEYOND = 0.01
+
 
 class SlaveMonitor(LeafSystem):
     """Ends the simulation with a clear message when a joint of the slave leaves its range.
@@ -34,6 +38,8 @@ class SlaveMonitor(LeafSystem):
     def __init__(self, arm: ArmModel, period: float) -> None:
         super().__init__()
         self._arm = arm
+        beyond = _BEYOND * (arm.upper - arm.lower)
+        self._lower, self._upper = arm.lower - beyond, arm.upper + beyond
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._status = self.DeclareVectorInputPort("ik_status", 1)
         self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
@@ -44,7 +50,7 @@ class SlaveMonitor(LeafSystem):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]
         # A comparison with NaN is false, so a lost joint is outside too.
-        inside = (q >= self._arm.lower) & (q <= self._arm.upper)
+        inside = (q >= self._lower) & (q <= self._upper)
         if inside.all():
             return
         joint = int(inside.argmin())

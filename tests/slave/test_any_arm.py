@@ -11,6 +11,7 @@ import pytest
 from odd_arms import other_arm_urdf
 from pydrake.geometry import Role
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.analysis.linearization import linearize, linearize_station
@@ -24,6 +25,7 @@ from drake_teleop.scenario import LoadScenario, Scenario, replace
 from drake_teleop.signals import SIGNALS
 from drake_teleop.simulation import MakeSimulator, simulate
 from drake_teleop.slave.ik_methods import method_of
+from drake_teleop.slave.monitor import SlaveMonitor
 from drake_teleop.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
 from drake_teleop.slave.skeleton import AddSkeleton
@@ -296,6 +298,25 @@ def test_contact_is_where_a_models_own_gripper_reaches(folder, scenario):
     at = odd_arms.joint("to_wedge", "fixed", "ft", "wedge", "0.006 0.02 0.1")
     (folder / "gripper.urdf").write_text(text.replace("</robot>", f"{wedge}{at}</robot>"))
     np.testing.assert_allclose(NominalSlave(slave).tip, [0.006, 0.02, 0.15], atol=1e-9)
+
+
+@pytest.mark.parametrize(("beyond", "stops"), [(0.005, False), (0.02, True), (np.nan, True)])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_joint_may_swing_a_little_beyond_its_limit(scenario, beyond, stops, side):
+    """One that follows a command that stays at its limit does, before the arm is at its stop."""
+    arm = NominalSlave(scenario.slave).arm
+    monitor = SlaveMonitor(arm, 1e-3)
+    context, q = monitor.CreateDefaultContext(), np.array(HOME)
+    limit = arm.upper[3] if side > 0 else arm.lower[3]
+    q[3] = limit + side * beyond * (arm.upper[3] - arm.lower[3])
+    state = monitor.GetInputPort("slave_state")
+    state.FixValue(context, np.append(q, np.zeros(arm.num_joints)))
+    simulator = Simulator(monitor, context)
+    if stops:
+        with pytest.raises(DrakeTeleopError, match="joint 4 of the slave left its range"):
+            simulator.AdvanceTo(2e-3)
+    else:
+        simulator.AdvanceTo(2e-3)
 
 
 def slowest(scenario):
