@@ -14,7 +14,7 @@ _BEYOND = 0.01
 
 
 class SlaveMonitor(LeafSystem):
-    """Ends the simulation with a clear message when a joint of the slave leaves its range.
+    """Ends the simulation with a clear message when a joint leaves its range by 1 % of it.
 
     .. pydrake_system::
 

@@ -68,6 +68,9 @@ class _Found(NamedTuple):
     unit: str
 
 
+_NOTHING = _Found([], "")
+
+
 def draft_description(table: Table, folder: Path) -> str:
     """A draft of a log description, guessed from names and magnitudes of a table's columns.
 
@@ -91,7 +94,7 @@ def draft_description(table: Table, folder: Path) -> str:
     wrench = stream(
         **{kind: _group(table, kind, found.get(kind, none)) for kind in ("force", "torque")}, sign=1
     )
-    forces = [_base(plain[name][0]) for name in found.get("force", _Found([], "")).columns[:1]]
+    forces = [_base(plain[name][0]) for name in found.get("force", _NOTHING).columns[:1]]
     if any(re.search(_IN_BASE, name) for name in forces):
         wrench["frame"] = "base"
     draft: dict[str, Any] = {}
@@ -100,7 +103,7 @@ def draft_description(table: Table, folder: Path) -> str:
     imu = {
         kind: _group(table, kind, found[kind])
         for kind in ("specific_force", "angular_velocity")
-        if len(found.get(kind, _Found([], "")).columns) == 3
+        if len(found.get(kind, _NOTHING).columns) == 3
     }
     if imu:
         draft["imu"] = stream(**imu)
@@ -196,7 +199,7 @@ def _group(table: Table, kind: str, found: _Found) -> dict[str, Any]:
 
 def _pose(table: Table, found: dict[str, _Found]) -> dict[str, Any]:
     """Orientation, and position if there is one."""
-    if len(found.get("orientation", _Found([], "")).columns) == 4:
+    if len(found.get("orientation", _NOTHING).columns) == 4:
         orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
     elif "matrix" in found:
         orientation = {"columns": found["matrix"].columns, "form": "matrix"}
@@ -206,7 +209,7 @@ def _pose(table: Table, found: dict[str, _Found]) -> dict[str, Any]:
     else:
         return {}
     pose: dict[str, Any] = {"orientation": orientation}
-    if len(found.get("position", _Found([], "")).columns) == 3:
+    if len(found.get("position", _NOTHING).columns) == 3:
         pose["position"] = _group(table, "position", found["position"])
     return pose
 
