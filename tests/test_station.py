@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 import weakref
 
 import numpy as np
@@ -454,8 +455,12 @@ def test_identifying_without_learning_is_refused_at_once():
 def test_leaving_the_joints_range_ends_the_simulation_with_a_clear_message(slave):
     scenario = replace(LoadScenario("identification"), simulation=Simulation(duration=2.0))
     station = MakeIdentificationStation(scenario, trajectory_of_joint_5(slave, 6.0))
-    with pytest.raises(DrakeTeleopError, match=r"joint 5 of the slave left its range at \d\.\d+ s"):
+    left = r"joint 5 of the slave left its range at \d\.\d+ s"
+    with pytest.raises(DrakeTeleopError, match=left) as error:
         simulate(station, scenario.simulation)
+    # What it advises can be had.
+    way, _, servo = re.search(r"(joint_control\.servo)(: )(\w+)", str(error.value)).groups()
+    assert replace(scenario, **{way.replace(".", "__"): servo}).joint_control.servo == servo
 
 
 def test_identification_leaves_the_teleoperation_station_alone(slave):
