@@ -146,6 +146,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "x.npz": read_table,
     "x.csv": read_table,
     "x.parquet": read_table,
+    "x.mat": read_table,
     "x.yaml": load_description,
     "log.parquet": SimulationResult.read_parquet,
     "load-1.npz": identified_load.read_load,

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from known_motion import quaternions
 from planted import NTNU_FRAME, Columns, findings, good, ntnu_log, written
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.cli import main
@@ -20,6 +21,7 @@ from drake_teleop.logs.check.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
+from drake_teleop.logs.read.tables import read_table
 
 PLANTED: list[tuple[Callable[[Columns], None], str, str, dict[str, bool]]] = [
     (planted.sign, "sign", "wrench.sign: -1", {}),
@@ -165,6 +167,15 @@ def as_written(form: str, c: Columns) -> tuple[dict[str, np.ndarray], str]:
         columns |= {f"{a.upper()} [mm]": 1e3 * c["p"][:, k] for k, a in enumerate("xyz")}
         columns |= {f"r{i + 1}{j + 1}": R[:, i, j] for i in range(3) for j in range(3)}
         return {"Zeit [s]": c["t"]} | columns, ";"
+    if form == "matlab":  # structures, in a .mat file
+        imu = {"acc": c["s"], "gyro": c["omega"]}
+        tool = {"position": c["p"], "R": R.transpose(1, 2, 0)}
+        return {
+            "t": c["t"],
+            "ft": {"F": c["force"], "M": c["torque"]},
+            "imu": imu,
+            "tool": tool,
+        }, ""
     topics = {"ft/wrench/force": c["force"], "ft/wrench/torque": c["torque"]}
     topics |= {"tcp/pose/position": c["p"], "imu/linear_acceleration": c["s"]}
     topics |= {"imu/angular_velocity": c["omega"]}
@@ -175,14 +186,18 @@ def as_written(form: str, c: Columns) -> tuple[dict[str, np.ndarray], str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("form", "said"), [("rtde", ["sign"]), ("franka", []), ("units", []), ("topics", [])]
+    ("form", "said"),
+    [("rtde", ["sign"]), ("franka", []), ("units", []), ("matlab", []), ("topics", [])],
 )
 def test_a_draft_of_what_robots_write_is_right_as_it_stands(
     tmp_path: Path, form: str, said: list[str]
 ) -> None:
     columns, separator = as_written(form, good())
-    pl.DataFrame(columns).write_csv(tmp_path / "table.csv", separator=separator)
-    drafted = inspect_command(tmp_path / "table.csv", tmp_path, quiet=True)
+    if separator:
+        pl.DataFrame(columns).write_csv(table := tmp_path / "table.csv", separator=separator)
+    else:
+        savemat(table := tmp_path / "table.mat", columns)
+    drafted = inspect_command(table, tmp_path, quiet=True)
     assert drafted["findings"] == []
     found = inspect_command(tmp_path / "draft.yaml", tmp_path / "again", quiet=True)
     assert [finding["name"] for finding in found["findings"]] == said
@@ -194,6 +209,19 @@ def test_a_draft_of_what_robots_write_is_right_as_it_stands(
     assert identify_log(tmp_path / "draft.yaml").identification.mass == pytest.approx(
         3.13, rel=2e-3
     )
+
+
+@pytest.mark.parametrize("first", ["0.00,1.5,0,0,0", "0.00,0,0,nan,1e-3"])
+def test_a_table_without_names_is_drafted_as_such(tmp_path: Path, first: str) -> None:
+    """Its first row of numbers is no row of names, nor lost."""
+    rows = [first, *(f"{0.01 * k:.2f},2.5,0,0,{k}" for k in range(1, 60))]
+    (tmp_path / "x.csv").write_text("\n".join(rows))
+    summary = inspect_command(tmp_path / "x.csv", tmp_path, quiet=True)
+    assert "places that were not recognized" in summary["findings"][0]["message"]
+    text = (tmp_path / "draft.yaml").read_text()
+    assert "# Columns without a guess: 0, 1, 2, 3, 4." in text
+    assert yaml.safe_load(text)["wrench"]["header"] is False
+    assert len(read_table(tmp_path / "x.csv", header=False).raw(0, "here")) == 60
 
 
 def test_a_unit_that_is_not_known_is_left_to_fill_in(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from scipy.io import savemat
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.read.tables import read_table
@@ -129,15 +130,54 @@ LAB = "t,f\n0.5,1.25\n1.5,-2.0\n"
         LAB.replace(",", "\t"),
         "# recorder 3, 500 Hz\n\n" + LAB,
         "# " + LAB.replace(",", " "),  # numpy.savetxt
+        "   t         f\n  0.5    1.25\n  1.5   -2.0\n",  # in columns for the eye
+        "# t    f\n   5.0e-01   1.25e+00\n   1.5e+00  -2.0e+00 \n",
         '"t";"f, in N"\n0,5;1,25\n1,5;-2,0\n'.replace("f, in N", "f"),
     ],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
-def test_csv_of_other_programs(tmp_path: Path, text: str, encoding: str) -> None:
-    path = tmp_path / "x.csv"
+@pytest.mark.parametrize("suffix", ["csv", "txt"])
+def test_text_of_other_programs(tmp_path: Path, text: str, encoding: str, suffix: str) -> None:
+    path = tmp_path / f"x.{suffix}"
     path.write_bytes(text.encode(encoding))
     found = read_table(path).numbers(["t", "f"], 2, "here")
     assert found.tolist() == [[0.5, 1.25], [1.5, -2.0]]
+
+
+@pytest.mark.parametrize("form", ["4", "5"])
+def test_matlab_s_variables_and_fields_are_columns(tmp_path: Path, form: str) -> None:
+    t, force, turned = np.arange(4.0), np.arange(12.0).reshape(4, 3), np.arange(36.0)
+    variables = {"t": t, "force": force, "rate": 500.0, "empty": np.zeros((0, 3))}
+    if form == "5":
+        pages = turned.reshape(4, 3, 3).transpose(1, 2, 0)  # as rotm2quat takes them
+        variables["tool"] = {"R": pages, "name": "gripper", "imu": {"gyro": 2 * force}}
+    savemat(tmp_path / "x.mat", variables, format=form)
+    table = read_table(tmp_path / "x.mat")
+    assert table.numbers(["t", "force"], 4, "here").tolist() == np.column_stack([t, force]).tolist()
+    if form == "5":
+        assert set(table.columns) == {"t", "force", "tool.R", "tool.imu.gyro"}
+        assert table.numbers(["tool.R"], 9, "here").tolist() == turned.reshape(4, 9).tolist()
+        assert table.numbers(["tool.imu.gyro"], 3, "here").tolist() == (2 * force).tolist()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"no mat", "cannot be read"),
+        (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n", "'-v7'"),
+        (None, "save as arrays"),
+    ],
+)
+def test_a_mat_file_without_arrays_says_how_to_save_them(
+    tmp_path: Path, content: bytes | None, words: str
+) -> None:
+    path = tmp_path / "x.mat"
+    if content is None:
+        savemat(path, {"name": "gripper"})
+    else:
+        path.write_bytes(content)
+    with pytest.raises(DrakeTeleopError, match=words):
+        read_table(path)
 
 
 def test_a_comma_between_whole_numbers_separates(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from pathlib import Path
@@ -71,12 +72,13 @@ class _Found(NamedTuple):
 _NOTHING = _Found([], "")
 
 
-def draft_description(table: Table, folder: Path) -> str:
+def draft_description(table: Table, folder: Path, *, header: bool = True) -> str:
     """A draft of a log description, guessed from names and magnitudes of a table's columns.
 
     Args:
         table: any table.
         folder: where the draft will be, which its path to the table starts from.
+        header: whether the file holds their names.
 
     Returns:
         YAML text whose first line says that it is a draft, and what was not found.
@@ -84,11 +86,12 @@ def draft_description(table: Table, folder: Path) -> str:
     import yaml
 
     plain = {name: _plain(name) for name in table.columns}
-    found = _vectors(plain) | _numbered(plain)
+    found = _vectors(plain) | _numbered(plain) | _arrays(table, plain)
     time = _time(table, plain)
+    file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
     def stream(**groups: Any) -> dict[str, Any]:
-        return {"file": os.path.relpath(table.path, folder), "time": dict(time), **groups}
+        return {**file, "time": dict(time), **groups}
 
     none = _Found([_FILL_IN] * 3, "")
     wrench = stream(
@@ -103,7 +106,7 @@ def draft_description(table: Table, folder: Path) -> str:
     imu = {
         kind: _group(table, kind, found[kind])
         for kind in ("specific_force", "angular_velocity")
-        if len(found.get(kind, _NOTHING).columns) == 3
+        if _width(table, found.get(kind, _NOTHING)) == 3
     }
     if imu:
         draft["imu"] = stream(**imu)
@@ -177,9 +180,27 @@ def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
     return found
 
 
+def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
+    """The same of arrays with several columns, which NPZ and MAT files hold, by their names."""
+    found: dict[str, _Found] = {}
+    for kind, names in {**_VECTORS, "matrix": "r|rot|rotation(_matrix)?"}.items():
+        width = {"orientation": 4, "matrix": 9}.get(kind, 3)
+        for name, (words, unit) in plain.items():
+            whole = _Found([name], unit)
+            is_array = table.columns[name].ndim > 1 and _width(table, whole) == width
+            if kind not in found and is_array and re.search(rf"(?:^|_)(?:{names})$", words):
+                found[kind] = whole
+    return found
+
+
+def _width(table: Table, found: _Found) -> int:
+    """How many numbers the columns have in a row."""
+    return sum(math.prod(table.columns[name].shape[1:]) for name in found.columns)
+
+
 def _group(table: Table, kind: str, found: _Found) -> dict[str, Any]:
     """Columns and unit of a vector: that of its name, or what its magnitude lets expect."""
-    group: dict[str, Any] = {"columns": found.columns}
+    group: dict[str, Any] = {"columns": list(found.columns)}
     if found.unit:
         unit = _SAID.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
         group["unit"] = unit if unit in _UNITS[kind] else _FILL_IN
@@ -199,7 +220,7 @@ def _group(table: Table, kind: str, found: _Found) -> dict[str, Any]:
 
 def _pose(table: Table, found: dict[str, _Found]) -> dict[str, Any]:
     """Orientation, and position if there is one."""
-    if len(found.get("orientation", _NOTHING).columns) == 4:
+    if _width(table, found.get("orientation", _NOTHING)) == 4:
         orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
     elif "matrix" in found:
         orientation = {"columns": found["matrix"].columns, "form": "matrix"}
@@ -209,7 +230,7 @@ def _pose(table: Table, found: dict[str, _Found]) -> dict[str, Any]:
     else:
         return {}
     pose: dict[str, Any] = {"orientation": orientation}
-    if len(found.get("position", _NOTHING).columns) == 3:
+    if _width(table, found.get("position", _NOTHING)) == 3:
         pose["position"] = _group(table, "position", found["position"])
     return pose
 

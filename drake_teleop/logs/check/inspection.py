@@ -23,6 +23,7 @@ draft           the file with a draft description of an unknown table or a bag, 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -111,7 +112,9 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
                 summary["kind"] = "canonical"
         tables = {log: table}
         if description is None:
-            draft = draft_description(table, out)
+            header = not _are_numbers(list(table.columns))
+            table = table if header else read_table(log, header=False)
+            draft = draft_description(table, out, header=header)
             summary["kind"] = "unknown"
     if description is not None:
         _inspect(description, str(log), tables, summary)
@@ -122,6 +125,15 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
     if not quiet:
         _print(summary)
     return summary
+
+
+def _are_numbers(names: Sequence[str]) -> bool:
+    """Whether what stands where names are expected is the first row of the numbers."""
+    with suppress(ValueError):
+        for name in names:  # those that occur twice are told apart by what polars adds to them
+            float(name.partition("_duplicated_")[0])
+        return True
+    return False
 
 
 def _write_draft(draft: str, path: Path, summary: dict[str, Any]) -> None:

@@ -3,7 +3,7 @@
 ======================================== =========================================================
 in the file                              taken as
 ======================================== =========================================================
-`;`, tab, or single spaces               the separator, where a line has no other; with the first
+`;`, tab, or spaces                      the separator, where a line has no other; with the first
                                          two a number may have a decimal comma
 lines before the header that begin       comments, but for one right before the numbers that has
 with `#`                                 as many names: the header, as `numpy.savetxt` writes it
@@ -54,6 +54,10 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     before = _comments(lines)
     rest = lines[before:]
     separator = _separator(rest[0]) if rest else ","
+    if separator == " " and any(line != " ".join(line.split()) for line in rest):
+        text = path.read_text("utf-8-sig") if isinstance(source, Path) else source.decode()
+        source = "\n".join(" ".join(line.split()) for line in text.splitlines()).encode()
+        rest = [" ".join(line.split()) for line in rest]
     names = _names_in_comment(lines[:before], rest, separator) if header else None
     header = header and names is None
     parse = partial(
@@ -95,7 +99,7 @@ def _separator(line: str) -> str:
     bare = _QUOTED.sub("", line).strip()
     if ";" in bare or "\t" in bare:
         return ";" if ";" in bare else "\t"
-    return " " if "," not in bare and " " in bare and "  " not in bare else ","
+    return " " if "," not in bare and " " in bare else ","
 
 
 def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
@@ -103,7 +107,8 @@ def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> l
     told = [line for line in comments if line.startswith("#")]
     if not told or not all(_is_number(cell) for cell in rest[0].split(separator)):
         return None
-    names = [name.strip() for name in told[-1].lstrip("# ").split(separator)]
+    cells = None if separator == " " else separator
+    names = [name.strip() for name in told[-1].lstrip("# ").split(cells)]
     alike = len(names) == len(rest[0].split(separator)) and len(set(names)) == len(names)
     return names if alike else None
 

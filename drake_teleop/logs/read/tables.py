@@ -1,4 +1,4 @@
-"""Tables of numbers from CSV, Parquet and NPZ files, with messages that name file, column, row.
+"""Tables of numbers from files of text, Parquet, NPZ, MAT; messages name file, column, row.
 
 Topics of bags become the same kind of table in `drake_teleop.logs.read.bags`.
 """
@@ -24,7 +24,8 @@ from drake_teleop.logs.read.csv_text import read_csv
 if TYPE_CHECKING:
     import polars as pl
 
-FORMATS = (".csv", ".parquet", ".npz")
+_TEXT = (".csv", ".tsv", ".txt", ".dat")
+FORMATS = (*_TEXT, ".parquet", ".npz", ".mat")
 LARGEST = 1e25
 """Numbers beyond are none that were measured, in whatever unit: nanoseconds since 1970 are 2e18."""
 _LARGE = 2**24
@@ -37,7 +38,7 @@ class Table:
 
     Args:
         path: the file, for messages.
-        columns: name to array (N,) or, from an NPZ file, (N, ...); of any type as yet.
+        columns: name to array (N,) or, from NPZ and MAT files, (N, ...); of any type as yet.
         first_row: number of the first data row in the file as a reader counts, for messages.
         absent: groups of columns, such as "orientation", that the file says it does not have.
     """
@@ -57,7 +58,7 @@ class Table:
     ) -> NDArray[np.float64]:
         """(N, width) finite numbers from the named columns side by side.
 
-        An array with several columns (NPZ) counts as that many, row-major.
+        An array with several columns counts as that many, row-major.
 
         Args:
             names: of the columns.
@@ -208,12 +209,12 @@ class Table:
 
 
 def read_table(path: Path, *, header: bool = True) -> Table:
-    """Reads a CSV, Parquet or NPZ file, told apart by its suffix.
+    """Reads a file of one of the `FORMATS`, told apart by its suffix.
 
     Args:
         path: the file.
-        header: whether the first line of a CSV file holds names; if not, the columns are named by
-            their numbers, from "0".
+        header: whether the first line of a file of text holds names; if not, the columns are named
+            by their numbers, from "0".
 
     Raises:
         DrakeTeleopError: if the file is absent, of another kind, or cannot be parsed.
@@ -227,7 +228,8 @@ def read_table(path: Path, *, header: bool = True) -> Table:
     if not os.path.isfile(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     with reading(path, f"check that it is a valid {path.suffix} file"):
-        table = _read_npz(path) if path.suffix.lower() == ".npz" else _read_frame(path, header)
+        arrays = {".npz": _read_npz, ".mat": _read_mat}.get(path.suffix.lower())
+        table = _read_frame(path, header) if arrays is None else Table(path, arrays(path))
     if not table.columns or not all(len(c) for c in table.columns.values()):
         raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
     return table
@@ -281,14 +283,37 @@ def _frame_column(series: pl.Series) -> NDArray:
     return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
 
 
-def _read_npz(path: Path) -> Table:
+def _read_npz(path: Path) -> dict[str, NDArray]:
     if not zipfile.is_zipfile(path):
         raise ValueError("it is no archive of arrays, or not all of one; numpy.savez writes them")
     with np.load(path, allow_pickle=False) as archive:
         columns = {key: archive[key] for key in archive.files}
-    return Table(
-        path, {key: x for key, x in columns.items() if isinstance(x, np.ndarray) and x.ndim}
-    )
+    return {key: x for key, x in columns.items() if isinstance(x, np.ndarray) and x.ndim}
+
+
+def _read_mat(path: Path) -> dict[str, NDArray]:
+    """Its variables, and the fields of its structures as `structure.field`."""
+    from scipy.io import loadmat
+
+    try:
+        variables = loadmat(path, simplify_cells=True)
+    except NotImplementedError as error:
+        raise ValueError("it is of version 7.3; save(..., '-v7') writes one that can be") from error
+    found = _arrays_in(variables, "")
+    if not found:
+        raise ValueError("it has no arrays: what is in tables and timeseries, save as arrays")
+    return found
+
+
+def _arrays_in(variables: dict[str, Any], before: str) -> dict[str, NDArray]:
+    found: dict[str, NDArray] = {}
+    for name, value in variables.items():
+        if isinstance(value, dict):
+            found |= _arrays_in(value, f"{before}{name}.")
+        elif isinstance(value, np.ndarray) and value.size and not name.startswith("__"):
+            rotations = value.ndim == 3 and value.shape[:2] == (3, 3)  # MATLAB counts them last
+            found[before + name] = np.moveaxis(value, 2, 0) if rotations else value
+    return found
 
 
 def _as_numbers(
