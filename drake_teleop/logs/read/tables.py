@@ -24,7 +24,7 @@ from drake_teleop.logs.read.csv_text import read_csv
 if TYPE_CHECKING:
     import polars as pl
 
-_TEXT = (".csv", ".tsv", ".txt", ".dat")
+_TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
 FORMATS = (*_TEXT, ".parquet", ".npz", ".mat")
 LARGEST = 1e25
 """Numbers beyond are none that were measured, in whatever unit: nanoseconds since 1970 are 2e18."""
