@@ -30,6 +30,8 @@ def test_npz_array_counts_as_several_columns(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", R=matrices, t=np.arange(2.0))
     found = read_table(tmp_path / "x.npz").numbers(["R"], 9, "here")
     assert found.tolist() == matrices.reshape(2, 9).tolist()
+    parts = read_table(tmp_path / "x.npz").numbers(["R[5]", "R[0]"], 2, "here")
+    assert parts.tolist() == [[5.0, 0.0], [14.0, 9.0]]
 
 
 def test_csv_without_header_is_addressed_by_number(tmp_path: Path) -> None:
@@ -155,7 +157,9 @@ def test_matlab_s_variables_and_fields_are_columns(tmp_path: Path, form: str) ->
     table = read_table(tmp_path / "x.mat")
     assert table.numbers(["t", "force"], 4, "here").tolist() == np.column_stack([t, force]).tolist()
     if form == "5":
-        assert set(table.columns) == {"t", "force", "tool.R", "tool.imu.gyro"}
+        whole = {name for name in table.columns if "[" not in name}
+        assert whole == {"t", "force", "tool.R", "tool.imu.gyro"}
+        assert table.raw("tool.R[1]", "here")[:, 0].tolist() == turned[1::9].tolist()
         assert table.numbers(["tool.R"], 9, "here").tolist() == turned.reshape(4, 9).tolist()
         assert table.numbers(["tool.imu.gyro"], 3, "here").tolist() == (2 * force).tolist()
 
@@ -178,6 +182,15 @@ def test_a_mat_file_without_arrays_says_how_to_save_them(
         path.write_bytes(content)
     with pytest.raises(DrakeTeleopError, match=words):
         read_table(path)
+
+
+def test_what_matlab_keeps_of_a_table_are_no_columns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workspace = {"__function_workspace__": np.zeros((1, 800), np.uint8), "None": b"MCOS"}
+    monkeypatch.setattr("scipy.io.loadmat", lambda *_, **__: workspace)
+    with pytest.raises(DrakeTeleopError, match="save as arrays"):
+        read_table(write(tmp_path / "x.mat", ""))
 
 
 def test_a_comma_between_whole_numbers_separates(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ _VECTORS = {
 }
 # What the names of numbered columns are, and where in them the components of a vector.
 _NUMBERED: dict[str, dict[str, tuple[int, ...]]] = {
-    r"tcp_force$|f_ext|wrench$|force_torque$|(^|_)ft$": {
+    r"tcp_force$|f_ext|wrench$|force_torque$|(^|_)(f|ft)$": {
         "force": (0, 1, 2),
         "torque": (3, 4, 5),
     },
@@ -35,6 +35,7 @@ _NUMBERED: dict[str, dict[str, tuple[int, ...]]] = {
         "position": (12, 13, 14),
     },
 }
+_HOMOGENEOUS = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
 _MATRIX = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 _IN_BASE = r"tcp_force$|^o_f_ext"
 _REMARKS = {
@@ -87,11 +88,11 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
 
     plain = {name: _plain(name) for name in table.columns}
     found = _vectors(plain) | _numbered(plain) | _arrays(table, plain)
-    time = _time(table, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
     def stream(**groups: Any) -> dict[str, Any]:
-        return {**file, "time": dict(time), **groups}
+        beside = next(iter(groups.values()))["columns"][0]
+        return {**file, "time": _time(table, plain, beside), **groups}
 
     none = _Found([_FILL_IN] * 3, "")
     wrench = stream(
@@ -119,8 +120,10 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
     used = {
         name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
     }
-    used |= {time["column"]}
-    unused = [name for name in table.columns if name not in used]
+    used |= {stream["time"]["column"] for stream in draft.values()}
+    parts = {f"{name}[{k}]" for name in table.columns for k in range(16)}
+    used |= {name.partition("[")[0] for name in used & parts}
+    unused = [name for name in table.columns if name not in used | parts]
     head = [
         "# DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
         "# above all wrench.sign, units and frames, and inspect it.",
@@ -187,9 +190,12 @@ def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Found
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
         for name, (words, unit) in plain.items():
             whole = _Found([name], unit)
-            is_array = table.columns[name].ndim > 1 and _width(table, whole) == width
-            if kind not in found and is_array and re.search(rf"(?:^|_)(?:{names})$", words):
+            fits = _width(table, whole) == width
+            if kind not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
                 found[kind] = whole
+    for name in [name for name, array in table.columns.items() if array.shape[1:] == (4, 4)][:1]:
+        for kind, places in _HOMOGENEOUS.items():
+            found[kind] = _Found([f"{name}[{k}]" for k in places], "")
     return found
 
 
@@ -235,12 +241,23 @@ def _pose(table: Table, found: dict[str, _Found]) -> dict[str, Any]:
     return pose
 
 
-def _time(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, Any]:
-    """The column of time: by its name, or the unit in that."""
+def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[str, Any]:
+    """The column of time: by its name, or the unit in that.
+
+    Of several, the first in the structure of a column that it goes with, or else of as many rows.
+    """
     named = [name for name, (words, _) in plain.items() if re.search(_TIME, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _UNITS["time"]]
     if not named:
         return {"column": _FILL_IN}
+    if beside in table.columns:
+        structure, rows = beside.rpartition(".")[0], len(table.columns[beside])
+        named.sort(
+            key=lambda name: (
+                name.rpartition(".")[0] != structure,
+                len(table.columns[name]) != rows,
+            )
+        )
     unit = _SAID.get(plain[named[0]][1].lower(), "")
     return {
         "column": named[0],

@@ -28,6 +28,7 @@ _TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
 FORMATS = (*_TEXT, ".parquet", ".npz", ".mat")
 LARGEST = 1e25
 """Numbers beyond are none that were measured, in whatever unit: nanoseconds since 1970 are 2e18."""
+_PARTS = 16  # numbers of an array that are columns of their own: up to a homogeneous matrix
 _LARGE = 2**24
 """Numbers in a table that are more than is kept in memory, where the file's format allows it."""
 
@@ -38,7 +39,8 @@ class Table:
 
     Args:
         path: the file, for messages.
-        columns: name to array (N,) or, from NPZ and MAT files, (N, ...); of any type as yet.
+        columns: name to array (N,) or, from NPZ and MAT files, (N, ...), whose numbers are columns
+            of their own as well, `name[0]` and so on in row-major order; of any type as yet.
         first_row: number of the first data row in the file as a reader counts, for messages.
         absent: groups of columns, such as "orientation", that the file says it does not have.
     """
@@ -229,7 +231,7 @@ def read_table(path: Path, *, header: bool = True) -> Table:
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     with reading(path, f"check that it is a valid {path.suffix} file"):
         arrays = {".npz": _read_npz, ".mat": _read_mat}.get(path.suffix.lower())
-        table = _read_frame(path, header) if arrays is None else Table(path, arrays(path))
+        table = _read_frame(path, header) if arrays is None else _table_of(path, arrays(path))
     if not table.columns or not all(len(c) for c in table.columns.values()):
         raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
     return table
@@ -283,6 +285,16 @@ def _frame_column(series: pl.Series) -> NDArray:
     return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
 
 
+def _table_of(path: Path, arrays: dict[str, NDArray]) -> Table:
+    parts = {
+        f"{name}[{k}]": array.reshape(len(array), -1)[:, k]
+        for name, array in arrays.items()
+        for k in range(math.prod(array.shape[1:]) if 1 < array.ndim <= 3 else 0)
+        if k < _PARTS
+    }
+    return Table(path, parts | arrays)
+
+
 def _read_npz(path: Path) -> dict[str, NDArray]:
     if not zipfile.is_zipfile(path):
         raise ValueError("it is no archive of arrays, or not all of one; numpy.savez writes them")
@@ -311,8 +323,8 @@ def _arrays_in(variables: dict[str, Any], before: str) -> dict[str, NDArray]:
         if isinstance(value, dict):
             found |= _arrays_in(value, f"{before}{name}.")
         elif isinstance(value, np.ndarray) and value.size and not name.startswith("__"):
-            rotations = value.ndim == 3 and value.shape[:2] == (3, 3)  # MATLAB counts them last
-            found[before + name] = np.moveaxis(value, 2, 0) if rotations else value
+            pages = value.ndim == 3 and value.shape[:2] in ((3, 3), (4, 4))  # as MATLAB has them
+            found[before + name] = np.moveaxis(value, 2, 0) if pages else value
     return found
 
 
