@@ -55,8 +55,9 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     rest = lines[before:]
     separator = _separator(rest[0]) if rest else ","
     if separator == " " and any(line != " ".join(line.split()) for line in rest):
-        text = path.read_text("utf-8-sig") if isinstance(source, Path) else source.decode()
-        source = "\n".join(" ".join(line.split()) for line in text.splitlines()).encode()
+        text = path.read_bytes() if isinstance(source, Path) else source
+        aligned = text.removeprefix(codecs.BOM_UTF8).splitlines()
+        source = b"\n".join([b" ".join(line.split()) for line in aligned])
         rest = [" ".join(line.split()) for line in rest]
     names = _names_in_comment(lines[:before], rest, separator) if header else None
     header = header and names is None
