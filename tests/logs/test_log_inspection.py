@@ -228,10 +228,11 @@ def test_each_stream_of_a_draft_has_the_time_that_goes_with_it(tmp_path: Path) -
     for name, columns, times in (
         ("structures", {"imu": imu, "ft": ft}, ["ft.t", "imu.time"]),
         ("lengths", {"pose_t": short, "ft": ft} | pose, ["ft.t", "pose_t"]),
+        ("named t", {"T": np.ones((60, 4, 4)), "s_t": t, "F": x, "M": x}, ["s_t", "s_t"]),
         ("flat", {"a_t": short, "b_t": t, "F": x, "M": x} | pose, ["b_t", "a_t"]),
     ):
-        savemat(tmp_path / f"{name}.mat", columns)
-        inspect_command(tmp_path / f"{name}.mat", tmp_path, quiet=True)
+        savemat(tmp_path / "x.mat", columns)
+        inspect_command(tmp_path / "x.mat", tmp_path, quiet=True)
         draft = yaml.safe_load((tmp_path / "draft.yaml").read_text())
         assert [stream["time"]["column"] for stream in draft.values()] == times, name
 

@@ -248,6 +248,7 @@ def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[
     """
     named = [name for name, (words, _) in plain.items() if re.search(_TIME, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _UNITS["time"]]
+    named = [name for name in named if table.columns[name].ndim == 1]
     if not named:
         return {"column": _FILL_IN}
     if beside in table.columns:
