@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import struct
+import zlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -184,13 +187,54 @@ def test_a_mat_file_without_arrays_says_how_to_save_them(
         read_table(path)
 
 
-def test_what_matlab_keeps_of_a_table_are_no_columns(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    workspace = {"__function_workspace__": np.zeros((1, 800), np.uint8), "None": b"MCOS"}
-    monkeypatch.setattr("scipy.io.loadmat", lambda *_, **__: workspace)
+def test_what_matlab_keeps_of_a_table_is_no_column(tmp_path: Path) -> None:
+    """An array without a name."""
+    savemat(path := tmp_path / "x.mat", {"t": np.arange(40.0)})
+    data = bytearray(path.read_bytes())
+    assert data[168:173] == b"\x01\0\x01\0t"
+    data[168:176] = b"\x01" + bytes(7)
+    path.write_bytes(data)
     with pytest.raises(DrakeTeleopError, match="save as arrays"):
-        read_table(write(tmp_path / "x.mat", ""))
+        read_table(path)
+
+
+def test_types_and_byte_order_of_mat_files_are_their_own(tmp_path: Path) -> None:
+    numbers = np.arange(-3, 4)
+    kinds = ["i1", "i2", "i4", "i8", "f4", "f8"]
+    savemat(tmp_path / "x.mat", {kind: numbers.astype(kind) for kind in kinds})
+    table = read_table(tmp_path / "x.mat")
+    for kind in kinds:
+        assert table.single(kind, "here").tolist() == numbers.tolist()
+    # As an old workstation writes it: big end first.
+    tag = partial(struct.pack, ">II")
+    content = tag(6, 8) + struct.pack(">II", 6, 0) + tag(5, 8) + struct.pack(">ii", 3, 1)
+    content += tag(1, 1) + b"t".ljust(8, b"\0") + tag(9, 24) + struct.pack(">3d", 0.5, 1.0, -2.0)
+    head = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x01\x00MI"
+    (tmp_path / "y.mat").write_bytes(head + tag(14, len(content)) + content)
+    assert read_table(tmp_path / "y.mat").single("t", "here").tolist() == [0.5, 1.0, -2.0]
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize(("place", "value"), [(48, 0x77), (17, 0x0E), (53, 0x33), (-60, None)])
+def test_a_broken_mat_file_does_not_end_the_process(
+    tmp_path: Path, place: int, value: int | None, compressed: bool
+) -> None:
+    """An unknown kind, an imaginary part that is not there, a wrong size, the end cut off.
+
+    SciPy's own reader would, of the first two.
+    """
+    savemat(path := tmp_path / "x.mat", {"t": np.arange(40.0)})
+    head, body = path.read_bytes()[:128], bytearray(path.read_bytes()[128:])
+    if value is None:
+        del body[place:]
+    else:
+        body[place] = value
+    if compressed:
+        packed = zlib.compress(bytes(body))
+        body = bytearray(struct.pack("<II", 15, len(packed)) + packed)
+    path.write_bytes(head + bytes(body))
+    with pytest.raises(DrakeTeleopError, match=r"it is broken, or not all|it has no arrays"):
+        read_table(path)
 
 
 def test_a_comma_between_whole_numbers_separates(tmp_path: Path) -> None:

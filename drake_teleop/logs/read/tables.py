@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError, reading
 from drake_teleop.logs.read.csv_text import read_csv
+from drake_teleop.logs.read.mat_file import read_mat
 
 if TYPE_CHECKING:
     import polars as pl
@@ -230,7 +231,7 @@ def read_table(path: Path, *, header: bool = True) -> Table:
     if not os.path.isfile(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     with reading(path, f"check that it is a valid {path.suffix} file"):
-        arrays = {".npz": _read_npz, ".mat": _read_mat}.get(path.suffix.lower())
+        arrays = {".npz": _read_npz, ".mat": read_mat}.get(path.suffix.lower())
         table = _read_frame(path, header) if arrays is None else _table_of(path, arrays(path))
     if not table.columns or not all(len(c) for c in table.columns.values()):
         raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
@@ -301,31 +302,6 @@ def _read_npz(path: Path) -> dict[str, NDArray]:
     with np.load(path, allow_pickle=False) as archive:
         columns = {key: archive[key] for key in archive.files}
     return {key: x for key, x in columns.items() if isinstance(x, np.ndarray) and x.ndim}
-
-
-def _read_mat(path: Path) -> dict[str, NDArray]:
-    """Its variables, and the fields of its structures as `structure.field`."""
-    from scipy.io import loadmat
-
-    try:
-        variables = loadmat(path, simplify_cells=True)
-    except NotImplementedError as error:
-        raise ValueError("it is of version 7.3; save(..., '-v7') writes one that can be") from error
-    found = _arrays_in(variables, "")
-    if not found:
-        raise ValueError("it has no arrays: what is in tables and timeseries, save as arrays")
-    return found
-
-
-def _arrays_in(variables: dict[str, Any], before: str) -> dict[str, NDArray]:
-    found: dict[str, NDArray] = {}
-    for name, value in variables.items():
-        if isinstance(value, dict):
-            found |= _arrays_in(value, f"{before}{name}.")
-        elif isinstance(value, np.ndarray) and value.size and not name.startswith("__"):
-            pages = value.ndim == 3 and value.shape[:2] in ((3, 3), (4, 4))  # as MATLAB has them
-            found[before + name] = np.moveaxis(value, 2, 0) if pages else value
-    return found
 
 
 def _as_numbers(
