@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 from scipy.io import savemat
+from scipy.sparse import eye_array
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.read.tables import read_table
@@ -156,6 +157,9 @@ def test_matlab_s_variables_and_fields_are_columns(tmp_path: Path, form: str) ->
     if form == "5":
         pages = turned.reshape(4, 3, 3).transpose(1, 2, 0)  # as rotm2quat takes them
         variables["tool"] = {"R": pages, "name": "gripper", "imu": {"gyro": 2 * force}}
+        structures = np.array([[(t,), (2 * t,)]], [("a", object)])
+        cells = np.array([t, "x"], object)
+        variables |= {"many": structures, "cells": cells, "z": 1j * t, "sparse": eye_array(3)}
     savemat(tmp_path / "x.mat", variables, format=form)
     table = read_table(tmp_path / "x.mat")
     assert table.numbers(["t", "force"], 4, "here").tolist() == np.column_stack([t, force]).tolist()

@@ -92,10 +92,9 @@ def _take(
     (flags, *_), size = (_numbers(part, order).tolist() for part in parts[:2])
     name = bytes(parts[2][1]).decode("latin-1") if name is None else name
     if flags & 0xFF in _NUMBERS and not flags & _COMPLEX:
-        numbers = _numbers(parts[3], order) if len(parts) == 4 else np.empty(0)
-        if len(parts) != 4 or len(numbers) != math.prod(size):
+        if len(parts) != 4:
             raise ValueError(_BROKEN)
-        _put(name, numbers.reshape(size, order="F"), found)
+        _put(name, _numbers(parts[3], order).reshape(size, order="F"), found)
     elif flags & 0xFF == _STRUCTURE and math.prod(size) == 1 and len(parts) > 4:
         (length, *_), names = _numbers(parts[3], order).tolist(), bytes(parts[4][1])
         fields = [names[i : i + length] for i in range(0, len(names), max(length, 1))]
@@ -113,7 +112,7 @@ def _numbers(part: tuple[int, memoryview], order: str) -> NDArray:
 
 def _put(name: str, array: NDArray, found: dict[str, NDArray]) -> None:
     """A row or a column is a list, and a single number nothing. MATLAB counts matrices last."""
-    if array.size < 2 or not name or name.startswith("__"):
+    if array.size < 2 or not name:
         return
     if array.ndim == 2 and 1 in array.shape:
         array = array.ravel()
