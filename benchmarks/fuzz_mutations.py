@@ -12,14 +12,19 @@ import io
 import json
 import random
 import re
+import tempfile
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import polars
 import yaml
+from scipy.io import savemat
+
+from drake_teleop.logs.read.mat_file import read_mat
 
 Mutation = Callable[[random.Random, bytes, bytes], bytes]
 
@@ -342,6 +347,10 @@ def decoded(suffix: str, content: bytes) -> dict[str, np.ndarray]:
     if suffix == ".npz":
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
+    if suffix == ".mat":
+        with tempfile.TemporaryDirectory() as folder:
+            (path := Path(folder) / "x.mat").write_bytes(content)
+            return read_mat(path)
     read = polars.read_csv if suffix == ".csv" else polars.read_parquet
     return {series.name: series.to_numpy() for series in read(io.BytesIO(content))}
 
@@ -351,6 +360,9 @@ def encoded(suffix: str, columns: dict[str, np.ndarray]) -> bytes:
     stream = io.BytesIO()
     if suffix == ".npz":
         np.savez(stream, **columns)
+        return stream.getvalue()
+    if suffix == ".mat":
+        savemat(stream, columns)
         return stream.getvalue()
     frame = polars.DataFrame({name: polars.Series(name, x) for name, x in columns.items()})
     write = frame.write_csv if suffix == ".csv" else frame.write_parquet

@@ -615,7 +615,7 @@ TARGETS = (
     Target("description", ".yaml", 3, _descriptions, _yaml, read_log),
     *(
         Target(f"log_{suffix}", f".{suffix}", 2, _tables(f".{suffix}"), change, read_log)
-        for suffix in ("csv", "npz", "parquet")
+        for suffix in ("csv", "npz", "parquet", "mat")
         for change in [mutations.table(f".{suffix}")]
     ),
     Target("identify", ".npz", 3, _tables(".npz"), mutations.table(".npz"), _processed),
