@@ -207,7 +207,8 @@ def test_a_draft_of_what_robots_write_is_right_as_it_stands(
     drafted = inspect_command(table, tmp_path, quiet=True)
     assert drafted["findings"] == []
     if not separator:
-        assert "# Columns without a guess: none." in (tmp_path / "draft.yaml").read_text()
+        text = (tmp_path / "draft.yaml").read_text()
+        assert "# Columns without a guess: none." in text and "No column of time" not in text
     found = inspect_command(tmp_path / "draft.yaml", tmp_path / "again", quiet=True)
     assert [finding["name"] for finding in found["findings"]] == said
     described = yaml.safe_load((tmp_path / "draft.yaml").read_text())
@@ -246,6 +247,7 @@ def test_a_table_without_names_is_drafted_as_such(tmp_path: Path, first: str) ->
     assert "places that were not recognized" in summary["findings"][0]["message"]
     text = (tmp_path / "draft.yaml").read_text()
     assert "# Columns without a guess: 0, 1, 2, 3, 4." in text
+    assert "# No column of time was recognized; where there is none, time: {rate: 500}" in text
     assert yaml.safe_load(text)["wrench"]["header"] is False
     assert len(read_table(tmp_path / "x.csv", header=False).raw(0, "here")) == 60
 

@@ -61,6 +61,7 @@ _UNITS = {
     "time": ("s", "ms", "us", "ns"),
 }
 _FILL_IN = "FILL IN"
+_WITHOUT_TIME = "No column of time was recognized; where there is none, time: {rate: 500}, in Hz."
 
 
 class _Found(NamedTuple):
@@ -120,7 +121,8 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
     used = {
         name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
     }
-    used |= {stream["time"]["column"] for stream in draft.values()}
+    times = {stream["time"]["column"] for stream in draft.values()}
+    used |= times
     parts = {f"{name}[{k}]" for name in table.columns for k in range(16)}
     used |= {name.partition("[")[0] for name in used & parts}
     unused = [name for name in table.columns if name not in used | parts]
@@ -128,6 +130,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
         "# DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
         "# above all wrench.sign, units and frames, and inspect it.",
         f"# Columns without a guess: {', '.join(unused) or 'none'}.",
+        *([f"# {_WITHOUT_TIME}"] if _FILL_IN in times else []),
         *(f"# {text}" for what, text in _REMARKS.items() for n in forces if re.search(what, n)),
     ]
     return "\n".join(head) + "\n" + yaml.safe_dump(draft, sort_keys=False)
