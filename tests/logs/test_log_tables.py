@@ -214,8 +214,16 @@ def test_types_and_byte_order_of_mat_files_are_their_own(tmp_path: Path) -> None
     content = tag(6, 8) + struct.pack(">II", 6, 0) + tag(5, 8) + struct.pack(">ii", 3, 1)
     content += tag(1, 1) + b"t".ljust(8, b"\0") + tag(9, 24) + struct.pack(">3d", 0.5, 1.0, -2.0)
     head = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x01\x00MI"
-    (tmp_path / "y.mat").write_bytes(head + tag(14, len(content)) + content)
-    assert read_table(tmp_path / "y.mat").single("t", "here").tolist() == [0.5, 1.0, -2.0]
+    # And before it an object, a string or a table, as MATLAB keeps them.
+    kept = tag(6, 8) + struct.pack(">II", 17, 0)
+    for word in (b"s", b"MCOS", b"string"):
+        kept += tag(1, len(word)) + word.ljust(8, b"\0")
+    kept += tag(14, 0)
+    variables = tag(14, len(kept)) + kept + tag(14, len(content)) + content
+    (tmp_path / "y.mat").write_bytes(head + variables)
+    table = read_table(tmp_path / "y.mat")
+    assert list(table.columns) == ["t"]
+    assert table.single("t", "here").tolist() == [0.5, 1.0, -2.0]
 
 
 @pytest.mark.parametrize("compressed", [False, True])

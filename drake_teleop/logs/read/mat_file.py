@@ -31,6 +31,7 @@ _TYPES = {
     12: "i8",
     13: "u8",
 }
+_FLAGS_AND_SIZE = [6, 5]
 _BROKEN = "it is broken, or not all of it is there"
 
 
@@ -85,9 +86,9 @@ def _take(
 ) -> None:
     """Puts the arrays of one variable, or of a field by its name, with those that were found."""
     parts = list(_elements(content, order)) if kind == _MATRIX else []
-    if not parts:
+    if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _FLAGS_AND_SIZE:  # objects have no size
         return
-    if depth > _DEEPEST or len(parts) < 3 or [kind for kind, _ in parts[:2]] != [6, 5]:
+    if depth > _DEEPEST:
         raise ValueError(_BROKEN)
     (flags, *_), size = (_numbers(part, order).tolist() for part in parts[:2])
     name = bytes(parts[2][1]).decode("latin-1") if name is None else name
