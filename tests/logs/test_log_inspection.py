@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import UserDict
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,11 +18,12 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.cli import main
+from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.check.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.read.tables import read_table
+from drake_teleop.logs.read.tables import Table, read_table
 
 PLANTED: list[tuple[Callable[[Columns], None], str, str, dict[str, bool]]] = [
     (planted.sign, "sign", "wrench.sign: -1", {}),
@@ -219,6 +221,21 @@ def test_a_draft_of_what_robots_write_is_right_as_it_stands(
     assert identify_log(tmp_path / "draft.yaml").identification.mass == pytest.approx(
         3.13, rel=2e-3
     )
+
+
+def test_a_draft_leaves_alone_what_it_has_no_use_for(tmp_path: Path) -> None:
+    """A large Parquet file reads a column whenever it is asked for one."""
+    asked = set()
+
+    class Columns(UserDict[str, np.ndarray]):
+        def __getitem__(self, key: str) -> np.ndarray:
+            asked.add(key)
+            return super().__getitem__(key)
+
+    names = ["t", *(f"{kind}{axis}" for kind in "FT" for axis in "xyz"), "current", "mode"]
+    columns = Columns({name: np.arange(60.0) for name in names})
+    draft_description(Table(tmp_path / "x.parquet", columns), tmp_path)
+    assert asked <= {"t", "Fx", "Tx"}
 
 
 def test_each_stream_of_a_draft_has_the_time_that_goes_with_it(tmp_path: Path) -> None:

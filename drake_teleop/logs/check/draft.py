@@ -123,8 +123,11 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
     }
     times = {stream["time"]["column"] for stream in draft.values()}
     used |= times
-    parts = {f"{name}[{k}]" for name in table.columns for k in range(16)}
-    used |= {name.partition("[")[0] for name in used & parts}
+    arrays = _names_of_arrays(table)
+    used |= {name.partition("[")[0] for name in used}
+    parts = {
+        name for name in table.columns if name not in arrays and name.partition("[")[0] in arrays
+    }
     unused = [name for name in table.columns if name not in used | parts]
     head = [
         "# DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
@@ -189,17 +192,24 @@ def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
 def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
     """The same of arrays with several columns, which NPZ and MAT files hold, by their names."""
     found: dict[str, _Found] = {}
+    arrays = _names_of_arrays(table)
     for kind, names in {**_VECTORS, "matrix": "r|rot|rotation(_matrix)?"}.items():
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
-        for name, (words, unit) in plain.items():
+        for name in arrays:
+            words, unit = plain[name]
             whole = _Found([name], unit)
             fits = _width(table, whole) == width
             if kind not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
                 found[kind] = whole
-    for name in [name for name, array in table.columns.items() if array.shape[1:] == (4, 4)][:1]:
+    for name in [name for name in arrays if table.columns[name].shape[1:] == (4, 4)][:1]:
         for kind, places in _HOMOGENEOUS.items():
             found[kind] = _Found([f"{name}[{k}]" for k in places], "")
     return found
+
+
+def _names_of_arrays(table: Table) -> list[str]:
+    """Of columns with several numbers in a row; without reading any, which Parquet leaves to us."""
+    return [name for name in table.columns if f"{name}[0]" in table.columns]
 
 
 def _width(table: Table, found: _Found) -> int:
@@ -251,7 +261,7 @@ def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[
     """
     named = [name for name, (words, _) in plain.items() if re.search(_TIME, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _UNITS["time"]]
-    named = [name for name in named if table.columns[name].ndim == 1]
+    named = [name for name in named if f"{name}[0]" not in table.columns]
     if not named:
         return {"column": _FILL_IN}
     if beside in table.columns:
