@@ -255,6 +255,14 @@ def test_each_stream_of_a_draft_has_the_time_that_goes_with_it(tmp_path: Path) -
         assert [stream["time"]["column"] for stream in draft.values()] == times, name
 
 
+def test_an_array_that_is_not_recognized_is_named_once(tmp_path: Path) -> None:
+    x = np.ones((60, 3))
+    columns = {"t": np.arange(60) * 0.01, "F": x, "M": x, "current": x}
+    savemat(tmp_path / "x.mat", columns)
+    inspect_command(tmp_path / "x.mat", tmp_path, quiet=True)
+    assert "# Columns without a guess: current.\n" in (tmp_path / "draft.yaml").read_text()
+
+
 @pytest.mark.parametrize("first", ["0.00,1.5,0,0,0", "0.00,0,0,nan,1e-3"])
 def test_a_table_without_names_is_drafted_as_such(tmp_path: Path, first: str) -> None:
     """Its first row of numbers is no row of names, nor lost."""
