@@ -213,7 +213,7 @@ def driven(seconds: float) -> dict[str, float]:
     scenario = live_scenario(with_device(LoadScenario("contact_transition")))
     load, clock = identified_load(scenario), time.perf_counter
     link = DeviceLink("udp://127.0.0.1:0")
-    live = Live(scenario, load, None, lambda rows: None, clock(), link)
+    live = Live(scenario, load, None, lambda rows: {}, clock(), link)
     with tempfile.TemporaryDirectory() as folder:
         told = Path(folder) / "device.json"
         device = client(link.port, seconds + 2.0, told, "--depth", "0.075", "--grip", "medium")

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import fuzz_mutations as mutations
+import fuzz_recordings as recordings
 import fuzz_robots as robots
 import numpy as np
 import polars as pl
@@ -655,6 +656,16 @@ TARGETS = (
             ("netft", robots.records, robots.netft_wrenches),
             ("rtde", robots.samples, robots.rtde_wrenches),
             ("ros", robots.messages, robots.ros_wrenches),
+        )
+    ),
+    Target("names", ".json", 2, recordings.names, recordings.name_mutation, recordings.new),
+    Target("files", ".json", 2, recordings.includes, recordings.include_mutation, recordings.model),
+    *(
+        Target(name, ".json", 0.5, seeds, _json, run)
+        for name, seeds, run in (
+            ("stamps", recordings.stamps, recordings.recorded),
+            ("full_disk", recordings.sizes, recordings.full_disk),
+            ("killed", recordings.delays, recordings.killed),
         )
     ),
     Target("options", ".json", 2, _commands, mutations.arguments, _command_line),

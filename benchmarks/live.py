@@ -25,7 +25,6 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatParams
 
 from drake_teleop.channel.network import PRESETS as NETWORK_PRESETS
 from drake_teleop.identified_load import identified_load
@@ -33,7 +32,7 @@ from drake_teleop.live.choice_names import NETWORKS
 from drake_teleop.live.inputs import SLICE_MS
 from drake_teleop.live.live import FRAME, Live
 from drake_teleop.live.pace import without_collections
-from drake_teleop.live.server import show_in
+from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.session import Session, live_scenario, read_drive, repeat
 from drake_teleop.pages.progress import silent
 from drake_teleop.passivity.methods import METHODS
@@ -53,8 +52,7 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
     scenario = live_scenario(LoadScenario("contact_transition"))
     load = identified_load(scenario)
     clock = time.perf_counter
-    meshcat = Meshcat(MeshcatParams(host="localhost"))
-    live = Live(scenario, load, folder, show_in(meshcat, scenario), clock())
+    live = Live(scenario, load, folder, PageScene("own", scenario).show, clock())
     live.join(1, clock())
     for _ in range(200):  # what is compiled and loaded at the first call
         live.tick(clock)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import os
 import signal
 import sys
@@ -798,9 +800,12 @@ def new(
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command line and exits: 0, 2 for unusable input, 130 for Ctrl-C or `kill`.
 
+    A drive that the user ends so has status 0.
+
     Also 1, if `reproduce` finds a number that is not as accepted.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, _terminate)
+    atexit.register(gc.freeze)  # the last search for garbage takes a second with Drake's objects
     with warnings.catch_warnings():
         # They are for those who write programs. What a user has to know of a result this package
         # never says so: it stands in the summary, and is printed from there.
@@ -828,6 +833,10 @@ def _run(arguments: list[str] | None) -> Any:
         return 130
     except OSError as error:
         return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+
+
+def _terminate(number: int, frame: Any) -> None:
+    raise KeyboardInterrupt("SIGTERM")
 
 
 def _fail(message: str) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import reprlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from drake_teleop.silence import silent_stderr
+
+_POLARS_USED_IN: list[int] = []  # the first process
 
 LONGEST_LINE = 300
 """Characters of a line that the command line says about an error."""
@@ -81,10 +84,30 @@ def reading(path: str | Path, remedy: str, what: str = "cannot be read") -> Iter
         raise DrakeTeleopError(f"{what}: {reason}", where=str(path), remedy=remedy) from error
 
 
+def refuse_fork() -> None:
+    """Call this before polars reads or writes, whose threads do not outlive a fork.
+
+    Raises:
+        DrakeTeleopError: in a process that was forked after another call; polars would hang.
+    """
+    _POLARS_USED_IN.append(os.getpid())
+    del _POLARS_USED_IN[1:]
+    if [os.getpid()] != _POLARS_USED_IN:
+        raise DrakeTeleopError(
+            "this process was forked after tables were read or written, and would hang",
+            remedy='start processes by multiprocessing.get_context("spawn")',
+        )
+
+
 def meant(name: object, names: Sequence[str], otherwise: str) -> str:
     """The remedy for a name that is none of these: the one that is near, or else `otherwise`."""
     near = difflib.get_close_matches(str(name), names, n=1)
     return f"did you mean '{near[0]}'?" if near else otherwise
+
+
+def install_extra(name: str) -> str:
+    """Return the remedy for a library of an extra; no package index has this project."""
+    return f"install the extra `{name}`: pip install '.[{name}]' in the clone of this project"
 
 
 def inside(where: str, name: Any) -> str:

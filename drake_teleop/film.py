@@ -9,17 +9,27 @@ from __future__ import annotations
 import gc
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, MeshcatParams, Rgba
+from pydrake.geometry import (
+    Cylinder,
+    GeometryId,
+    Meshcat,
+    MeshcatCone,
+    MeshcatParams,
+    Rgba,
+    SceneGraphInspector,
+)
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.pages.html import render
+from drake_teleop.pages.policy import policy
 from drake_teleop.writing import make_folder, write_text
 
 Array = NDArray[np.float64]
@@ -34,9 +44,21 @@ _SLOWER = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # speeds that the player has
 
 _SHAFT, _HEAD = 0.006, 0.03  # radius of an arrow's shaft, length of its head [m]
 _METRES_PER_NEWTON = 0.003
+_GREY = Rgba(0.9, 0.9, 0.9)  # Drake's own default
 _BACK = RotationMatrix.MakeXRotation(np.pi)
 # Meshcat's page has none of the first: a telephone lays it out as if it were 980 pixels wide.
+_POLICY = '<meta http-equiv="Content-Security-Policy" content="{}">'
 _TITLE = '<meta name="viewport" content="width=device-width, initial-scale=1"><title>drake_teleop<'
+
+
+class Canvas(Protocol):
+    """Receives where things are: Meshcat, or what has its methods."""
+
+    def SetTransform(self, path: str, X_ParentPath: RigidTransform, time: float) -> None:
+        """Set the pose of what is at `path`, at a time of the recording [s]."""
+
+    def SetProperty(self, path: str, property: str, value: Any, time: float) -> None:
+        """Set a property, such as "scale"."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +170,8 @@ class Film:
         }
         player = render("drake_teleop.pages", "player.html.j2", film=film)
         head, body, tail = page.rpartition("</body>")
-        return head.replace("<title>Drake MeshCat<", _TITLE, 1) + player + body + tail
+        whole = head.replace("<title>Drake MeshCat<", _TITLE, 1) + player + body + tail
+        return whole.replace("<title>", _POLICY.format(policy(whole)) + "<title>", 1)
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
@@ -177,6 +200,22 @@ def plain_room(meshcat: Meshcat) -> None:
     meshcat.SetProperty("/Background/<object>", "bottom_color", [0.86, 0.89, 0.93])
 
 
+def add_shapes(
+    meshcat: Meshcat,
+    path: str,
+    inspector: SceneGraphInspector,
+    shapes: Iterable[GeometryId],
+    colour: Rgba = _GREY,
+) -> None:
+    """Add the shapes of a body below its path, in the model's colours, or else in `colour`."""
+    for shape in shapes:
+        seen = inspector.GetIllustrationProperties(shape)
+        own = colour if seen is None else seen.GetPropertyOrDefault("phong", "diffuse", colour)
+        name = f"{path}/{shape.get_value()}"
+        meshcat.SetObject(name, inspector.GetShape(shape), own)
+        meshcat.SetTransform(name, inspector.GetPoseInFrame(shape))
+
+
 def rgba(colour: str) -> Rgba:
     """Drake's colour of "#rrggbb"."""
     return Rgba(*(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)))
@@ -186,13 +225,13 @@ class Arrow:
     """A force at a place; its length follows the force, 3 mm a newton."""
 
     def __init__(self, meshcat: Meshcat, name: str, colour: str) -> None:
-        self._meshcat, self._path = meshcat, f"/forces/{name}"
+        self._path = f"/forces/{name}"
         meshcat.SetObject(f"{self._path}/shaft/scaled", Cylinder(_SHAFT, 1.0), rgba(colour))
         # The cone's tip is at its origin and it widens along its z axis.
         head = MeshcatCone(_HEAD, 0.4 * _HEAD, 0.4 * _HEAD)
         meshcat.SetObject(f"{self._path}/head/scaled", head, rgba(colour))
 
-    def show(self, film_time: float, place: Array, force: Array) -> None:
+    def show(self, canvas: Canvas, film_time: float, place: Array, force: Array) -> None:
         """Shows (3,) `force` [N] at (3,) `place` [m], both in W, at a time of the recording [s]."""
         length = _METRES_PER_NEWTON * float(np.linalg.norm(force))
         shaft = max(length - _HEAD, 1e-3)
@@ -200,10 +239,10 @@ class Arrow:
         R = along.matrix()
         middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _HEAD) * R[:, 2]
         back = along @ _BACK
-        put = self._meshcat.SetTransform
+        put = canvas.SetTransform
         put(f"{self._path}/shaft", RigidTransform(along, middle), film_time)
         put(f"{self._path}/head", RigidTransform(back, tip), film_time)
-        scale = self._meshcat.SetProperty
+        scale = canvas.SetProperty
         size = min(1.0, length / _HEAD)
         scale(f"{self._path}/shaft/scaled", "scale", [size, size, shaft], film_time)
         scale(f"{self._path}/head/scaled", "scale", [size, size, size], film_time)

@@ -8,6 +8,7 @@ once: in free motion, and down onto a wall.
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -32,7 +33,8 @@ from drake_teleop.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.slave.plant import ParseSlave, finalize, lowest_point
 from drake_teleop.slave.slave_config import Slave
 from drake_teleop.slave.tool import Ball, Tool
-from drake_teleop.writing import make_folder, write_text
+from drake_teleop.texts import yaml_text
+from drake_teleop.writing import make_folder, whole_file
 
 #: The cube in which the Phantom's grip can go from where scenarios start, half its edge [m] (E).
 _PHANTOMS = 0.08
@@ -165,13 +167,24 @@ def new_command(
                 remedy=f"one of {', '.join(filter(None, known))}{later if name == LEADER else ''}",
             )
     plan = plan_station(arm, sensor_frame, package_paths, tool, device)
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
     make_folder(folder)
     paths = [_from(folder, path) for path in package_paths]
     tools = None if tool is None else _from(folder, tool)
-    write_text(
-        scenario, _text(plan, _from(folder, arm), sensor_frame, paths, tools, device, sensor)
-    )
-    LoadScenario(scenario)
+    try:
+        text = _text(plan, _from(folder, arm), sensor_frame, paths, tools, device, sensor)
+        with whole_file(scenario) as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
+            slave = LoadScenario(unfinished).slave
+            read = [slave.path, *slave.packages, *(slave.files()[1:] if tool else ())]
+            given = [path.resolve() for path in (arm, *package_paths, *([tool] if tool else ()))]
+            if read != given or slave.sensor_frame != sensor_frame:
+                raise DrakeTeleopError("is read as another station", where=str(scenario))
+    except BaseException:
+        for each in made:
+            with suppress(OSError):
+                each.rmdir()
+        raise
     if not quiet:
         _print(plan, scenario)
     return run_command(scenario, folder / "first_run", quiet=quiet)
@@ -361,64 +374,58 @@ def _text(
     device: str,
     sensor: str | None,
 ) -> str:
-    """The scenario, each line with what it says."""
+    """The scenario, with comments on what was found."""
     s, swing = plan.translation_scale, plan.swing
     x, y, z = plan.lowest
-    wall = z - 1.5 * swing
     down = 1.5 * swing + min(_PRESS, swing / 4.0)
-    stand_in = (
-        "tool:  # a stand-in: put your tool's file (model: ...) or its numbers here\n"
-        f"    mass: {_STAND_IN.mass}\n    com: {_STAND_IN.com}\n"
-        "    shapes: [!Ball {radius: 0.012, position: [0.0, 0.0, 0.1]}]"
-    )
-    what = "tool: null  # what the model has beyond the sensor" if plan.own_tool else stand_in
-    where = f"position: {_row(plan.place.position)}  # of the sensor at the start, tool down [m]"
-    if plan.place.home:
-        where = f"home: {plan.place.home}  # joints at the start, tool down [rad, m]"
-    lines = [
-        "# Made by drake-teleop new. Fields that are not here have their defaults; all, with their",
-        "# unit, range and meaning: drake-teleop scenario station.yaml",
-        f"description: {Path(arm).stem} led by {device}",
-        "simulation: {duration: 5.0, settle: 0.8}",
-        *_rates(device),
-        "slave:",
-        f"  model: {arm}",
-        *([f"  package_paths: [{', '.join(package_paths)}]"] if package_paths else []),
-        f"  sensor_frame: {sensor_frame}",
-        f"  {where}",
-        f"  {what if tool is None else f'tool: {{model: {tool}}}'}",
-        "master:",
-        f"  model: {device}",
-        *(["wrist_sensor:", f"  preset: {sensor}"] if sensor else []),
-        "kinematic_scaling:",
-        f"  translation_scale: {s:g}  # the arm can go {1e3 * plan.place.half:g} mm to all sides",
-        "force_scaling:",
-        "  sigma: 0.0  # 1: the hand feels the whole tool",
-        f"  force_scale: {plan.force_scale:g}  # for which hands and walls: drake-teleop analyze",
-        "environment:",
-        f"  - !Wall {{position: {_row([x, y, wall])}, stiffness: {_WALL:g}}}",
-        "operator:",
-        "  grip: medium",
-        "  intent:  # of the hand: a swing up and down, and then down onto the wall",
-        "    - !Sine {t_start: 0.2, duration: 2.6, ramp: 0.5, "
-        f"frequency: {_FREQUENCY:g},"
-        f" translation: [0.0, 0.0, {swing / s:.4g}]}}",
-        "    - !MinimumJerk {t_start: 3.2, duration: 1.2,"
-        f" translation: [0.0, 0.0, {-down / s:.4g}]}}",
-    ]
-    return "\n".join(lines) + "\n"
+    home, packages = plan.place.home, {"package_paths": package_paths} if package_paths else {}
+    start = {"home": home} if home else {"position": _rounded_row(plan.place.position)}
+    slave: dict[str, Any] = {"model": arm, **packages, "sensor_frame": sensor_frame, **start}
+    comments = {
+        "slave.position": "of the sensor at the start, tool down [m]",
+        "slave.home": "joints at the start, tool down [rad, m]",
+        "kinematic_scaling": f"the arm can go {1e3 * plan.place.half:g} mm to all sides",
+        "force_scaling": "sigma 1: the hand feels the whole tool; force_scale: see analyze",
+        "operator.intent": "of the hand: a swing up and down, and then down onto the wall",
+        "rates": "of the device",
+    }
+    if tool is not None:
+        slave["tool"] = {"model": tool}
+    elif plan.own_tool:
+        slave["tool"], comments["slave.tool"] = None, "what the model has beyond the sensor"
+    else:
+        slave["tool"] = {"mass": _STAND_IN.mass, "com": _STAND_IN.com}
+        slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(_STAND_IN.shapes[0])]}
+        comments["slave.tool"] = "a stand-in: put your tool's file (model: ...) or its numbers here"
+    swings = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
+    swings |= {"frequency": _FREQUENCY, "translation": _rounded_row([0.0, 0.0, swing / s])}
+    presses = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2}
+    presses |= {"translation": _rounded_row([0.0, 0.0, -down / s])}
+    wall = {"_tag": "!Wall", "position": _rounded_row([x, y, z - 1.5 * swing]), "stiffness": _WALL}
+    data = {
+        "description": f"{Path(arm).stem} led by {device}",
+        "simulation": {"duration": 5.0, "settle": 0.8},
+        **_rates(device),
+        "slave": slave,
+        "master": {"model": device},
+        **({"wrist_sensor": {"preset": sensor}} if sensor else {}),
+        "kinematic_scaling": {"translation_scale": s},
+        "force_scaling": {"sigma": 0.0, "force_scale": plan.force_scale},
+        "environment": [wall],
+        "operator": {"grip": "medium", "intent": [swings, presses]},
+    }
+    head = "Made by drake-teleop new. All fields and defaults: drake-teleop scenario station.yaml"
+    return yaml_text(data, head=[head], comments=comments)
 
 
-def _rates(device: str) -> list[str]:
+def _rates(device: str) -> dict[str, Any]:
     """Those of a device that is slower than the hand, or `analyze` refuses them."""
     own = Master(model=device).own_period(Rates().hand_hz)
-    if own is None:
-        return []
-    return [f"rates: {{hand_hz: {1 / own:g}, joint_control_hz: {1 / own:g}}}  # of the device"]
+    return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 
 
-def _row(values: Any) -> str:
-    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+def _rounded_row(values: Any) -> list[float]:
+    return [float(f"{value:.4g}") for value in values]
 
 
 def _print(plan: Plan, scenario: Path) -> None:
@@ -430,7 +437,7 @@ def _print(plan: Plan, scenario: Path) -> None:
     for name, value in (
         ("Joints", f"{len(plan.joints)}: {', '.join(plan.joints)}"),
         ("Tool", f"{plan.tool_mass:.4g} kg, {tool}"),
-        ("Start", f"sensor at {_row(plan.place.position)} m, tool down"),
+        ("Start", f"sensor at {_rounded_row(plan.place.position)} m, tool down"),
         ("Room around it", f"{1e3 * plan.place.half:g} mm to all sides"),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):

@@ -12,22 +12,30 @@ writes, or the YAML file of the log's own name, as in the folder `logs` of `repr
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.geometry import Box, Meshcat, MeshcatVisualizer, Rgba
+from pydrake.geometry import Box, Meshcat, Rgba, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex
-from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.film import Arrow, Film, Reading, Show, frame_times, plain_room
+from drake_teleop.film import (
+    Arrow,
+    Canvas,
+    Film,
+    Reading,
+    Show,
+    add_shapes,
+    frame_times,
+    plain_room,
+)
 from drake_teleop.master.data_sheets import PHANTOM
 from drake_teleop.master.leader_model import Leader
 from drake_teleop.master.phantom import serial_joint_angles
@@ -35,13 +43,12 @@ from drake_teleop.pages.style import BLUE, VERMILION, contact_spans
 from drake_teleop.resources import models_dir
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario
-from drake_teleop.scenario_reference import commented
 from drake_teleop.signals import POSE_OF
 from drake_teleop.slave.moving_pose import positions_of
 from drake_teleop.slave.plant import NominalSlave, ParseSlave, finalize
 from drake_teleop.slave.skeleton import AddSkeleton
 from drake_teleop.slave.surroundings import AddEnvironment, MovingBodies, Touched
-from drake_teleop.writing import output_folder, write_json, write_text
+from drake_teleop.writing import output_folder, write_json
 
 Array = NDArray[np.float64]
 Signals = Mapping[str, Array]
@@ -94,11 +101,6 @@ def replay_command(
         summary = {"films": films}
         write_json(out / "summary.json", summary)
     return summary
-
-
-def write_scenario(path: Path, scenario: Scenario) -> None:
-    """Writes every field of a scenario to a YAML file, for `LoadScenario`."""
-    write_text(path, commented(scenario))
 
 
 def write_replay(
@@ -209,12 +211,14 @@ class ReplayScene:
     Attributes:
         plant: slave, what it touches and haptic device, for their shapes and kinematics only.
         context: of the plant, in the posture that was shown last.
+        canvas: receives poses and sizes; Meshcat, unless it is replaced.
     """
 
     def __init__(self, meshcat: Meshcat, scenario: Scenario, recorded: Container[str]) -> None:
         """What was not `recorded` is not shown."""
-        builder = DiagramBuilder()
-        self.plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
+        self.canvas: Canvas = meshcat
+        self.plant, self._shapes = MultibodyPlant(time_step=0.0), SceneGraph()
+        self.plant.RegisterAsSourceForSceneGraph(self._shapes)
         self._parsed = ParseSlave(self.plant, scenario.slave)
         self._slave, self._sensor = self._parsed.instance, self._parsed.sensor_frame
         nominal = NominalSlave(scenario.slave)
@@ -229,10 +233,8 @@ class ReplayScene:
             self._master = _add_master(self.plant, scenario)
         finalize(self.plant)
         self._moving = {POSE_OF + k: body for k, body in MovingBodies(self.plant, touched).items()}
-        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
-        self._diagram: Diagram = builder.Build()
-        self._root = self._diagram.CreateDefaultContext()
-        self.context = self.plant.GetMyMutableContextFromRoot(self._root)
+        self.context = self.plant.CreateDefaultContext()
+        self._bodies = dict(self._add_bodies(meshcat))
         _furnish(meshcat, scenario, with_table=self._master is not None)
         # The device's base stands along the world's axes here, whatever its alignment in the run.
         alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
@@ -245,9 +247,20 @@ class ReplayScene:
             for place in ((at_slave,) if self._master is None else (at_slave, "stylus"))
         ]
 
+    def _add_bodies(self, meshcat: Meshcat) -> Iterator[tuple[str, RigidBody]]:
+        """Adds the shapes of all bodies; yields path and body of each that moves."""
+        plant, inspector = self.plant, self._shapes.model_inspector()
+        for body in (plant.get_body(BodyIndex(k)) for k in range(plant.num_bodies())):
+            path = f"/station/{int(body.index())}_{body.name()}"
+            shapes = plant.GetVisualGeometriesForBody(body)
+            add_shapes(meshcat, path, inspector, shapes)
+            if shapes and plant.IsAnchored(body):
+                meshcat.SetTransform(path, plant.EvalBodyPoseInWorld(self.context, body))
+            elif shapes:
+                yield path, body
+
     def show(self, film_time: float, signals: Mapping[str, Array], sample: int) -> None:
         """Shows a sample (its index) of signals of a run, at a time of the recording [s]."""
-        self._root.SetTime(film_time)
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
         if self._master is not None:
@@ -259,13 +272,15 @@ class ReplayScene:
         for name, body in self._moving.items():
             if name in signals:
                 self._move(body, signals[name][sample])
-        self._diagram.ForcedPublish(self._root)
+        for path, body in self._bodies.items():
+            self.canvas.SetTransform(path, plant.EvalBodyPoseInWorld(context, body), film_time)
         if not self._arrows:
             return
         forces, places = self._forces(signals, sample), self._places()
         for force, place, arrow in self._arrows:
             f_W = forces[force]
-            arrow.show(film_time, places[place], self._R_BW @ f_W if place == "stylus" else f_W)
+            f_W = self._R_BW @ f_W if place == "stylus" else f_W
+            arrow.show(self.canvas, film_time, places[place], f_W)
 
     def _move(self, index: BodyIndex, pose: Array) -> None:
         """Puts a body of the surroundings where it was, after those that it hangs on."""

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError, expect, reading
+from drake_teleop.errors import DrakeTeleopError, expect, install_extra, reading, refuse_fork
+from drake_teleop.load.arrays import numbers
 from drake_teleop.writing import make_folder, write_table
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ class SimulationResult:
     def __init__(
         self, t: ArrayLike, signals: Mapping[str, ArrayLike], specs: Sequence[Signal]
     ) -> None:
-        self._t = _read_only(_numbers("t", t))
+        self._t = _read_only(numbers("t", t))
         self._specs = {spec.name: spec for spec in specs}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
@@ -106,7 +107,7 @@ class SimulationResult:
             self._values = {name: self._checked(name, signals[name]) for name in self._specs}
 
     def _checked(self, name: str, values: ArrayLike) -> NDArray[np.float64]:
-        array = _numbers(name, values)
+        array = numbers(name, values)
         shape = (len(self._t), len(self._specs[name].components))
         if array.ndim == 1:
             array = array[:, np.newaxis]
@@ -180,7 +181,7 @@ class SimulationResult:
             raise DrakeTeleopError(
                 f"{error.name or 'a library'} is not installed",
                 where="to_pandas",
-                remedy="install the extra that has it: pip install 'drake_teleop[notebook]'",
+                remedy=install_extra("notebook"),
             ) from None
 
     def to_dataframe(self) -> pl.DataFrame:
@@ -240,7 +241,7 @@ class SimulationResult:
             folder: that `remove_log` has seen.
             first_row: number of the first of these rows in the whole log.
         """
-        part = folder / _PART_NAME.format(first_row)
+        part = part_of_log(folder, first_row)
         if len(self.t) or not part.exists():
             make_folder(folder)
             self._write(part, aside=folder)
@@ -372,6 +373,11 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
         return len(self._columns)
 
 
+def part_of_log(folder: Path, first_row: int) -> Path:
+    """Return the file of a part, named after the number of its first row."""
+    return folder / _PART_NAME.format(first_row)
+
+
 def remove_log(path: Path) -> None:
     """Removes a log that `write_part` or `write_parquet` wrote, if there is one.
 
@@ -416,18 +422,12 @@ def _describe(spec: Signal) -> str:
     return f"{text}  {spec.description}" if spec.description else text
 
 
-def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    try:
-        return np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise DrakeTeleopError(f"holds no numbers ({error})", where=name) from None
-
-
 def _columns_of_numbers(path: Path, columns: list[str]) -> NDArray[np.float64]:
     """(N, k) the columns of a Parquet file; whatever goes wrong is for `reading`."""
     import polars as pl
 
-    table = pl.read_parquet(path, columns=columns)
+    refuse_fork()
+    table = pl.read_parquet(sorted(path.glob(_PART_NAMES)) or path, columns=columns)
     if not all(dtype.is_numeric() for dtype in table.dtypes):
         raise ValueError(f"{', '.join(columns)} hold no numbers")
     return table.to_numpy()

@@ -70,10 +70,11 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.pages.progress import Stage, show_progress
 from drake_teleop.pages.style import contact_spans
 from drake_teleop.quaternions import conjugate, logarithm, multiply
-from drake_teleop.replay import write_replay, write_scenario
+from drake_teleop.replay import write_replay
 from drake_teleop.result import SimulationResult, remove_log
 from drake_teleop.run_warnings import run_warnings
 from drake_teleop.scenario import LoadScenario, Scenario, check_scenario, replace
+from drake_teleop.scenario_reference import write_scenario
 from drake_teleop.signals import POSE_OF
 from drake_teleop.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station import MakeTeleopStation
@@ -167,13 +168,16 @@ def run_command(
     with output_folder(out):
         with show_progress(progress and not quiet) as stage:
             run = _logged(setup, out, stage, fresh, drive)
+            written = stage("Write pictures and film")
+            write_picture(out / "overview.png", overview(run.result))
+            written(0.3)
+            write_replay(out / "replay.html", run.result, run.scenario)
+            written(1.0)
         summary = {"scenario": str(scenario or inputs)} | summarise(run)
         session = {"load_source": run.load_source, "real_time_factor": run.real_time_factor}
         write_table(out / "sensor_log.parquet", run.result.sensor_log())
         if run.identification is not None:
             run.identification.save(out / "identification.json")
-        write_picture(out / "overview.png", overview(run.result))
-        write_replay(out / "replay.html", run.result, run.scenario)
         write_json(out / "session.json", session)
         write_json(out / "summary.json", summary)
     if not quiet:

@@ -6,18 +6,20 @@ docs/make_reference.py writes both), `commented` what `drake-teleop scenario NAM
 
 from __future__ import annotations
 
+import dataclasses
 import json
-import math
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-import yaml
-
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.fields import FieldInfo, fields_of
-from drake_teleop.scenario import Scenario
+from drake_teleop.scenario import Scenario, ScenarioFromData
 from drake_teleop.sensor.presets import preset_of
 from drake_teleop.sensor.sensor_chain import WristSensorConfig
+from drake_teleop.texts import yaml_data, yaml_scalar
+from drake_teleop.writing import write_text
 
 _COLUMN = 34  # at which the comments of a block begin, if its values leave them that place
 
@@ -53,6 +55,21 @@ def commented(scenario: Scenario) -> str:
     return _HEAD + "\n".join(_block_lines(scenario)) + "\n"
 
 
+def write_scenario(path: Path, scenario: Scenario) -> None:
+    """Write every field of a scenario to a YAML file, for `LoadScenario`.
+
+    Raises:
+        DrakeTeleopError: if the text would be read as another scenario, or cannot be written.
+    """
+    text, where = commented(scenario), str(path)
+    found = ScenarioFromData(yaml_data(text, where, tagged=True), where)
+    if scenario.master.figures is None:  # which are read from the data sheet then
+        found.master = dataclasses.replace(found.master, figures=None)
+    if found != scenario:
+        raise DrakeTeleopError("the scenario cannot be written to YAML", where=where)
+    write_text(path, text)
+
+
 def reference() -> str:
     """Markdown with a table for each block: field, default, range and meaning."""
     return _REFERENCE + "".join(_sections(Scenario(), ""))
@@ -76,15 +93,10 @@ def _comment(entry: FieldInfo) -> str:
     return f"[{_takes(entry)}] {entry.meaning}" if entry.kind != "block" else entry.meaning
 
 
-def _scalar(value: Any) -> str:
-    text = yaml.safe_dump(value, default_flow_style=True, width=math.inf, allow_unicode=True)
-    return text.removesuffix("...\n").strip()
-
-
 def _block_lines(config: Any) -> list[str]:
     """The fields of a block and of what is in it, each on a line, not indented."""
     entries = fields_of(config)
-    starts = {entry.name: f"{entry.name}: {_scalar(entry.default)}"
+    starts = {entry.name: f"{entry.name}: {yaml_scalar(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
     column = min(_COLUMN, max(map(len, starts.values()), default=0))
     preset = preset_of({"preset": config.preset}) if isinstance(config, WristSensorConfig) else None
@@ -137,7 +149,7 @@ def _sections(config: Any, path: str) -> Iterator[str]:
     entries = fields_of(config)
     yield "\n| field | default | takes | meaning |\n|---|---|---|---|\n"
     for entry in entries:
-        default = _scalar(entry.default) if entry.kind != "block" or not entry.default else ""
+        default = yaml_scalar(entry.default) if entry.kind != "block" or not entry.default else ""
         takes = _links(entry, path) if entry.kind == "block" else _takes(entry)
         cells = (f"`{entry.name}`", default, takes, entry.meaning)
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"

@@ -9,14 +9,16 @@ holds. Nothing in a file is ever executed, whatever its tags say.
 from __future__ import annotations
 
 import json
+import math
 import re
 import reprlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from drake_teleop.errors import DrakeTeleopError, inside
+from drake_teleop.errors import DrakeTeleopError, inside, one_line
 
 _MOST_VALUES = 50_000  # with what aliases repeat
 _DEEPEST = 50  # brackets inside each other
@@ -54,9 +56,26 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
+class _Dumper(yaml.SafeDumper):
+    """PyYAML's emitter that quotes what is no word in YAML 1.1 or in 1.2."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+    def represent_text(self, text: str) -> Any:
+        return self.represent_scalar(f"{_TAG}str", text, None if text.isprintable() else '"')
+
+    def represent_fields(self, data: dict[str, Any]) -> Any:
+        tag = data.get("_tag", f"{_TAG}map")
+        return self.represent_mapping(tag, [item for item in data.items() if item[0] != "_tag"])
+
+
+_Dumper.add_representer(str, _Dumper.represent_text)
+_Dumper.add_representer(dict, _Dumper.represent_fields)
 _PATTERNS = {kind: re.compile(rf"(?:{pattern})\Z") for kind, pattern, _ in _CORE}
 for _kind, _, _first in _CORE:
-    _Loader.add_implicit_resolver(_TAG + _kind, _PATTERNS[_kind], _first)
+    for _side in (_Loader, _Dumper):
+        _side.add_implicit_resolver(_TAG + _kind, _PATTERNS[_kind], _first)
 
 
 def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
@@ -86,6 +105,44 @@ def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
         raise DrakeTeleopError(f"is not YAML ({error})", where=where) from None
     except RecursionError:
         raise DrakeTeleopError("is nested too deeply", where=where) from None
+
+
+def yaml_text(
+    data: Any, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
+) -> str:
+    """Return YAML that `read_yaml` reads as the same data.
+
+    Args:
+        data: as `read_yaml` gives it, with the tag of a mapping under "_tag".
+        head: comments above it, a line each.
+        comments: comments behind fields, by the place of the field, "block.field".
+
+    Raises:
+        DrakeTeleopError: if it would be read as something else.
+    """
+    lines, place, left = [f"# {one_line(text)}" for text in head], list[str](), comments or {}
+    for line in yaml_scalar(data, flow=None).splitlines():
+        inner = line.lstrip(" ")
+        place[(len(line) - len(inner)) // 2 :] = [inner.partition(":")[0]]
+        comment = left.get(".".join(place), "")
+        lines.append(f"{line}  # {comment}" if comment else line)
+    text = "\n".join(lines) + "\n"
+    if yaml_data(text, "YAML", tagged=True) != data:
+        raise DrakeTeleopError(f"{reprlib.repr(data)} cannot be written", where="YAML")
+    return text
+
+
+def yaml_scalar(value: Any, flow: bool | None = True) -> str:
+    """Return a value as YAML in one line; with `flow` None, blocks are lines of their own."""
+    text: str = yaml.dump(
+        value,
+        Dumper=_Dumper,
+        default_flow_style=flow,
+        width=math.inf,
+        allow_unicode=True,
+        sort_keys=False,
+    )
+    return text.removesuffix("...\n").strip("\n")
 
 
 def read_json(path: str | Path) -> Any:

@@ -6,6 +6,7 @@ process leaves a part of one under its name, and what was there before stays unt
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, refuse_fork
 
 if TYPE_CHECKING:
     import polars as pl
@@ -92,6 +93,7 @@ def write_table(
     """Writes CSV, or Parquet for any other name, as `whole_file` does; `options` are for polars."""
     import polars as pl
 
+    refuse_fork()
     write = table.write_csv if path.suffix == ".csv" else table.write_parquet
     with whole_file(path, aside=aside) as unfinished:
         try:
@@ -142,6 +144,30 @@ def make_folder(folder: Path) -> None:
         raise CannotWrite(what, where=str(folder), remedy=remedy) from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise CannotWrite("is a write-protected folder", where=str(folder), remedy=remedy)
+
+
+def set_aside(*paths: Path) -> Path | None:
+    """Move recordings into the first absent folder `earlier-1`, `earlier-2`, ... beside them.
+
+    Args:
+        paths: of one folder; they may be absent.
+
+    Returns:
+        the new folder; None if there is nothing to move.
+
+    Raises:
+        CannotWrite: if they cannot be moved.
+    """
+    there = [path for path in paths if path.exists()]
+    if not there:
+        return None
+    folders = (there[0].with_name(f"earlier-{k}") for k in itertools.count(1))
+    with naming(there[0]):
+        folder = next(folder for folder in folders if not folder.exists())
+        folder.mkdir()
+        for path in there:
+            path.rename(folder / path.name)
+    return folder
 
 
 def _reason(error: OSError) -> str:

@@ -71,11 +71,11 @@ def the_block(page: str, start: str) -> Block:
     return found
 
 
-def press_ctrl_c() -> None:
-    """In this process, as a terminal does: for the main thread, which it wakes."""
+def press_ctrl_c(number: signal.Signals = signal.SIGINT) -> None:
+    """In this process, as a terminal does, or `kill`: for the main thread, which it wakes."""
     main_thread = threading.main_thread().ident
     assert main_thread is not None
-    signal.pthread_kill(main_thread, signal.SIGINT)
+    signal.pthread_kill(main_thread, number)
 
 
 @contextlib.contextmanager

@@ -22,6 +22,12 @@ def listening() -> set[str]:
     return {address for address, _, inode in _listeners() if inode in mine}
 
 
+def ports() -> set[int]:
+    """On which ports they listen."""
+    mine = _inodes()
+    return {port for _, port, inode in _listeners() if inode in mine}
+
+
 def open_to_others() -> set[str]:
     """As `listening`, without what this machine alone reaches; quicker, to be asked often."""
     there = [

@@ -22,6 +22,7 @@ SAID = {
     "description-long_name.yaml": "no such file",
     "dmd-circle.dmd.yaml": "its joints form a circle through",
     "dmd-own_alias.dmd.yaml": "is nested too deeply",
+    "files-absent_folder.json": "names itself by a.dmd.yaml",
     "inspect-backwards.npz": "",
     "inspect-lengths.npz": "'q_z' of case.npz has 160 rows where 80 are needed",
     "load-negative_variance.json": "covariance: has a negative variance",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import random
 from itertools import product
 from pathlib import Path
 
@@ -168,6 +169,64 @@ def test_an_arm_of_five_joints_starts_with_its_tool_about_down(tmp_path, runs, m
         target, reached = start.X_WS_start + half * np.append(np.zeros(4), way), np.empty(7)
         pose_into(start.arm.table, find_posture(start.arm, target, start.start)[0], reached)
         assert np.linalg.norm(reached[4:] - p_WS - half * way) < 0.11 * half
+
+
+PIECES = [
+    *("#", " #", ": ", "{", "}", "[", "]", ",", "&", "*", "!", "|", ">", "'", '"', "%", "@", "`"),
+    *("- ", "? ", "\t", "\n", "\r", " ", "~", "null", "true", "no", "1", "010", "1e-3", "0x1f"),
+    *("1:30", "2001-01-01", "<<", "=", "--- ", "...", "\\", "$HOME", "..", "ä", "日本", "\u2028"),
+    *("\x85", "\ufeff", "\x07", "\x1b[31m", "%41", "package://", "file:", "arm", "<", "&amp;"),
+    *("\udcff", "x" * 40, "-", "_tag", "!Wall", ".inf", "yes", "\U0001f916"),
+]
+
+
+def odd_names(count: int) -> list[str]:
+    rng = random.Random(3)
+    drawn = ("".join(rng.choices(PIECES, k=rng.randrange(2, 5))) for _ in range(count))
+    return [*PIECES, *drawn][:count]
+
+
+def test_of_400_names_each_is_read_as_it_was_given_or_nothing_is_left(tmp_path, runs, monkeypatch):
+    """As the name of the arm's file or folder, of packages, the tool, the sensor's frame."""
+    plan = plan_station(ARM, "sensor")
+    monkeypatch.setattr(new_station, "plan_station", lambda *_: plan)
+    equal = 0
+    for k, name in enumerate(odd_names(400)):
+        folder = tmp_path / str(k) / f"{name}.d".replace("/", "_")
+        folder.mkdir(parents=True)
+        odd = folder / folder.name
+        odd.touch()
+        arm, tool = (odd, ARM) if k % 2 else (ARM, odd)
+        station, options = tmp_path / str(k) / "mine" / "new", {"tool": tool, "quiet": True}
+        try:
+            new_command(station, arm, name, package_paths=(folder, ARM.parent), **options)
+        except DrakeTeleopError as error:
+            assert len(str(error).splitlines()) == 1 and not station.parent.exists()
+            continue
+        slave = LoadScenario(station / "station.yaml").slave
+        read = [slave.path, *slave.packages, slave.tool.path]
+        assert read == [path.resolve() for path in (arm, folder, ARM.parent, tool)]
+        assert slave.sensor_frame == name and len(list(station.iterdir())) == 1
+        equal += 1
+    assert equal > 390
+
+
+@pytest.mark.parametrize("name", ["arm.sdf #2", "arm: v2", "*arm", "a\nb", "010", "%41", "\udcff"])
+def test_a_station_of_an_odd_name_is_that_of_this_arm(name, tmp_path, runs):
+    path, text = tmp_path / f"{name}.sdf", ARM.read_text()
+    path.write_text(text.replace("</model>", '<frame name="1e-3" attached_to="sensor"/></model>'))
+    (tmp_path / "arm.sdf").write_text(text.replace("<mass>", "<mass>1"))  # another one beside it
+    new_command(tmp_path / "mine", path, "1e-3", quiet=True)
+    slave = LoadScenario(tmp_path / "mine" / "station.yaml").slave
+    assert (slave.path, slave.sensor_frame) == (path, "1e-3")
+    assert NominalSlave(slave).arm.num_joints == 6
+
+
+def test_what_is_read_as_another_station_leaves_nothing(tmp_path, runs, monkeypatch):
+    monkeypatch.setattr(new_station, "_from", lambda folder, path: "tool.sdf")
+    with pytest.raises(DrakeTeleopError, match="is read as another station"):
+        new_command(tmp_path / "a" / "mine", ARM, "sensor")
+    assert list(tmp_path.iterdir()) == [] and runs == []
 
 
 @pytest.mark.parametrize(

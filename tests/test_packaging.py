@@ -10,12 +10,14 @@ import sys
 import sysconfig
 import venv
 import zipfile
+from importlib.metadata import metadata
 from pathlib import Path
 
 import pytest
 import yaml
 
 import drake_teleop
+from drake_teleop.errors import install_extra
 
 ROOT = Path(__file__).parents[1]
 
@@ -24,6 +26,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import drake_teleop
+from drake_teleop.errors import install_extra
 from drake_teleop.resources import models_dir, scenarios_dir
 
 home = Path(drake_teleop.__file__).parent
@@ -122,3 +125,23 @@ def test_the_version_that_is_released_is_the_one_that_is_cited():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert released == (citation["version"], str(citation["date-released"]))
     assert drake_teleop.__version__.startswith(released[0])
+
+
+def test_what_is_advised_installs_an_extra_that_there_is():
+    """No index has this project: an extra is installed in the clone."""
+    extras = set(metadata("drake_teleop").get_all("Provides-Extra"))
+    texts = {
+        path: path.read_text(encoding="utf-8")
+        for folder, kind in (("drake_teleop", "py"), ("docs", "md"), ("notebooks", "ipynb"))
+        for path in (ROOT / folder).rglob(f"*.{kind}")
+    }
+    assert not [path for path, text in texts.items() if re.search(r"install '?drake_teleop", text)]
+    advised = {
+        name
+        for text in texts.values()
+        for name in re.findall(r"install_extra\(\"(\w+)\"\)|install '\.\[(\w+)\]'", text)
+        for name in name
+        if name
+    }
+    assert {"notebook", "ros", "robots", "cluster"} <= advised <= extras
+    assert install_extra("ros").endswith("pip install '.[ros]' in the clone of this project")

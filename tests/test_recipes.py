@@ -119,6 +119,49 @@ assert (force(method="share", share={"share": 0.0}) == 0.0).all()
     )
 
 
+DRIVE = """
+from pathlib import Path
+from drake_teleop.live.inputs import Inputs
+from drake_teleop.live.session import Session, live_scenario, read_drive, repeat
+from drake_teleop.pages.progress import silent
+from drake_teleop.passivity.methods import METHODS
+from drake_teleop.scenario import ScenarioFromData
+
+folder = Path({folder!r})
+assert METHODS.index("tdpa") == {tdpa}
+if {tdpa} == 2:
+    data = {{"passivity": {{"method": "wave"}}, "channel": {{"network": "lan"}}}}
+    scenario = live_scenario(ScenarioFromData(data, "test.yaml"))
+    session = Session(scenario, log=folder / "log.parquet", record=folder)
+    inputs = session.inputs
+    for ms in range(0, 60, 10):
+        inputs = inputs.changed({{"z": -20 * ms}})
+        session.apply(inputs.changed({{"method": {tdpa}}} if ms >= 30 else {{}}))
+        session.advance(10)
+    session.close()
+else:
+    repeat(read_drive(folder), silent(""), folder / "again.parquet")
+    names = [sorted((folder / name).iterdir()) for name in ("log.parquet", "again.parquet")]
+    one, other = ([path.read_bytes() for path in paths] for paths in names)
+    assert one == other and len(b"".join(one)) > 10_000
+"""
+
+
+@pytest.mark.slow
+def test_a_recorded_drive_is_the_same_after_a_method_is_entered_first(copy, tmp_path):
+    first = tmp_path / "checkout"
+    shutil.copytree(copy, first)
+    methods = first / "drake_teleop" / "passivity" / "methods.py"
+    line = "    share: ShareConfig = field(default_factory=ShareConfig)\n"
+    source = methods.read_text().replace(line, "", 1)
+    wave = "    wave: WaveConfig ="
+    methods.write_text(source.replace(wave, line + wave, 1))
+    drive = str(tmp_path / "drive")
+    run(copy, DRIVE.format(folder=drive, tdpa=2))
+    assert ",tdpa," in (tmp_path / "drive" / "inputs.csv").read_text()
+    run(first, DRIVE.format(folder=drive, tdpa=3))
+
+
 @pytest.mark.slow
 def test_an_identification_with_the_new_estimator(copy):
     run(

@@ -14,9 +14,10 @@ from pydrake.geometry import Meshcat
 from drake_teleop import film, replay
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.identification import true_load
-from drake_teleop.replay import ReplayScene, replay_command, write_replay, write_scenario
+from drake_teleop.replay import ReplayScene, replay_command, write_replay
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.scenario_reference import write_scenario
 from drake_teleop.simulation import simulate
 from drake_teleop.slave.home import R_WS_HOME
 from drake_teleop.station import MakeTeleopStation
@@ -45,7 +46,7 @@ def arrows(monkeypatch) -> dict[str, np.ndarray]:
         def __init__(self, meshcat, name, colour):
             self.name = name
 
-        def show(self, film_time, place, force):
+        def show(self, canvas, film_time, place, force):
             shown[self.name] = force
 
     monkeypatch.setattr(replay, "Arrow", Arrow)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sockets
+import yaml
 from sockets import THIS_MACHINE, listening, open_to_others
 
 from drake_teleop import identified_load
@@ -45,6 +46,7 @@ EXPLAINED = {
     ("__init__.py", "import_module"),
     # A child of this package's own code, with a host's name as its argument.
     ("robots/rtde.py", "subprocess"),
+    ("robots/changes.py", "subprocess"),  # the test of the fit, beside the loop
     # Likewise, with the addresses of a device and of this process.
     ("live/device.py", "subprocess"),
 }  # fmt: skip
@@ -56,7 +58,7 @@ LISTENING = {
     ("film.py", 'Meshcat(MeshcatParams(host="localhost", port=0))'),
     ("studies/processes.py", "Client("),
     # Who is let in: tests/live/test_server.py.
-    ("live/server.py", 'Meshcat(MeshcatParams(host="localhost"))'),
+    ("live/page_scene.py", 'Meshcat(MeshcatParams(host="localhost", port=0))'),
     ("live/server.py", "asyncio"),
     ("live/server.py", "socket"),
     ("live/server.py", "serve("),
@@ -82,11 +84,16 @@ WRITING = {
     ("identified_load.py", 'open("wb'), ("identified_load.py", "np.savez"),
     ("slave/meshes.py", ".write_text"),
     # A line for each change of a drive's inputs, which is to outlive the process.
-    ("live/session.py", 'open("w'),
+    ("live/record.py", 'open("x'),
+    # To memory, and then into the file with the wrenches that have come before.
+    ("robots/table.py", ".write_csv"),
+    # Under another name, until it was read back.
+    ("new_station.py", ".write_text"),
     # Figures, where --json says.
     ("live/device_client.py", ".write_text"),
     # A mark of one byte more.
     ("studies/store.py", 'open("ab'),
+    ("robots/changes.py", "json.dump"),  # to the process that asked
     # Functions of the package that write by `writing.py`.
     ("run.py", ".save"), ("logs/commands.py", ".save"), ("excitation/command.py", ".save"),
     ("reproduction/reproduce.py", ".save"), ("reproduction/reproduce.py", ".write_parquet"),
@@ -234,3 +241,20 @@ def test_a_socket_for_all_is_seen():
         sockets.on_purpose.add(server.getsockname()[1])
     with socket.create_server(("127.0.0.1", 0)):
         assert listening() <= THIS_MACHINE
+
+
+USES = re.compile(r"uses: (\S+)@(\S+)  # (v\d+\.\d+\.\d+)")
+
+
+def test_workflows_run_pinned_actions_and_the_job_that_publishes_runs_nothing_else():
+    """A tag can be moved; who may publish must not run the code of this repository."""
+    for path in (ROOT / ".github" / "workflows").glob("*.yml"):
+        text = path.read_text()
+        assert len(USES.findall(text)) == text.count("uses:")
+        assert all(re.fullmatch("[0-9a-f]{40}", commit) for _, commit, _ in USES.findall(text))
+        workflow = yaml.safe_load(text)
+        assert workflow["permissions"] == {"contents": "read"}
+        for job in workflow["jobs"].values():
+            assert not ("permissions" in job and any("run" in step for step in job["steps"]))
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "site.yml").read_text())["jobs"]
+    assert jobs["publish"]["permissions"] == {"pages": "write", "id-token": "write"}

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
+import polars as pl
 import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError, one_line
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.read.description import load_description
+from drake_teleop.logs.read.tables import read_table
+from drake_teleop.master.data_sheets import Master
 from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.scenario_reference import write_scenario
 from drake_teleop.studies.study import LoadStudy
-from drake_teleop.texts import read_json, read_yaml
+from drake_teleop.texts import read_json, read_yaml, yaml_data, yaml_text
 
 ALIASES = "a: &a [1, 1]\n" + "\n".join(
     f"{to}: &{to} [{', '.join([f'*{of}'] * 20)}]" for of, to in zip("abcd", "bcde", strict=True)
@@ -212,3 +220,56 @@ def test_a_misspelt_name_is_told_which_one_is_near(load, name, expected):
     with pytest.raises(DrakeTeleopError) as error:
         load(name)
     assert expected in str(error.value)
+
+
+WORDS = st.one_of(
+    st.text(max_size=40),
+    st.sampled_from(["1e-3", "010", "0x1f", "1:30", "yes", "null", "~", ".inf", "<<", "=", "a #b"]),
+    st.from_regex(r"[-+.0-9eE_:xob#,{}\[\]&*!|>'\"%@`~? ]{1,8}", fullmatch=True),
+)
+DATA = st.recursive(
+    st.one_of(
+        WORDS, st.booleans(), st.none(), st.integers(-(10**17), 10**17), st.floats(allow_nan=False)
+    ),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3),
+        st.dictionaries(WORDS.filter(lambda w: w != "_tag"), inner, max_size=3),
+    ),
+    max_leaves=8,
+)
+
+
+@given(DATA)
+def test_all_data_are_read_as_they_were_written(data) -> None:
+    """By this package; and by YAML 1.1, which has other words for numbers and flags."""
+    text = yaml_text(data, head=["a\nb: 1"])
+    assert yaml_data(text, "text") == data
+    assert yaml.safe_load(text) == data
+
+
+def test_comments_stand_behind_their_fields_and_change_nothing() -> None:
+    data = {"a": {"b": "x: #", "c": [1.5, 2]}, "b": [{"_tag": "!Wall", "b": "two\nlines"}]}
+    text = yaml_text(data, head=["above"], comments={"a.b": "of a", "b": "of b"})
+    lines = text.splitlines()
+    assert lines[0] == "# above" and "  b: 'x: #'  # of a" in lines and "b:  # of b" in lines
+    assert yaml_data(text, "text", tagged=True) == data
+    with pytest.raises(DrakeTeleopError, match="cannot be written"):
+        yaml_text({"a": (1, 2)})
+
+
+@pytest.mark.parametrize("word", ["1e-3", "010", "a\nb: 1", "x # y", "\x1b[31m", "!Touch {}"])
+def test_a_scenario_is_written_as_it_is(tmp_path, word) -> None:
+    path = tmp_path / "scenario.yaml"
+    device = Master(model="haply_inverse3")
+    scenario = replace(Scenario(), description=word, slave__sensor_frame=word, master=device)
+    write_scenario(path, scenario)
+    assert LoadScenario(path).description == word
+    assert LoadScenario(path).slave.sensor_frame == word
+
+
+def test_no_column_s_name_gets_out_of_the_comment_of_a_draft(tmp_path) -> None:
+    path = tmp_path / "x.parquet"
+    names = ["t", "fx", "fy", "fz", "a\nimu: {file: /etc/passwd}\n#"]
+    pl.DataFrame({name: np.arange(5.0) for name in names}).write_parquet(path)
+    draft = yaml_data(draft_description(read_table(path), tmp_path), "draft")
+    assert set(draft) == {"wrench"}

@@ -97,14 +97,14 @@ def excite(
         harmonics,
     )
     with show_progress(progress) as stage:
-        told, checking = stage("Design the trajectory"), stage("Check it at 1 kHz")
+        told = stage("Design the trajectory")
 
         def designing(done: float, best: float) -> None:
             told(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
 
         found = design(Problem(task), seed=seed, starts=starts, seconds=seconds, progress=designing)
         designing(1.0, min((iterate.value for iterate in found), default=np.inf))
-        trajectory, uses = best_checked(robot, found, checking)
+        trajectory, uses = best_checked(robot, found, stage("Check it at 1 kHz"))
     best = accumulate((iterate.value for iterate in found), min)
     return Excitation(
         robot,

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import Box, Cylinder, GeometryId, Meshcat, Rgba
+from pydrake.geometry import Box, Cylinder, Meshcat, Rgba
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import Context
@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context
 from drake_teleop.excitation.check import RATE
 from drake_teleop.excitation.excite import Excitation, sensor_motion
 from drake_teleop.excitation.robot import Robot
-from drake_teleop.film import Film, Reading, Show, frame_times, plain_room, rgba
+from drake_teleop.film import Film, Reading, Show, add_shapes, frame_times, plain_room, rgba
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.pages.style import BLUE
@@ -93,20 +93,10 @@ def _AddLinks(meshcat: Meshcat, robot: Robot, context: Context) -> None:
     for k in range(1, plant.num_bodies()):
         body = plant.get_body(BodyIndex(k))
         seen = plant.GetVisualGeometriesForBody(body)
-        for shape in seen or plant.GetCollisionGeometriesForBody(body):
-            name = f"/arm/{k}/{int(shape.get_value())}"
-            meshcat.SetObject(name, inspector.GetShape(shape), _colour(robot, shape))
-            meshcat.SetTransform(name, inspector.GetPoseInFrame(shape))
+        shapes = seen or plant.GetCollisionGeometriesForBody(body)
+        add_shapes(meshcat, f"/arm/{k}", inspector, shapes, _BONE)
         for number, p_BJ in enumerate(() if seen else _carried(robot, context, body)):
             _add_bone(meshcat, f"/arm/{k}/bone_{number}", p_BJ)
-
-
-def _colour(robot: Robot, shape: GeometryId) -> Rgba:
-    """As the model says, if it says so."""
-    properties = robot.scene_graph.model_inspector().GetIllustrationProperties(shape)
-    if properties is None:
-        return _BONE
-    return properties.GetPropertyOrDefault("phong", "diffuse", _BONE)
 
 
 def _carried(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -25,10 +26,14 @@ from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import FRAME, Live, Show
 from drake_teleop.operator.task import Insert
 from drake_teleop.scenario import Scenario
+from drake_teleop.writing import CannotWrite
 
 #: Between the intervals of a trial [s].
 _GAP = 0.8
-_KNOWN = ("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped")
+_KNOWN = (
+    *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
+    *("speed", "slow", "view", "no_view", "moves"),
+)
 _HIDDEN = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": "", "scene": "own"}
 
 
@@ -50,7 +55,7 @@ class Guided:
         stations: of each task and condition.
         scenarios: of the tasks.
         store: beside whose trials the drives are recorded.
-        shows: makes what shows a scenario, which takes the place of the one before.
+        shows: what shows the scene of each task.
         now: the clock [s].
         link: to a haptic device that is the hand.
     """
@@ -61,7 +66,7 @@ class Guided:
         stations: dict[tuple[int, int], Apparatus],
         scenarios: list[Scenario],
         store: Store,
-        shows: Callable[[Scenario], Show],
+        shows: Sequence[Show],
         now: float,
         link: DeviceLink | None = None,
     ) -> None:
@@ -70,7 +75,7 @@ class Guided:
         self._drives, self._shows, self._link = store.folder / "drives", shows, link
         self._clients: list[int] = []
         self._driver: int | None = None
-        self._shown = -1
+        self._unwritten = ""
         self._intervals, self._since, self._frame_due = 0, now, now
         self._prepare(now)
 
@@ -79,8 +84,7 @@ class Guided:
         procedure = self._procedure
         trial, self._prepared = procedure.trial, procedure.prepared
         self._apparatus = self._stations[trial.task, trial.condition]
-        if self._shown != trial.task:
-            self._show, self._shown = self._shows(self._apparatus.scenario), trial.task
+        self._show = self._shows[trial.task]
         insert = self._scenarios[trial.task].operator.task
         insert = insert if isinstance(insert, Insert) else None
         self._rows = Rows(procedure.task, self._apparatus.scenario, insert)
@@ -100,9 +104,9 @@ class Guided:
         if self._driver is not None:
             self._live.join(self._driver, now)
 
-    def _watch(self, rows: dict[str, np.ndarray]) -> None:
+    def _watch(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
         self._rows.add(rows)
-        self._show(unseen(rows))
+        return self._show(unseen(rows))
 
     def hello(self) -> dict[str, Any]:
         """What a page has to know."""
@@ -139,9 +143,18 @@ class Guided:
 
     def _keep_up(self, now: float) -> None:
         """Another interval has its own station."""
-        if self._procedure.prepared != self._prepared:
-            self._live.end()
-            self._prepare(now)
+        with self._noting():
+            if self._procedure.prepared != self._prepared:
+                self._live.end()
+                self._prepare(now)
+
+    @contextmanager
+    def _noting(self) -> Iterator[None]:
+        """Keep what cannot be written for `tick`, which ends the experiment with it."""
+        try:
+            yield
+        except CannotWrite as error:
+            self._unwritten = str(error)
 
     def hear(self, client: int, text: Any, now: float) -> None:
         """A message of a page; what is not one changes nothing but a counter."""
@@ -154,11 +167,13 @@ class Guided:
         if client != self._driver:
             return
         procedure = self._procedure
-        if "set" in said and procedure.phase == INTERVAL:
-            self._live.hear(client, json.dumps({"set": said["set"]}), now)
+        if procedure.phase == INTERVAL:
+            moves = {kind: said[kind] for kind in said.keys() & {"set", "rates"}}
+            self._live.hear(client, json.dumps(moves), now)
         before = procedure.phase, procedure.number
         if "answer" in said:
-            procedure.answer(said["answer"], now - self._since)
+            with self._noting():
+                procedure.answer(said["answer"], now - self._since)
         elif "go" in said:
             procedure.go()
         if (procedure.phase, procedure.number) == before:
@@ -173,11 +188,27 @@ class Guided:
         return self._live.wait(now) if self._runs else max(0.0, self._frame_due - now)
 
     @property
+    def stopped(self) -> str:
+        """Why simulated time stands still; "" if nothing has failed."""
+        return self._live.stopped
+
+    @property
+    def ms(self) -> int:
+        """Simulated time of the present interval [ms]."""
+        return self._live.ms
+
+    @property
     def _runs(self) -> bool:
         return self._procedure.phase == INTERVAL and self._driver is not None
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulates what is due; gives a frame when one is due."""
+        """Simulates what is due; gives a frame when one is due.
+
+        Raises:
+            CannotWrite: if a trial or a drive cannot be written.
+        """
+        if self._unwritten:
+            raise CannotWrite(self._unwritten)
         now = clock()
         if self._procedure.phase == GAP and now - self._since >= _GAP:
             self._procedure.second()

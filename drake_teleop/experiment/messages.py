@@ -15,12 +15,12 @@ def parse_study(text: Any) -> dict[str, Any] | None:
     """What a message asks for; None if it is not one.
 
     Returns:
-        Any of "set" (numbers of `HAND`), "drive", "go" (True), "answer" (1 or 2).
+        Any of "set" and "rates" (numbers of `HAND`), "drive", "go" (True), "answer" (1 or 2).
     """
     said = parse(text) or {}
     found: dict[str, Any] = {}
-    if "set" in said:
-        found["set"] = {name: value for name, value in said["set"].items() if name in HAND}
+    for kind in said.keys() & {"set", "rates"}:
+        found[kind] = {name: value for name, value in said[kind].items() if name in HAND}
     if "drive" in said:
         found["drive"] = True
     try:

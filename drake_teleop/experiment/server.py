@@ -8,15 +8,15 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.experiment.design import Experiment
 from drake_teleop.experiment.guided import Guided
 from drake_teleop.experiment.procedure import Procedure
 from drake_teleop.experiment.simulated import all_apparatus
 from drake_teleop.experiment.store import Store
-from drake_teleop.identified_load import IdentifiedLoad
 from drake_teleop.live.external_master import with_device
-from drake_teleop.live.live import Show
-from drake_teleop.live.server import LiveDrive, show_in
+from drake_teleop.live.page_scene import PageScene
+from drake_teleop.live.server import LiveDrive, waits, warm_up
 from drake_teleop.scenario import Scenario
 
 
@@ -46,18 +46,27 @@ class ExperimentDrive(LiveDrive):
         self._scenarios, self._store = scenarios, store
         super().__init__(scenarios[0], None, port, device)
 
-    def _make(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> Any:
-        def shows(scenario: Scenario) -> Show:
-            self._meshcat.Delete()
-            return show_in(self._meshcat, scenario, forces=False)  # which eyes would tell
+    def _prepare(self, scenario: Scenario, device: bool) -> None:
+        """Make a 3D scene for each task. Arrows would show which force is rendered."""
+        for task in map(str, range(len(self._scenarios))):
+            seen = self._stations[int(task), 0].scenario
+            self._views[task] = PageScene(task, seen, forces=False)
+        first = self._stations[0, 0]
+        warm_up(first.scenario, first.load, device)
 
+    def _make(self, scenario: Scenario, record: Path | None) -> Any:
         link = None if self._device is None else self._device.link
+        shows = [view.show for view in self._views.values()]
         setup = (self._procedure, self._stations, self._scenarios, self._store, shows)
         return Guided(*setup, time.perf_counter(), link)
 
-    def _page(self) -> bytes:
-        panel = resources.files("drake_teleop.experiment").joinpath("page.html").read_bytes()
-        return super()._page().replace(b"</body>", panel + b"</body>")
+    def done(self) -> tuple[int, int]:
+        """Trials that the participant has done, and all."""
+        return self._procedure.number, len(self._procedure.trials)
+
+    def _page(self) -> str:
+        panel = resources.files("drake_teleop.experiment").joinpath("page.html").read_text("utf-8")
+        return super()._page().replace("</body>", panel + "</body>")
 
 
 def serve_experiment(
@@ -70,14 +79,24 @@ def serve_experiment(
     browser: bool,
     device: str | None,
 ) -> None:
-    """Serves the page until Ctrl-C.
+    """Serve the page until Ctrl-C or SIGTERM.
 
     Args:
         experiment, scenarios, store, participant, port, device: as of `ExperimentDrive`.
         browser: whether to open the page.
+
+    Raises:
+        DrakeTeleopError: with what had stopped the drive.
+        KeyboardInterrupt: if the participant has not done all trials.
     """
     live = ExperimentDrive(experiment, scenarios, store, participant, port, device)
     if browser:
         webbrowser.open(live.url)
-    print(f"participant {participant} at {live.url}\nCtrl-C ends it", flush=True)
-    live.wait()
+    print(f"participant {participant} at {live.url}\n{waits(device)}; Ctrl-C ends it", flush=True)
+    reason, (done, trials) = live.until_signal(), live.done()
+    what = f"participant {participant} has done {done} of {trials} trials"
+    if live.ended:
+        raise DrakeTeleopError(f"had stopped: {live.ended}; {what}", where="drive")
+    if done < trials:
+        raise KeyboardInterrupt(f"{reason}: {what}; the same command continues")
+    print(f"\nended by {reason}: {what}")

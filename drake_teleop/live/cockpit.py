@@ -139,24 +139,24 @@ class Cockpit:
                 faults = set(rows[name][:, 0]) - {0.0}
                 yield from (MEANINGS[Fault(int(fault))] for fault in sorted(faults))
         if rows["ik_status"].max() >= IkStatus.OUT_OF_REACH:
-            yield "the arm cannot get where the hand wants it"
+            yield "the arm cannot reach the position of the hand"
         if rows["saturated"].max() > 0:
             yield "the wrist sensor is saturated"
         if self._forces[2, 1] >= _AT_LIMIT * self._peak:
-            yield f"the device gives all that it can, {self._peak:g} N"
+            yield f"the device renders its largest force, {self._peak:g} N"
         hand = np.empty(2)
         _least_and_most(rows["hand_wrench_E"], nothing, hand)
         if hand[1] > _HAND_PULLS:
-            yield "the hand pulls as hard as it can"
+            yield "the simulated hand pulls with its largest force"
         for what, name, part, limits in self._limits:
             full = _at_limits(rows[name][:, part], limits)
             if full:
                 joints = [str(k + 1) for k in range(len(limits)) if full >> k & 1]
                 yield f"joint {', '.join(joints)} at the limit of its {what}"
         if "ports" in rows and rows["ports"][:, 4:6].max() > _SILENT:
-            yield "the network is silent"
+            yield "the network delivers no packets"
         if any(abs(getattr(inputs, name)) == RANGES[name][1] for name in ("x", "y", "z")):
-            yield "the hand is as far out as it may go"
+            yield "the hand is at the edge of its box, 0.3 m wide"
 
 
 def _numbers(values: Array, digits: int) -> list[float]:

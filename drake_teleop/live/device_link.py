@@ -21,8 +21,10 @@ from drake_teleop.live.device_packets import (
     DeviceState,
     ForceCommand,
     packed_force,
+    refusal,
     unpacked_state,
 )
+from drake_teleop.live.inputs import ANGLE, LENGTH
 from drake_teleop.quaternions import conjugate, logarithm, multiply
 from drake_teleop.robots.udp import endpoint, listening
 
@@ -30,7 +32,6 @@ _MOST = 256  # packets at once
 _REMEMBERED = 2000  # packets, of which lateness is told
 # After silence the hand's place is taken anew, with the clutch open for so long [s].
 _SETTLES = 0.05
-_LENGTH, _ANGLE = 1e5, 1e4  # of `Inputs`: in 10 um, in 0.1 mrad
 
 
 class DeviceLink:
@@ -38,6 +39,7 @@ class DeviceLink:
 
     Attributes:
         refused: packets that were none, or another sender's.
+        refusal: why the last of them was.
         lost: packets that never came, or came too late.
         port: that it listens on.
 
@@ -60,6 +62,7 @@ class DeviceLink:
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
         self.refused = self.lost = 0
+        self.refusal = ""
         self._peer: Any = None
         self._state: DeviceState | None = None
         self._heard, self._since, self._now = -np.inf, np.inf, 0.0
@@ -87,6 +90,7 @@ class DeviceLink:
         state, silent = unpacked_state(packet), self.silent(now)
         if state is None or (peer != self._peer and not silent):
             self.refused += 1
+            self.refusal = refusal(packet) if state is None else "is from a second device"
             return
         if silent:  # a new one, or the same one again
             self._peer, self._since, self._state = peer, now, None
@@ -131,8 +135,8 @@ class DeviceLink:
         turn = logarithm(multiply(state.orientation, conjugate(first.orientation)))
         values: dict[str, float] = {"held": 1}
         for k, name in enumerate("xyz"):
-            values[name] = _LENGTH * (state.position[k] - first.position[k])
-            values["r" + name] = _ANGLE * turn[k]
+            values[name] = (state.position[k] - first.position[k]) / LENGTH
+            values["r" + name] = turn[k] / ANGLE
         if state.flags & CLUTCH_OPEN or now - self._since < _SETTLES:
             values["clutch"] = 0
         return values
@@ -151,19 +155,28 @@ class DeviceLink:
         }
 
     def text(self) -> str:
-        """The same at the last `poll` in words, for the page."""
+        """The same at the last `poll` in words, for the page, and what was refused."""
+        return self._heard_text() + self.refused_text()
+
+    def refused_text(self) -> str:
+        """Return how many packets were refused, and why the last was; "" if none was."""
+        if not self.refused:
+            return ""
+        return f". Refused packets: {self.refused}; the last one {self.refusal}"
+
+    def _heard_text(self) -> str:
         now = self._now
         if self.silent(now):
-            what = "the device is silent: no force" if self._peer else "no device yet"
+            what = "The device is silent: no force" if self._peer else "No device yet"
             return f"{what} (udp://127.0.0.1:{self.port})"
         found = self.figures(now)
-        said = f"device: packets {found['late_p99_ms']:.1f} ms late (p99)"
+        said = f"Device: packets arrive up to {found['late_p99_ms']:.1f} ms late (99 of 100)"
         if found["behind_p99_ms"] > 0.0:
             said += (
-                f", its force answers the place of {found['behind_p50_ms']:.1f} ms ago"
-                f" (p99 {found['behind_p99_ms']:.1f})"
+                f"; its force belongs to its position {found['behind_p50_ms']:.1f} ms ago"
+                f" (99 of 100: up to {found['behind_p99_ms']:.1f} ms)"
             )
-        return said + (f", {found['lost']:.0f} lost" if found["lost"] else "")
+        return said + (f"; {found['lost']:.0f} packets lost" if found["lost"] else "")
 
     def close(self) -> None:
         """Frees the port."""

@@ -92,6 +92,18 @@ def believable(number: int, t: float, flags: int, numbers: Sequence[float]) -> D
     return DeviceState(number, t, (x, y, z), orientation, flags & CLUTCH_OPEN, behind)
 
 
+def refusal(packet: bytes) -> str:
+    """Return why a packet is no state of a device: its length, kind, version or values."""
+    if len(packet) != _STATE.size:
+        length = len(packet) if len(packet) < _STATE.size else f"more than {_STATE.size}"
+        return f"is {length} bytes long, not {_STATE.size}"
+    if packet[:3] != _FROM_DEVICE[:3]:
+        return f"begins with {packet[:4]!r}, not {_FROM_DEVICE!r}"
+    if packet[3:4] != _FROM_DEVICE[3:]:
+        return f"has version {packet[3:4]!r}, not {_FROM_DEVICE[3:]!r}"
+    return "has a position, orientation or time out of range"
+
+
 def packed_force(command: ForceCommand) -> bytes:
     """Its packet."""
     return _FORCE.pack(_TO_DEVICE, 0, command.number, command.t, *command.wrench)

@@ -1,12 +1,14 @@
 """What a driver does, as whole numbers: what is recorded is exactly what was simulated.
 
 A recorded drive is a table `inputs.csv`: one row for each change, with its time in ms since the
-start and every input; the last row is the end of the drive, so far as it was recorded.
+start and every input; the last row is the end of the drive, so far as it was recorded. Choices are
+written by name. A comment above has what else the motion depends on, such as versions.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop._version import __version__
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.live.choice_names import NETWORKS, SENSORS, first_choices
+from drake_teleop.live.choice_names import NAMES, NETWORKS, SENSORS, first_choices
 from drake_teleop.operator.operator import GRIPS
 from drake_teleop.passivity.methods import METHODS
 from drake_teleop.quaternions import exponential, logarithm
@@ -29,7 +32,8 @@ Array = NDArray[np.float64]
 INPUTS = "inputs.csv"
 #: The inputs change between slices of this length [ms], and a slice is simulated at once.
 SLICE_MS = 5
-_LENGTH, _ANGLE, _SHARE, _SCALE = 1e-5, 1e-4, 1e-2, 1e-5
+LENGTH, ANGLE = 1e-5, 1e-4  #: units of place [m] and rotation [rad]
+_SHARE, _SCALE = 1e-2, 1e-5
 _LONGEST = 36_000_000  # ms; ten hours, as of a scenario
 
 
@@ -112,14 +116,14 @@ class Inputs:
         """The wanted X_BE (7,), of (3,) the stylus' position at the start [m]; None: let go."""
         if not self.held:
             return None
-        turn = exponential(tuple(_ANGLE * r for r in (self.rx, self.ry, self.rz)))
-        return np.concatenate([turn, start + _LENGTH * np.array([self.x, self.y, self.z])])
+        turn = exponential(tuple(ANGLE * r for r in (self.rx, self.ry, self.rz)))
+        return np.concatenate([turn, start + LENGTH * np.array([self.x, self.y, self.z])])
 
     def held_at(self, pose: Array, start: Array) -> Inputs:
         """With the hand that wants the stylus at `pose` (7,) X_BE, as nearly as numbers allow."""
         turn = logarithm(tuple(pose[:4]))
-        places = zip(("x", "y", "z"), (pose[4:] - start) / _LENGTH, strict=True)
-        turns = zip(("rx", "ry", "rz"), (r / _ANGLE for r in turn), strict=True)
+        places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH, strict=True)
+        turns = zip(("rx", "ry", "rz"), (r / ANGLE for r in turn), strict=True)
         return self.changed({name: float(x) for name, x in (*places, *turns)} | {"held": 1})
 
     @property
@@ -155,50 +159,82 @@ RANGES = {
     **_CHOICES,
 }
 _COLUMNS = ("ms", *RANGES)
+_VERSION = {"drake_teleop": __version__}
 
 
-def header() -> str:
-    """The first line of a file of inputs."""
-    return ",".join(_COLUMNS) + "\n"
+def header(made_by: Mapping[str, str] = _VERSION) -> str:
+    """Return the first lines of a file of inputs.
+
+    Args:
+        made_by: what the motion depends on besides: versions by the name of the package, and so on.
+    """
+    comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
+    return f"# {comment}\n{','.join(_COLUMNS)}\n"
 
 
 def row(ms: int, inputs: Inputs) -> str:
     """A line of it: what holds from this time on [ms]."""
-    return ",".join(map(str, (ms, *(getattr(inputs, name) for name in RANGES)))) + "\n"
+    values = {name: getattr(inputs, name) for name in RANGES}
+    values |= {name: names[values[name]] for name, names in NAMES.items()}
+    return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
-def read_inputs(path: Path) -> list[tuple[int, Inputs]]:
+def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
     """The changes in a file of inputs, with their times [ms]; the last one is the end.
 
     A last line that was being written when its process was killed is left out.
 
+    Args:
+        path: of the file.
+        made_by: as of `header`, of this process.
+
     Raises:
-        DrakeTeleopError: naming file and line, for whatever else is wrong.
+        DrakeTeleopError: naming file and line, for whatever else is wrong; or if the drive cannot
+            be repeated exactly.
     """
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
-    if tuple(lines[0]) != _COLUMNS:
+    if tuple(lines[0]) == _COLUMNS:
+        raise _cannot_repeat("has numbers for names, and no version that gives them meaning", path)
+    if tuple(lines[1:2]) != (list(_COLUMNS),) or not complete.startswith("# "):
         raise DrakeTeleopError(
             "is no record of a drive",
             where=str(path),
             remedy=f"its columns are {', '.join(_COLUMNS)}",
         )
-    changes = list(_checked(lines[1:], path))
+    before = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
+    for name, value in made_by.items():
+        if before.get(name) != value:
+            found = before.get(name, "unknown")
+            what = f"was recorded with {name} {found}, and this is {value}"
+            changed = "the models or other files that its scenario names have changed"
+            raise _cannot_repeat(changed if name == "files" else what, path)
+    changes = list(_checked(lines[2:], path))
     if not changes or changes[-1][0] == 0:
         raise DrakeTeleopError("ends when it begins", where=str(path))
     return changes
 
 
+def _cannot_repeat(what: str, path: Path) -> DrakeTeleopError:
+    remedy = f"it cannot be repeated exactly; for its log: drake-teleop replay {path.parent}"
+    return DrakeTeleopError(what, where=str(path), remedy=remedy)
+
+
 def _checked(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]:
     earlier = -1
-    for number, line in enumerate(lines, start=2):
+    for number, line in enumerate(lines, start=3):
         where = f"{path}:{number}"
+        if len(line) != len(_COLUMNS):
+            raise DrakeTeleopError(f"has {len(line)} values, not {len(_COLUMNS)}", where=where)
+        for column, name in enumerate(_COLUMNS):
+            if name in NAMES and line[column] in NAMES[name]:
+                line[column] = str(NAMES[name].index(line[column]))
+            elif name in NAMES:
+                raise _cannot_repeat(f"has an unknown {name}, {line[column]!r}", path)
         try:
             ms, *values = map(int, line)
         except ValueError:
             raise DrakeTeleopError("has something other than whole numbers", where=where) from None
-        if len(values) != len(RANGES):
-            raise DrakeTeleopError(f"has {len(line)} numbers, not {len(_COLUMNS)}", where=where)
         if not max(earlier, 0) <= ms <= _LONGEST or (earlier < 0 and ms):
             raise DrakeTeleopError(
                 f"{ms} ms is no time here",

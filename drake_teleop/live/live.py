@@ -15,22 +15,23 @@ from typing import Any
 import numpy as np
 from pydrake.math import RollPitchYaw
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, one_line
 from drake_teleop.identified_load import IdentifiedLoad
 from drake_teleop.live.choice_names import NAMES
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.external_master import TICK_MS
-from drake_teleop.live.hand import BEHIND
-from drake_teleop.live.inputs import CHOICES, RANGES, SLICE_MS
+from drake_teleop.live.following import Follower, Steering
+from drake_teleop.live.inputs import CHOICES, RANGES, SLICE_MS, Inputs
 from drake_teleop.live.messages import parse
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.scenes import SCENES
 from drake_teleop.live.session import Session
 from drake_teleop.scenario import Scenario
+from drake_teleop.writing import CannotWrite
 
-Show = Callable[[dict[str, np.ndarray]], None]
-"""Shows the newest of some rows of a log."""
+Show = Callable[[dict[str, np.ndarray]], dict[str, Any]]
+"""Returns what a frame contains of the 3D scene, at the newest of some rows of a log."""
 
 #: Frames for the page [s].
 FRAME = 1 / 60
@@ -42,6 +43,8 @@ _ALONE, _IN_A_ROW = 0.25, 4
 _KEPT_BACK = 0.05  # N of which it is said
 _LONGEST_MS = 36_000_000
 _LIMP = {"held": 0, "clutch": 0}
+# Of this package, of Drake, and of Drake's assertions.
+_FAILURES = (DrakeTeleopError, RuntimeError, SystemExit)
 
 
 class Live:
@@ -49,14 +52,17 @@ class Live:
 
     Attributes:
         refused: how many messages were none.
+        stopped: why simulated time stands still until a reset; "" if nothing has failed.
         asked: the scene that is asked for, "" for none; time stands still until `change`.
         scene: that is driven.
         pace: when slices are due.
+        recorded: folders of the drives that are over.
 
     Args:
         scenario: as `live_scenario` makes it.
         load: what the station knows of its load.
-        record: the folder of the record; None for none. After a reset another one beside it.
+        record: the folder of the record; None for none. If it is not empty, as after a reset, the
+            record goes into the next free one beside it.
         show: what shows the scene.
         now: the clock [s].
         link: to a haptic device that is the hand; None for that of a page.
@@ -82,7 +88,9 @@ class Live:
         self._scenario, self._load, self._record, self._show = scenario, load, record, show
         self._clients: list[int] = []
         self._driver: int | None = None
-        self._drives, self._paused, self._stopped = 0, False, ""
+        self._drives, self._paused, self.stopped = 0, False, ""
+        self.recorded: list[str] = []
+        self._unwritten = ""
         self._alone_since = now
         self.pace = Pace(1e-3 * self._slice_ms, now)
         self._frame_due, self._framed, self._heeded = now, now, False
@@ -90,21 +98,23 @@ class Live:
 
     def _begin(self, now: float) -> None:
         """A drive from the scenario's start."""
-        folder = self._record
-        if folder is not None and self._drives:
-            folder = _next_to(folder)
+        folder = None if self._record is None else _free(self._record)
         self._drives += 1
-        self._folder = "" if folder is None else str(folder)
         log = folder / "log.parquet" if folder is not None and self._log else None
         self._session = Session(
             self._scenario, self._load, log=log, record=folder, device=self._link is not None
         )
+        self._folder = "" if folder is None else str(folder)
         self._session.apply(self._session.inputs.changed(self._first))
         if self._link is not None:
             self._link.begin_anew(now)
-        self._cockpit, self._stopped, self._asleep = Cockpit(self._scenario), "", False
+        scaling, by_device = self._scenario.kinematic_scaling, self._link is not None
+        scales = scaling.translation_scale, scaling.rotation_scale
+        self._follower = Follower(1e-3 * self._slice_ms, scales, device=by_device)
+        self._cockpit, self.stopped = Cockpit(self._scenario), ""
+        self._asleep = self._driver is None
         self._refusal, self._pressed = "", False
-        self._wanted = self._session.inputs
+        self._wanted, self._steering = self._session.inputs, Steering()
         self._led = self._wanted.target
         self._frame: dict[str, Any] = {}
         self.pace.start(now)
@@ -113,10 +123,17 @@ class Live:
         self, scenario: Scenario, load: IdentifiedLoad | None, show: Show, now: float
     ) -> None:
         """A drive of another scenario, the scene that was asked for."""
-        self._try(self._session.close)
         self._scenario, self._load, self._show = scenario, load, show
         self.scene, self.asked = self.asked, ""
-        self._begin(now)
+        self._restart(now)
+
+    def _restart(self, now: float) -> None:
+        """Close the record and begin again. What fails stops the drive, or is said in it."""
+        self.stopped = ""
+        self._try(self.end)
+        failure = self.stopped
+        self._try(lambda: self._begin(now))
+        self._refusal = failure
 
     def refuse(self, why: str, now: float) -> None:
         """The scene that was asked for cannot be driven; the present one goes on."""
@@ -135,7 +152,6 @@ class Live:
             "known": self._load is not None,
             "noise": self._load is not None and self._load.noise_floor is not None,
             "scale": scaling.translation_scale,
-            "behind": BEHIND,
             "alignment": RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix().tolist(),
             "scenes": SCENES,
         }
@@ -151,7 +167,7 @@ class Live:
         self._clients.remove(client)
         if client == self._driver:
             self._driver, self._alone_since = None, now
-            self._wanted = self._wanted.changed(_LIMP)
+            self._wanted, self._steering = self._wanted.changed(_LIMP), Steering()
 
     def hear(self, client: int, text: Any, now: float) -> None:
         """A message of a page; what is not one changes nothing but a counter."""
@@ -167,21 +183,24 @@ class Live:
             if not CHOICES.isdisjoint(said["set"]):
                 self._refusal = ""
             self._wanted = self._wanted.changed(said["set"])
+            self._steering = Steering()
+        if "rates" in said:
+            self._wanted = self._steering.begin(said["rates"], self._wanted, now)
         if "slow" in said:
             self.pace.slow = said["slow"]
+            self.pace.start(now)
         if "pause" in said and said["pause"] != self._paused:
             self._paused = said["pause"]
             self.pace.start(now)
         if "scene" in said and not self.asked:
             self.asked = said["scene"]
         if "reset" in said:
-            self._try(self._session.close)
-            self._begin(now)
+            self._restart(now)
 
     def _hand_over(self, client: int, now: float) -> None:
         """The client takes hold of the stylus where it is."""
         self._driver = client
-        self._wanted = self._session.stylus().changed({"clutch": 1})
+        self._wanted, self._steering = self._session.stylus().changed({"clutch": 1}), Steering()
         if self._asleep:
             self.pace.start(now)
         self._asleep = False
@@ -194,7 +213,7 @@ class Live:
     @property
     def still(self) -> bool:
         """Whether simulated time stands still."""
-        return self._paused or self._asleep or bool(self._stopped or self.asked)
+        return self._paused or self._asleep or bool(self.stopped or self.asked)
 
     def wait(self, now: float) -> float:
         """How long there is nothing to do [s]."""
@@ -235,51 +254,59 @@ class Live:
         """Where the station or the disk cannot go on, the drive stops and says why."""
         try:
             action()
-        except DrakeTeleopError as error:
-            self._stopped = str(error)
+        except _FAILURES as error:
+            self.stopped = one_line(str(error))
 
     def _slice(self, now: float) -> None:
         by_device = {} if self._link is None else self._link.lead(now)
+        self._wanted = self._steering.step(self._wanted, 1e-3 * self._slice_ms, now)
         self._heeded |= self._wanted.target != self._led
         self._led = self._wanted.target
         try:
-            self._session.apply(self._wanted.changed(by_device))
-        except DrakeTeleopError as error:
+            self._session.apply(self._followed(self._wanted.changed(by_device)))
+        except _FAILURES as error:
             present = self._session.inputs
             if self._wanted.station == present.station:
-                self._stopped = str(error)
+                self.stopped = one_line(str(error))
             else:  # there is no such station: the present one goes on
-                self._refusal = str(error)
+                self._refusal = one_line(str(error))
                 kept = {name: getattr(present, name) for name in CHOICES}
                 self._wanted = self._wanted.changed(kept)
-        if not self._stopped:
+        if not self.stopped:
             self._try(lambda: self._session.advance(self._slice_ms))
             pressed = self._session.pressed() > TOUCH
             self._heeded |= pressed and not self._pressed
             self._pressed = pressed
-        if self._link is not None and not self._stopped:
+        if self._link is not None and not self.stopped:
             self._link.send(self._session.force())
         if self._session.ms >= _LONGEST_MS:
-            self._stopped = "ten hours are over"
+            self.stopped = "ten hours are over"
+
+    def _followed(self, wanted: Inputs) -> Inputs:
+        """The inputs of this slice; what does not move the arm may jump."""
+        by_device = self._link is not None
+        free = not self._session.inputs.held or (by_device and not wanted.clutch)
+        return self._follower.step(wanted, free=free)
 
     def frame(self) -> dict[str, Any]:
         """What a page is shown now."""
         rows = self._session.news()
         if len(rows["t"]):
-            self._frame = self._cockpit.frame(rows, self._session.inputs)
-            self._show(rows)
+            self._frame = self._cockpit.frame(rows, self._session.inputs) | self._show(rows)
         inputs = self._wanted
         words = self._frame.get("words", [])
         if self._session.filling:
-            words = ["another channel fills: the clutch is open until it has", *words]
+            words = ["a new channel starts: the clutch is open until its packets arrive", *words]
         kept = self._session.kept_back()
         if kept > _KEPT_BACK:
-            words = [f"{kept:.1f} N are kept from the hand until it eases off", *words]
+            words = [f"{kept:.1f} N are not rendered until the hand presses less", *words]
         if self._refusal:
             words = [self._refusal, *words]
         return self._frame | {
             "words": words,
             "device": "" if self._link is None else self._link.text(),
+            "speed": round(self.pace.factor, 4),
+            "slow": self.pace.slow,
             "factor": round(self.pace.factor * self.pace.slow, 3),
             "late": round(1e3 * self.pace.lateness(), 1),
             "lost": round(self.pace.given_up, 2),
@@ -288,29 +315,49 @@ class Live:
             "drive": self._drives,
             "scene": self.asked or self.scene,
             "record": self._folder,
-            "stopped": self._stopped,
+            "stopped": self.stopped,
             "inputs": {name: getattr(inputs, name) for name in RANGES},
         }
 
     def _state(self) -> str:
         if self.asked:
             return "preparing"
-        if self._stopped:
+        if self.stopped:
             return "stopped"
         return "paused" if self._paused else "waiting" if self._asleep else "running"
 
     def end(self) -> None:
-        """Its record is complete; a device may go on in another drive."""
-        self._session.close()
+        """Completes its record; a device may go on in another drive.
+
+        Raises:
+            CannotWrite: if the record cannot be completed.
+        """
+        try:
+            self._session.close()
+        except DrakeTeleopError as error:
+            self._unwritten = self._unwritten or str(error)
+            raise
+        if self._folder and self._session.ms:
+            self.recorded.append(self._folder)
+        self._folder = ""
 
     def close(self) -> None:
-        """Ends the drive, and the link to a device."""
-        self.end()
+        """Ends the drive, and the link to a device.
+
+        Raises:
+            CannotWrite: if the record of any of its drives is incomplete.
+        """
+        self._try(self.end)
         if self._link is not None:
             self._link.close()
+        if self._unwritten:
+            raise CannotWrite(self._unwritten)
 
 
-def _next_to(folder: Path) -> Path:
-    """The first of DIR-2, DIR-3, ... that is not there."""
+def _free(folder: Path) -> Path:
+    """Return the folder if it is absent or empty, else the first absent one of DIR-2, DIR-3, ..."""
+    folder = folder if folder.name.strip(".") else folder.resolve()  # "." has no neighbour
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return folder
     names = (folder.with_name(f"{folder.name}-{k}") for k in itertools.count(2))
     return next(name for name in names if not name.exists())

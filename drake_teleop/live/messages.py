@@ -18,8 +18,9 @@ def parse(text: Any) -> dict[str, Any] | None:
     """What a message asks for; None if it is not one.
 
     Returns:
-        Any of "set" (a dict of numbers by input), "pause" (bool), "slow" (1 to 20), "scene" (one of
-        `SCENES`), "reset" and "drive" (True); nothing else is in it.
+        Any of "set" (a dict of numbers by input), "rates" (likewise, per simulated second),
+        "pause" (bool), "slow" (1 to 20), "scene" (one of `SCENES`), "reset" and "drive" (True);
+        nothing else is in it.
     """
     if not isinstance(text, str) or len(text) > LONGEST:
         return None
@@ -30,9 +31,10 @@ def parse(text: Any) -> dict[str, Any] | None:
     if not isinstance(said, dict):
         return None
     found: dict[str, Any] = {}
-    values = said.get("set")
-    if isinstance(values, dict):
-        found["set"] = {name: value for name, value in values.items() if _is_number(value)}
+    for kind in ("set", "rates"):
+        values = said.get(kind)
+        if isinstance(values, dict):
+            found[kind] = {name: value for name, value in values.items() if _is_number(value)}
     if isinstance(said.get("pause"), bool):
         found["pause"] = said["pause"]
     if _is_number(said.get("slow")):

@@ -1,8 +1,7 @@
 """`drake-teleop drive`: one page on this machine, and the socket that drives.
 
-The page, Drake's 3D viewer and the socket are served on 127.0.0.1 alone, to who knows the token in
-the address; the socket, to this very page. Meshcat listens there too, and tells the scene to
-whoever asks; nothing is ever taken from it.
+One port of 127.0.0.1 serves page, 3D viewer, scenes and socket, to clients that send the token of
+the address; the socket, to this page alone. Nothing else listens.
 """
 
 from __future__ import annotations
@@ -10,21 +9,25 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-import gc
 import itertools
 import json
+import logging
+import os
 import secrets
+import shlex
+import sys
 import threading
 import time
 import webbrowser
+from collections.abc import Callable
+from concurrent.futures import Future
 from http import HTTPStatus
 from importlib import resources
 from pathlib import Path
-from urllib.parse import parse_qs, urlsplit
+from typing import Any
+from urllib.parse import parse_qs
 
-import numpy as np
 from pydrake.common import FindResourceOrThrow
-from pydrake.geometry import Meshcat, MeshcatParams
 from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -32,16 +35,18 @@ from websockets.http11 import Request, Response
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.estimation.contact_detection import ContactDetectionConfig
-from drake_teleop.film import quiet_drake
 from drake_teleop.identified_load import IdentifiedLoad, identified_load
+from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device import DrivenBy
 from drake_teleop.live.external_master import with_device
-from drake_teleop.live.live import Live, Show
+from drake_teleop.live.live import Live
 from drake_teleop.live.messages import LONGEST
 from drake_teleop.live.pace import without_collections
-from drake_teleop.live.scenes import scene
-from drake_teleop.live.session import live_scenario
-from drake_teleop.replay import ReplayScene
+from drake_teleop.live.page_scene import PageScene
+from drake_teleop.live.scenes import SCENES, scene
+from drake_teleop.live.session import Session, live_scenario
+from drake_teleop.pages.policy import policy
+from drake_teleop.pages.progress import Progress, Stage, show_progress
 from drake_teleop.scenario import LoadScenario, Scenario, check_scenario
 from drake_teleop.writing import make_folder
 
@@ -50,6 +55,12 @@ _MOST_CLIENTS = 8
 # Turns of the loop from a socket that can be read to what has been said: one wakes its reader.
 _STEPS_OF_A_MESSAGE = 3
 _BEHIND = 2**18  # bytes that wait for a slow page, before it misses frames
+# s: for the clients, for the thread of the drive.
+_CLOSES, _ENDS = 1.0, 4.0
+_OR_DEVICE = ("", " or until the device sends")
+# Of websockets' log everything else is about connections that failed, which a client causes.
+_LOGGER = logging.getLogger("drake_teleop.live.server")
+_LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
 
 
 class LiveDrive:
@@ -57,6 +68,9 @@ class LiveDrive:
 
     Attributes:
         url: of the page; whoever has it may drive.
+        recorded: folders of the drives that are over.
+        ended: afterwards, why simulated time had stopped; "" if it had not.
+        ms: afterwards, the simulated time [ms].
     """
 
     def __init__(
@@ -65,66 +79,125 @@ class LiveDrive:
         setup = live_scenario(scenario if device is None else with_device(scenario))
         setup.check()
         if record is not None:
-            make_folder(record)  # before there is a Meshcat, which only its own thread may unmake
-        load = _load_of(setup)
+            make_folder(record)
+        self.ended, self.ms = "", 0
+        self._views: dict[str, PageScene] = {}
+        self._prepare(setup, device is not None)
         self._pages: dict[ServerConnection, int] = {}
-        self._own = setup
+        self.recorded: list[str] = []
         self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
         self._device = None if device is None else DrivenBy(device)
-        self._failed: Exception | None = None
-        self._ready, self._over = threading.Event(), threading.Event()
+        self._failed: BaseException | None = None
+        self._ready, self._over, self._stop = (threading.Event() for _ in range(3))
         self._numbers = itertools.count(1)  # of pages
-        self._thread = threading.Thread(target=self._run, args=(setup, load, record), daemon=True)
-        self._thread.start()
-        self._ready.wait()
-        if self._failed is not None:
-            raise self._failed
+        self._threads: list[threading.Thread] = []
+        self._start(self._run, setup, record)
+        try:
+            self._ready.wait()
+        except KeyboardInterrupt:
+            self._end()
+            raise
+        self._check()
+
+    def _start(self, work: Callable[..., None], *arguments: Any) -> None:
+        """Start a thread that ends with the drive."""
+        self._threads.append(threading.Thread(target=work, args=arguments, daemon=True))
+        self._threads[-1].start()
+
+    def _prepare(self, scenario: Scenario, device: bool) -> None:
+        """Identify the load, and make the 3D scenes before anything listens."""
+        with show_progress(True) as stage:
+            self._load = _load_of(scenario, stage)
+            self._make_scenes(scenario, device, stage("Prepare the station and its 3D scenes"))
+
+    def _make_scenes(self, scenario: Scenario, device: bool, told: Progress) -> None:
+        self._offered = {name: scene(name, scenario) for name in SCENES}
+        if device:
+            self._offered = {name: with_device(each) for name, each in self._offered.items()}
+        for name, each in self._offered.items():
+            self._views[name] = PageScene(name, each)
+            told(len(self._views) / (1 + len(SCENES)))
+        warm_up(scenario, self._load, device)
+        told(1.0)
 
     def wait(self) -> None:
-        """Waits until it is over: after `stop`, or Ctrl-C."""
+        """Wait until the drive is over: after `stop`, or Ctrl-C.
+
+        Raises:
+            DrakeTeleopError: if the record is not complete.
+        """
         try:
             while not self._over.wait(0.2):
                 pass
         finally:
-            self.stop()
+            self._end()
+        self._check()
+
+    def until_signal(self) -> str:
+        """Wait for Ctrl-C or SIGTERM, and return which.
+
+        Raises:
+            DrakeTeleopError: if the record is not complete.
+        """
+        try:
+            self.wait()
+            return "stop"
+        except KeyboardInterrupt as signal:
+            self._check()
+            return str(signal) or "Ctrl-C"
+
+    def _check(self) -> None:
+        """Raise what ended the drive, if it was an error."""
         if self._failed is not None:
             raise self._failed
 
     def stop(self) -> None:
-        """Ends the drive; its record is then complete on the disk."""
-        with contextlib.suppress(RuntimeError):  # the loop is closed already
-            self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join()
+        """End the drive; its record is then complete on the disk."""
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+
+    def _end(self) -> None:
+        """Stop within 4 s, whatever further signals come.
+
+        Compiled code in another thread cannot be ended, and Python may crash at its exit then.
+        """
+        self._stop.set()
+        end = time.monotonic() + _ENDS
+        for thread in self._threads:
+            while thread.is_alive() and (rest := end - time.monotonic()) > 0.0:
+                with contextlib.suppress(KeyboardInterrupt):
+                    thread.join(rest)
+        if any(thread.is_alive() for thread in self._threads):
+            lost = "; its record may lack two seconds" if self._threads[0].is_alive() else ""
+            print(f"error: drive: does not end within {_ENDS:g} s{lost}", file=sys.stderr)
+            sys.stdout.flush()
+            os._exit(2)
 
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.url}" style="width:100%;height:44rem;border:0"></iframe>'
 
-    def _run(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> None:
-        """The drive's thread. Meshcat is made and unmade here: no other thread may touch it."""
+    def _run(self, scenario: Scenario, record: Path | None) -> None:
+        """Run the drive on its thread."""
         try:
-            with quiet_drake():
-                self._meshcat = Meshcat(MeshcatParams(host="localhost"))
-            self._live = self._make(scenario, load, record)
+            self._live = self._make(scenario, record)
             asyncio.run(self._serve())
-        except Exception as error:
-            self._failed = _without_frames(error)
+        except (Exception, SystemExit) as error:  # the second is a failed assertion of Drake
+            self._failed = error
         finally:
-            for name in ("_live", "_meshcat"):  # none, if it could not be made
-                self.__dict__.pop(name, None)
-            while gc.collect():  # what Drake's objects keep alive is garbage after they are gone
-                pass
             if self._device is not None:
                 self._device.close()
             self._over.set()
             self._ready.set()
 
-    def _make(self, scenario: Scenario, load: IdentifiedLoad | None, record: Path | None) -> Live:
-        show = show_in(self._meshcat, scenario)
+    def _make(self, scenario: Scenario, record: Path | None) -> Live:
+        show = self._views[SCENES[0]].show
         link = None if self._device is None else self._device.link
-        return Live(scenario, load, record, show, time.perf_counter(), link)
+        live = Live(scenario, self._load, record, show, time.perf_counter(), link)
+        self.recorded = live.recorded
+        return live
 
     async def _serve(self) -> None:
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         try:
             server = await serve(
                 self._meet,
@@ -136,7 +209,8 @@ class LiveDrive:
                 compression=None,
                 ping_interval=5,
                 ping_timeout=5,
-                close_timeout=1,
+                close_timeout=_CLOSES,
+                logger=_LOGGER,
             )
         except OSError as error:
             what = f"cannot be listened to ({error.strerror})"
@@ -146,13 +220,19 @@ class LiveDrive:
         self.url = f"http://{_HOST}:{self._port}/?token={self._token}"
         self._ready.set()
         try:
-            async with server:
-                await self._drive(server)
+            await self._drive(server)
         finally:
-            self._live.close()
+            self.ended, self.ms = self._live.stopped, self._live.ms
+            try:
+                self._live.close()
+            finally:
+                server.close()
+                with contextlib.suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(server.wait_closed(), 2 * _CLOSES)
 
     async def _drive(self, server: Server) -> None:
         """The one loop: slices and frames, and messages whenever there is time between them."""
+        refusal = ""
         with without_collections():
             while not self._stop.is_set():
                 if self._live.asked:
@@ -165,6 +245,9 @@ class LiveDrive:
                         if c.transport.get_write_buffer_size() < _BEHIND
                     ]
                     broadcast(ready, json.dumps({"frame": frame}))
+                if self._device is not None and self._device.link.refusal != refusal:
+                    refusal = self._device.link.refusal
+                    _tell(f"a packet of the device was refused: it {refusal}")
                 await self._sleep()
 
     async def _sleep(self) -> None:
@@ -180,48 +263,66 @@ class LiveDrive:
             await asyncio.sleep(0)
 
     async def _change_scene(self) -> None:
-        """Identifies the load beside the loop, which may take a while; all else is Meshcat's."""
-        live = self._live
-        frame = json.dumps({"frame": live.frame()})
-        broadcast(self._pages, frame)
+        """Identify the load on another thread, which may take minutes."""
+        live, found = self._live, Future[IdentifiedLoad | None]()
+        broadcast(self._pages, json.dumps({"frame": live.frame()}))
+        scenario, show = self._offered[live.asked], self._views[live.asked].show
+
+        def identify() -> None:
+            try:
+                found.set_result(_load_of(scenario, self._until_stopped))
+            except Exception as error:
+                found.set_exception(error)
+
+        self._start(identify)
+        while not found.done():
+            if self._stop.is_set():
+                return
+            await asyncio.sleep(0.05)
         try:
-            scenario = scene(live.asked, self._own)
-            if self._device is not None:
-                scenario = with_device(scenario)
-            load = await asyncio.to_thread(_load_of, scenario)
+            live.change(scenario, found.result(), show, time.perf_counter())
         except DrakeTeleopError as error:
             live.refuse(str(error), time.perf_counter())
             return
-        self._meshcat.Delete()
-        live.change(scenario, load, show_in(self._meshcat, scenario), time.perf_counter())
         for page in tuple(self._pages):
             with contextlib.suppress(ConnectionClosed):
                 await page.send(self._hello(page))
 
-    def _hello(self, page: ServerConnection) -> str:
-        more = {"you": self._pages[page], "meshcat": self._meshcat.ws_url()}
-        return json.dumps({"hello": self._live.hello() | more})
+    def _until_stopped(self, name: str) -> Progress:
+        """A stage that ends its computation when the drive ends."""
 
-    def _page(self) -> bytes:
-        return resources.files("drake_teleop.live").joinpath("page.html").read_bytes()
+        def progress(fraction: float, words: str = "") -> None:
+            if self._stop.is_set():
+                raise DrakeTeleopError("the drive has ended")
+
+        return progress
+
+    def _hello(self, page: ServerConnection) -> str:
+        return json.dumps({"hello": self._live.hello() | {"you": self._pages[page]}})
+
+    def _page(self) -> str:
+        return resources.files("drake_teleop.live").joinpath("page.html").read_text("utf-8")
 
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Serves a file, or lets a socket be opened; refuses whatever is not from our own page."""
+        """Serve a file, or let a socket be opened; refuse everything that is not our own page's."""
         host = f"{_HOST}:{self._port}"
-        address = urlsplit(request.path)
-        token = parse_qs(address.query).get("token", [""])[0]
-        if request.headers.get("Host") != host or not secrets.compare_digest(
-            token.encode(), self._token.encode()
-        ):
+        path, _, query = request.path.partition("?")
+        token = parse_qs(query).get("token", [""])[0].encode(errors="replace")
+        ours = secrets.compare_digest(token, self._token.encode())
+        if request.headers.get_all("Host") != [host] or not ours:
             return _response(HTTPStatus.FORBIDDEN, "text/plain", b"The address needs its token.\n")
-        if address.path == "/socket":
+        if path == "/socket":
             origin = request.headers.get_all("Origin")
             if origin != [f"http://{host}"]:
                 return _response(HTTPStatus.FORBIDDEN, "text/plain", b"Another page's.\n")
             return None
-        if address.path == "/":
-            return _response(HTTPStatus.OK, "text/html; charset=utf-8", self._page())
-        if address.path == "/meshcat.js":
+        if path == "/":
+            page = self._page()
+            own = policy(page, host)
+            return _response(HTTPStatus.OK, "text/html; charset=utf-8", page.encode(), own)
+        if path.startswith("/scene/") and (view := self._views.get(path[len("/scene/") :])):
+            return _response(HTTPStatus.OK, "application/json", view.objects)
+        if path == "/meshcat.js":
             script = Path(FindResourceOrThrow("drake/geometry/meshcat.js")).read_bytes()
             return _response(HTTPStatus.OK, "text/javascript; charset=utf-8", script)
         return _response(HTTPStatus.NOT_FOUND, "text/plain", b"Nothing is here.\n")
@@ -243,26 +344,29 @@ class LiveDrive:
         finally:
             del self._pages[connection]
             live.leave(you, time.perf_counter())
+            if not (self._pages or self._stop.is_set()):
+                _tell("no page is open: nothing runs" + _OR_DEVICE[self._device is not None])
 
 
-def _load_of(scenario: Scenario) -> IdentifiedLoad | None:
+def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | None:
     """What the station is told of its load; with its noise, so that contact may be detected."""
     if scenario.load_estimator.enabled:
         return None
     detection = scenario.contact_detection or ContactDetectionConfig()
-    return identified_load(dataclasses.replace(scenario, contact_detection=detection))
+    return identified_load(dataclasses.replace(scenario, contact_detection=detection), progress)
 
 
-def _without_frames(error: Exception) -> Exception:
-    """It and what led to it hold no frames, whose variables another thread would unmake."""
-    link: BaseException | None = error
-    while link is not None:
-        link.__traceback__ = None
-        link = link.__cause__ or link.__context__
-    return error
+def warm_up(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> None:
+    """Compile what the first slices need before anybody waits for them: a minute, once."""
+    session, cockpit = Session(scenario, load, device=device), Cockpit(scenario)
+    for z in (-1, -2):  # one row first, then several: to numba they are of different types
+        cockpit.frame(session.news(), session.inputs)
+        session.apply(session.inputs.changed({"z": z}))
+        session.advance()
+    session.stylus()
 
 
-def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
+def _response(status: HTTPStatus, kind: str, body: bytes, own: str = "") -> Response:
     headers = Headers(
         {
             "Content-Type": kind,
@@ -271,20 +375,10 @@ def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
             "Referrer-Policy": "no-referrer",
             "X-Content-Type-Options": "nosniff",
             "Connection": "close",
+            "Content-Security-Policy": own or "default-src 'none'",
         }
     )
     return Response(status.value, status.phrase, headers, body)
-
-
-def show_in(meshcat: Meshcat, scenario: Scenario, forces: bool = True) -> Show:
-    """What shows the newest rows of a log in Meshcat, as a film does, with or without `forces`."""
-    arrows = ("measured_wrench_S", "contact_wrench_S") if forces else ()
-    scene = ReplayScene(meshcat, scenario, ("slave_state", "master_state", *arrows))
-
-    def show(rows: dict[str, np.ndarray]) -> None:
-        scene.show(float(rows["t"][-1]), rows, -1)
-
-    return show
 
 
 def drive(
@@ -323,16 +417,26 @@ def drive(
 def drive_command(
     scenario: str, *, record: Path | None, port: int, browser: bool, device: str | None = None
 ) -> None:
-    """`drake-teleop drive`: until Ctrl-C.
+    """`drake-teleop drive`: until Ctrl-C or SIGTERM.
 
     Raises:
-        DrakeTeleopError: as `drive`.
-        KeyboardInterrupt: saying how the drive is repeated, if it is recorded.
+        DrakeTeleopError: as `drive`; if the record is not complete; or with what had stopped it.
     """
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
-    print(f"drive it at {live.url}\nCtrl-C ends it", flush=True)
-    try:
-        live.wait()
-    except KeyboardInterrupt:
-        if record is not None:
-            print(f"\nrecorded; repeat it: drake-teleop run --inputs {record}")
+    print(f"drive it at {live.url}\n{waits(device)}; Ctrl-C ends it", flush=True)
+    reason = live.until_signal()
+    print(f"\nended by {reason} after {1e-3 * live.ms:.1f} s of simulated time")
+    for folder in live.recorded:
+        print(f"recorded; repeat it: drake-teleop run --inputs {shlex.quote(folder)}")
+    if live.ended:
+        raise DrakeTeleopError(f"had stopped: {live.ended}", where="drive")
+
+
+def waits(device: str | None) -> str:
+    """Return what a drive waits for, for the terminal."""
+    return "nothing runs until that page is open" + _OR_DEVICE[device is not None]
+
+
+def _tell(text: str) -> None:
+    """Tell on the terminal what no page may show."""
+    print(text, file=sys.stderr, flush=True)

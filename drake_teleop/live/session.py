@@ -11,7 +11,6 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +20,21 @@ from pydrake.systems.analysis import InitializeParams
 from pydrake.systems.framework import Context
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identified_load import IdentifiedLoad, read_load, write_load
+from drake_teleop.identified_load import IdentifiedLoad, read_load
 from drake_teleop.live.choices import BLEND, chosen, filled_after, known_estimate
 from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
 from drake_teleop.live.handing_on import hand_on
-from drake_teleop.live.inputs import INPUTS, SLICE_MS, Inputs, header, read_inputs, row
+from drake_teleop.live.inputs import INPUTS, SLICE_MS, Inputs, read_inputs
 from drake_teleop.live.log_beside import LogBeside
+from drake_teleop.live.record import DEVICE, LOAD, SCENARIO, Record, made_by
 from drake_teleop.live.steps import take_short_steps_in_contact
 from drake_teleop.pages.progress import Progress
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.scenario_reference import commented
 from drake_teleop.signals import LOG, SIGNALS, signal_of
 from drake_teleop.simulation import MakeSimulator, advance, columns, read_log
 from drake_teleop.station import GetBlock, MakeTeleopStation
-from drake_teleop.writing import make_folder, naming, write_text
 
 #: Of a log on disk: two seconds. A longer part takes longer to copy, which a driver would notice; a
 #: file of its own takes 10 ms of CPU however short it is.
@@ -50,9 +48,6 @@ _RAMP = 0.05
 _SHORTEST_STEP = 2.5e-4
 #: By how much another channel may raise what a pressing hand feels [N].
 _MOST_RISE = 0.9
-_LOAD, _SCENARIO = "load.npz", "scenario.yaml"
-# Where this is, the hand's place in the inputs is that of a device.
-_DEVICE = "device.txt"
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
@@ -202,9 +197,9 @@ class Session:
         self._stations, self._seen, self._fills_ms = 1, 0, 0
         estimate = None if load is None else load.estimate
         self._now = _Station(scenario, estimate, load, 0, device=device)
-        self._record = None
+        self._record: Record | None = None
         if record is not None:
-            self._record = _Record(record, scenario, load, self.inputs, device=device)
+            self._record = Record(record, scenario, load, self.inputs, device=device)
         self._on_disk: LogBeside | None = None
         if log is not None:
             self._on_disk = LogBeside(log, self._now.simulator, 0.0, with_all_signals)
@@ -331,54 +326,14 @@ class Session:
         return SimulationResult(t, values, parts[0].specs)
 
     def close(self) -> None:
-        """Ends the record."""
-        self.keep()
-        if self._record is not None:
-            self._record.close()
-
-
-class _Record:
-    """The folder of a drive, but for the log."""
-
-    def __init__(
-        self,
-        folder: Path,
-        scenario: Scenario,
-        load: IdentifiedLoad | None,
-        inputs: Inputs,
-        *,
-        device: bool,
-    ) -> None:
-        make_folder(folder)
-        write_text(folder / _SCENARIO, commented(scenario))
-        path = folder / INPUTS
-        with naming(folder / _LOAD):
-            (folder / _LOAD).unlink(missing_ok=True)
-            (folder / _DEVICE).unlink(missing_ok=True)
-        if device:
-            write_text(folder / _DEVICE, "x to rz of inputs.csv are the places of a device.\n")
-        if load is not None:
-            write_load(folder / _LOAD, load)
-        with naming(path):
-            self._file: TextIOWrapper = path.open("w", encoding="utf-8", newline="\n")
-        self._last = ""
-        self._append(header())
-        self.write(0, inputs)
-
-    def write(self, ms: int, inputs: Inputs) -> None:
-        """Records a change at once: it outlives the process."""
-        line = row(ms, inputs)
-        if line != self._last:
-            self._append(line)
-            self._last = line
-
-    def _append(self, line: str) -> None:
-        with naming(Path(self._file.name)):
-            self._file.write(line)
-            self._file.flush()
-
-    def close(self) -> None:
-        self._file.close()
+        """Ends the record; that of a drive that never began is removed."""
+        record, self._record = self._record, None
+        try:
+            if record is not None:
+                record.close(self.ms, self.inputs)
+        finally:
+            if record is None or self.ms:
+                self.keep()
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,14 +360,14 @@ def read_drive(folder: str | Path) -> Drive:
         DrakeTeleopError: if it is none, or naming what in it cannot be used.
     """
     folder = Path(folder)
-    changes = read_inputs(folder / INPUTS)
-    scenario = LoadScenario(folder / _SCENARIO)
-    load = read_load(folder / _LOAD)
+    scenario = LoadScenario(folder / SCENARIO)
+    changes = read_inputs(folder / INPUTS, made_by(scenario))
+    load = read_load(folder / LOAD)
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
-    if not known or (load is None and (folder / _LOAD).exists()):
-        raise DrakeTeleopError("is damaged, or no load of a drive", where=str(folder / _LOAD))
+    if not known or (load is None and (folder / LOAD).exists()):
+        raise DrakeTeleopError("is damaged, or no load of a drive", where=str(folder / LOAD))
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
-    return Drive(driven, load, changes, (folder / _DEVICE).exists())
+    return Drive(driven, load, changes, (folder / DEVICE).exists())
 
 
 def repeat(

@@ -26,12 +26,7 @@ def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> 
     """
     wanted = ", ".join(["..."] * leading + [str(n) for n in shape])
     wanted = f"({wanted},)" if len(shape) == 1 and not leading else f"({wanted})"
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise DrakeTeleopError(
-            f"holds no numbers ({error})", where=name, remedy=f"give an array of shape {wanted}"
-        ) from error
+    array = numbers(name, value, f"give an array of shape {wanted}")
     own = array.shape[array.ndim - len(shape) :] if leading else array.shape
     if own != shape:
         raise DrakeTeleopError(f"has shape {array.shape} instead of {wanted}", where=name)
@@ -40,6 +35,21 @@ def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> 
         first = tuple(int(i) for i in np.argwhere(~finite)[0])
         raise DrakeTeleopError(f"is not finite at index {first}", where=name)
     return array
+
+
+def numbers(name: str, value: ArrayLike, remedy: str = "") -> Array:
+    """`value` as a float64 array of any shape, without loss.
+
+    Raises:
+        DrakeTeleopError: if it holds no numbers, complex ones, or some that are masked.
+    """
+    try:
+        if np.iscomplexobj(value) or np.ma.is_masked(value):
+            raise ValueError("complex" if np.iscomplexobj(value) else "masked")
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        what = f"holds no numbers ({error})"
+        raise DrakeTeleopError(what, where=name, remedy=remedy) from error
 
 
 def checked_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list[Array]]:
@@ -74,7 +84,7 @@ def _rows(table: Array, shape: tuple[int, ...]) -> Array:
 def number(name: str, value: Any) -> float:
     """`value` as a float, which may be NaN; raises DrakeTeleopError unless it is one."""
     try:
-        return float(value)
+        return float(numbers(name, value) if isinstance(value, (np.generic, np.ndarray)) else value)
     except (TypeError, ValueError, OverflowError):
         raise DrakeTeleopError(
             f"expected a number, found {reprlib.repr(value)}", where=name

@@ -50,7 +50,7 @@ WORTH_STATING = 0.05
 # Worth stating: standard deviation over natural scale, smallest size of a load [m], gravity.
 _WEAK, _SMALLEST_SIZE, _GRAVITY = 0.5, 0.03, 9.81
 _LARGEST = 1e9  # of any value, in SI: beyond, its squares' squares are not far from infinity
-_OPTIONAL = {"degrees_of_freedom", "prior_dominated", "verdicts"}
+_OPTIONAL = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,6 +70,8 @@ class Identification:
         residual_rms: (6,) of the wrench channels [N, N m].
         method: in words, as `METHODS`.
         samples: number of samples.
+        weight_removed: whether the robot had removed the load's weight from the wrench, so that
+            only its inertia was left: then only that is to be subtracted. Optional in the file.
         degrees_of_freedom: (16,) of the variances, for the quantiles of intervals; inf (null in the
             file) where the noise was given and not estimated. Optional in the file.
         prior_dominated: (16,) bools, whether the value is mostly a prior's
@@ -85,6 +87,7 @@ class Identification:
     residual_rms: Array
     method: str
     samples: int
+    weight_removed: bool = False
     degrees_of_freedom: Array = field(default_factory=lambda: np.full(16, np.inf))
     prior_dominated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(16, dtype=bool))
 
@@ -130,7 +133,7 @@ class Identification:
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def __repr__(self) -> str:
-        """Eight lines; +- is the largest standard deviation, of the centre for this mass."""
+        """Eight lines; +- is the largest standard deviation."""
         deviations, named = self.standard_deviations, zip(PARAMETERS, self.verdicts, strict=True)
         mass, com, inertia = mass_com_inertia(self.phi)
         inertia = np.where(self.identifiable[10:], inertia[np.triu_indices(3)], np.nan)
@@ -141,7 +144,7 @@ class Identification:
             (
                 f"{self.method}, {self.samples} samples: {known}",
                 f"  mass              {_numbers([mass], deviations[6:7])} kg",
-                f"  centre of mass    {_numbers(com, deviations[7:10] / abs(mass))} m",
+                f"  centre of mass    {_numbers(com, com_deviations(self.phi, self.covariance))} m",
                 f"  inertia xx yy zz  {_numbers(inertia[[0, 3, 5]])} kg m^2, about that centre",
                 f"  inertia xy xz yz  {_numbers(inertia[[1, 2, 4]])} kg m^2",
                 f"  offset of force   {_numbers(self.offsets[:3], deviations[:3])} N",
@@ -173,6 +176,7 @@ class Identification:
             "residual_rms": self.residual_rms.tolist(),
             "method": self.method,
             "samples": self.samples,
+            "weight_removed": self.weight_removed,
             "degrees_of_freedom": [
                 float(n) if np.isfinite(n) else None for n in self.degrees_of_freedom
             ],
@@ -208,6 +212,10 @@ class Identification:
         if not isinstance(document["method"], str):
             raise DrakeTeleopError("is no text", where=f"{path}:method")
         optional: dict[str, Any] = {}
+        if (name := "weight_removed") in document:
+            if not isinstance(document[name], bool):
+                raise DrakeTeleopError("is neither true nor false", where=f"{path}:{name}")
+            optional[name] = document[name]
         if (name := "degrees_of_freedom") in document:
             optional[name] = _read_degrees(f"{path}:{name}", document[name])
         if (name := "prior_dominated") in document:
@@ -260,6 +268,36 @@ def _numbers(values: Sequence[float] | Array, deviations: Array | None = None) -
     if deviations is None:
         return text
     return f"{text} +- {deviations.max():.1g}" if np.isfinite(deviations).all() else f"{text} +- ?"
+
+
+def com_deviations(phi: Array, covariance: Array) -> Array:
+    """(3,) standard deviations of the centre of mass [m], to first order.
+
+    Args:
+        phi: (10,) the load.
+        covariance: (16, 16) of [offsets; phi].
+    """
+    mass, com, _ = mass_com_inertia(phi)
+    change = np.column_stack([-com, np.eye(3)]) / mass
+    part = covariance[6:10, 6:10]
+    unknown = np.isinf(np.diag(part))
+    squares = np.diag(change @ np.where(np.isinf(part), 0.0, part) @ change.T)
+    return np.where(unknown[0] | unknown[1:], np.inf, np.sqrt(np.maximum(squares, 0.0)))
+
+
+def with_weight(load: Identification, path: str | Path) -> Identification:
+    """Return a load of a wrench that contains its weight.
+
+    Raises:
+        DrakeTeleopError: if the robot had removed the weight.
+    """
+    if load.weight_removed:
+        raise DrakeTeleopError(
+            "is true: this command subtracts weight and inertia, and cannot subtract inertia alone",
+            where=f"{path}:weight_removed",
+            remedy="use a wrench without the robot's payload compensation, or `eliminate`",
+        )
+    return load
 
 
 def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:

@@ -34,12 +34,19 @@ of n samples whose sums were kept (batch means):
   parameter is a weighted sum of the six v_c; Satterthwaite's formula gives its degrees of freedom
   nu, and an interval is +- t_nu times the standard deviation (`uncertainty.intervals`).
   benchmarks/intervals.py counts how often such intervals hold.
+
+**Poses at rest** are few, and in no order. The three forces then share one noise and the three
+torques another, from all of their residuals and the degrees of freedom that the fit leaves. Poses
+with the same orientation show what repeats: if the others deviate from the fit by significantly
+more (F test at `_ALPHA`), the error belongs to the orientation, and repeating it adds no
+information. The variance is then that between orientations. It is never below that of rounding.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import fdtrc
 
 from drake_teleop._compiled import njit
 from drake_teleop.errors import DrakeTeleopError
@@ -55,6 +62,8 @@ _MOST_BLOCKS, _WINDOW, _FEWEST_DEGREES = 1024, 4.0, 8.0
 # For noise that is weaker at low frequencies: degrees of freedom, share of the motion that is seen.
 _MANY_DEGREES, _SEEN = 20.0, 0.9
 _FEWEST_SAMPLES = 3
+# Poses of one orientation: difference of specific force [m/s^2]; level of the F test.
+_SAME_POSE, _ALPHA = 0.05, 0.01
 # Residual over wrench that rounding of the sums may leave.
 _ROUNDING = 1e-6
 # Where the wrench and the factors of [offset, phi] stand in x of the sums.
@@ -69,12 +78,17 @@ class NormalEquations:
     Args:
         noise: (6,) standard deviations of the wrench channels [N, N m], for the weights. None
             gives every row the same weight, in N and N m alike.
+        resolution: (2,) step of the numbers of forces and torques [N, N m], if the samples are
+            poses at rest; None for samples in the order of time.
 
     Raises:
         DrakeTeleopError: if a standard deviation is not a positive number.
     """
 
-    def __init__(self, noise: ArrayLike | None = None) -> None:
+    def __init__(
+        self, noise: ArrayLike | None = None, *, resolution: tuple[float, float] | None = None
+    ) -> None:
+        self._resolution = resolution
         self._weights = np.ones(6) if noise is None else positive("noise", noise, 6) ** -2.0
         # Channel c: sum of x x^T, x = [1, wrench c, row c of V (10)]; and its first row by blocks.
         self._moments = np.zeros((6, 12, 12))
@@ -155,6 +169,8 @@ class NormalEquations:
         parts = self._channel_grams() * (self._weights**2 * variances)[:, None, None]
         parts = inverse @ parts @ inverse
         shares = np.diagonal(parts, axis1=1, axis2=2)
+        if self._resolution is not None:  # three channels have one variance
+            shares, degrees = shares.reshape(2, 3, 16).sum(axis=1), degrees[::3]
         total, of_squares = shares.sum(axis=0), (shares**2 / degrees[:, None]).sum(axis=0)
         known = (total > 0.0) & (of_squares > 0.0)
         return parts.sum(axis=0), np.divide(
@@ -236,6 +252,9 @@ class NormalEquations:
         grams = self._channel_grams()
         n = float(self.samples)
         power = self.residual_squares(theta)
+        if self._resolution is not None:
+            absorbed = self._absorbed(grams, inverse)
+            return *self._of_poses(power, absorbed, theta), np.zeros(6, dtype=bool)
         variances, degrees = self._unbiased(power, n, grams, grams, inverse)
         of_samples = variances
         # Rounding in the sums is no noise of the wrench.
@@ -277,6 +296,37 @@ class NormalEquations:
         variances = np.where(weaker, of_longest, variances)
         degrees = np.where(weaker, degrees_of_longest, degrees)
         return variances, degrees, slow & (n * of_samples > _ROUNDING**2 * wrench)
+
+    def _of_poses(self, power: Array, absorbed: Array, theta: Array) -> tuple[Array, Array]:
+        """(6,) variances of poses at rest and (6,) their degrees of freedom (module docstring).
+
+        Args:
+            power: (6,) sums of squared residuals.
+            absorbed: (6,) degrees of freedom that the fit takes from them.
+            theta: (16,) [offsets; phi].
+        """
+        assert self._resolution is not None
+        squares, lost = (x.reshape(2, 3).sum(axis=1) for x in (power, absorbed))
+        least = np.array(self._resolution) ** 2 / 12.0
+        blocks = self._blocks[: self._state[0] + 1]
+        count = blocks[:, 0, 0]
+        s = blocks[:, range(3), 2] / count[:, None]
+        first = (np.linalg.norm(s[:, None] - s, axis=2) < _SAME_POSE).argmax(axis=1)
+        groups = (np.unique(first)[:, None] == first).astype(float)
+        sums = groups @ (
+            blocks[:, :, _WRENCH] - blocks[:, :, 0] * theta[:6] - blocks[:, :, 2:] @ theta[6:]
+        )
+        between = (sums**2 / (groups @ count)[:, None]).reshape(-1, 2, 3).sum(axis=(0, 2))
+        left, repeats = 3.0 * len(groups) - lost, 3.0 * (self.samples - len(groups))
+        within = np.maximum(squares - between, repeats * least) / max(repeats, 1.0)
+        apart = np.divide(
+            between, left * within, out=np.zeros(2), where=(left > 0.0) & (within > 0.0)
+        )
+        differ = fdtrc(np.maximum(left, 1.0), max(repeats, 1.0), apart) < _ALPHA
+        degrees = np.where(differ, left, left + repeats)
+        squares = np.where(differ, between, squares)
+        variances = np.maximum(squares / np.maximum(degrees, 1.0), least)
+        return variances.repeat(3), degrees.repeat(3)
 
     def _absorbed(self, between: Array, inverse: Array) -> Array:
         """(6,) degrees of freedom that the fit takes from the residuals between blocks."""

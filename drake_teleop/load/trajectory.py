@@ -77,15 +77,14 @@ class FourierTrajectory:
 
     def save(self, path: str | Path, joint_names: tuple[str, ...]) -> None:
         """Writes the coefficients as YAML: `frequency`, and by joint `q0`, `rho`, `delta`."""
-        import yaml
+        from drake_teleop.texts import yaml_text
 
         joints = {
             name: {"q0": float(q0), "rho": rho.tolist(), "delta": delta.tolist()}
             for name, q0, rho, delta in zip(joint_names, self.q0, self.rho, self.delta, strict=True)
         }
         data = {"frequency": float(self.frequency), "joints": joints}
-        text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
-        write_text(Path(path), f"# Eqs. (9)-(10), rad and Hz.\n{text}")
+        write_text(Path(path), yaml_text(data, head=["Eqs. (9)-(10), rad and Hz."]))
 
     @classmethod
     def load(cls, path: str | Path) -> FourierTrajectory:

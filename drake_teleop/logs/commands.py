@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from drake_teleop.logs.figures import (
     common_figures,
     contact_figures,
     load_figures,
+    load_of_stretch,
     object_figures,
     object_notes,
     plain,
@@ -69,14 +70,8 @@ def identify_command(
         "residual_rms": result.residual_rms,
         "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
         "residual_rms_torque": float(np.linalg.norm(result.residual_rms[3:])),
-        "load_changes": [
-            {
-                "t_s": found.log.t[after.start],
-                "mass_before": before.load.mass,
-                "mass_after": after.load.mass,
-            }
-            for before, after in pairwise(found.loads)
-        ],
+        "causes": [asdict(cause) for cause in found.causes],
+        "loads": [load_of_stretch(stretch) for stretch in found.loads],
     }
     if alone is not None:
         summary |= {"gripper": str(gripper), "object": object_figures(alone)}
@@ -120,7 +115,8 @@ def eliminate_command(
 
     The Parquet table has `t` and, for each channel such as f_x, `contact_f_x`, `scaled_f_x`,
     `non_contact_f_x` and `measured_f_x` (offsets removed); with `causal` (see `eliminate_log`) also
-    `causal_contact_f_x` and `causal_scaled_f_x`. The flag `in_contact` says where there is contact.
+    `causal_contact_f_x` and `causal_scaled_f_x`. The flag `in_contact` says where there is contact,
+    `edge` which samples are not judged (see `EliminatedLog`).
 
     Returns:
         the summary; its names are explained at the top of `logs.figures`.
@@ -188,5 +184,5 @@ def _wrenches(found: EliminatedLog) -> pl.DataFrame:
         for name in ("contact", "scaled"):
             values = getattr(found.causal, name)
             columns |= {f"causal_{name}_{c}": values[:, i] for i, c in enumerate(WRENCH)}
-    columns["in_contact"] = found.touched
+    columns |= {"in_contact": found.touched, "edge": found.edge}
     return pl.DataFrame(columns)

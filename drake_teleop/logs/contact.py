@@ -9,7 +9,8 @@ itself has to say what free motion is, though there are contacts in it. That is 
    same for all motions; contact in less than half of the record does not raise those.
 2. The noise floor is fitted to what is quiet, and quiet is then the half of the blocks of 0.1 s
    with the least mean square over that floor: four times (Rousseeuw and Van Driessen, Technometrics
-   41, 1999, call these concentration steps). In less than 2 s of record this is left out.
+   41, 1999, call these concentration steps). In less than 2 s of record, and if the half has fewer
+   than 100 samples, this is left out.
 3. Noise floor and statistic are fitted to what is quiet. What they would reach in as long a record
    without contact is extrapolated: the largest values of the quiet blocks are taken to have a
    Fréchet distribution (the logarithm a Gumbel one) through their lower quartile and their median.
@@ -122,6 +123,7 @@ def detect_contact(
     covariance: NDArray[np.float64],
     usual: NDArray[np.float64],
     *,
+    edge: NDArray[np.bool_] | None = None,
     free: tuple[Samples, float] | None = None,
     statistic: str = "level",
 ) -> Detection | None:
@@ -139,6 +141,7 @@ def detect_contact(
         cutoff_hz: of the low-pass; None for none.
         covariance: (16, 16) of [offsets; phi], as of `finite_covariance`.
         usual: (6,) what the identification of the load left of the wrench, rms [N, N m].
+        edge: (N,) samples that are not judged either; None for none.
         free: the same of a log of free motion, and its dt; None takes free motion from `rows`, see
             the top of this module.
         statistic: one of `STATISTICS`.
@@ -150,7 +153,7 @@ def detect_contact(
         DrakeTeleopError: for another statistic, or too little free motion.
     """
     period = 1.0 / (cutoff_hz or _PERIOD_HZ)
-    inner = _judged(rows, dt, period)
+    inner = _judged(rows, dt, period, edge)
     judged = rows.at(inner)
     if len(judged.contact) < FEWEST:
         return None
@@ -179,9 +182,17 @@ def detect_contact(
     )
 
 
-def _judged(rows: Samples, dt: float, period: float) -> slice:
-    ends = max(1, round(period / dt))
-    return slice(ends, len(rows.contact) - ends)
+def _judged(
+    rows: Samples, dt: float, period: float, edge: NDArray[np.bool_] | None = None
+) -> slice | NDArray[np.bool_]:
+    """The samples that are judged; a slice if they are in one piece, which needs no copies."""
+    ends, judged = max(1, round(period / dt)), np.zeros(len(rows.contact), bool)
+    judged[ends : len(judged) - ends] = True
+    if edge is not None:
+        judged &= ~edge
+    at = np.flatnonzero(judged)
+    one_piece = len(at) > 0 and len(at) == at[-1] + 1 - at[0]
+    return slice(int(at[0]), int(at[-1]) + 1) if one_piece else judged
 
 
 def _own_floor(
@@ -203,7 +214,10 @@ def _own_floor(
         quiet = some = np.ones(n, bool)
     for _ in range(_STEPS if n >= _BLOCKS * block else 0):
         floor = fit_noise_floor(*rows.at(quiet & some), covariance, fade=fade)
-        quiet = _quieter_half(statistics(floor, *rows)[:, 0], block)
+        half = _quieter_half(statistics(floor, *rows)[:, 0], block)
+        if (half & some).sum() < FEWEST:
+            break
+        quiet = half
     for attempt in range(_ROUNDS):
         train = rows.at(quiet & some)
         floor = fit_noise_floor(*train, covariance, fade=fade)
@@ -283,6 +297,36 @@ def shifted(shift: NDArray[np.float64], found: Detection) -> tuple[str, ...]:
         " motion: either the sensor drifted, or most of the record is contact, which is then taken"
         " for an offset and the rest for contact",
     )
+
+
+def robust_offsets(residual: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The constant that most samples agree on, untouched by contact in the rest of them.
+
+    Starts from the middle of the shortest interval that holds half of the samples in each channel
+    (Rousseeuw's shorth), then takes the mean of all samples within 4 robust standard deviations of
+    it in every channel, until that no longer changes.
+
+    Args:
+        residual: (N, 6) wrench minus non-contact wrench.
+
+    Returns:
+        offsets (6,), and the share of the samples that they are the mean of.
+    """
+    ordered = np.sort(residual, axis=0)
+    half = len(ordered) // 2
+    widths = ordered[half:] - ordered[: len(ordered) - half]
+    start, channels = np.argmin(widths, axis=0), np.arange(6)
+    offsets = (ordered[start, channels] + ordered[start + half, channels]) / 2
+    agrees = np.zeros(len(residual), bool)
+    for _ in range(50):
+        distance = np.abs(residual - offsets)
+        # 1.4826 * median |x| is the standard deviation of a normal x.
+        spread = 1.4826 * np.median(distance, axis=0) + 1e-12
+        before, agrees = agrees, (distance <= 4 * spread).all(axis=1)
+        if np.array_equal(before, agrees) or not agrees.any():
+            break
+        offsets = residual[agrees].mean(axis=0)
+    return offsets, float(agrees.mean())
 
 
 def noise_floor(contact: NDArray[np.float64]) -> NDArray[np.float64]:

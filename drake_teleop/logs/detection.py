@@ -117,7 +117,8 @@ def detect_command(
 ) -> dict[str, Any]:
     """`detect_log`, writing detection.parquet, detection.png and summary.json.
 
-    The Parquet table has `t`, the three statistics, `contact_f_x` and so on, and `in_contact`.
+    The Parquet table has `t`, the three statistics, `contact_f_x` and so on, `in_contact`, and
+    `edge` for samples that are not judged.
 
     Returns:
         the summary; its names are explained at the top of this module.
@@ -156,7 +157,9 @@ def _above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
         "eliminated": found.contact,
     }
     return {
-        name: None if wrench is None else (np.linalg.norm(wrench[:, :3], axis=1) > threshold).mean()
+        name: None
+        if wrench is None
+        else (np.linalg.norm(wrench[~found.edge, :3], axis=1) > threshold).mean()
         for name, wrench in wrenches.items()
     }
 
@@ -169,7 +172,7 @@ def _table(found: DetectedLog) -> pl.DataFrame:
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
     columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTICS)}
     columns |= {f"contact_{c}": found.eliminated.contact[:, i] for i, c in enumerate(WRENCH)}
-    return pl.DataFrame(columns | {"in_contact": found.touched})
+    return pl.DataFrame(columns | {"in_contact": found.touched, "edge": found.eliminated.edge})
 
 
 def draw_detection(found: DetectedLog) -> Any:
@@ -177,28 +180,30 @@ def draw_detection(found: DetectedLog) -> Any:
     from drake_teleop.pages.style import BLACK, BLUE, ORANGE, Picture, house_style, shade_contact
 
     eliminated = found.eliminated
-    t = eliminated.log.t
+    inner = ~eliminated.edge
+    t = eliminated.log.t[inner]
     with house_style():
         figure = Picture(figsize=(10, 6))
         top, below = figure.subplots(2, 1, sharex=True)
-        raw = np.linalg.norm((eliminated.measured - eliminated.measured[0])[:, :3], axis=1)
+        raw = np.linalg.norm((eliminated.measured - eliminated.measured[0])[inner, :3], axis=1)
         top.plot(t, raw, color="#A3AAB5", label="measured, tared at the start")
         if eliminated.gravity_only is not None:
-            weightless = np.linalg.norm(eliminated.gravity_only[:, :3], axis=1)
+            weightless = np.linalg.norm(eliminated.gravity_only[inner, :3], axis=1)
             top.plot(t, weightless, color=ORANGE, label="static weight removed")
-        top.plot(t, np.linalg.norm(eliminated.contact[:, :3], axis=1), color=BLUE, label="contact")
+        contact = np.linalg.norm(eliminated.contact[inner, :3], axis=1)
+        top.plot(t, contact, color=BLUE, label="contact")
         top.axhline(found.force_threshold, color=BLACK, linewidth=0.8, linestyle=":")
         top.set_yscale("symlog", linthresh=1.0)
         top.set_ylim(bottom=0.0)
         top.set_ylabel("$|F|$ [N]")
         top.set_title("dotted: the same threshold for all motions")
-        below.plot(t, found.statistics[:, STATISTICS.index(found.statistic)], color=BLUE)
+        below.plot(t, found.statistics[inner, STATISTICS.index(found.statistic)], color=BLUE)
         below.axhline(found.threshold, color=BLACK, linewidth=0.8, linestyle="--")
         below.set_ylabel(f"{found.statistic} [standard deviations]")
         below.set_xlabel("time [s]")
         below.set_title(f"above the threshold {100 * found.above.mean():.2g} % of the time")
         for axis in (top, below):
-            shade_contact(axis, t, found.touched)
+            shade_contact(axis, t, found.touched[inner])
         figure.legend(loc="outside lower center", ncols=3)
         figure.suptitle(Path(eliminated.log.source).name, x=0.01, ha="left", fontsize=11)
     return figure

@@ -22,7 +22,7 @@ findings               list of name and message: suspected errors of the descrip
 identify
 ====================== ==========================================================================
 mass, mass_std         kg; standard deviations are null for what is not determined at all
-com, com_std           m; the standard deviation is of com with the mass held
+com, com_std           m; the standard deviation includes that of the mass
 inertia_com            kg m^2, about the centre of mass, axes of S
 offsets, offsets_std   [f; tau]
 phi, phi_std           Eq. (6), in the order of this project
@@ -39,8 +39,10 @@ rejected               share of the samples that a robust fit took for disturbed
 condition_number       of the regression
 residual_rms           [f; tau], after the fit
 residual_rms_force     of |F|; residual_rms_torque of |tau|
-load_changes           list of t_s, mass_before, mass_after: where the load changes in the record,
-                       so that one load for all of it is wrong
+causes                 list of name, message, start_s, stop_s, values: what acts beside a rigid
+                       load with constant offsets; the load is that of the model with them
+loads                  list of start_s, stop_s, mass, com, phi and their standard deviations: the
+                       load of each stretch, if it changes; phi above is that of the first
 gripper                its file, if --gripper was given; otherwise this and the next are absent
 object                 of phi_total - phi_gr: mass, com, inertia_com, phi with their standard
                        deviations, identifiable, not_identifiable and physically_consistent as
@@ -63,6 +65,8 @@ residual_peak             largest |F_c|
 raw_torque_rms ...        the same four of the torque
 raw_rms_per_channel ...   the same four of each channel [f; tau]
 noise_floor               [f; tau], standard deviation of the contact wrench where it is quiet
+edge_s                    how much of the record is not judged and in no figure, because its motion
+                          or low-pass has measurements on one side only: ends, and beside gaps
 free                      the log of free motion that the threshold is of; null for what is quiet
                           in the record itself, see `drake_teleop.logs.contact`
 threshold                 of contact, in standard deviations; null, as the next two, for static
@@ -88,7 +92,9 @@ from numpy.typing import NDArray
 
 from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.gripper import SIGNIFICANT, consistency_margin
-from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.load.identification import PARAMETERS, Identification, com_deviations
+from drake_teleop.load.inertia import mass_com_inertia
+from drake_teleop.logs.causes.cause import Stretch
 from drake_teleop.logs.contact import contacts_of, noise_floor
 from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 
@@ -112,6 +118,22 @@ def common_figures(
     }
 
 
+def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
+    """The load of a part of a record."""
+    mass, com, _ = mass_com_inertia(stretch.phi)
+    deviations = np.sqrt(np.diag(stretch.covariance))[6:]
+    return {
+        "start_s": stretch.start_s,
+        "stop_s": stretch.stop_s,
+        "mass": mass,
+        "mass_std": deviations[0],
+        "com": com,
+        "com_std": com_deviations(stretch.phi, stretch.covariance),
+        "phi": stretch.phi,
+        "phi_std": deviations,
+    }
+
+
 def load_figures(load: Identification) -> dict[str, Any]:
     """A load: values, uncertainties, and which of them mean something."""
     deviations = load.standard_deviations
@@ -120,7 +142,7 @@ def load_figures(load: Identification) -> dict[str, Any]:
         "mass": load.mass,
         "mass_std": deviations[6],
         "com": load.com,
-        "com_std": deviations[7:10] / load.mass,
+        "com_std": com_deviations(load.phi, load.covariance),
         "inertia_com": load.inertia_com,
         "phi": load.phi,
         "phi_std": deviations[6:],
@@ -173,11 +195,12 @@ def rms_figures(found: EliminatedLog) -> dict[str, Any]:
     def peak(x: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.abs(x).max(axis=0)
 
+    inner, weightless = ~found.edge, found.gravity_only
     return (
-        _reduced("raw", "rms", found.measured, rms)
-        | _reduced("gravity_only", "rms", found.gravity_only, rms)
-        | _reduced("residual", "rms", found.contact, rms)
-        | _reduced("residual", "peak", found.contact, peak)
+        _reduced("raw", "rms", found.measured[inner], rms)
+        | _reduced("gravity_only", "rms", None if weightless is None else weightless[inner], rms)
+        | _reduced("residual", "rms", found.contact[inner], rms)
+        | _reduced("residual", "peak", found.contact[inner], peak)
     )
 
 
@@ -185,6 +208,7 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
     """Noise floor and contacts, and what `--causal` adds."""
     figures: dict[str, Any] = {
         "noise_floor": found.noise_floor,
+        "edge_s": 0.0 if found.log.static else float(found.edge.sum()) * found.log.dt,
         "threshold": None,
         "contacts": None,
         "in_contact": None,
@@ -195,7 +219,7 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
         figures["contacts"] = contacts_of(found.log.t, found.contact, found.touched)
         figures["in_contact"] = found.touched.mean()
     if found.causal is not None:
-        late = found.causal.contact
+        late, contact = found.causal.contact[~found.edge], found.contact[~found.edge]
 
         def rms(name: str, wrench: NDArray[np.float64]) -> dict[str, float]:
             force, torque = np.sqrt(np.mean(wrench**2, axis=0).reshape(2, 3).sum(axis=1))
@@ -208,7 +232,7 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
             "offsets": found.causal.offsets,
             **rms("residual", late),
             "noise_floor": noise_floor(late),
-            **rms("difference", late - found.contact),
+            **rms("difference", late - contact),
         }
     return figures
 

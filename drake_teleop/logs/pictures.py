@@ -195,7 +195,8 @@ def draw_elimination(found: EliminatedLog) -> Figure:
     """|F| on top, then six channels: measured, static weight removed, contact wrench.
 
     The three forces share one scale, and so do the three torques. The scaled wrench is drawn if it
-    differs from the contact wrench, the causal contact wrench if there is one; contacts are shaded.
+    differs from the contact wrench, the causal contact wrench if there is one; contacts are shaded,
+    samples that are not judged are left out.
     """
     curves = [("measured, offsets removed", found.measured, _MEASURED)]
     if found.gravity_only is not None:
@@ -205,7 +206,9 @@ def draw_elimination(found: EliminatedLog) -> Figure:
     curves.append(("contact wrench", found.contact, BLUE))
     if not np.array_equal(found.scaled, found.contact):
         curves.append(("scaled wrench", found.scaled, GREEN))
-    t, static = found.log.t, found.log.static
+    inner = ~found.edge
+    curves = [(name, wrench[inner], colour) for name, wrench, colour in curves]
+    t, touched, static = found.log.t[inner], found.touched[inner], found.log.static
     with house_style():
         figure = Picture(figsize=(10, 9))
         top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[1, 2.6])[:, 0]
@@ -219,12 +222,12 @@ def draw_elimination(found: EliminatedLog) -> Figure:
             fontsize=8.5,
         )
         magnitude.set_ylabel("force [N]")
-        shade_contact(magnitude, t, found.touched)
+        shade_contact(magnitude, t, touched)
         axes = _channel_axes(below)
         for i, axis in enumerate(axes):
             _draw(axis, t, [(n, w[:, i], c) for n, w, c in curves], static)
             axis.set_title(_CHANNELS[i])
-            shade_contact(axis, t, found.touched)
+            shade_contact(axis, t, touched)
         _finish(figure, axes, Path(found.log.source).name, found.log, found.delay_s)
     return figure
 

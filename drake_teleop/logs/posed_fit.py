@@ -14,13 +14,13 @@ from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.check.against_frame import frame_finding, usable
-from drake_teleop.logs.check.conventions import NO_YAML
 from drake_teleop.logs.check.finding import Finding
-from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
-from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed, widened
+from drake_teleop.logs.pose_motion.estimate import PoseEstimate
+from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, widened
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.delay import delay_of
+from drake_teleop.logs.read.description import NO_YAML
 from drake_teleop.logs.read.tables import FORMATS
+from drake_teleop.logs.spline_motion import clock_note, motion_and_load, moved_by_splines
 
 ROBUST = ("robust", "consistent")
 """Methods that take this way; the others have the motion differentiated and believe it."""
@@ -28,7 +28,6 @@ _LEAST = 1e-9
 # Samples that a log keeps, at least, and their rate over the cut-off of the low-pass.
 _SHOWN, _RATE_OF_CUTOFF = 400_000, 0.25
 _CHUNK, _BESIDE = 2**14, 2**8  # of those, at a time, and beside them to smooth with
-_DELAY_KNOWN = 0.005  # s, standard deviation
 
 
 @dataclass(frozen=True)
@@ -40,12 +39,14 @@ class PosedFit:
         fit: the load.
         delay_s: that was taken out [s].
         source: "given", "estimated", or "undetermined" (0 was taken).
+        motion: of the poses.
     """
 
     log: Log
     fit: BatchResult
     delay_s: float
     source: str
+    motion: PoseEstimate
 
 
 def fit_posed(
@@ -64,18 +65,12 @@ def fit_posed(
     """
     if log.posed is None or method not in ROBUST or not usable(log):
         return None, ()
-    known, source = (None, "estimated") if delay == "auto" else delay_of(log, None, delay)
-    found = _estimate(log, known)
-    if known is None and not found.delay_deviation < _DELAY_KNOWN:
-        found, source = _estimate(log, 0.0), "undetermined"
-    finding = frame_finding(found, log.posed)
+    found, source = motion_and_load(log, delay)
+    finding = None if log.free else frame_finding(found, log.posed)
     if log.posed.imu is not None and not (found.imu_agrees and finding is None):
         return None, () if finding is None else (finding,)
-    moved = _moved(_fewer(log, cutoff_hz), found)
-    shown = low_passed(moved, cutoff_hz)
-    margin = 2.0 * found.spacing
-    inside = (moved.t >= moved.t[0] + margin) & (moved.t <= moved.t[-1] - margin)
-    shown = shown.only(measured(moved, cutoff_hz) & inside)
+    moved, one_sided = moved_by_splines(_fewer(log, cutoff_hz), found)
+    shown = low_passed(moved, cutoff_hz).only(measured(moved, cutoff_hz) & ~one_sided)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _fit(shown, found, found.rejected[at], method, log.gain_std)
     # Gains that are wrong are no rigid load's; what stated ones explain is in the deviations.
@@ -87,21 +82,7 @@ def fit_posed(
         if Path(log.source).suffix.lower() in FORMATS:
             finding = replace(finding, message=f"{finding.message} ({NO_YAML})")
     findings = () if finding is None else (finding,)
-    return PosedFit(shown, fit, found.delay_s, source), findings
-
-
-def _estimate(log: Log, delay: float | None) -> PoseEstimate:
-    assert log.posed is not None
-    return estimate_from_poses(
-        log.t,
-        log.wrench,
-        log.posed.poses,
-        log.posed.gravity_W,
-        delay=delay,
-        gain=log.gain_std,
-        lost=log.bridged,
-        imu=log.posed.imu,
-    )
+    return PosedFit(shown, fit, found.delay_s, source, found), findings
 
 
 def _fewer(log: Log, cutoff_hz: float | None) -> Log:
@@ -119,14 +100,6 @@ def _fewer(log: Log, cutoff_hz: float | None) -> Log:
         wrench[start : start + _CHUNK] = smooth[::stride][start - before :][:_CHUNK]
     bridged = None if log.bridged is None else widened(log.bridged, stride)[::stride]
     return replace(few, wrench=wrench, bridged=bridged)
-
-
-def _moved(log: Log, found: PoseEstimate) -> Log:
-    """The log with the motion of the splines, moved forward by the delay [s]."""
-    assert log.posed is not None
-    moved = undelayed(log, found.delay_s)
-    s, omega, alpha = found.splines.motion(moved.t + found.delay_s, log.posed.gravity_W)
-    return replace(moved, specific_force=s, angular_velocity=omega, angular_acceleration=alpha)
 
 
 def _fit(
@@ -169,14 +142,7 @@ def _consistent(found: PoseEstimate) -> NDArray[np.float64]:
 
 
 def _note(found: PoseEstimate, stated: float) -> str:
-    notes = [found.note] if found.note else []
-    if found.clock_rate:
-        side = "faster" if found.clock_rate > 0.0 else "slower"
-        notes.append(
-            f"the clock of the pose runs {1e6 * abs(found.clock_rate):.0f} millionths {side} than"
-            " that of the wrench, which is taken out; to say so, multiply pose.time.scale (1 by"
-            f" default) by {1.0 / (1.0 + found.clock_rate):.6f}"
-        )
+    notes = [*([found.note] if found.note else []), *clock_note(found)]
     if not found.fit.explained:
         gains = "gains (state wrench.gain_std), " if stated == 0.0 else f"gains beyond {stated:g}, "
         notes.append(

@@ -1,10 +1,9 @@
-"""Identification and elimination on recorded logs, as functions from files to arrays."""
+"""Identification and elimination on logs, from files to arrays (long: two commands)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +18,27 @@ from drake_teleop.load.contact.noise_floor import finite_covariance, statistic_i
 from drake_teleop.load.gripper import identified_object
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.online.segments import Segment, segments
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
+from drake_teleop.logs.cause_lines import doubted_force_unit
+from drake_teleop.logs.causes.cause import Cause, Stretch
 from drake_teleop.logs.check.conventions import check_log, question_fit
 from drake_teleop.logs.check.finding import Finding
-from drake_teleop.logs.contact import Detection, detect_contact, noise_floor, samples_of, shifted
+from drake_teleop.logs.contact import (
+    Detection,
+    detect_contact,
+    noise_floor,
+    robust_offsets,
+    samples_of,
+    shifted,
+)
+from drake_teleop.logs.explained_log import (
+    explain_log,
+    explained_load,
+    named_frame,
+    removed_note,
+)
 from drake_teleop.logs.posed_fit import ROBUST, fit_posed
 from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log
@@ -32,6 +46,9 @@ from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.one_thread import one_blas_thread
 
+_BY_GAINS = {"gain", "sensor rotation", "torque factor"}
+"""Causes that stated errors of the gains explain."""
+_CONSTANT = 1e-6  # change of a channel over its largest value
 _FEWEST_TO_TARE = 10
 _LARGEST_SCALE = 100.0  # as of `ForceScalingConfig`
 
@@ -48,7 +65,9 @@ class IdentifiedLog:
         rejected: (N,) samples that "robust" and "consistent" fits took for disturbed.
         base: which combinations of offsets and load the samples that were used determine.
         findings: suspected errors of the log's description; only looked for if the fit is poor.
-        loads: the parts with a load each, if the load changes within the record.
+        causes: what acts beside a rigid load with constant offsets, with times and values; the load
+            is then that within the model that has them, at the start of the record.
+        loads: the load of each stretch, if it changes within the record.
     """
 
     log: Log
@@ -58,7 +77,8 @@ class IdentifiedLog:
     rejected: NDArray[np.bool_]
     base: BaseParameters
     findings: tuple[Finding, ...] = ()
-    loads: tuple[Segment, ...] = ()
+    causes: tuple[Cause, ...] = ()
+    loads: tuple[Stretch, ...] = ()
 
     def __repr__(self) -> str:
         return repr(self.identification)
@@ -88,6 +108,8 @@ class EliminatedLog:
         causal: the same wrenches as a loop would have had them, or None if not asked for.
         findings: suspected errors of the log's description; only looked for if the load hardly
             explains the wrench in half of the record.
+        edge: (N,) samples at the ends of the record, and beside gaps of the poses, whose motion or
+            low-pass has measurements on one side only. They are neither judged nor in any figure.
     """
 
     log: Log
@@ -104,6 +126,7 @@ class EliminatedLog:
     gravity_only: NDArray[np.float64] | None
     noise_floor: NDArray[np.float64]
     causal: CausalWrench | None
+    edge: NDArray[np.bool_]
     detection: Detection | None = None
     findings: tuple[Finding, ...] = ()
 
@@ -147,38 +170,69 @@ def _identified(
     path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
 ) -> IdentifiedLog:
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in ROBUST)
+    as_read = log
     posed, other = fit_posed(log, method, cutoff_hz, delay)
     if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
     if posed is not None:
         log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.source
+        raw = as_read
     else:
         delay_s, source = delay_of(log, cutoff_hz, delay)
+        raw = log
         log = undelayed(log, delay_s)
         log = low_passed(log, cutoff_hz).only(measured(log, cutoff_hz))
-        fitted = partial(identify_batch, shared_noise=log.static, gain_std=log.gain_std)
-        fit = fitted(log.wrench, *log.motion, method=method, delay_s=delay_s)
+        fit = identify_batch(
+            log.wrench,
+            *log.motion,
+            method=method,
+            shared_noise=log.static,
+            resolution=log.resolution,
+            delay_s=delay_s,
+            gain_std=log.gain_std,
+        )
     result = fit.identification
-    loads = () if log.static else tuple(segments(log.wrench, *log.motion, log.dt))
-    notes = [*_load_notes(log, loads), *([fit.note] if fit.note else [])]
-    log = replace(log, notes=(*log.notes, *notes))
+    motion = None if posed is None else posed.motion
+    why = explain_log(raw, delay_s, motion) if _can_be_explained(raw, posed is not None) else None
+    if why is not None and log.gain_std > 0.0 and {x.name for x in why.causes} <= _BY_GAINS:
+        why = replace(why, causes=(), explained=True, loads=())
+    causes: tuple[Cause, ...] = ()
+    if why is not None:
+        result = explained_load(result, why)
+        causes = named_frame(why, other[0]) if other else why.causes
+    note = fit.note if not causes or (why is not None and why.several_gains) else ""
+    if raw.free and why is not None:
+        note = removed_note(why)
+    log = replace(log, notes=(*log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
-    findings = question_fit(Path(path), log, result, predicted, known_delay) or other
+    findings = tuple(Finding(cause.name, cause.message) for cause in causes)
+    if not causes and not raw.free:
+        findings = question_fit(Path(path), log, result, predicted, known_delay) or other
+    doubt = doubted_force_unit(result.mass, causes, raw)
+    if doubt is not None:
+        findings = (*findings, Finding("units", doubt))
     if any(finding.name == "payload" for finding in findings):
         result = replace(
             result, identifiable=np.repeat([True, False], [6, 10]) & result.identifiable
         )
     base = base_parameters(fit.equations)
-    return IdentifiedLog(log, result, predicted, source, fit.rejected, base, findings, loads)
+    loads = () if why is None else why.loads
+    return IdentifiedLog(
+        log, result, predicted, source, fit.rejected, base, findings, causes, loads
+    )
 
 
-def _load_notes(log: Log, loads: tuple[Segment, ...]) -> list[str]:
-    return [
-        f"the load changes at t = {log.t[after.start]:.2f} s, from {before.load.mass:.4g} kg to"
-        f" {after.load.mass:.4g} kg: one load for the whole record is wrong, cut it there"
-        for before, after in pairwise(loads)
-    ]
+def _can_be_explained(log: Log, by_splines: bool) -> bool:
+    """Whether units and clocks of the motion are right and every channel of the wrench lives."""
+    largest = np.abs(log.wrench).max(axis=0)
+    if log.static or (np.ptp(log.wrench, axis=0) <= _CONSTANT * largest).any():
+        return False
+    if log.posed is not None and log.posed.imu is not None and not by_splines:
+        return False  # poses and IMU disagree
+    still = by_splines and not log.specific_force.any()
+    weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
+    return still or 5.0 < weight < 20.0
 
 
 def eliminate_log(
@@ -200,6 +254,9 @@ def eliminate_log(
 ) -> EliminatedLog:
     """Removes (or scales) the non-contact wrench of a known load in a log.
 
+    Where poses have positions the motion is of splines that the wrench chooses, as in
+    `identify_log`.
+
     Args:
         path: canonical table or log description.
         load: identification.json, or what is in it.
@@ -216,9 +273,9 @@ def eliminate_log(
         delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
         tare: take the sensor's offsets from this record (they drift between records), not from
             `load`: the constant that most of the record agrees on, see `robust_offsets`.
-        causal: "delayed" or "predicted" gives `EliminatedLog.causal` as well. Accelerations that
-            were differentiated from poses have seen half a smoother's window ahead, which a loop
-            would have to wait for in addition.
+        causal: "delayed" or "predicted" gives `EliminatedLog.causal` as well. Its motion is
+            differentiated, not of splines. Accelerations that were differentiated from poses have
+            seen half a smoother's window ahead, which a loop would have to wait for in addition.
         causal_tare_s: length of the start of the record, with nothing touched, that the offsets of
             the causal wrench are taken from [s]; None takes those of `load`. Either way they come
             from the past alone.
@@ -263,7 +320,10 @@ def eliminate_log(
         cutoff_hz,
         finite_covariance(found.phi, identification.covariance, tared=tare),
         identification.residual_rms,
-        free=None if calm is None else (samples_of(calm.log, calm.contact, cutoff_hz), calm.log.dt),
+        edge=found.edge,
+        free=None
+        if calm is None
+        else (samples_of(calm.log, calm.contact, cutoff_hz).at(~calm.edge), calm.log.dt),
         statistic=statistic,
     )
     if calm is not None and tare and detection is not None:
@@ -285,22 +345,28 @@ def _eliminated(
     causal_tare_s: float | None = None,
 ) -> EliminatedLog:
     """`eliminate_log` without its detection of contact."""
-    log = read_log(path, bandwidth_hz=cutoff_hz)
     if causal is None and causal_tare_s is not None:
         raise DrakeTeleopError(
             "is for the causal wrench only", where="causal_tare_s", remedy="give causal as well"
         )
+    phi, point_mass = usable_phi(identification)
+    phi_object = phi - phi_gripper
+    aligned = aligned_log(
+        path,
+        phi,
+        identification.delay_s,
+        cutoff_hz,
+        delay,
+        causal is not None,
+        identification.weight_removed,
+    )
+    log, delay_s, source = aligned.log, aligned.delay_s, aligned.source
     if log.static and causal is not None:
         raise DrakeTeleopError(
             "poses at rest have no order in time", where="causal", remedy="leave it out"
         )
-    phi, point_mass = usable_phi(identification)
-    phi_object = phi - phi_gripper
-    delay_s, source = delay_of(log, cutoff_hz, delay, phi)
-    if source == "undetermined":
-        delay_s, source = identification.delay_s, "load"
-    log = undelayed(log, delay_s)
     known = measured(log, cutoff_hz)
+    edge = aligned.edge[known]
 
     def smooth(wrench: NDArray[np.float64]) -> NDArray[np.float64]:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
@@ -313,14 +379,16 @@ def _eliminated(
     gravity_only = None
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
-        weightless = contact_wrench(log.wrench, np.zeros(6), -log.gravity, rest, rest, phi)
+        removed = identification.weight_removed or "weight" in log.free
+        gravity = rest if removed else log.gravity
+        weightless = contact_wrench(log.wrench, np.zeros(6), -gravity, rest, rest, phi)
         weightless = smooth(weightless)
         gravity_only = weightless - (robust_offsets(weightless)[0] if tare else offsets)
     contact = contact_wrench(log.wrench, offsets, *motion, phi)
     scaled = scaled_wrench(log.wrench, offsets, *motion, phi_gripper, phi_object, **scales)
     late = None
-    if causal is not None:
-        before = identification.offsets
+    if causal is not None and aligned.differentiated is not None:
+        before, motion = identification.offsets, aligned.differentiated.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
             before = _start(log, causal_tare_s, untouched).mean(axis=0)
@@ -343,12 +411,13 @@ def _eliminated(
         delay_s=delay_s,
         delay_source=source,
         measured=smooth(log.wrench - offsets),
-        non_contact=smooth(non_contact_wrench(*motion, phi)),
+        non_contact=smooth(non_contact_wrench(*log.motion, phi)),
         contact=contact,
         scaled=smooth(scaled),
         gravity_only=gravity_only,
-        noise_floor=noise_floor(contact),
+        noise_floor=noise_floor(contact[~edge]),
         causal=late,
+        edge=edge,
         findings=_suspected(Path(path), log.wrench - offsets, contact),
     )
 
@@ -379,36 +448,6 @@ def usable_phi(identification: Identification) -> tuple[NDArray[np.float64], tup
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
     phi[4 + replaced] = point[4 + replaced]
     return phi, tuple(PARAMETERS[10 + i] for i in replaced)
-
-
-def robust_offsets(residual: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """The constant that most samples agree on, untouched by contact in the rest of them.
-
-    Starts from the middle of the shortest interval that holds half of the samples in each channel
-    (Rousseeuw's shorth), then takes the mean of all samples within 4 robust standard deviations of
-    it in every channel, until that no longer changes.
-
-    Args:
-        residual: (N, 6) wrench minus non-contact wrench.
-
-    Returns:
-        offsets (6,), and the share of the samples that they are the mean of.
-    """
-    ordered = np.sort(residual, axis=0)
-    half = len(ordered) // 2
-    widths = ordered[half:] - ordered[: len(ordered) - half]
-    start, channels = np.argmin(widths, axis=0), np.arange(6)
-    offsets = (ordered[start, channels] + ordered[start + half, channels]) / 2
-    agrees = np.zeros(len(residual), bool)
-    for _ in range(50):
-        distance = np.abs(residual - offsets)
-        # 1.4826 * median |x| is the standard deviation of a normal x.
-        spread = 1.4826 * np.median(distance, axis=0) + 1e-12
-        before, agrees = agrees, (distance <= 4 * spread).all(axis=1)
-        if np.array_equal(before, agrees) or not agrees.any():
-            break
-        offsets = residual[agrees].mean(axis=0)
-    return offsets, float(agrees.mean())
 
 
 def _suspected(

@@ -20,6 +20,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.figures import plain
 from drake_teleop.logs.read.description import STANDARD_GRAVITY, UNITS
+from drake_teleop.texts import yaml_text
 from drake_teleop.writing import output_folder, write_json, write_table, write_text
 
 Array = NDArray[np.float64]
@@ -81,20 +82,30 @@ TOUCHES = (
 )
 """A tap, a push, a light tap; less than what the gripper's weight and inertia make."""
 
-_DESCRIPTION = """\
-# A gripper on a lab arm, {what}: made by drake-teleop sample-log.
-wrench:
-  file: {name}_wrench.csv           # 500 Hz
-  time: {{column: time, unit: ms}}
-  force: {{columns: [Fx, Fy, Fz], unit: lbf}}
-  torque: {{columns: [Tx, Ty, Tz], unit: lbf in}}
-  sign: -1                        # the sensor reports what the load exerts on it, as most do
-pose:                             # of the sensor
-  file: {name}_pose.csv             # 125 Hz
-  time: {{column: uptime, offset: {offset}}}   # s; the arm's clock is ahead by that much
-  orientation: {{columns: [rx, ry, rz], form: rotation_vector, unit: deg}}
-  position: {{columns: [x, y, z], unit: mm}}
-"""
+_COMMENTS = {
+    "wrench.file": "500 Hz",
+    "wrench.sign": "the sensor reports what the load exerts on it, as most do",
+    "pose": "of the sensor",
+    "pose.file": "125 Hz",
+    "pose.time": "s; the arm's clock is ahead by that much",
+}
+
+
+def _description(name: str) -> dict[str, Any]:
+    wrench = {
+        "file": f"{name}_wrench.csv",
+        "time": {"column": "time", "unit": "ms"},
+        "force": {"columns": ["Fx", "Fy", "Fz"], "unit": "lbf"},
+        "torque": {"columns": ["Tx", "Ty", "Tz"], "unit": "lbf in"},
+        "sign": -1,
+    }
+    pose = {
+        "file": f"{name}_pose.csv",
+        "time": {"column": "uptime", "offset": -CLOCK_S},
+        "orientation": {"columns": ["rx", "ry", "rz"], "form": "rotation_vector", "unit": "deg"},
+        "position": {"columns": ["x", "y", "z"], "unit": "mm"},
+    }
+    return {"wrench": wrench, "pose": pose}
 
 
 def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict[str, Any]:
@@ -111,7 +122,8 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
     files = []
     with output_folder(out):
         for row, (name, (touches, what)) in enumerate(records.items()):
-            text = _DESCRIPTION.format(what=what, name=name, offset=-CLOCK_S)
+            head = [f"A gripper on a lab arm, {what}: made by drake-teleop sample-log."]
+            text = yaml_text(_description(name), head=head, comments=_COMMENTS)
             write_text(out / f"{name}.yaml", text)
             _write_wrench(out / f"{name}_wrench.csv", _motion(row), touches, OFFSETS[row], random)
             _write_pose(out / f"{name}_pose.csv", _motion(row), random)

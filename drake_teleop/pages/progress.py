@@ -1,7 +1,8 @@
-"""Progress bars, one for each named stage of a command or of a call in Python."""
+"""Progress of each named stage: a bar on a terminal, elsewhere one line on stderr."""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,7 +23,7 @@ def silent(name: str) -> Progress:
 def show_progress(progress: bool | Stage, *, after: float = 0.0) -> Iterator[Stage]:
     """Bars on the terminal or in the notebook for as long as the context lasts.
 
-    There are none if the output goes to a file.
+    If the output goes elsewhere, each stage is one line on stderr when it begins.
 
     Args:
         progress: whether to show them; or what a caller has from here, and goes on showing.
@@ -30,8 +31,10 @@ def show_progress(progress: bool | Stage, *, after: float = 0.0) -> Iterator[Sta
     """
     if callable(progress):
         yield progress
-    elif not progress or not _somebody_looks():
+    elif not progress:
         yield silent
+    elif not _somebody_looks():
+        yield _lines(after)
     else:
         yield from _bars(after)
 
@@ -41,6 +44,24 @@ def _somebody_looks() -> bool:
 
     console = get_console()
     return console.is_terminal or console.is_jupyter
+
+
+def _lines(after: float) -> Stage:
+    opened = time.monotonic()
+
+    def stage(name: str) -> Progress:
+        told = False
+
+        def update(fraction: float, words: str = "") -> None:
+            nonlocal told
+            if not told and time.monotonic() - opened >= after:
+                told = True
+                print(f"{name} ...", file=sys.stderr, flush=True)
+
+        update(0.0)
+        return update
+
+    return stage
 
 
 def _bars(after: float) -> Iterator[Stage]:

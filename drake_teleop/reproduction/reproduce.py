@@ -43,7 +43,7 @@ from drake_teleop.identification import (
 from drake_teleop.load.compensation import scaled_wrench
 from drake_teleop.pages.progress import Progress, Stage, show_progress
 from drake_teleop.pages.style import PAGE_DPI
-from drake_teleop.replay import write_replay, write_scenario
+from drake_teleop.replay import write_replay
 from drake_teleop.reproduction.figures import contact_figure, scaling_figure
 from drake_teleop.reproduction.reaction import eliminated_reaction
 from drake_teleop.reproduction.report import (
@@ -59,6 +59,7 @@ from drake_teleop.reproduction.speed import MakeBarePlant, MakeMovingStation, cp
 from drake_teleop.result import SimulationResult
 from drake_teleop.run import FILTER_TAIL, in_contact
 from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.scenario_reference import write_scenario
 from drake_teleop.simulation import simulate
 from drake_teleop.station import MakeTeleopStation
 from drake_teleop.writing import (

@@ -31,7 +31,7 @@ from drake_teleop.robots.calibration import FIRST_S, GROWS, Look, look
 from drake_teleop.robots.joints import arm_of
 from drake_teleop.robots.recording import Records
 from drake_teleop.robots.sources_and_sinks import recorded
-from drake_teleop.writing import make_folder, write_json, write_picture
+from drake_teleop.writing import make_folder, set_aside, write_json, write_picture
 
 DEFAULT = "mass 0.5 %, com 0.5 mm, inertia 5 %"
 """What is asked for if nothing is."""
@@ -76,6 +76,7 @@ def calibrate(
         DrakeTeleopError: if hardly anything came, or the record cannot be written.
     """
     looks, after = list[Look](), FIRST_S
+    earlier = [path.with_name(name) for name in recorder.files] if source.live else []
     pending: Future[Look] | None = None
 
     def seen(result: Look) -> bool:
@@ -83,26 +84,37 @@ def calibrate(
         show(result)
         return bool(result.known.all())
 
+    def record() -> None:
+        if recorder.seconds:
+            set_aside(*earlier)
+            earlier.clear()
+        recorder.write(path)
+
     over = False
-    with ThreadPoolExecutor(1) as beside, suppress(KeyboardInterrupt):
-        while not over and (readings := source.read(_IDLE_S)) is not None:
-            for each in readings:
-                recorder.take(each)
-                if pending is None and recorder.seconds >= after:
-                    after = max(FIRST_S, GROWS * recorder.seconds)
-                    recorder.write(path)
-                    options = {"cutoff_hz": cutoff_hz, "delay": delay}
-                    before = looks[-1] if looks else None
-                    pending = beside.submit(look, path, tolerance, before, **options)  # type: ignore[arg-type]
-                if pending is not None and (not source.live or pending.done()):
-                    over, pending = seen(pending.result()), None
-                    if over:
-                        break
-            over = over or recorder.seconds >= seconds
+    try:
+        with ThreadPoolExecutor(1) as beside, suppress(KeyboardInterrupt):
+            while not over and (readings := source.read(_IDLE_S)) is not None:
+                for each in readings:
+                    recorder.take(each)
+                    if pending is None and recorder.seconds >= after:
+                        after = max(FIRST_S, GROWS * recorder.seconds)
+                        record()
+                        options = {"cutoff_hz": cutoff_hz, "delay": delay}
+                        before = looks[-1] if looks else None
+                        pending = beside.submit(look, path, tolerance, before, **options)  # type: ignore[arg-type]
+                    if pending is not None and (not source.live or pending.done()):
+                        over, pending = seen(pending.result()), None
+                        if over:
+                            break
+                over = over or recorder.seconds >= seconds
+    except Exception:
+        if recorder.seconds:
+            record()
+        raise
     if pending is not None:
         seen(pending.result())
     if not looks or not looks[-1].known.all():
-        recorder.write(path)
+        record()
         before = looks[-1] if looks else None
         seen(look(path, tolerance, before, cutoff_hz=cutoff_hz, delay=delay))
     return looks

@@ -81,7 +81,7 @@ def draw_settling(looks: list[Look], tolerance: Tolerance) -> Figure:
         for at in looks:
             if at.advice and at.advice != last:
                 axes.axvline(at.t, color=GREY, linewidth=0.6)
-                words = at.advice.split(",")[0].replace(" the wrist", "")
+                words = at.advice.split(",")[0].split(":")[0].replace(" the wrist", "")
                 axes.text(
                     at.t, 0.02, words, rotation=90, size=7, transform=axes.get_xaxis_transform()
                 )

@@ -5,8 +5,8 @@ grown by `GROWS`. A number is known when the half-width of its interval of `SURE
 tolerance, two looks in a row; the 95 % interval that is shown is then half of it or about. To look
 often and to stop at the first good news makes intervals too narrow; therefore the level is far
 above 95 %, two looks have to agree, and the variance be known itself (`FEWEST_DEGREES`). Nothing is
-known while something speaks against the record: suspected errors, another load from some time on,
-poses at rest.
+known while something speaks against the record: suspected errors, another load or another zero from
+some time on, poses at rest. Contacts are left out of the record and cast no doubt on it.
 
 **What is missing.** The information of the recorded motion, G = sum of [E V]^T W [E V] over the
 samples that are independent behind the low-pass, and that of each of six motions from the present
@@ -29,6 +29,7 @@ from drake_teleop.load.arrays import Array
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
+from drake_teleop.logs.causes.cause import CHANGES
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.alignment import low_passed
 from drake_teleop.logs.read.reading import read_log
@@ -41,6 +42,7 @@ FIRST_S = 1.0
 """Length of the record at the first look [s]."""
 FEWEST_DEGREES = 20.0
 """Of freedom of the variance of a number that is known."""
+_ANEW = "start again: the record has another zero or another load from t = {t:.2f} s on"
 _GRAVITY = 9.81
 # A load and a sensor [N, N m] to give advice with before anything is known.
 _GUESS = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
@@ -68,7 +70,7 @@ class Look:
         sure: (k,) whether the wider interval of each is within its tolerance.
         known: (k,) whether that is so in the look before, too.
         doubts: what speaks against the record; nothing is known then.
-        advice: the motion that tells most of what is not known; "" if all is.
+        advice: the motion that tells most of what is not known, or to start again; "" if all is.
     """
 
     t: float
@@ -115,6 +117,10 @@ def look(
     known = sure & (before is not None and before.sure)
     if log is not None and sure.all():
         return Look(float(log.t[-1]), found, why, half, sure, known, doubts, "")
+    changes = [x.start_s or 0.0 for x in found.causes if x.name in CHANGES] if found else []
+    if log is not None and changes:
+        advice = _ANEW.format(t=min(changes))
+        return Look(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
     try:
         log = log or low_passed(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
     except DrakeTeleopError:  # hardly anything yet
@@ -139,10 +145,7 @@ def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Arra
 
 def doubts_of(found: IdentifiedLog) -> tuple[str, ...]:
     """Why the numbers of a record are not to be trusted, whatever their intervals."""
-    doubts = [finding.message for finding in found.findings]
-    if len(found.loads) > 1:
-        at = found.log.t[found.loads[1].start]
-        doubts.append(f"the load changes at t = {at:.2f} s")
+    doubts = [finding.message for finding in found.findings if finding.name != "contact"]
     if found.log.static:
         doubts.append("there are only poses at rest")
     if found.identification.mass <= 0.0:

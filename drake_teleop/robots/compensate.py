@@ -6,22 +6,24 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
 
 from drake_teleop.load.arrays import Array
-from drake_teleop.load.identification import Identification
+from drake_teleop.load.identification import Identification, with_weight
 from drake_teleop.robots.assembly import Assembly
+from drake_teleop.robots.changes import Changes
 from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
 from drake_teleop.robots.detector import Detector
 from drake_teleop.robots.joints import arm_of
 from drake_teleop.robots.lines import names_of
-from drake_teleop.robots.sources_and_sinks import sink_of, source_of
+from drake_teleop.robots.sources_and_sinks import is_file, sink_of, source_of
 from drake_teleop.robots.streams import Compensated, Sink, Source
 from drake_teleop.robots.udp import THIS_MACHINE, listening
 from drake_teleop.robots.watch import Watch
+from drake_teleop.writing import set_aside
 
 _IDLE_S = 0.01  # between wrenches of zero while nothing comes
 
@@ -55,6 +57,7 @@ def run(
     *,
     control: Control | None = None,
     tare: bool = False,
+    changes: Changes | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
     """Compensates until the source ends, or Ctrl-C.
@@ -62,6 +65,7 @@ def run(
     Args:
         control: answers requests to tare.
         tare: also once, as soon as there is `TARE_S` of good readings, whatever comes of it.
+        changes: reports a tare or another load in the stream.
         say: takes what is to be known: a tare, and each kind of fault when it first comes.
 
     Returns:
@@ -87,7 +91,10 @@ def run(
             if source.live and (stale := compensator.idle(time.monotonic())) and not readings:
                 put(stale)
             for reading in readings:
-                put(compensator.step(reading, time.monotonic() if source.live else reading.t))
+                out = compensator.step(reading, time.monotonic() if source.live else reading.t)
+                put(out)
+                if changes is not None:
+                    changes.take(reading, out.flags)
                 if compensator.rested >= tare_at:
                     tare_at = np.inf
                     say(f"tare {compensator.tare()}")
@@ -127,7 +134,8 @@ def compensate_command(
         sigma, gamma, cutoff_hz, predicted: see `Compensator`.
         largest: the sensor's range [N], [N m].
         tare: at the start.
-        watch: for contact and another load, see `drake_teleop.robots.watch`.
+        watch: for contact and another load, see `drake_teleop.robots.watch`; a tare or a grasp is
+            reported with its time, see `drake_teleop.robots.changes`.
         free: log of free motion, whose noise floor contact is told by, see `Detector`.
         control: port of `Control`.
         model, sensor_frame, package_paths: of the arm whose joints tell the motion, see `arm_of`.
@@ -135,7 +143,7 @@ def compensate_command(
     Raises:
         DrakeTeleopError: if one of them cannot be used.
     """
-    found = Identification.load(load)
+    found = with_weight(Identification.load(load), load)
     readings = source_of(
         source,
         found,
@@ -160,23 +168,30 @@ def compensate_command(
         watch=Watch(found, readings.dt, cutoff_hz) if watch else None,
         detector=None if free is None else Detector(found, free, readings.dt, cutoff_hz),
     )
-    wrenches = sink_of(sink)
-    asked = None if control is None else Control(control)
 
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
+    file = [Path(sink)] if readings.live and is_file(sink) else []
+    if earlier := set_aside(*file):
+        say(f"{sink} exists; it is kept in {earlier}")
+    wrenches = sink_of(sink)
+    asked = None if control is None else Control(control)
+    changes = Changes(readings.dt, live=readings.live, say=say) if watch else None
     late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
     say(f"late by {1e3 * late:.1f} ms")
     say(f"stale after {1e3 * STALE_S:.0f} ms; what cannot be trusted is zero")
     if largest is None:
         say("no --range: nothing says how large a wrench can be, and what is saturated is not seen")
     try:
-        counts = run(readings, compensator, wrenches, control=asked, tare=tare, say=say)
+        counts = run(
+            readings, compensator, wrenches, control=asked, tare=tare, changes=changes, say=say
+        )
         say(", ".join(f"{name} {count}" for name, count in counts.items()))
         if isinstance(readings, Assembly):
             say(f"the motion came {1e3 * readings.delay_s:.1f} ms behind the wrench at the end")
     finally:
-        for each in (readings, wrenches, asked):
-            if each is not None:
-                each.close()
+        with ExitStack() as last:
+            for each in (wrenches, readings, asked, changes):
+                if each is not None:
+                    last.callback(each.close)

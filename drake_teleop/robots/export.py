@@ -31,13 +31,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array
-from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.load.identification import PARAMETERS, Identification, with_weight
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
+from drake_teleop.texts import yaml_text
 
 STANDARD_GRAVITY = 9.80665  #: m/s^2, for a weight in N
 
@@ -157,7 +159,7 @@ def export_command(
     Raises:
         DrakeTeleopError: as `Identification.load` and `export`.
     """
-    found = Identification.load(identification)
+    found = with_weight(Identification.load(identification), identification)
     if sensor_pose is None:
         return export(found, to, sign=sign)
     roll, pitch, yaw = np.radians(sensor_pose[3:])
@@ -222,29 +224,32 @@ def _xarm(load: Load) -> str:
 
 
 def _kth(load: Load) -> str:
-    return (
-        f"bias: [{_row(load.offsets)}]\n"
-        "gripper_com_frame_id: ft_sensor\n"
-        f"gripper_com_pose: [{_row(load.com)}, 0.0, 0.0, 0.0]\n"
-        f"gripper_mass: {_number(load.mass)}\n"
+    return yaml_text(
+        {
+            "bias": _list(load.offsets),
+            "gripper_com_frame_id": "ft_sensor",
+            "gripper_com_pose": [*_list(load.com), 0.0, 0.0, 0.0],
+            "gripper_mass": float(load.mass),
+        }
     )
 
 
 def _ft_tools(load: Load) -> str:
-    return (
-        f"mass: {_number(load.mass)}\n"
-        f"sensor_frame_to_com: [{_row(load.com)}]\n"
-        f"force_offset: [{_row(load.offsets[:3])}]\n"
-        f"torque_offset: [{_row(load.offsets[3:])}]\n"
+    return yaml_text(
+        {
+            "mass": float(load.mass),
+            "sensor_frame_to_com": _list(load.com),
+            "force_offset": _list(load.offsets[:3]),
+            "torque_offset": _list(load.offsets[3:]),
+        }
     )
 
 
 def _admittance(load: Load) -> str:
-    return (
-        "admittance_controller:\n  ros__parameters:\n    gravity_compensation:\n"
-        "      frame: {id: ft_sensor, external: false}\n"
-        f"      CoG: {{pos: [{_row(load.com)}], force: {_number(load.mass * STANDARD_GRAVITY)}}}\n"
-    )
+    centre = {"pos": _list(load.com), "force": float(load.mass * STANDARD_GRAVITY)}
+    compensation = {"frame": {"id": "ft_sensor", "external": False}, "CoG": centre}
+    parameters = {"gravity_compensation": compensation}
+    return yaml_text({"admittance_controller": {"ros__parameters": parameters}})
 
 
 def _bota(load: Load) -> str:
@@ -260,38 +265,46 @@ def _bota(load: Load) -> str:
     return _json({"payload_compensator_config": config})
 
 
+_SIX = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+
+
 def _urdf(load: Load) -> str:
-    xx, yy, zz, xy, xz, yz = map(_number, load.six)
-    return (
-        '<robot name="load">\n  <link name="load">\n    <inertial>\n'
-        f'      <origin xyz="{_words(load.com)}" rpy="0 0 0"/>\n'
-        f'      <mass value="{_number(load.mass)}"/>\n'
-        f'      <inertia ixx="{xx}" ixy="{xy}" ixz="{xz}" iyy="{yy}" iyz="{yz}" izz="{zz}"/>\n'
-        "    </inertial>\n  </link>\n</robot>\n"
-    )
+    root = Element("robot", name="load")
+    inertial = SubElement(SubElement(root, "link", name="load"), "inertial")
+    SubElement(inertial, "origin", xyz=_words(load.com), rpy="0 0 0")
+    SubElement(inertial, "mass", value=_number(load.mass))
+    SubElement(inertial, "inertia", dict(zip(_SIX, map(_number, load.six), strict=True)))
+    return _xml(root)
 
 
 def _sdf(load: Load) -> str:
-    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    inertia = "".join(
-        f"<{name}>{_number(value)}</{name}>" for name, value in zip(names, load.six, strict=True)
-    )
-    return (
-        '<sdf version="1.9">\n  <model name="load">\n    <link name="load">\n      <inertial>\n'
-        f"        <pose>{_words(load.com)} 0 0 0</pose>\n"
-        f"        <mass>{_number(load.mass)}</mass>\n"
-        f"        <inertia>{inertia}</inertia>\n"
-        "      </inertial>\n    </link>\n  </model>\n</sdf>\n"
-    )
+    root = Element("sdf", version="1.9")
+    link = SubElement(SubElement(root, "model", name="load"), "link", name="load")
+    inertial = SubElement(link, "inertial")
+    SubElement(inertial, "pose").text = f"{_words(load.com)} 0 0 0"
+    SubElement(inertial, "mass").text = _number(load.mass)
+    inertia = SubElement(inertial, "inertia")
+    for name, value in zip(_SIX, load.six, strict=True):
+        SubElement(inertia, name).text = _number(value)
+    return _xml(root)
 
 
 def _mjcf(load: Load) -> str:
-    return (
-        '<mujoco model="load">\n  <worldbody>\n    <body name="load">\n      <freejoint/>\n'
-        f'      <inertial pos="{_words(load.com)}" mass="{_number(load.mass)}"'
-        f' fullinertia="{_words(load.six)}"/>\n'
-        "    </body>\n  </worldbody>\n</mujoco>\n"
-    )
+    root = Element("mujoco", model="load")
+    body = SubElement(SubElement(root, "worldbody"), "body", name="load")
+    SubElement(body, "freejoint")
+    inertia = {"mass": _number(load.mass), "fullinertia": _words(load.six)}
+    SubElement(body, "inertial", {"pos": _words(load.com)} | inertia)
+    return _xml(root)
+
+
+def _xml(root: Element) -> str:
+    indent(root)
+    return tostring(root, encoding="unicode") + "\n"
+
+
+def _list(values: Array) -> list[float]:
+    return [float(value) + 0.0 for value in values]
 
 
 def _words(values: Any) -> str:

@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, install_extra
 from drake_teleop.logs.read.canonical import WRENCH
 from drake_teleop.robots.lines import names_of
 from drake_teleop.robots.streams import Compensated
@@ -40,7 +40,7 @@ class _Channel:
             raise DrakeTeleopError(
                 "is written by the library foxglove-sdk, which is not installed",
                 where=where,
-                remedy="pip install 'drake_teleop[robots]'",
+                remedy=install_extra("robots"),
             )
         import foxglove
 

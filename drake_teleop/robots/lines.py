@@ -37,7 +37,7 @@ def read_line(line: bytes, number: int) -> Reading:
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         return DAMAGED
     good = values.shape == (VALUES,) and [len(part) for part in parts] == [6, 3, 3, 3]
-    return Reading(number, t, values, flags) if good and number >= 0 else DAMAGED
+    return Reading(number, t, values, flags) if good and 0 <= number < 2**64 else DAMAGED
 
 
 def written_line(out: Compensated) -> str:
@@ -74,7 +74,7 @@ class LineSource:
         block = os.read(self._file, _BLOCK)
         self._over = not block
         *lines, self._rest = (self._rest + block).split(b"\n")
-        if len(self._rest) > _LONGEST:
+        if self._over or len(self._rest) > _LONGEST:
             lines, self._rest = [*lines, self._rest], b""
         found = []
         for line in lines:

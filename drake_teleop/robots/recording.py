@@ -3,8 +3,9 @@
 Readings make a canonical log. Parts make a table for each stream and a description of them,
 log.yaml: the poses stay as they came, so that `identify` finds the motion, its noise, the delay and
 the drift of the clock as it does of every log, and better than a motion that was differentiated as
-it came. What is damaged, not finite, no pose, or saturated is left out, and so is what comes late;
-a clock that was set begins the record anew.
+it came. What is damaged, not finite, no pose, or saturated is left out, and so is what comes late.
+A clock that was set begins another part of the record, if `_SET` samples in a row confirm it: fewer
+are wrong stamps, and left out. The longest part is written.
 
 **Clocks.** Streams of one source have one. Those of two are brought together by what each took
 least time for; what is left of that is the delay that is estimated.
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.robots.compensator import JUMP_S
 from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Flag, Part, Reading
+from drake_teleop.texts import yaml_text
 from drake_teleop.writing import write_table, write_text
 
 _WRONG = Flag.DAMAGED | Flag.NOT_FINITE | Flag.OUT_OF_RANGE | Flag.SATURATED | Flag.GAP
@@ -36,6 +38,7 @@ _COLUMNS = {
 }
 _GRAVITY = 9.81  # as `compensate` has it
 _UNIT = 0.01  # by which the norm of a quaternion may be off
+_SET = 50  # samples in a row on another clock
 _T = TypeVar("_T", contravariant=True)
 
 
@@ -44,12 +47,14 @@ class Records(Protocol[_T]):
 
     Attributes:
         file: name of the log that it writes.
+        files: names of all that it writes.
         left_out: of what came.
         began_anew: how often the clock was set.
         seconds: length of the record.
     """
 
     file: str
+    files: tuple[str, ...]
     left_out: int
     began_anew: int
 
@@ -69,7 +74,44 @@ class Records(Protocol[_T]):
         """
 
 
-class Recorder:
+class _Record:
+    """Samples of streams in parts between steps of a clock."""
+
+    def __init__(self, largest: dict[str, Array | None]) -> None:
+        self._largest = {k: np.full(6, np.inf) if x is None else x for k, x in largest.items()}
+        self.left_out, self.began_anew = 0, 0
+        self._part, self._other_clock = self._new(), self._new()
+        self._longest = self._part
+
+    def _new(self) -> dict[str, _Kept]:
+        return {stream: _Kept() for stream in self._largest}
+
+    def _keep(self, stream: str, t: float, values: Array, flags: int, now: float = 0.0) -> None:
+        finite = math.isfinite(t) and bool(np.isfinite(values).all())
+        if not finite or flags & _WRONG or (np.abs(values[:6]) >= self._largest[stream]).any():
+            self.left_out += 1
+            return
+        kept, other = self._part[stream], self._other_clock[stream]
+        stays = not kept.jumps(t)
+        if stays or other.jumps(t):
+            self.left_out += len(other.t)
+            other = self._other_clock[stream] = _Kept()
+        self.left_out += not (kept if stays else other).add(t, values, now)
+        if len(other.t) == _SET:
+            self.began_anew += 1
+            self._longest = self._best()
+            self._part, self._other_clock = self._other_clock, self._new()
+
+    def _best(self) -> dict[str, _Kept]:
+        return max(self._part, self._longest, key=_seconds)
+
+    @property
+    def seconds(self) -> float:
+        """Length of the record [s]."""
+        return _seconds(self._best())
+
+
+class Recorder(_Record):
     """`Records` of readings.
 
     Args:
@@ -77,35 +119,23 @@ class Recorder:
     """
 
     file = "log.parquet"
+    files: tuple[str, ...] = (file,)
 
     def __init__(self, largest: Array | None = None) -> None:
-        self._kept = _Kept(largest)
-        self.left_out, self.began_anew = 0, 0
+        super().__init__({WRENCH: largest})
 
     def take(self, reading: Reading) -> None:
         """See `Records`."""
-        if not self._kept.fits(reading.t, reading.values, reading.flags):
-            self.left_out += 1
-        elif self._kept.jumps(reading.t):
-            self._kept.forget()
-            self.began_anew += 1
-            self._kept.add(reading.t, reading.values)
-        elif not self._kept.add(reading.t, reading.values):
-            self.left_out += 1
-
-    @property
-    def seconds(self) -> float:
-        """Length of the record [s]."""
-        return self._kept.seconds
+        self._keep(WRENCH, reading.t, reading.values, reading.flags)
 
     def write(self, path: Path) -> None:
         """See `Records`."""
-        t, values = self._kept.table(VALUES, self.left_out)
+        t, values = self._best()[WRENCH].table(VALUES, self.left_out)
         wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
         write_log(Log(t - t[0], wrench, s, omega, alpha), path)
 
 
-class PartRecorder:
+class PartRecorder(_Record):
     """`Records` of what `Parts` reads.
 
     Args:
@@ -115,42 +145,28 @@ class PartRecorder:
     """
 
     file = "log.yaml"
+    files: tuple[str, ...] = (file, *(f"{stream}.parquet" for stream in _COLUMNS))
 
     def __init__(self, parts: Parts, largest: Array | None, X_FS: Array) -> None:
+        super().__init__({WRENCH: largest, parts.told: None})
         self._told, self._two_clocks = parts.told, parts.two_clocks
-        self._streams = {WRENCH: _Kept(largest), parts.told: _Kept(None)}
         self._R_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0]
         self._p_FS = X_FS[4:]
-        self.left_out, self.began_anew = 0, 0
 
     def take(self, one: tuple[Part, float]) -> None:
         """See `Records`."""
         part, now = one
-        kept = self._streams.get(part.stream)
-        if kept is None:
+        if part.stream not in self._part:
             return
-        values = part.values
-        posed = part.stream != POSE or abs(float(np.linalg.norm(values[:4])) - 1.0) < _UNIT
-        if not (kept.fits(part.t, values, part.flags) and posed):
-            self.left_out += 1
-            return
-        if kept.jumps(part.t):
-            for each in self._streams.values():
-                each.forget()
-            self.began_anew += 1
-        if not kept.add(part.t, values, now):
-            self.left_out += 1
-
-    @property
-    def seconds(self) -> float:
-        """Length of the record [s]."""
-        return min(each.seconds for each in self._streams.values())
+        size = float(np.linalg.norm(part.values[:4])) if part.stream == POSE else 1.0
+        flags = part.flags if abs(size - 1.0) < _UNIT else part.flags | Flag.DAMAGED
+        self._keep(part.stream, part.t, part.values, flags, now)
 
     def write(self, path: Path) -> None:
         """See `Records`. The tables stand beside the log."""
         import polars as pl
 
-        wrench, motion = self._streams[WRENCH], self._streams[self._told]
+        wrench, motion = (self._best()[stream] for stream in (WRENCH, self._told))
         start = wrench.table(6, self.left_out)[0][0]
         behind = motion.least - wrench.least if self._two_clocks else 0.0
         for stream, kept, shift in ((WRENCH, wrench, -start), (self._told, motion, behind - start)):
@@ -158,33 +174,27 @@ class PartRecorder:
             t, values = kept.table(len(names), self.left_out)
             columns = {"t": t + shift} | dict(zip(names, values.T, strict=True))
             write_table(path.with_name(f"{stream}.parquet"), pl.DataFrame(columns))
-        write_text(path, self._description())
+        write_text(path, yaml_text(self._description()))
 
-    def _description(self) -> str:
-        lines = [f"gravity: {_GRAVITY}"]
-        for stream in self._streams:
-            lines += [f"{stream}:", f"  file: {stream}.parquet", "  time: {column: t}"]
-            lines += [f"  {field}: {{{words}}}" for field, words in _FIELDS[stream].items()]
+    def _description(self) -> dict[str, Any]:
+        found: dict[str, Any] = {"gravity": _GRAVITY}
+        for stream in (WRENCH, self._told):
+            fields = {name: {"columns": list(names)} for name, names in _FIELDS[stream].items()}
+            found[stream] = {"file": f"{stream}.parquet", "time": {"column": "t"}} | fields
         if self._told == POSE:
             R_SF = self._R_FS.T
-            lines.append(f"  position_in_sensor: {(-R_SF @ self._p_FS).tolist()}")
-            lines.append(f"  rotation_in_sensor: {R_SF.tolist()}")
-        return "\n".join(lines) + "\n"
+            found[POSE]["orientation"]["form"] = "quaternion_wxyz"
+            found[POSE]["position_in_sensor"] = (-R_SF @ self._p_FS).tolist()
+            found[POSE]["rotation_in_sensor"] = R_SF.tolist()
+        return found
 
 
-def _columns(names: tuple[str, ...], more: str = "") -> str:
-    return f"columns: [{', '.join(names)}]{more}"
-
-
-_FIELDS = {
-    WRENCH: {"force": _columns(canonical.WRENCH[:3]), "torque": _columns(canonical.WRENCH[3:])},
-    POSE: {
-        "orientation": _columns(canonical.ORIENTATION, ", form: quaternion_wxyz"),
-        "position": _columns(canonical.POSITION),
-    },
+_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
+    WRENCH: {"force": canonical.WRENCH[:3], "torque": canonical.WRENCH[3:]},
+    POSE: {"orientation": canonical.ORIENTATION, "position": canonical.POSITION},
     IMU: {
-        "specific_force": _columns(canonical.SPECIFIC_FORCE),
-        "angular_velocity": _columns(canonical.ANGULAR_VELOCITY),
+        "specific_force": canonical.SPECIFIC_FORCE,
+        "angular_velocity": canonical.ANGULAR_VELOCITY,
     },
 }
 
@@ -193,45 +203,37 @@ class _Kept:
     """Samples of one stream, in order.
 
     Attributes:
+        t: their times [s].
         least: our clock less the stream's, of the sample that took least time.
     """
 
-    def __init__(self, largest: Array | None) -> None:
-        self._largest = np.full(6, np.inf) if largest is None else largest
-        self.forget()
-
-    def forget(self) -> None:
-        self._t: list[float] = []
+    def __init__(self) -> None:
+        self.t: list[float] = []
         self._values: list[Array] = []
         self.least = math.inf
 
-    def fits(self, t: float, values: Array, flags: int) -> bool:
-        """Whether it is a sample at all."""
-        finite = math.isfinite(t) and bool(np.isfinite(values).all())
-        return finite and not flags & _WRONG and bool((np.abs(values[:6]) < self._largest).all())
-
     def jumps(self, t: float) -> bool:
-        return bool(self._t) and abs(t - self._t[-1]) > JUMP_S
+        return bool(self.t) and abs(t - self.t[-1]) > JUMP_S
 
-    def add(self, t: float, values: Array, now: float = 0.0) -> bool:
+    def add(self, t: float, values: Array, now: float) -> bool:
         """Whether it came in order; it is kept then."""
-        if self._t and t <= self._t[-1]:
+        if self.t and t <= self.t[-1]:
             return False
-        self._t.append(t)
+        self.t.append(t)
         self._values.append(values)
         self.least = min(self.least, now - t)
         return True
 
-    @property
-    def seconds(self) -> float:
-        return self._t[-1] - self._t[0] if self._t else 0.0
-
     def table(self, width: int, left_out: int) -> tuple[Array, Array]:
         """(N,) times and (N, width) values."""
-        if len(self._t) < 2:
+        if len(self.t) < 2:
             raise DrakeTeleopError(
-                f"{len(self._t)} good readings came, {left_out} were left out",
+                f"{len(self.t)} good readings came, {left_out} were left out",
                 where="calibrate",
                 remedy="does the source send, and to this port?",
             )
-        return np.array(self._t), np.array(self._values).reshape(-1, width)
+        return np.array(self.t), np.array(self._values).reshape(-1, width)
+
+
+def _seconds(part: dict[str, _Kept]) -> float:
+    return min(kept.t[-1] - kept.t[0] if kept.t else 0.0 for kept in part.values())

@@ -13,7 +13,7 @@ import json
 import struct
 from typing import Any
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, install_extra
 from drake_teleop.robots.address import Address
 
 PORT = 7447
@@ -34,7 +34,7 @@ def needed(where: str) -> None:
             raise DrakeTeleopError(
                 f"ROS 2 is spoken by the library {library}, which is not installed",
                 where=where,
-                remedy="pip install 'drake_teleop[ros]'",
+                remedy=install_extra("ros"),
             )
 
 

@@ -18,7 +18,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, install_extra
 from drake_teleop.quaternions import exponential
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.rtde_reader import SAMPLE
@@ -51,7 +51,7 @@ class RtdeSource:
             raise DrakeTeleopError(
                 "robots of UR are read by the library ur_rtde, which is not installed",
                 where=address,
-                remedy="pip install 'drake_teleop[robots]'",
+                remedy=install_extra("robots"),
             )
         self._host, self._sign, self._rest, self._began = told.host, told.sign(), b"", 0.0
         self._start()

@@ -113,6 +113,11 @@ def recorded(
     return source_of(address, None, rate_hz=rate_hz, **readings), Recorder(largest)  # type: ignore[arg-type]
 
 
+def is_file(address: str) -> bool:
+    """Whether a sink is a file, or a folder of them."""
+    return not _kind(address) and Path(address).suffix in (".csv", ".parquet", ".mcap")
+
+
 def sink_of(address: str) -> Sink:
     """The sink at an address: udp, zenoh, foxglove, - for stdout, .csv, .parquet or .mcap.
 
@@ -128,11 +133,11 @@ def sink_of(address: str) -> Sink:
         from drake_teleop.robots.ros2_sink import Ros2Sink
 
         return Ros2Sink(address)
-    if kind == "foxglove" or (not kind and path.suffix == ".mcap"):
+    if kind == "foxglove" or (is_file(address) and path.suffix == ".mcap"):
         from drake_teleop.robots.foxglove import FoxgloveSink, McapSink
 
         return FoxgloveSink(address) if kind else McapSink(path)
-    if kind or path.suffix not in (".csv", ".parquet"):
+    if not is_file(address):
         raise DrakeTeleopError("is no sink", where=address, remedy=_SINKS)
     return TableSink(path)
 

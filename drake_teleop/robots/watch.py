@@ -38,6 +38,7 @@ MODEL_ERROR = 0.02
 """Share of the load's wrench that may be wrong by gains and times."""
 LEAST = np.repeat([0.05, 0.0025], 3)
 """Noise of a reading at 1 kHz is at least that [N, N m]."""
+_NEVER = 1e-12  # accuracy at which another load would count as the known one
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
 _BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
@@ -65,7 +66,10 @@ class Watch:
 
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
         noise = raw_noise(load, dt, cutoff_hz)
-        self._parameters = change_parameters(noise, np.zeros(9), dt, model_error=MODEL_ERROR)
+        # The known load stays what is eliminated, however well a new one is known.
+        self._parameters = change_parameters(
+            noise, np.zeros(9), dt, model_error=MODEL_ERROR, bound=_NEVER
+        )
         self._phi = usable_phi(load)[0]
         self._covariance = finite_covariance(self._phi, load.covariance)
         self._fallback, self._dt = np.zeros(10), dt

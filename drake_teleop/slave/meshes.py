@@ -1,13 +1,15 @@
-"""The meshes of a robot model: where their addresses lead, and what to do without them."""
+"""The meshes of a robot model, and what to do without them."""
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.slave.model_references import ModelFiles
 
 # Of meshes that Drake can use as collision shapes.
 _READABLE = (".obj", ".gltf", ".vtk")
@@ -15,37 +17,8 @@ _READABLE = (".obj", ".gltf", ".vtk")
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 
 
-class Packages:
-    """Where the addresses of a model's meshes lead."""
-
-    def __init__(self, model: Path, package_paths: tuple[Path, ...]) -> None:
-        self._folder = model.resolve().parent
-        self.found: dict[str, Path] = {}
-        if model.suffix.lower() not in (".urdf", ".sdf"):  # which may lead to other files
-            for folder in package_paths:
-                for candidate in (folder, *sorted(folder.glob("*"))):
-                    if candidate.is_dir():
-                        self.found.setdefault(candidate.name, candidate.resolve())
-        text = model.read_bytes().decode("utf-8", errors="replace")
-        for name in set(re.findall(r"package://([^/\s\"'<]+)", text)):
-            for folder in (*package_paths, self._folder, *self._folder.parents):
-                for candidate in (folder / name, folder):
-                    if os.path.isdir(candidate) and candidate.name == name:
-                        self.found.setdefault(name, candidate.resolve())
-
-    def file(self, address: str) -> Path | None:
-        """The file at an address; None if it is not there."""
-        match = re.match(r"(package|model)://([^/]+)/(.*)", address)
-        if match:
-            folder = self.found.get(match[2])
-            path = None if folder is None else folder / match[3]
-        else:
-            path = self._folder / address.removeprefix("file://")
-        return path if path is not None and os.path.isfile(path) else None
-
-
 def without_lost_meshes(
-    root: ElementTree.Element, packages: Packages, folder: Path
+    root: ElementTree.Element, files: ModelFiles, folder: Path
 ) -> dict[str, list[str]]:
     """Removes shapes whose mesh is missing or not readable, and makes the others' paths absolute.
 
@@ -60,7 +33,7 @@ def without_lost_meshes(
         faults = {"collision": set[str](), "visual": set[str]()}
         for kind, of_kind in faults.items():
             for shape in link.findall(kind):
-                if fault := _fault(shape, packages, folder):
+                if fault := _fault(shape, files, folder):
                     link.remove(shape)
                     of_kind.add(fault)
         if link.find("collision") is not None:
@@ -74,24 +47,28 @@ def without_lost_meshes(
     return lost
 
 
-def _fault(shape: ElementTree.Element, packages: Packages, folder: Path) -> str | None:
+def _fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> str | None:
     """What is wrong with the mesh of a shape; if nothing is, its path becomes absolute."""
     mesh = shape.find("geometry/mesh")
     if mesh is None:
         return None
     address = mesh.get("filename") or mesh.findtext("uri") or ""
-    file = packages.file(address.strip())
-    if file is None:
+    file = files.file(address.strip())
+    if file is None or not file.is_file():
         return "meshes were not found (--package-path, slave.package_paths)"
+    try:
+        files.check(file)
+    except DrakeTeleopError as error:
+        return str(error)
     if file.suffix.lower() == ".stl":
         file = _hull_of_stl(file, folder)
     if file is None or file.suffix.lower() not in _READABLE:
         suffix = Path(address.strip()).suffix
         return f"{suffix} meshes cannot be read (convert them to .obj or .stl)"
     if mesh.get("filename"):
-        mesh.set("filename", file.as_uri())
+        mesh.set("filename", f"file://{file.resolve()}")  # Drake takes %20 as it is
     else:
-        mesh.find("uri").text = file.as_uri()  # type: ignore[union-attr]
+        mesh.find("uri").text = f"file://{file.resolve()}"  # type: ignore[union-attr]
     return None
 
 

@@ -2,43 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
-from xml.parsers import expat
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.slave.meshes import Packages
 from drake_teleop.slave.model_check import WORLD
+from drake_teleop.slave.model_references import ModelFiles, added_models, read_xml
 from drake_teleop.texts import read_yaml
 
 XACRO = "run it through xacro first, and give the URDF that comes out"
 
 
-def _read_xml(path: Path) -> Element:
-    """The root of an XML file, with names as they stand there: Drake knows its own by `drake:`.
-
-    Drake's parser reads what is no XML too. That would be checked by nobody, so it is an error.
-    """
-    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
-    parser.CharacterDataHandler = builder.data
-
-    def unread(name: str | None, *_: object) -> NoReturn:
-        raise ValueError(f"the entity {name} is not in this file")
-
-    parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = unread
-    try:
-        parser.Parse(path.read_bytes(), True)
-        return builder.close()
-    except (expat.ExpatError, ValueError, LookupError) as error:  # the last two of its encoding
-        remedy = "give a URDF or SDF that other readers of XML take too"
-        raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
-
-
-def read_roots(path: Path, packages: Packages) -> dict[Path, Element]:
+def read_roots(path: Path, files: ModelFiles) -> dict[Path, Element]:
     """Roots of the XML that is a model, by file: of itself, or of what model directives add.
 
     Raises:
@@ -47,24 +22,15 @@ def read_roots(path: Path, packages: Packages) -> dict[Path, Element]:
     kind = path.suffix.lower()
     if kind == ".yaml":
         data = read_yaml(path, tagged=True)  # Drake's parser overflows its stack over many brackets
-        files = [file for address in _added(data) if (file := packages.file(address))]
+        added = [file for address in added_models(data) if (file := files.file(address))]
         # What is not there, and what they include, is said by Drake, or not at all.
-        roots = {file: _read_xml(file) for file in files if file.suffix in (".urdf", ".sdf")}
+        roots = {file: read_xml(file) for file in added if file.suffix in (".urdf", ".sdf")}
     else:
-        roots = {path: _read_xml(path)} if kind in (".urdf", ".sdf", ".xml") else {}
+        roots = {path: read_xml(path)} if kind in (".urdf", ".sdf", ".xml") else {}
     for file, root in roots.items():
         if any(element.tag.startswith("xacro:") for element in root.iter()):
             raise DrakeTeleopError("is a macro", where=str(file), remedy=XACRO)
     return roots
-
-
-def _added(data: Any) -> Iterator[str]:
-    """Addresses of the models that directives add."""
-    directives = data.get("directives") if isinstance(data, dict) else None
-    for each in directives if isinstance(directives, list) else []:
-        model = each.get("add_model") if isinstance(each, dict) else None
-        if isinstance(model, dict) and isinstance(model.get("file"), str):
-            yield model["file"]
 
 
 def peculiar_joints(root: Element) -> dict[str, str]:

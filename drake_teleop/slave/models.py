@@ -31,7 +31,7 @@ from pydrake.multibody.tree import (
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.silence import silent_stderr
-from drake_teleop.slave.meshes import Packages, without_lost_meshes
+from drake_teleop.slave.meshes import without_lost_meshes
 from drake_teleop.slave.model_check import WORLD, check_model, check_tree
 from drake_teleop.slave.model_files import (
     XACRO,
@@ -41,6 +41,7 @@ from drake_teleop.slave.model_files import (
     read_roots,
     without_idle,
 )
+from drake_teleop.slave.model_references import ModelFiles
 from drake_teleop.texts import read_text
 
 # What ties links to each other besides joints: Drake's tags in URDF and SDF, MJCF's.
@@ -224,20 +225,18 @@ def _read(
         raise DrakeTeleopError("there is no such file", where=str(path))
     if path.suffix.lower() == ".xacro":
         raise DrakeTeleopError("is a macro", where=str(path), remedy=XACRO)
-    packages = Packages(path, package_paths)
+    kind = path.suffix.lower().removeprefix(".")
+    if kind == "xml":
+        read_text(path)  # or names cannot be said
+    files = ModelFiles(path, package_paths)
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
-    for name, folder in packages.found.items():
-        if parser.package_map().Contains(name):  # Drake's own, which theirs takes the place of
-            parser.package_map().Remove(name)
-        parser.package_map().Add(name, str(folder))
-    kind = path.suffix.lower().removeprefix(".")
+    files.share_packages(parser.package_map())
+    files.check(path)
     assumptions: list[str] = []
     converted = TemporaryDirectory(prefix="drake_teleop_")
     forces = plant.num_force_elements()
-    if kind == "xml":
-        read_text(path)  # or names cannot be said
-    roots = read_roots(path, packages)
+    roots = read_roots(path, files)
     _check_no_loop(path, kind)
     with drakes_errors_said(path, said):
         for file, root in roots.items():
@@ -245,8 +244,11 @@ def _read(
         if kind in ("urdf", "sdf"):
             root = roots[path]
             assumptions += without_idle(root)
-            lost = without_lost_meshes(root, packages, Path(converted.name))
+            lost = without_lost_meshes(root, files, Path(converted.name))
             assumptions += [f"{_MISSING} {', '.join(ls)}: {what}" for what, ls in lost.items()]
+            for uri in root.iterfind(".//include/uri"):  # relative to the file, not to the process
+                if (included := files.file((uri.text or "").strip())) is not None:
+                    uri.text = f"file://{included.resolve()}"
             text = ElementTree.tostring(root, encoding="unicode")
             with _drakes_errors_raised():
                 instances = parser.AddModelsFromString(text, kind)

@@ -85,6 +85,10 @@ class Factor:
                 where=where,
                 remedy="give either values, or words, or flags, or vectors, or both low and high",
             )
+        numbers = [*self.values, *itertools.chain(*self.vectors)]
+        numbers += [self.high - self.low] if self.low is not None and self.high is not None else []
+        if not all(map(math.isfinite, numbers)):
+            raise DrakeTeleopError("its numbers, or their range, are not finite", where=where)
         if self.low is not None and self.high is not None and not self.low < self.high:
             raise DrakeTeleopError(
                 f"the range ends at {self.high:g}, before it begins", where=f"{where}.high"

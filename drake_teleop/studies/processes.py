@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, install_extra
 from drake_teleop.studies.store import Store
 
 Chunk: TypeAlias = list[dict[str, Any]]
@@ -156,7 +156,7 @@ def _client(address: str, jobs: int) -> Iterator[Any]:
         raise DrakeTeleopError(
             "Dask is not installed",
             where="--cluster",
-            remedy="install it with the extra: pip install 'drake_teleop[cluster]'",
+            remedy=install_extra("cluster"),
         ) from None
     local = {
         "n_workers": jobs if jobs > 0 else None,

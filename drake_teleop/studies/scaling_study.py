@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.pages.style import COLOURS, Picture, house_style
 from drake_teleop.studies.effects import estimated, numbers
+from drake_teleop.studies.store import Store
 from drake_teleop.studies.study import LoadStudy, study_command
 from drake_teleop.writing import make_folder, output_folder, write_json, write_picture, write_table
 
@@ -99,8 +100,6 @@ def scaling_study_command(
     Returns:
         What answer.json holds.
     """
-    import polars as pl
-
     make_folder(out)
     rows = {}
     for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT):
@@ -108,7 +107,7 @@ def scaling_study_command(
             name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
             progress=progress, yes=yes,
         )  # fmt: skip
-        rows[name] = pl.read_parquet(out / name / "runs.parquet").sort("run")
+        rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _tables(rows[f"scaling_{task}"], task) for task in TASKS}
     sigmas, gammas = _axes()
     answers = {way: answer(tables, criteria) for way, criteria in WAYS.items()}

@@ -36,8 +36,19 @@ class Store:
 
     def finished(self) -> set[int]:
         """The first runs of the chunks that are complete."""
-        pattern = _PART.format(0).replace("0", "[0-9]")
-        return {int(part.stem.removeprefix("run_")) for part in self.folder.glob(pattern)}
+        return set(map(_first_run, self._parts()))
+
+    def _parts(self) -> list[Path]:
+        """The parts in order; other files in the folder are ignored."""
+        return sorted(self.folder.glob(_PART.format(0).replace("0", "[0-9]")))
+
+    def remove_damaged_parts(self) -> None:
+        """Remove parts that cannot be read or are empty, so that their runs are repeated."""
+        parts = self._parts()
+        whole = _runs_in(parts)
+        for part in parts:
+            if not {_first_run(part)} & (whole or _runs_in([part])):
+                part.unlink()
 
     def write(self, rows: pl.DataFrame) -> None:
         """Adds the rows of one chunk; column "run" of the first one gives the part's name."""
@@ -70,7 +81,21 @@ class Store:
 
         remedy = "remove the part that is damaged; the same command makes it anew"
         with reading(self.folder, remedy):
-            return pl.read_parquet(self.folder).sort("run")
+            return pl.read_parquet(self._parts()).sort("run")
+
+
+def _first_run(part: Path) -> int:
+    return int(part.stem.removeprefix("run_"))
+
+
+def _runs_in(parts: list[Path]) -> set[int]:
+    """The runs that some parts hold; none if one of the parts cannot be read."""
+    import polars as pl
+
+    if parts:
+        with suppress(DrakeTeleopError), reading(parts[0], ""):
+            return set(pl.read_parquet(parts, columns=["run"])["run"])
+    return set()
 
 
 @contextmanager
@@ -87,6 +112,7 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
     store = Store(out / "runs.parquet")
     make_folder(store.folder)
     with claimed(out, identity):
+        store.remove_damaged_parts()
         yield store
         with suppress(OSError):  # not there, or with marks in it
             store._marks.rmdir()

@@ -49,7 +49,7 @@ class Person:
             {(0, 0): make_apparatus(task, condition, scenario, load)},
             [scenario],
             self.store,
-            lambda scenario: lambda rows: None,
+            [lambda rows: {}],
             self.now,
         )
         self.guided.join(1, self.now)

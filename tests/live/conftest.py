@@ -39,7 +39,7 @@ def load(scenario: Scenario) -> IdentifiedLoad:
 def live(scenario: Scenario, load: IdentifiedLoad) -> Iterator[server.LiveDrive]:
     """A drive that listens."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(server, "identified_load", lambda scenario: load)
+        patch.setattr(server, "identified_load", lambda *_: load)
         drive = server.drive(scenario)
     yield drive
     drive.stop()

@@ -47,20 +47,20 @@ def test_joints_at_their_limits_are_named(scenario, rows):
 
 def test_all_else_that_is_not_right_is_said(scenario, rows):
     peak = scenario.master.device(0.0, 0.0).peak_force
-    strongest = f"the device gives all that it can, {peak:g} N"
+    strongest = f"the device renders its largest force, {peak:g} N"
     for name, change, said in (
-        ("ik_status", IkStatus.OUT_OF_REACH, "the arm cannot get where the hand wants it"),
+        ("ik_status", IkStatus.OUT_OF_REACH, "the arm cannot reach the position of the hand"),
         ("saturated", 1.0, "the wrist sensor is saturated"),
         ("force_to_master", [0, 0, -peak, 0, 0, 0], strongest),
-        ("hand_wrench_E", [0, 60, 0, 0, 0, 0], "the hand pulls as hard as it can"),
-        ("ports", [0, 0, 0, 0, 0, 0.06, 0, 0], "the network is silent"),
+        ("hand_wrench_E", [0, 60, 0, 0, 0, 0], "the simulated hand pulls with its largest force"),
+        ("ports", [0, 0, 0, 0, 0, 0.06, 0, 0], "the network delivers no packets"),
         ("fault", float(Fault.WRENCH), MEANINGS[Fault.WRENCH]),
     ):
         found = {key: values.copy() for key, values in rows.items()}
         found.setdefault(name, np.zeros((len(rows["t"]), np.size(change))))[1] = change
         assert words(scenario, found) == [said]
     edge = Inputs(y=RANGES["y"][0])
-    assert words(scenario, rows, edge) == ["the hand is as far out as it may go"]
+    assert words(scenario, rows, edge) == ["the hand is at the edge of its box, 0.3 m wide"]
 
 
 def test_forces_are_at_the_hand_without_the_sensors_offset(scenario, rows):

@@ -128,6 +128,40 @@ def test_a_force_goes_to_haply_as_its_place_came():
     assert read_message(json.dumps({"inverse3": [device]})).state.position == (1.0, 2.0, 3.0)
 
 
+@pytest.mark.parametrize(
+    ("packet", "reason"),
+    [
+        (b"", "is 0 bytes long, not 88"),
+        (packed_state(DeviceState(1, 0.0, (0.0, 0.0, 0.0)))[:-1], "is 87 bytes long, not 88"),
+        (
+            packed_state(DeviceState(1, 0.0, (0.0, 0.0, 0.0))) + b"more",
+            "is more than 88 bytes long",
+        ),
+        (b"HELO" + bytes(84), "begins with b'HELO', not b'DTD1'"),
+        (b"DTD2" + bytes(84), "has version b'2', not b'1'"),
+        (
+            packed_state(DeviceState(1, 0.0, (np.nan, 0.0, 0.0))),
+            "has a position, orientation or time out",
+        ),
+        (
+            packed_state(DeviceState(1, 0.0, (11.0, 0.0, 0.0))),
+            "has a position, orientation or time out",
+        ),
+        (
+            packed_state(DeviceState(1, 0.0, (0.0,) * 3, (0.0,) * 4)),
+            "has a position, orientation or time out",
+        ),
+    ],
+)
+def test_a_packet_that_is_refused_is_counted_with_the_reason(link, packet, reason):
+    sender = Sender(link.port)
+    for _ in range(3):
+        sender.raw(packet)
+    link.poll(0.0)
+    assert link.text().startswith("No device yet (udp://127.0.0.1:")
+    assert f". Refused packets: 3; the last one {reason}" in link.text()
+
+
 def test_one_device_leads_until_it_is_silent_and_late_packets_do_not(link):
     one, other = Sender(link.port), Sender(link.port)
     one.send(1, (0.1, 0.0, 0.0))
@@ -141,6 +175,7 @@ def test_one_device_leads_until_it_is_silent_and_late_packets_do_not(link):
     led = link.lead(0.049)
     assert led["x"] == pytest.approx(1000.0)
     assert (link.lost, link.refused) == (1, 1)
+    assert ". Refused packets: 1; the last one is from a second device" in link.text()
     link.send(np.arange(6.0))
     assert one.force() == ForceCommand(4, 0.004, (0.0, 1.0, 2.0, 3.0, 4.0, 5.0))
     assert link.lead(0.0991) == {"held": 0, "clutch": 0}
@@ -282,7 +317,7 @@ def test_a_device_elsewhere_or_of_another_kind_is_one_error(address):
 
 
 def test_a_device_drives_without_a_page_and_lets_go_when_it_is_silent(scenario, load, link):
-    live = Live(with_device(scenario), load, None, lambda rows: None, 0.0, link)
+    live = Live(with_device(scenario), load, None, lambda rows: {}, 0.0, link)
     sender, seen = Sender(link.port), []
     for k in range(95):
         if k < 60:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 import threading
 import time
 import webbrowser
@@ -11,11 +12,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from shown import press_ctrl_c, type_in
+from shown import hearing_ctrl_c, press_ctrl_c, type_in
+from sockets import ports
 from websockets.sync.client import connect
 
 from drake_teleop import replay
-from drake_teleop.live.session import read_drive
+from drake_teleop.cli import main
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.live.session import Session, read_drive
 
 pytestmark = pytest.mark.slow
 
@@ -25,7 +29,7 @@ def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
     """What the browser does when it is told to open the page, and then Ctrl-C; it keeps frames."""
     monkeypatch.chdir(tmp_path)
     for room in ("live.server", "experiment.apparatus"):
-        monkeypatch.setattr(f"drake_teleop.{room}.identified_load", lambda scenario: load)
+        monkeypatch.setattr(f"drake_teleop.{room}.identified_load", lambda *_: load)
     for painted in ("write_replay", "write_picture", "overview"):
         monkeypatch.setattr(f"drake_teleop.run.{painted}", lambda *_: None)
 
@@ -33,6 +37,7 @@ def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
         says: str = '{"set": {"z": -3000}}',
         until: Callable[[dict], bool] = lambda frame: frame["t"] > 0.3,
         does: Callable[[], None] = lambda: None,
+        stop: signal.Signals = signal.SIGINT,
     ) -> list[dict]:
         frames: list[dict] = []
 
@@ -48,7 +53,7 @@ def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
                             does()
                         frames.extend([said["frame"]] if "frame" in said else [])
             finally:
-                press_ctrl_c()
+                press_ctrl_c(stop)
 
         monkeypatch.setattr(
             webbrowser, "open", lambda url: threading.Thread(target=visit, args=(url,)).start()
@@ -65,7 +70,10 @@ def log(folder: str) -> list[bytes]:
 def test_a_drive_is_recorded_and_repeated(page, capsys):
     frames = page()
     type_in("docs/live.md", "drake-teleop drive contact_transition --record")
-    assert "repeat it: drake-teleop run --inputs out/drive" in capsys.readouterr().out
+    said, stages = capsys.readouterr()
+    assert stages.startswith("Prepare the station and its 3D scenes ...\n")
+    assert "nothing runs until that page is open; Ctrl-C ends it" in said
+    assert "repeat it: drake-teleop run --inputs out/drive" in said
     assert frames[-1]["inputs"]["z"] == -3000
     type_in("docs/live.md", "drake-teleop run --inputs")
     assert log("out/again") == log("out/drive")
@@ -97,7 +105,58 @@ def test_a_virtual_device_is_the_hand(page, capfd):
 
 def test_an_experiment_asks_for_consent_first_and_shows_no_force(page, capsys, monkeypatch):
     monkeypatch.setattr(replay, "Arrow", None)  # eyes would tell, were it called
-    frames = page('{"go": true}', lambda frame: frame["study"]["phase"] == "task")
+    before, opened = ports(), list[int]()
+    frames = page(
+        '{"go": true}',
+        lambda frame: frame["study"]["phase"] == "task",
+        lambda: opened.append(len(ports() - before)),
+    )
     type_in("docs/experiment.md", "drake-teleop drive --study", status=130)
     assert [frame["study"]["phase"] for frame in (frames[0], frames[-1])] == ["consent", "task"]
-    assert "written out/experiment/results.csv" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "written out/experiment/results.csv" in said.out
+    assert "interrupted: Ctrl-C: participant 1 has done 0 of " in said.err
+    assert opened == [1]
+
+
+def drive(*arguments: str) -> object:
+    """The exit status."""
+    with hearing_ctrl_c(), pytest.raises(SystemExit) as ended:
+        main(["drive", "contact_transition", *arguments])
+    return ended.value.code
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_drive_says_what_ended_it(page, capsys, stop):
+    frames = page(stop=stop)
+    assert drive("--record", "here") == 0
+    said = capsys.readouterr().out
+    name = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}[stop]
+    (seconds,) = re.findall(rf"ended by {name} after (\S+) s of simulated time", said)
+    assert float(seconds) >= round(frames[-1]["t"], 1)
+    assert said.endswith("repeat it: drake-teleop run --inputs here\n")
+    assert read_drive("here").changes[-1][0] == pytest.approx(1e3 * float(seconds), abs=51)
+
+
+def test_a_drive_that_had_stopped_ends_with_the_reason_and_status_2(page, capsys, monkeypatch):
+    def fail(self, ms=5):
+        raise RuntimeError("joint 2\nleaves its range")
+
+    page(until=lambda frame: bool(frame["stopped"]))
+    monkeypatch.setattr("drake_teleop.live.server.warm_up", lambda *_: None)
+    monkeypatch.setattr(Session, "advance", fail)
+    assert drive() == 2
+    said = capsys.readouterr().err
+    assert said.endswith("error: drive: had stopped: joint 2 leaves its range\n")
+
+
+def test_a_record_that_is_not_complete_is_no_success(page, capsys, monkeypatch):
+    def fail(self):
+        raise DrakeTeleopError("no space left on device", where="here/log.parquet")
+
+    page()
+    monkeypatch.setattr(Session, "close", fail)
+    assert drive("--record", "here") == 2
+    said = capsys.readouterr()
+    assert said.err.endswith("error: here/log.parquet: no space left on device\n")
+    assert "recorded" not in said.out

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from full_disk import small_disk
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.live.live import FRAME, Live
@@ -15,6 +17,7 @@ from drake_teleop.live.pace import Pace
 from drake_teleop.live.session import Session, read_drive, repeat
 from drake_teleop.pages.progress import silent
 from drake_teleop.result import SimulationResult
+from drake_teleop.writing import CannotWrite
 
 
 class Clock:
@@ -33,7 +36,7 @@ def clock() -> Clock:
 
 
 def make(scenario, load, clock, record=None) -> Live:
-    return Live(scenario, load, record, lambda rows: None, clock())
+    return Live(scenario, load, record, lambda rows: {}, clock())
 
 
 def pass_time(live: Live, clock: Clock, seconds: float) -> list[dict]:
@@ -130,7 +133,7 @@ def test_what_is_kept_from_the_hand_is_said(scenario, load, clock, monkeypatch):
     live.join(1, clock())
     assert pass_time(live, clock, FRAME)[-1]["words"] == []
     monkeypatch.setattr(Session, "kept_back", lambda session: 1.234)
-    said = "1.2 N are kept from the hand until it eases off"
+    said = "1.2 N are not rendered until the hand presses less"
     assert pass_time(live, clock, FRAME)[-1]["words"] == [said]
 
 
@@ -144,12 +147,67 @@ def test_another_scene_is_another_drive_and_its_record_another_folder(
     live.hear(1, '{"scene": "wall"}', clock())
     frame = pass_time(live, clock, 0.05)[-1]  # time stands still until its load is known
     assert (frame["state"], frame["scene"], live.asked) == ("preparing", "wall", "wall")
-    live.change(scenario, load, lambda rows: None, clock())
+    live.change(scenario, load, lambda rows: {}, clock())
     frame = pass_time(live, clock, 0.03)[-1]
     assert (frame["state"], frame["scene"], frame["drive"]) == ("running", "wall", 2)
     assert frame["record"] == str(tmp_path / "drive-3")
     assert read_drive(tmp_path / "drive").changes[-1][0] > 0
     live.close()
+
+
+@pytest.mark.slow
+def test_a_recorded_drive_is_never_overwritten(scenario, load, clock, tmp_path, monkeypatch):
+    """Not by the next one into the same folder, nor after a reset, nor in a folder with a file."""
+    monkeypatch.chdir(tmp_path)
+    before: dict[Path, bytes] = {}
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "scenario.yaml").write_text("mine")
+    for name, first in (("drive", "drive"), ("drive", "drive-3"), ("mine", "mine-2")):
+        live = make(scenario, load, clock, Path(name))
+        live.join(1, clock())
+        assert pass_time(live, clock, 0.02)[-1]["record"] == first
+        live.hear(1, '{"reset": true}', clock())
+        pass_time(live, clock, 0.02)
+        live.close()
+        assert live.recorded[0] == first and len(set(live.recorded)) == 2
+        assert all(path.read_bytes() == content for path, content in before.items())
+        before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    monkeypatch.chdir(tmp_path / "drive")
+    live = make(scenario, load, clock, Path("."))
+    assert live.frame()["record"] == str(tmp_path / "drive-5")
+    live.close()
+    assert live.recorded == [] and not (tmp_path / "drive-5").exists()  # it never began
+
+
+def test_two_drives_that_begin_at_once_share_no_folder(scenario, load, tmp_path):
+    first = Session(scenario, load, record=tmp_path)
+    with pytest.raises(CannotWrite, match=r"inputs.csv: cannot be written .File exists"):
+        Session(scenario, load, record=tmp_path)
+    first.advance(5)
+    first.close()
+    assert read_drive(tmp_path).changes[-1][0] == 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("room", [60_000, 400_000])
+def test_a_full_disk_is_an_error_of_the_drive(scenario, load, clock, tmp_path, room):
+    """Of the inputs or of the log; the drive stops, and its end is no success."""
+    with small_disk(tmp_path, room):
+        live = make(scenario, load, clock, tmp_path / "drive")
+        live.join(1, clock())
+        for k in range(6000):
+            live.hear(1, json.dumps({"set": {"x": k % 2000}}), clock())
+            frames = pass_time(live, clock, 0.005)
+            if frames and frames[-1]["state"] == "stopped":
+                break
+        else:
+            pytest.fail("the disk was never full")
+        assert "cannot be written" in frames[-1]["stopped"]
+        live.hear(1, '{"reset": true}', clock())
+        live.frame()
+        with pytest.raises(CannotWrite, match=r"cannot be written .*(No space left|large)"):
+            live.close()
+        assert live.recorded == []
 
 
 def test_what_is_done_is_shown_at_once(scenario, load, clock):
@@ -187,6 +245,37 @@ def test_what_stops_a_drive_is_said_and_a_reset_begins_again(scenario, load, clo
     assert pass_time(live, clock, 0.02)[-1]["state"] == "running"
 
 
+def test_a_reset_that_fails_is_said_and_another_one_begins_again(
+    scenario, load, clock, monkeypatch, tmp_path
+):
+    """Of the record that ends, and of the station that begins."""
+    live = make(scenario, load, clock, tmp_path / "drive")
+    live.join(1, clock())
+    pass_time(live, clock, 0.02)
+
+    def fail(*_, **__):
+        raise DrakeTeleopError("no space left on device")
+
+    for owner, name, state in ((Session, "close", "running"), (Session, "__init__", "stopped")):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, fail)
+            live.hear(1, '{"reset": true}', clock())
+        frame = pass_time(live, clock, 0.03)[-1]
+        assert frame["state"] == state
+        assert "no space left on device" in [frame["stopped"], *frame["words"]]
+    live.hear(1, '{"reset": true}', clock())
+    frame = pass_time(live, clock, 0.03)[-1]
+    assert (frame["state"], frame["words"]) == ("running", []) and frame["t"] > 0.0
+    with pytest.raises(CannotWrite, match="no space left"):  # the record of the first is lost
+        live.close()
+
+
+def test_without_a_page_nothing_runs(scenario, load, clock, tmp_path):
+    live = make(scenario, load, clock)
+    frames = pass_time(live, clock, 0.5)
+    assert live.ms == 0 and frames[-1]["state"] == "waiting"
+
+
 def test_lost_time_is_caught_up_with_or_given_up():
     pace = Pace(5e-3, 0.0)
     for k in range(10):
@@ -219,7 +308,7 @@ def nonsense(rng: np.random.Generator) -> object:
     names = ["x", "rz", "sigma", "force_scale", "held", "clutch", "__class__", "ms", ""]
     names += ["network", "method", "sensor", "object"]
     values = ", ".join(f'"{rng.choice(names)}": {rng.choice(wild)}' for _ in range(3))
-    other = rng.choice(["slow", "pause", "reset", "drive", "set"])
+    other = rng.choice(["slow", "pause", "reset", "drive", "set", "rates"])
     return f'{{"set": {{{values}}}, "{other}": {rng.choice(wild)}}}'
 
 
@@ -248,6 +337,7 @@ def test_ten_thousand_messages_of_nonsense_leave_every_number_finite(scenario, l
     ("text", "found"),
     [
         ('{"set": {"x": 1, "y": NaN, "z": true, "rx": "1"}}', {"set": {"x": 1}}),
+        ('{"rates": {"x": -2.5, "y": null}, "set": 3}', {"rates": {"x": -2.5}}),
         ('{"slow": 1e9, "pause": 1}', {"slow": 20.0}),
         ('{"drive": true, "reset": 1}', {"drive": True}),
         ('{"scene": "leaf", "pause": true}', {"scene": "leaf", "pause": True}),

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -15,6 +16,10 @@ from browser import CHROMIUM, Page, opened
 SPY = """window.effects = []; window.axes = [0, 0, 0, 0];
 navigator.getGamepads = () => [{connected: true, id: "spy", axes, buttons: [],
   vibrationActuator: {playEffect: (_, how) => { effects.push(how); return Promise.resolve(); }}}];
+window.path = (end) => Object.keys(frame.moves.poses).find((path) => path.endsWith(end));
+window.told = (end) => frame.moves.poses[path(end)].slice(12, 15);
+window.inScene = (end) => viewer.scene_tree.find(path(end).split("/").filter(Boolean))
+  .object.position.toArray();
 // Drawing without a graphics card takes longer than all else.
 addEventListener("DOMContentLoaded", () => { MeshCat.Viewer.prototype.render = () => {}; });"""
 
@@ -32,6 +37,44 @@ def drag(page: Page, x: int, y: int, dx: int, dy: int) -> None:
         page.mouse(kind, x + dx * k / 5, y + dy * k / 5)
 
 
+def speed_by_key(page: Page, slow: int) -> float:
+    """Of the simulated tool while a key is held [m/s]: the slope over all frames of 0.8 s."""
+    page.run(f"say({{slow: {slow}}}); Object.assign(target, {{x: 0, y: 0, z: 0}}); 1")
+    page.until(f"frame.slow === {slow} && frame.inputs.z === 0 && frame.speed > 0")
+    page.call("Input.dispatchKeyEvent", type="keyDown", code="KeyE", key="e")
+    page.until("frame.inputs.z > 2000")  # the hand has the speed
+    page.run("rows.length = 0; 1")
+    page.until("rows.length && frame.t > rows[0][0] + 0.8")
+    t, z = np.transpose(page.run("rows"))
+    page.call("Input.dispatchKeyEvent", type="keyUp", code="KeyE", key="e")
+    return float(np.polyfit(t, z, 1)[0])
+
+
+@pytest.mark.slow
+def test_keys_move_the_hand_at_the_same_simulated_speed_in_slow_motion(page):
+    page.until("typeof frame !== 'undefined' && frame && frame.tool && target && viewer")
+    page.run(
+        "window.rows = []; show = ((before) => (said) => { before(said);"
+        " rows.push([said.t, said.tool[2]]); })(show); 1"
+    )
+    for slow in (1, 10, 2):
+        assert speed_by_key(page, slow) == pytest.approx(0.12, rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_machine_that_is_too_slow_offers_slow_motion_with_one_click(page):
+    page.until("typeof frame !== 'undefined' && frame && frame.tool && target")
+    page.run("say({slow: 2}); 1")
+    page.until("frame.slow === 2 && at('slow').value === '2'")
+    page.run("show = ((before) => (said) => before({...said, factor: 0.5}))(show); 1")
+    page.until("document.querySelectorAll('#words button').length === 2")
+    said = page.run("at('words').textContent")
+    assert said.startswith("This machine is too slow") and said.endswith("1/5 1/10")
+    page.run("[...document.querySelectorAll('#words button')][1].click()")
+    page.until("frame.slow === 10 && at('slow').value === '10'")
+    page.until("document.querySelectorAll('#words button').length === 0")
+
+
 @pytest.mark.slow
 def test_the_page_drives(page):
     page.until("typeof frame !== 'undefined' && frame && frame.tool && target && viewer")
@@ -40,14 +83,21 @@ def test_the_page_drives(page):
     x, z = page.run("[frame.tool[0], frame.tool[2]]")
     drag(page, 300, 300, 20, -10)
     page.until(f"frame.tool[0] > {x + 0.005} && frame.tool[2] > {z + 0.002}")
+    page.until("loaded && inScene('_tool').every((p, k) => Math.abs(p - told('_tool')[k]) < 1e-6)")
+    page.until(
+        f"inScene('_tool')[0] > {x - 0.1} && inScene('measured_at_wrist/shaft').some(Boolean)"
+    )
     page.run("Object.assign(target, {x: 0, y: 0, z: 0})")
     for event in ("keyDown", "keyUp"):
         page.call("Input.dispatchKeyEvent", type=event, code="Space", key=" ")
         page.until(f"frame.inputs.clutch === {int(event == 'keyUp')}")
     page.call("Input.dispatchKeyEvent", type="keyDown", code="KeyE", key="e")
-    page.until("frame.inputs.z > 500 && ahead[2] > 0")  # the hand hangs back behind what it is led
+    page.until("frame.inputs.z > 500")
     page.call("Input.dispatchKeyEvent", type="keyUp", code="KeyE", key="e")
-    page.until("ahead[2] === 0 && frame.inputs.z === Math.round(target.z)")
+    page.until(f"frame.t > {page.run('frame.t')} + 0.2")
+    z = page.run("frame.inputs.z")
+    page.until(f"frame.t > {page.run('frame.t')} + 0.2 && frame.inputs.z === target.z")
+    assert page.run("frame.inputs.z") == z > 200
     page.run("Object.assign(target, {x: 0, y: 0, z: 0})")
     page.run("at('sigma').value = 40; at('sigma').dispatchEvent(new Event('input'))")
     page.until("frame.inputs.sigma === 40")

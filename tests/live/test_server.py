@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import socket
+import threading
 import time
+from collections.abc import Iterator
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import pytest
-from sockets import THIS_MACHINE, listening
+from sockets import THIS_MACHINE, listening, ports
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -57,6 +61,8 @@ def test_only_who_has_the_token_gets_the_page(live):
     assert status(live.url.replace("/?", "/meshcat.js?")) == 200
     assert status(live.url.replace("/?", "/other?")) == 404
     assert status(base) == status(live.url + "x") == status(base + "meshcat.js") == 403
+    assert json.loads(urlopen(live.url.replace("/?", "/scene/leaf?")).read())["commands"]
+    assert status(live.url.replace("/?", "/scene/../leaf?")) == 404
     # A name that somebody else's server gave to this address.
     assert status(live.url, Host="evil.example") == 403
     assert live.url in live._repr_html_()
@@ -69,7 +75,6 @@ def test_the_socket_takes_orders_from_our_own_page_alone(live):
             open_socket(live, origin)
     with open_socket(live) as page:
         hello = json.loads(page.recv())["hello"]
-        assert hello["meshcat"].startswith("ws://localhost:")
         page.send('{"set": {"z": -300, "sigma": 50}}')
         frame = until(page, lambda frame: frame["inputs"]["sigma"] == 50)
         assert frame["driver"] == hello["you"] and frame["inputs"]["z"] == -300
@@ -83,10 +88,112 @@ def test_the_socket_takes_orders_from_our_own_page_alone(live):
 
 @pytest.mark.slow
 def test_a_port_that_is_taken_is_one_line(live, scenario, load, monkeypatch):
-    monkeypatch.setattr(server, "identified_load", lambda scenario: load)
+    monkeypatch.setattr(server, "identified_load", lambda *_: load)
     taken = int(live.url.partition("/?")[0].rpartition(":")[2])
     with pytest.raises(DrakeTeleopError, match=f"port {taken}: cannot be listened to"):
         server.drive(scenario, port=taken)
     with pytest.raises(DrakeTeleopError, match="there is no scenario"):
         server.drive("no-such-scenario")
     assert isinstance(scenario, Scenario)
+
+
+@pytest.mark.slow
+def test_one_port_listens_also_when_the_scene_changes(scenario, load, monkeypatch):
+    monkeypatch.setattr(server, "identified_load", lambda *_: load)
+    before = ports()
+    drive = server.drive(scenario)
+    with open_socket(drive) as page:
+        assert len(ports() - before) == 1
+        page.send('{"scene": "wall"}')
+        until(page, lambda frame: frame["view"] == "wall" and frame["state"] == "running")
+        assert len(ports() - before) == 1
+    drive.stop()
+    assert ports() == before
+
+
+@pytest.mark.slow
+def test_the_policy_of_the_page_allows_its_own_scripts_alone(live):
+    with urlopen(live.url) as answer:
+        policy, page = answer.headers["Content-Security-Policy"], answer.read()
+    assert "default-src 'none'" in policy and "unsafe-eval" not in policy
+    (scripts,) = (part for part in policy.split("; ") if part.startswith("script-src"))
+    assert "unsafe-inline" not in scripts and scripts.count("'sha256-") == page.count(b"<script>")
+
+
+def hostile(host: str, token: str) -> Iterator[bytes]:
+    """Requests that no browser makes, or that a foreign page can make it make."""
+    start = f"GET /?token={token} HTTP/1.1\r\n"
+    upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+    yield f"{start}Host: {host}\r\nHost: {host}\r\n\r\n".encode()
+    yield f"{start}Host: evil.example\r\nHost: {host}\r\n\r\n".encode()
+    yield f"{start}\r\n".encode()
+    for path in ("//[", "/socket?token=%ff", "/?" + "&" * 5000, "http://[::1", "*", "/%", "?"):
+        yield f"GET {path} HTTP/1.1\r\nHost: {host}\r\n\r\n".encode()
+    yield f"GET /?token=\xe9\xff HTTP/1.1\r\nHost: {host}\r\n\r\n".encode("latin-1")
+    for origin in ("Origin: http://evil.example\r\n", f"Origin: http://{host}\r\n" * 2, ""):
+        to = f"GET /socket?token={token} HTTP/1.1\r\nHost: {host}\r\n"
+        yield f"{to}{origin}{upgrade}{key}\r\n".encode()
+        yield f"{to}Origin: http://{host}\r\n{upgrade}{key}{key}\r\n".encode()
+    yield b"\x16\x03\x01\x02\x00\x01\x00" + bytes(range(256))  # a browser that was told https
+    yield b"POST / HTTP/1.1\r\nContent-Length: 5\r\n\r\nhello"
+    yield b"GET / HTTP/1.1\r\n" + b"A: b\r\n" * 5000
+    yield b"\r\n" * 100
+    yield b""
+
+
+@pytest.mark.slow
+def test_no_client_ends_a_drive_or_holds_up_its_end(scenario, load, monkeypatch, capfd):
+    """And it prints nothing but that the last page has gone."""
+    monkeypatch.setattr(server, "identified_load", lambda *_: load)
+    drive = server.drive(scenario)
+    host, token = drive.url.partition("//")[2].partition("/")[0], drive.url.partition("token=")[2]
+    address = host.partition(":")[0], int(host.partition(":")[2])
+    for request in hostile(host, token):
+        with socket.create_connection(address) as client:
+            client.settimeout(5.0)
+            with contextlib.suppress(OSError):  # it closes what it refuses, sooner or later
+                client.sendall(request)
+                if request.endswith(b"\r\n\r\n"):
+                    assert b" 200 " not in client.recv(65536).partition(b"\r\n")[0]
+    with contextlib.ExitStack() as stack:
+        for text in ("[]", b"\xc1", "x" * 4096, "", b"", "x" * (LONGEST + 1)):
+            with open_socket(drive) as page:
+                page.send(text)
+        silent = [socket.create_connection(address) for _ in range(5)]
+        stack.callback(lambda: [each.close() for each in silent])
+        deaf = stack.enter_context(open_socket(drive))
+        frame = until(deaf, lambda frame: frame["state"] == "running")
+        assert frame["t"] > 0.0
+        start = time.monotonic()
+        drive.stop()
+        assert time.monotonic() - start < 5.0
+    said = capfd.readouterr()
+    assert said.out == "" and set(said.err.splitlines()) == {
+        "Prepare the station and its 3D scenes ...",
+        "no page is open: nothing runs",
+    }
+
+
+@pytest.mark.slow
+def test_a_drive_ends_while_another_scene_identifies_its_load(scenario, load, monkeypatch):
+    """However long that would take: it looks at the clock whenever it tells how far it is."""
+    asked = threading.Event()
+
+    def identify(_, progress):
+        if progress is True:
+            return load
+        told = progress("Identify the load")
+        while True:
+            asked.set()
+            told(0.5)
+            time.sleep(0.01)
+
+    monkeypatch.setattr(server, "identified_load", identify)
+    drive = server.drive(scenario)
+    with open_socket(drive) as page:
+        page.send('{"scene": "slot"}')
+        assert asked.wait(10.0)
+        start = time.monotonic()
+        drive.stop()
+        assert time.monotonic() - start < 5.0

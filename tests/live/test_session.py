@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs
 from drake_teleop.live.session import Drive, Session, read_drive, repeat
 from drake_teleop.pages.progress import silent
 from drake_teleop.passivity.methods import METHODS
+from drake_teleop.resources import models_dir
 from drake_teleop.result import SimulationResult
 from drake_teleop.scenario import Scenario, replace
 from drake_teleop.slave.arm import forward_kinematics
@@ -272,9 +274,13 @@ def test_of_a_drive_that_is_not_closed_two_seconds_are_lost_and_no_input(scenari
         session.apply(changes[-1][1])
         session.advance(100)
     session._on_disk.finish()  # what has been taken, the thread beside has had time to write
-    assert read_inputs(tmp_path / INPUTS)[1:] == changes[1:]
+    assert list(read_drive(tmp_path).changes)[1:] == changes[1:]
     log = SimulationResult.read_parquet(tmp_path / "log.parquet")
     assert log.t[-1] >= 1e-3 * session.ms - 2.0
+
+
+MADE_BY = {"drake_teleop": "1.2", "drake": "3.4"}
+HEADER = header(MADE_BY)
 
 
 def test_inputs_are_brought_into_their_ranges_and_nonsense_is_left_out():
@@ -288,23 +294,51 @@ def test_inputs_are_brought_into_their_ranges_and_nonsense_is_left_out():
     ("text", "message"),
     [
         ("", "no record of a drive"),
-        (header(), "ends when it begins"),
-        (header() + row(0, Inputs()), "ends when it begins"),
-        (header() + row(5, Inputs()), "5 ms is no time"),
-        (header() + row(0, Inputs()) + row(-5, Inputs()), "-5 ms is no time"),
-        (header() + row(0, Inputs()) + row(5, Inputs(x=1_000_000)), ":3.*x = 1000000 is outside"),
-        (header() + "0,1\n", "has 2 numbers, not 22"),
-        (header() + "0,a\n", "something other than whole numbers"),
+        (HEADER, "ends when it begins"),
+        (HEADER + row(0, Inputs()), "ends when it begins"),
+        (HEADER + row(5, Inputs()), "5 ms is no time"),
+        (HEADER + row(0, Inputs()) + row(-5, Inputs()), "-5 ms is no time"),
+        (HEADER + row(0, Inputs()) + row(5, Inputs(x=1_000_000)), ":4.*x = 1000000 is outside"),
+        (HEADER + "0,1\n", "has 2 values, not 22"),
+        (HEADER + row(0, Inputs()).replace("0,", "a,", 1), "something other than whole numbers"),
+        (
+            HEADER + row(0, Inputs()).replace("none", "share"),
+            "has an unknown method, 'share'; it ca",
+        ),
+        (
+            HEADER + row(0, Inputs()).replace("none", "0"),
+            "has an unknown method, '0'; it cannot be",
+        ),
+        (HEADER + row(0, Inputs()).replace("medium", "iron"), "has an unknown grip, 'iron'"),
+        (
+            HEADER.replace("1.2", "1.1"),
+            "recorded with drake_teleop 1.1, and this is 1.2; it cannot",
+        ),
+        (HEADER.replace(", drake 3.4", ""), "recorded with drake unknown, and this is 3.4"),
+        (HEADER.partition("\n")[2] + "0,0\n", "has numbers for names, and no version"),
+        ("# \n" + HEADER.partition("\n")[2], "recorded with drake_teleop unknown"),
     ],
 )
 def test_a_file_of_inputs_that_is_none_is_one_line(tmp_path, text, message):
     (tmp_path / INPUTS).write_text(text)
     with pytest.raises(DrakeTeleopError, match=message):
-        read_inputs(tmp_path / INPUTS)
+        read_inputs(tmp_path / INPUTS, MADE_BY)
+
+
+def test_a_drive_whose_model_has_changed_is_not_repeated(scenario, load, tmp_path):
+    model = tmp_path / "arm.sdf"
+    shutil.copy(models_dir() / "rx90.sdf", model)
+    session = Session(replace(scenario, slave__model=str(model)), load, record=tmp_path / "drive")
+    session.advance(5)
+    session.close()
+    assert read_drive(tmp_path / "drive").changes[-1][0] == 5
+    model.write_text(model.read_text() + "\n")
+    with pytest.raises(DrakeTeleopError, match=r"models or other files .* have changed; it cannot"):
+        read_drive(tmp_path / "drive")
 
 
 def test_a_line_that_a_killed_process_did_not_finish_is_left_out(tmp_path):
     path = tmp_path / INPUTS
-    path.write_text(header() + row(0, Inputs()) + row(5, Inputs(x=3)) + row(10, Inputs())[:9])
-    assert read_inputs(path) == [(0, Inputs()), (5, Inputs(x=3))]
+    path.write_text(HEADER + row(0, Inputs()) + row(5, Inputs(x=3)) + row(10, Inputs())[:9])
+    assert read_inputs(path, MADE_BY) == [(0, Inputs()), (5, Inputs(x=3))]
     assert len(RANGES) == 21

@@ -27,6 +27,7 @@ from drake_teleop.load.inertia import (
 )
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench, regressor
+from drake_teleop.result import SimulationResult
 
 TRUTH = np.concatenate([OFFSETS, TOOL])
 WRENCH_NOISE = np.array([0.3, 0.3, 0.5, 0.01, 0.01, 0.005])
@@ -387,6 +388,20 @@ def test_a_file_of_each(tmp_path):
         loaded = Identification.load(tmp_path / "identification.json")
         np.testing.assert_array_equal(loaded.phi, result.phi)
         assert loaded.method == METHODS[method].name
+
+
+@pytest.mark.parametrize("what", ["complex", "masked"])
+def test_no_part_of_a_number_is_lost(what):
+    wrench, *motion = record(50, noise=1.0)
+    other = wrench + 0j if what == "complex" else np.ma.masked_greater(wrench, 1.0)
+    with pytest.raises(DrakeTeleopError, match=rf"wrench: holds no numbers \({what}\)"):
+        identify_batch(other, *motion)
+    with pytest.raises(DrakeTeleopError, match=rf"t: holds no numbers \({what}\)"):
+        SimulationResult(other[:, 0], {}, [])
+    kept = identify_batch(np.ma.array(wrench), *motion)  # of which nothing is masked
+    np.testing.assert_array_equal(
+        kept.identification.phi, identify_batch(wrench, *motion).identification.phi
+    )
 
 
 def test_bad_input_is_named():

@@ -13,15 +13,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from load_cases import OFFSETS, TOOL, rich_motion, rotations
 from scipy.signal import butter, lfilter
+from scipy.spatial.transform import Rotation
 
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.uncertainty import (
     base_parameters,
     intervals,
     prior_dominated,
     wrench_standard_deviations,
 )
-from drake_teleop.load.identification import PARAMETERS, Identification, natural_scale
+from drake_teleop.load.identification import (
+    PARAMETERS,
+    Identification,
+    com_deviations,
+    natural_scale,
+)
 from drake_teleop.load.normal_equations import NormalEquations, identify
 from drake_teleop.load.online.recursive import RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor
@@ -421,3 +428,101 @@ def test_undetermined_inertia_makes_no_promise_for_turning():
     turning = wrench_standard_deviations(load, s[0], still[0], [1.0, 0.0, 0.0])
     assert np.isfinite(turning[:3]).all()
     assert np.isinf(turning[3:]).tolist() == [True, True, True]
+
+
+def poses_at_rest(count, rng):
+    """(count, 3) specific force that differs along two directions at least."""
+    while True:
+        s = Rotation.random(count, random_state=rng).apply([0.0, 0.0, 9.81])
+        if np.linalg.svd(s - s.mean(axis=0), compute_uv=False)[1] > np.sqrt(count):
+            return s
+
+
+def loads_at_rest(count, tables, repeats=1, misfit=0.0):
+    """Loads from tables of poses at rest, with errors of a pose and of a row in units of NOISE."""
+    rng = np.random.default_rng(count)
+    for _ in range(tables):
+        s = poses_at_rest(count, rng)
+        F = OFFSETS + non_contact_wrench(s, 0 * s, 0 * s, TOOL)
+        F = np.repeat(F + misfit * SHARED * rng.normal(size=F.shape), repeats, axis=0)
+        F = F + SHARED * rng.normal(size=F.shape)
+        s = np.repeat(s, repeats, axis=0)
+        yield identify_batch(F, s, 0 * s, 0 * s, shared_noise=True).identification
+
+
+SHARED = np.repeat([0.3, 0.01], 3)
+GROUPS = {"offsets": slice(0, 6), "mass": slice(6, 7), "first moments": slice(7, 10)}
+
+
+@pytest.mark.parametrize(("repeats", "misfit"), [(1, 0.0), (8, 0.0), (8, 4.0)])
+def test_intervals_of_poses_at_rest_cover_the_truth(repeats, misfit):
+    """Also where an orientation has an error that all of its repetitions share."""
+    covered = []
+    for count in (3, 4, 6, 12) if repeats == 1 else (4, 6, 12):
+        for load in loads_at_rest(count, 300 if repeats == 1 else 150, repeats, misfit):
+            lower, upper = intervals(load)
+            covered.append((lower <= TRUTH) & (upper >= TRUTH))
+            assert not load.identifiable[10:].any()
+    for name, group in GROUPS.items():
+        assert 0.93 < np.mean(np.array(covered)[:, group]) < 0.97, name
+
+
+@pytest.mark.parametrize("count", [3, 4, 7])
+def test_degrees_of_freedom_of_poses_at_rest(count):
+    """Force: 3 offsets and the mass; torque: 3 offsets and 3 first moments."""
+    load = next(iter(loads_at_rest(count, 1)))
+    forces, torques = 3 * count - 4, 3 * count - 6
+    expected = [*[forces] * 3, *[torques] * 3, forces, *[torques] * 3, *[np.inf] * 6]
+    np.testing.assert_allclose(load.degrees_of_freedom, expected)
+
+
+@pytest.mark.parametrize("resolution", [(0.1, 0.002), (0.02, 0.05)])
+def test_poses_at_rest_are_no_better_known_than_the_resolution_allows(resolution):
+    s = poses_at_rest(5, np.random.default_rng(4))
+    F = OFFSETS + non_contact_wrench(s, 0 * s, 0 * s, TOOL)
+    exact, rounded, twice = (
+        identify_batch(
+            F, s, 0 * s, 0 * s, shared_noise=True, resolution=tuple(k * np.array(resolution))
+        ).identification
+        for k in (0.0, 1.0, 2.0)
+    )
+    assert exact.standard_deviations[:10].max() < 1e-6
+    np.testing.assert_allclose(
+        twice.standard_deviations[:10], 2.0 * rounded.standard_deviations[:10]
+    )
+    # Of the mean of five forces alone, and of five torques alone.
+    least = np.repeat(resolution, 3) / np.sqrt(12 * 5)
+    assert (rounded.standard_deviations[:6] >= least).all()
+    assert (rounded.standard_deviations[:6] < 3.0 * least).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_poses_about_the_vertical_determine_three_offsets_alone(seed):
+    s = np.tile([0.0, 0.0, 9.81], (6, 1))
+    F = OFFSETS + non_contact_wrench(s, 0 * s, 0 * s, TOOL)
+    F = F + SHARED * np.random.default_rng(seed).normal(size=F.shape)
+    load = identify_batch(F, s, 0 * s, 0 * s, shared_noise=True).identification
+    known = [
+        name
+        for name, x in zip(PARAMETERS, load.covariance.diagonal(), strict=True)
+        if np.isfinite(x)
+    ]
+    assert known == ["f_ox", "f_oy", "tau_oz"]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_deviation_of_the_centre_of_mass_includes_that_of_the_mass(sign):
+    covariance = np.zeros((16, 16))
+    spread = np.random.default_rng(3).normal(size=(4, 4)) * 1e-3
+    covariance[6:10, 6:10] = spread @ spread.T
+    draws = np.random.default_rng(5).multivariate_normal(
+        sign * TOOL[:4], covariance[6:10, 6:10], 200_000
+    )
+    expected = (draws[:, 1:] / draws[:, :1]).std(axis=0)
+    found = com_deviations(np.r_[sign * TOOL[:4], TOOL[4:]], covariance)
+    np.testing.assert_allclose(found, expected, rtol=0.01)
+    covariance[8, :] = covariance[:, 8] = 0.0
+    covariance[8, 8] = np.inf
+    assert np.isfinite(com_deviations(TOOL, covariance)).tolist() == [True, False, True]
+    covariance[6, 6] = np.inf
+    assert np.isinf(com_deviations(TOOL, covariance)).all()

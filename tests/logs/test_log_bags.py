@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import sys
 from collections.abc import Iterable
 from itertools import islice
@@ -20,6 +21,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.check.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.read import bags
 from drake_teleop.logs.read.bags import is_bag, read_topic, topics_of
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
@@ -364,3 +366,37 @@ def test_without_the_library_the_message_names_it(
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(DrakeTeleopError, match=r"; install .*: pip install '\.\[ros\]' "):
         topics_of(tmp_path / "run1")
+
+
+@pytest.mark.parametrize("limit", ["_MOST_UNPACKED", "_MOST_MEMORY"])
+def test_a_bag_that_unpacks_to_too_much_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str
+) -> None:
+    """By what its chunks say, and by what they are."""
+    mcap = pytest.importorskip("mcap.writer")
+    path, size = tmp_path / "x.mcap", 60_000_000
+    with path.open("wb") as file:
+        writer = mcap.Writer(file, chunk_size=2 * size)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channel = writer.register_channel("/x", "cdr", schema)
+        writer.add_message(channel, 0, b"\0\1\0\0" + bytes(size), 0)
+        writer.finish()
+    assert path.stat().st_size < size / 100
+    monkeypatch.setattr(bags, "_MOST_RATIO", 1 if limit == "_MOST_UNPACKED" else 10**6)
+    monkeypatch.setattr(bags, limit, 40_000_000)
+    with pytest.raises(DrakeTeleopError, match="unpacks to more than can be read; cut it"):
+        read_topic(path, "/x")
+    assert resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY
+
+
+def test_many_messages_are_the_same_as_few(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag = write_bag(tmp_path / "bag", {"/ft": wrenches(), "/tf": poses("TFMessage")})
+    for topic, child in (("/ft", None), ("/tf", "tool0")):
+        whole = read_topic(bag, topic, child).columns
+        with monkeypatch.context() as patch:
+            patch.setattr(bags, "_BLOCK", 7)
+            parts = read_topic(bag, topic, child).columns
+        assert parts.keys() == whole.keys() and len(whole["received"]) > 7
+        for name, values in whole.items():
+            np.testing.assert_array_equal(parts[name], values)

@@ -12,7 +12,6 @@ from numpy.lib import format as npy
 from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
-from drake_teleop.load.online.segments import segments
 from drake_teleop.logs.check.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.description import load_description
@@ -155,20 +154,6 @@ def test_a_description_beyond_all_units(change, expected, tmp_path):
     static += " {columns: [c]}}"
     path.write_text(f"{static}\n{change}" if "gravity" in change else change)
     assert expected in message(lambda: load_description(path))
-
-
-@pytest.mark.parametrize("dead", [slice(3, 4), slice(0, 1), slice(3, 6)])
-def test_a_channel_that_says_nothing_divides_by_nothing(dead):
-    t = np.arange(2000) * 2e-3
-    motion = np.sin(np.outer(t, 2.0 + np.arange(9)))
-    wrench = np.cos(np.outer(t, 3.0 + np.arange(6)))
-    wrench[:, dead] = 0.0
-    with np.errstate(all="raise", under="ignore"):
-        assert segments(wrench, *np.split(motion, 3, axis=1), 2e-3) == []
-
-
-def test_a_record_shorter_than_a_block_has_one_load():
-    assert segments(np.ones((9, 6)), *np.ones((3, 9, 3)), 1e-5) == []
 
 
 @pytest.mark.parametrize("rows", [2, 3])

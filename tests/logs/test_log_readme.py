@@ -73,7 +73,8 @@ def test_what_is_left_is_the_touches():
     for contact, touch in zip(found, truth, strict=True):
         assert contact["peak_N"] == pytest.approx(touch["peak_N"], rel=0.03)
         assert contact["push"] == pytest.approx(touch["push"], abs=0.03)
-        assert contact["start_s"] == pytest.approx(touch["start_s"], abs=0.015)
+        # The low-pass of 30 Hz shows a touch up to half a period early.
+        assert contact["start_s"] == pytest.approx(touch["start_s"], abs=0.5 / 30.0 + 0.004)
         assert contact["stop_s"] == pytest.approx(touch["stop_s"], abs=0.06)
 
 

@@ -43,7 +43,7 @@ def test_the_page_stands_alone_and_has_the_numbers_of_the_summary(tmp_path: Path
     assert (out / "report.png").stat().st_size > 50_000
     # Nothing is fetched: no address but the data in it, and what came from the log is escaped.
     assert re.findall(r'(?:src|href)="(?!data:)', page) == []
-    assert "http" not in page and "<log>" not in page and "&lt;log&gt;.parquet" in page
+    assert "://" not in page and "<log>" not in page and "&lt;log&gt;.parquet" in page
     assert page.count("data:image/png;base64,") == 2
     assert f"{summary['mass']:.4g}" in page
     assert page.count('"pill agrees"') == len(summary["identifiable"])

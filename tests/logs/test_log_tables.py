@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import struct
+import subprocess
+import sys
 import zlib
 from functools import partial
 from pathlib import Path
@@ -12,7 +14,9 @@ from scipy.io import savemat
 from scipy.sparse import eye_array
 
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.logs.read.tables import read_table
+from drake_teleop.logs.read.canonical import Log, write_log
+from drake_teleop.logs.read.reading import read_log
+from drake_teleop.logs.read.tables import decimal_step, read_table
 
 
 def write(path: Path, text: str) -> Path:
@@ -71,9 +75,7 @@ def test_errors_name_file_and_remedy(
 
 
 @pytest.mark.parametrize("row", [0, 2500])
-@pytest.mark.parametrize(
-    "cell", ["2.5", "1e3", " 3", "+5", "nan", "", "Infinity", "1_000", "9" * 25]
-)
+@pytest.mark.parametrize("cell", ["2.5", "1e3", " 3", "+5", "nan", "", "Infinity", "9" * 25])
 def test_a_cell_is_the_same_number_in_any_row(tmp_path: Path, row: int, cell: str) -> None:
     """Types are told by the first rows, if they can be; the others are of whole numbers here."""
     cells = [str(k) for k in range(3000)]
@@ -276,3 +278,122 @@ def test_dates_and_times_of_day_are_seconds(tmp_path: Path, stamps: list[str]) -
     pl.DataFrame({"t": stamps}).write_csv(tmp_path / "y.csv")
     pl.read_csv(tmp_path / "y.csv", try_parse_dates=True).write_parquet(tmp_path / "y.parquet")
     assert read_table(tmp_path / "y.parquet").single("t", "here").tolist() == t.tolist()
+
+
+@pytest.mark.parametrize(
+    ("values", "step"),
+    [
+        ([1.25, -3.5], 0.01),
+        ([12.0, 700.0], 1.0),
+        ([0.1 + 0.2, 1.0 / 3.0], 0.0),
+        ([16.448062, 1e-6], 1e-6),
+        ([0.0, 0.0], 0.0),
+        ([0.0, 0.7, 5.0], 0.1),
+    ],
+)
+def test_step_of_printed_decimals(values: list[float], step: float) -> None:
+    assert decimal_step(np.array(values)) == pytest.approx(step)
+
+
+PLAIN = "t,a\n0,1.5\n1,2.5\n"
+SPELLINGS = {
+    "empty lines at the end": f"{PLAIN}\n\n\n",
+    "empty lines at the end, with CR": PLAIN.replace("\n", "\r\n") + "\r\n\r\n",
+    "spaces at the end": f"{PLAIN}   \n \t\n",
+    "separators at the end": f"{PLAIN},\n,\n",
+    "semicolons at the end": "t;a\n0;1.5\n1;2.5\n;\n",
+    "70 kB of empty lines": PLAIN + "\n" * 70_000,
+    "the end of a file of DOS": f"{PLAIN}\x1a",
+    "a file that was not filled": PLAIN + "\0" * 5000,
+    "CR alone": PLAIN.replace("\n", "\r"),
+    "CR alone, no end": PLAIN.replace("\n", "\r").rstrip(),
+    "quoted decimal commas": 't,a\n"0,0","1,5"\n"1,0","2,5"\n',
+    "quoted decimal commas, semicolons": 't;a\n"0,0";"1,5"\n"1,0";"2,5"\n',
+    "some quoted decimal commas": 't,a\n0,"1,500"\n1,"2,5"\n',
+    "small quoted decimal commas": 't,a\n"0,000","1,500"\n"1,000","2,500"\n',
+}
+
+
+@pytest.mark.parametrize("name", SPELLINGS)
+def test_text_of_spreadsheets_is_the_same_table(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "x.csv"
+    path.write_bytes(SPELLINGS[name].encode())
+    table = read_table(path)
+    assert table.numbers(["t", "a"], 2, "here").tolist() == [[0.0, 1.5], [1.0, 2.5]]
+
+
+@pytest.mark.parametrize("cell", ["1_000", '"1,500"', "1_0.5", "_1", "1__0", "0x10", "\u0663"])
+def test_a_cell_that_may_be_another_number_is_refused(tmp_path: Path, cell: str) -> None:
+    for text in (f"t,a\n0,{cell}\n1,2.5\n", f"t,a\n0,2.5\n1,{cell}\n", f"t,a\n0,{cell}\n"):
+        with pytest.raises(DrakeTeleopError):
+            read_table(write(tmp_path / "x.csv", text)).numbers(["a"], 1, "here")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_canonical_log_in_capitals_has_all_of_its_columns(tmp_path: Path, suffix: str) -> None:
+    """None of them is left out without a word, such as the angular acceleration."""
+    log = sample_motion()
+    path = tmp_path / f"x{suffix}"
+    write_log(log, path)
+    read = pl.read_csv if suffix == ".csv" else pl.read_parquet
+    frame = read(path).rename(str.upper)
+    (frame.write_csv if suffix == ".csv" else frame.write_parquet)(path)
+    again = read_log(path)
+    np.testing.assert_allclose(again.angular_acceleration, log.angular_acceleration, atol=1e-9)
+    np.testing.assert_allclose(again.wrench, log.wrench, atol=1e-9)
+
+
+def sample_motion() -> Log:
+    t = 0.01 * np.arange(400)
+    groups = [np.sin(np.outer(t, 1.0 + np.arange(k, k + n))) for k, n in ((0, 6), (6, 3), (9, 3))]
+    return Log(t, *groups, np.cos(np.outer(t, np.arange(1.0, 4.0))))
+
+
+def test_an_empty_array_beside_others_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    np.savez(path, t=np.arange(2.0), none=np.zeros(0), nothing=np.zeros((0, 3)))
+    table = read_table(path)
+    assert list(table.columns) == ["t"]
+    with pytest.raises(DrakeTeleopError, match="has no column 'none'"):
+        table.raw("none", "here")
+    np.savez(path, none=np.zeros(0))
+    with pytest.raises(DrakeTeleopError, match="holds no rows"):
+        read_table(path)
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 2)])
+def test_complex_arrays_of_files_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    np.savez(tmp_path / "x.npz", a=np.ones(shape) + 1j)
+    with pytest.raises(DrakeTeleopError, match="is not a number"):
+        read_table(tmp_path / "x.npz").raw("a", "here")
+
+
+FORKS = """
+import multiprocessing, sys
+from pathlib import Path
+from drake_teleop.logs.read.tables import read_table
+from drake_teleop.result import SimulationResult
+
+def rows(_):
+    return read_table(Path(sys.argv[1])).rows
+
+first = rows(0) if sys.argv[2] == "after" else 2
+with multiprocessing.get_context("fork").Pool(1) as pool:
+    try:
+        print(pool.apply(rows, [1]) == first)
+    except ValueError as error:
+        print(error)
+"""
+
+
+@pytest.mark.slow
+def test_a_process_that_is_forked_after_a_log_was_read_says_so(tmp_path: Path) -> None:
+    path = write(tmp_path / "x.csv", PLAIN)
+    for when, says in (("before", "True"), ("after", "forked after tables were read")):
+        done = subprocess.run(
+            [sys.executable, "-c", FORKS, str(path), when],
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+        assert says in done.stdout, done.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import io
+import time
 
 import numpy as np
 import pytest
@@ -57,14 +58,38 @@ def test_a_terminal_shows_each_stage(terminal):
     assert "Counting sheep" in text and "100%" in text
 
 
-def test_nothing_is_shown_if_nobody_looks_or_wants_it(terminal, monkeypatch):
+def test_nothing_is_shown_if_nobody_wants_it(terminal, capsys):
     shown(False)
     shown(silent)
     shown(True, after=3600.0)  # done before
+    assert terminal.getvalue() == capsys.readouterr().err == ""
+
+
+def test_without_a_terminal_each_stage_is_one_line_on_stderr(monkeypatch, capsys):
     file = io.StringIO()
     monkeypatch.setattr(rich, "_console", Console(file=file, force_terminal=False))
-    shown(True)
-    assert terminal.getvalue() == file.getvalue() == ""
+    with show_progress(True) as stage:
+        first = stage("Counting sheep")
+        assert capsys.readouterr().err == "Counting sheep ...\n"  # before it has done anything
+        for fraction in (0.0, 0.5, 1.0):
+            first(fraction, "words")
+        stage("Counting goats")(1.0)
+    shown(True, after=3600.0)
+    shown(False)
+    said = capsys.readouterr()
+    assert (said.err, said.out, file.getvalue()) == ("Counting goats ...\n", "", "")
+
+
+def test_without_a_terminal_a_stage_that_takes_long_is_told_late(monkeypatch, capsys):
+    monkeypatch.setattr(rich, "_console", Console(file=io.StringIO(), force_terminal=False))
+    with show_progress(True, after=0.05) as stage:
+        told = stage("Counting sheep")
+        told(0.1)
+        assert capsys.readouterr().err == ""
+        time.sleep(0.06)
+        told(0.2)
+        told(0.3)
+        assert capsys.readouterr().err == "Counting sheep ...\n"
 
 
 def test_a_callers_stages_go_on_in_what_it_calls(terminal):

@@ -7,20 +7,25 @@ import os
 import random
 import re
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
+from full_disk import small_disk
 from test_compensator import DT, load, readings
 
 import drake_teleop.robots.udp as udp
 from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.robots.compensate import Control, run
+from drake_teleop.robots import table
+from drake_teleop.robots.compensate import Control, compensate_command, run
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.lines import LineSource, read_line, written_line
 from drake_teleop.robots.sources_and_sinks import sink_of, source_of
 from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Compensated, Flag, Part, Reading
+from drake_teleop.writing import CannotWrite
 
 HEADER = Path(udp.__file__).with_name("drake_teleop_udp.h").read_text()
 
@@ -91,6 +96,15 @@ def test_a_line_that_is_none(line: bytes) -> None:
     assert read_line(line, 0) is DAMAGED
 
 
+@pytest.mark.parametrize("number", [2**64, 10**20, -1, 1e300, 10**400, None, "x", [1]])
+def test_a_number_that_no_packet_and_no_table_holds_is_damage(number) -> None:
+    line = json.loads(line_of(readings(1)[0]))
+    assert read_line(json.dumps(line | {"number": number}).encode(), 0) is DAMAGED
+    largest = read_line(json.dumps(line | {"number": 2**64 - 1}).encode(), 0)
+    out = Compensator(load(), DT).step(largest, 0.0)
+    assert udp.unpacked_wrench(udp.packed_wrench(out)).number == 2**64 - 1
+
+
 def test_from_socket_to_socket_on_this_machine_alone() -> None:
     source = udp.UdpSource("udp://:0", DT)
     with udp.listening(udp.THIS_MACHINE, 0) as there:
@@ -144,6 +158,105 @@ def test_lines_from_a_pipe_to_a_table(tmp_path: Path) -> None:
     assert counts["wrenches"] == len(table) == 31 and counts["damaged"] == 1
     assert table["contact_f_x"][29] == pytest.approx(5.0) and table["flags"][30] == 2
     assert any(text.endswith("damaged") for text in said)
+
+
+TABLES = ("x.csv", "x.parquet")
+
+
+def table_of(path: Path) -> pl.DataFrame:
+    return (pl.read_csv if path.suffix == ".csv" else pl.read_parquet)(path)
+
+
+WRITER = """
+import sys, time
+import numpy as np
+from pathlib import Path
+from drake_teleop.robots import table
+from drake_teleop.robots.streams import Compensated
+table.PERIOD_S = dict.fromkeys(table.PERIOD_S, 0.02)
+sink = table.TableSink(Path(sys.argv[1]))
+for k in range(10**6):
+    sink.write(Compensated(k, 0.1 * k, np.full(6, k), np.zeros(6), 0))
+    print(k, flush=True)
+    time.sleep(1e-3)
+"""
+
+
+@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("after", [1, 57, 200])
+def test_a_kill_leaves_what_came_until_then(tmp_path: Path, name: str, after: int) -> None:
+    writer = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(tmp_path / name)], stdout=subprocess.PIPE, text=True
+    )
+    assert writer.stdout is not None
+    while int(writer.stdout.readline()) < after:
+        pass
+    writer.kill()
+    last = int((writer.stdout.read().split() or [str(after)])[-1])
+    writer.wait()
+    rows = table_of(tmp_path / name)
+    assert rows["number"].to_list() == list(range(len(rows)))
+    assert rows["contact_tau_z"].to_list() == list(range(len(rows)))
+    assert len(rows) >= last - 60  # of which 1000 come in a second
+
+
+class Failing:
+    """A sink's wrenches until the disk is full, or an error or Ctrl-C comes from elsewhere."""
+
+    def __init__(self, sink: table.TableSink) -> None:
+        self.sink, self.written = sink, 0
+
+    def write_until(self, error: type[BaseException], count: int = 10**6) -> None:
+        with pytest.raises(error):
+            for k in range(self.written, count):
+                self.sink.write(Compensated(k, 1e-5 / (k + 1), np.ones(6), np.zeros(6), 0))
+                self.written += 1
+            raise error
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_what_was_written_before_a_full_disk_is_whole(tmp_path, name: str, monkeypatch) -> None:
+    monkeypatch.setattr(table, "PERIOD_S", dict.fromkeys((".csv", ".parquet"), 1e-3))
+    with small_disk(tmp_path, 100_000):
+        failing = Failing(table.TableSink(tmp_path / name))
+        failing.write_until(CannotWrite)
+        with pytest.raises(CannotWrite):
+            failing.sink.close()
+        found = table_of(tmp_path / name)
+        assert found["number"].to_list() == list(range(len(found))) and len(found) > 20
+        np.testing.assert_array_equal(found["t"], 1e-5 / np.arange(1, len(found) + 1))
+
+
+@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OverflowError])
+def test_an_error_or_an_interrupt_loses_no_row_and_doubles_none(tmp_path, name, error) -> None:
+    """Not even when it comes while rows are written."""
+    failing, path = Failing(table.TableSink(tmp_path / name)), tmp_path / name
+    failing.write_until(error, 50)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(table.time, "monotonic", lambda: (_ for _ in ()).throw(error))
+        with pytest.raises(error):
+            failing.sink.close()
+    failing.sink.close()
+    assert table_of(path)["number"].to_list() == list(range(50))
+
+
+@pytest.mark.parametrize("name", [*TABLES, "x.mcap"])
+def test_a_live_source_overwrites_no_earlier_file(tmp_path, name, monkeypatch) -> None:
+    if name == "x.mcap":
+        pytest.importorskip("foxglove")
+    load().save(tmp_path / "load.json")
+    for _ in range(3):
+        out, into = os.pipe()
+        os.write(into, b"\n".join(map(line_of, readings(30))))
+        os.close(into)
+        monkeypatch.setattr("sys.stdin", os.fdopen(out))
+        compensate_command("-", tmp_path / "load.json", str(tmp_path / name), rate_hz=1 / DT)
+    earlier = sorted(path.parent.name for path in tmp_path.glob(f"*/{name}"))
+    assert earlier == ["earlier-1", "earlier-2"]
+    if name != "x.mcap":
+        assert len(table_of(tmp_path / "earlier-1" / name)) == 30
+        assert len(table_of(tmp_path / name)) == 30
 
 
 class Interrupted:

@@ -212,7 +212,7 @@ def test_a_dask_cluster_gives_the_same_bytes_and_is_for_this_machine_alone(
 
 def test_without_dask_the_extra_is_named(files, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(DrakeTeleopError, match=r"drake_teleop\[cluster\]"):
+    with pytest.raises(DrakeTeleopError, match=r"pip install '\.\[cluster\]' in"):
         study_command(files / "study.yaml", files / "none", cluster="local", quiet=True)
 
 
@@ -279,6 +279,35 @@ def test_another_study_does_not_mix_with_the_rows(serial, files):
     with pytest.raises(DrakeTeleopError, match="another study"):
         study_command(files / "other.yaml", serial[1], quiet=True)
     assert parts(serial[1]) == before
+
+
+@pytest.mark.parametrize("damage", ["empty", "no rows", "damaged"])
+def test_a_part_without_rows_is_run_again_and_other_files_are_ignored(tmp_path, damage):
+    """In the folder of a study that is complete but for that."""
+    study = Study(factors=[Factor("force_scaling.sigma", values=[0.0, 0.5, 1.0])], measures=[])
+    calls: list[int] = []
+
+    def work(values, seed):
+        calls.append(seed)
+        return {}
+
+    def run():
+        return run_study(study, tmp_path, work, {}, jobs=1, progress=False)
+
+    rows, folder = run(), tmp_path / "runs.parquet"
+    part = folder / "run_00000001.parquet"
+    content = part.read_bytes()
+    if damage == "no rows":
+        pl.read_parquet(part).clear().write_parquet(part)
+    else:
+        part.write_bytes(b"" if damage == "empty" else content[:-20])
+    (folder / "notes.txt").write_text("mine")
+    (folder / "mine.parquet").write_bytes(b"")
+    calls.clear()
+    assert run().equals(rows) and len(calls) == 1
+    assert part.read_bytes() == content and (folder / "notes.txt").read_text() == "mine"
+    calls.clear()
+    assert run().equals(rows) and not calls
 
 
 def test_two_processes_do_not_write_at_once(tmp_path):
@@ -552,6 +581,12 @@ def test_a_preset_brings_its_values():
         (("values: [0, 0.5, 1]", "low: 1"), "factors[0]: what it varies over"),
         (("values: [0, 0.5, 1]", "values: []"), "factors[0]: what it varies over"),
         (("values: [0, 0.5, 1]", "low: 1, high: 0"), "factors[0].high: the range ends at 0"),
+        (("[0, 0.5, 1]", "[0, .inf]"), "factors[0]: its numbers, or their range, are not finite"),
+        (("[0, 0.5, 1]", "[.nan]"), "factors[0]: its numbers"),
+        (("values: [0, 0.5, 1]", "vectors: [[0, .inf]]"), "factors[0]: its numbers"),
+        (("values: [0, 0.5, 1]", "low: 0, high: .inf"), "factors[0]: its numbers"),
+        (("values: [0, 0.5, 1]", "low: -.inf, high: .inf"), "factors[0]: its numbers"),
+        (("values: [0, 0.5, 1]", "low: -1e308, high: 1e308"), "factors[0]: its numbers"),
         (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: a value stands there twice"),
         (("operator.grip, words: [light, firm]", "force_scaling.sigma, values: [1]"), "twice"),
         (("force_scaling.sigma", "simulation.seed"), "factors[0].field: the seed is no factor"),

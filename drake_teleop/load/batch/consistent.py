@@ -128,6 +128,9 @@ def consistent_least_squares(
     cross = gram[:6, 6:]
     offsets = np.linalg.solve(gram[:6, :6], np.column_stack([right[:6], cross]))  # less phi's share
     reduced = (gram[6:, 6:] - cross.T @ offsets[:, 1:]) * np.outer(unit, unit)
+    whole = float((np.diag(gram)[6:] * unit**2).max())
+    if prior is None and np.abs(reduced).max() <= _RANK * whole:
+        return theta  # no load differs from offsets in this record
     linear = (right[6:] - cross.T @ offsets[:, 0]) * unit
     phi = unit * _solve(0.5 * (reduced + reduced.T), linear, unit, prior, row)
     return np.concatenate([offsets[:, 0] - offsets[:, 1:] @ phi, phi])

@@ -208,6 +208,7 @@ def identify_batch(
     noise: Noise | None = None,
     offsets: bool = True,
     shared_noise: bool = False,
+    resolution: tuple[float, float] = (0.0, 0.0),
     prior: Prior | None = None,
     ellipsoid: Ellipsoid | None = None,
     delay_s: float = 0.0,
@@ -225,6 +226,7 @@ def identify_batch(
         offsets: whether to estimate the sensor's; otherwise they were subtracted before.
         shared_noise: whether the three forces have one estimated noise, and the three torques one,
             as is right for averages over poses at rest (module docstring).
+        resolution: step of the numbers of forces and torques [N, N m], for averages over poses.
         prior, ellipsoid: what is known of the load, for "consistent".
         delay_s: the delay that was taken out of the motion, for the record [s].
         gain_std: standard deviation of each of the sensor's 36 gains, such as 0.01, of one between
@@ -249,7 +251,9 @@ def identify_batch(
     fit = METHODS[method].fit(
         record, Options(noise or Noise(), offsets, shared_noise, prior, ellipsoid)
     )
-    equations = NormalEquations(np.diag(fit.form.weights) ** -0.5)
+    equations = NormalEquations(
+        np.diag(fit.form.weights) ** -0.5, resolution=resolution if shared_noise else None
+    )
     kept = ~fit.rejected
     equations.add(*(rows if kept.all() else [table[kept] for table in rows]))
     plain = equations.solve(delay_s)

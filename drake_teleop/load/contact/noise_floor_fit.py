@@ -67,7 +67,9 @@ def fit_noise_floor(
         variance = np.full(len(square), max(float(square.mean()), _RESOLUTION[c] ** 2))
         for _ in range(_FITS):
             before = found[c].copy()
-            found[c] = nnls(terms / variance[:, None], (square - given) / variance)[0]
+            weighted = np.column_stack([terms, square - given]) / variance[:, None]
+            R = np.asarray(np.linalg.qr(weighted, mode="r"))  # the same problem, of four rows
+            found[c] = nnls(R[:, :3], R[:, 3])[0]
             found[c, 0] = max(found[c, 0], _RESOLUTION[c] ** 2)
             variance = terms @ found[c] + given
             if np.allclose(found[c], before, rtol=_SETTLED, atol=0.0):

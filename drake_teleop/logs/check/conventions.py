@@ -8,6 +8,7 @@ Eqs. (1)-(2) for some load (`against_load`), or, of the IMU, with the motion of 
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,14 +32,14 @@ from drake_teleop.logs.check.rest_poses import rest_finding
 from drake_teleop.logs.check.wrench_alone import wrench_findings
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.delay import estimate_delay
-from drake_teleop.logs.read.description import Description, load_description
+from drake_teleop.logs.read.description import NO_YAML, Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 from drake_teleop.one_thread import one_blas_thread
 
 _STILL = 0.3, 0.1
 """Specific force [m/s^2] and angular velocity [rad/s], rms, below which nothing is said of axes."""
-NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
+_SAME = 1e-6  # share of the largest reading by which a wrench changes that is read and not repeated
 
 
 @dataclass(frozen=True)
@@ -91,14 +92,19 @@ def question_fit(
             explains less than half of the wrench, or the accelerometer is in another unit, and a
             finding says what to change.
     """
+    if (np.ptp(log.wrench, axis=0) <= _SAME * np.abs(log.wrench).max()).all():
+        raise DrakeTeleopError(
+            "the wrench is the same in all samples: no load can be identified",
+            where=log.source,
+            remedy="check the sensor's cable; a driver may repeat its last value",
+        )
     unexplained = unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     clocks = log.static or (delay is not None and abs(delay) < CLOCK)
     if load.mass > 0 and unexplained < EXPLAINED and clocks and 5.0 < weight < 20.0:
         # What a good fit hides; `check_log` takes longer than the fit.
-        doubted = _doubted(path, log)
-        return tuple(f for f in check_log(path).findings if f.name != "lag") if doubted else ()
-    found = [finding for finding in check_log(path).findings if finding.name != "lag"]
+        return tuple(_findings(path, log))
+    found = _findings(path, None)
     if any(finding.name == "payload" for finding in found):
         own = payload_finding(load, unexplained)
         found = [own if own and f.name == "payload" else f for f in found]
@@ -122,6 +128,19 @@ def question_fit(
             remedy="set `sign: -1` in the log description (or remove it if it is there)",
         )
     return tuple(found)
+
+
+def _findings(path: Path, doubted: Log | None) -> list[Finding]:
+    """What `check_log` says, if it can: the log was read, so that no failure of it is the log's.
+
+    Args:
+        path: of the log.
+        doubted: the samples that have to look wrong first; None if they do.
+    """
+    with suppress(ValueError, ArithmeticError):
+        if doubted is None or _doubted(path, doubted):
+            return [finding for finding in check_log(path).findings if finding.name != "lag"]
+    return []
 
 
 def _check_moves(log: Log) -> None:
@@ -172,6 +191,8 @@ def check_conventions(
 
 def _check(data: LogData, description: Description) -> Conventions:
     log = data.read(description)
+    if "gravity" in log.free and log.described is not None:  # found once, not for each edit
+        description = description.model_copy(update={"gravity": log.described.gravity})
     dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
     if dead:  # What that does to motion and load would be taken for something else.
         return Conventions((*dead, *broken), load_fit(data.thin(description)), None, None)
@@ -186,6 +207,8 @@ def _check(data: LogData, description: Description) -> Conventions:
     fit = load_fit(data.thin(description))
     if broken or (mounting is not None and mounting.mirrored):
         return Conventions((*broken, *findings), fit, mounting, None)
+    if "weight" in log.free:  # the checks below take the weight for the load's
+        return Conventions(tuple(findings), fit, mounting, None)
     if not findings:
         more, description = drift_finding(description, data)
         findings += more

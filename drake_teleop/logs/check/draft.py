@@ -12,6 +12,7 @@ import numpy as np
 
 from drake_teleop.logs.read.description import UNITS
 from drake_teleop.logs.read.tables import Table
+from drake_teleop.texts import yaml_text
 
 _TIME = r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?)(_?(s|ms|us|ns))?$"
 # How the names of vectors end, before the axis.
@@ -85,8 +86,6 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
     Returns:
         YAML text whose first line says that it is a draft, and what was not found.
     """
-    import yaml
-
     plain = {name: _plain(name) for name in table.columns}
     found = _vectors(plain) | _numbered(plain) | _arrays(table, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
@@ -130,13 +129,13 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
     }
     unused = [name for name in table.columns if name not in used | parts]
     head = [
-        "# DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
-        "# above all wrench.sign, units and frames, and inspect it.",
-        f"# Columns without a guess: {', '.join(unused) or 'none'}.",
-        *([f"# {_WITHOUT_TIME}"] if _FILL_IN in times else []),
-        *(f"# {text}" for what, text in _REMARKS.items() for n in forces if re.search(what, n)),
+        "DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
+        "above all wrench.sign, units and frames, and inspect it.",
+        f"Columns without a guess: {', '.join(unused) or 'none'}.",
+        *([_WITHOUT_TIME] if _FILL_IN in times else []),
+        *(text for what, text in _REMARKS.items() for n in forces if re.search(what, n)),
     ]
-    return "\n".join(head) + "\n" + yaml.safe_dump(draft, sort_keys=False)
+    return yaml_text(draft, head=head)
 
 
 def _plain(name: str) -> tuple[str, str]:

@@ -47,7 +47,7 @@ def in_other_unit(description: Description, log: Log) -> Description:
 
 def _over_gravity(description: Description, log: Log) -> float:
     median = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
-    return median / float(np.linalg.norm(description.gravity))
+    return median / float(np.linalg.norm(description.gravity_W))
 
 
 def _right_unit(description: Description, log: Log, field: str) -> str | None:
@@ -100,7 +100,7 @@ def pose_edits(description: Description) -> Iterator[Edit]:
     if orientation is None:
         return
     if imu is None or imu.specific_force is None:
-        turned = tuple(0.0 - x for x in description.gravity)
+        turned = tuple(0.0 - x for x in description.gravity_W.tolist())
         yield (
             Finding(
                 "reversed gravity",

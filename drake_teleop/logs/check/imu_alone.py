@@ -48,7 +48,7 @@ def against_itself(description: Description, log: Log) -> tuple[list[Finding], D
         return [unit[0]], edit_field(description, *unit[1:])
     if imu.specific_force is None or imu.frame == "base":
         return [], description
-    gravity = float(np.linalg.norm(description.gravity))
+    gravity = float(np.linalg.norm(description.gravity_W))
     axes = _gyro_axes(imu, log, gravity)
     if axes is not None:
         finding, columns = axes

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, one_line
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.check.finding import Finding
@@ -147,7 +147,7 @@ def _write_draft(draft: str, path: Path, summary: dict[str, Any]) -> None:
         lacking.append(str(error).removeprefix(f"{path}: "))
     for message in lacking:
         summary["findings"].append({"name": "incomplete", "message": f"the draft has {message}"})
-        draft += f"# INCOMPLETE, this has {message}\n"
+        draft += f"# {one_line(f'INCOMPLETE, this has {message}')}\n"
     write_text(path, draft)
 
 

@@ -68,8 +68,11 @@ def load_fit(log: Log) -> LoadFit:
     w = wrench - wrench.mean(axis=0)
     scale = _scale(wrench)
     V = regressor(*(x[rows] for x in smooth.motion))
+    if "weight" in log.free and smooth.gravity is not None:
+        rest = np.zeros_like(smooth.gravity[rows])
+        V = np.dstack([V, regressor(-smooth.gravity[rows], rest, rest)[..., :4]])
     V = (V - V.mean(axis=0)) / scale[:, None]
-    matrix = V.reshape(-1, 10)
+    matrix = V.reshape(-1, V.shape[2])
     size = np.linalg.norm(matrix, axis=0) + 1e-12
     theta = np.linalg.lstsq(matrix / size, (w / scale).ravel(), rcond=1e-6)[0] / size
     total = float((w / scale).var(axis=0).sum()) + 1e-30

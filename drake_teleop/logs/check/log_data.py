@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.logs.read.bags import read_stream
 from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.clocks import spread
 from drake_teleop.logs.read.description import Description, Time
 from drake_teleop.logs.read.reading import MINIMUM_SAMPLES, read_description
 from drake_teleop.logs.read.tables import Table
@@ -70,13 +71,20 @@ class LogData:
         if time.rate is not None:
             rate = time.rate
         else:
-            t = self.tables[stream.source].single(str(time.column), "time")
+            t = self._stamps(stream)
             if len(t) < 2:  # read_log says what is wrong
                 return 1
             rate = 1 / max(1e-12, float(np.median(np.diff(t))) * description.scale(time.unit))
         # So that enough are left of a short record.
         most = min(rate / _RATE, self.tables[stream.source].rows / MINIMUM_SAMPLES)
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
+
+    def _stamps(self, stream: Any) -> NDArray[np.float64]:
+        """The stream's time stamps; those that rows share are spread, as `read_clock` does."""
+        t = self.tables[stream.source].single(str(stream.time.column), "time")
+        steps = np.diff(t)
+        shared = bool((steps == 0.0).any() and (steps >= 0.0).all() and t[0] < t[-1])
+        return spread(t) if shared else t
 
     def _thin(self, stream: Any, thin: Table, k: int) -> None:
         """Means over k rows; of an orientation, which has no mean, the row in the middle."""
@@ -89,7 +97,7 @@ class LogData:
                 thin.columns[column] = taken if field == "orientation" else _means(x, k)
         time: Time | None = getattr(stream, "time", None)
         if time is not None and time.column is not None:
-            thin.columns[str(time.column)] = _means(table.raw(time.column, "time"), k)
+            thin.columns[str(time.column)] = _means(self._stamps(stream)[:, None], k)
         elif time is not None and time.rate is not None:
             thin.columns[_STAMPS] = _means(np.arange(table.rows)[:, None] / time.rate, k)
 

@@ -83,7 +83,7 @@ def _axes(description: Description, wrench: Wrench, M: Array, deviation: float) 
     """From the force over the specific force, and its deviation."""
     U, masses, Vt = np.linalg.svd(M)
     mass = float(masses.mean())
-    if deviation > _KNOWN * mass or masses[0] - masses[2] > _SPREAD * mass:
+    if deviation >= _KNOWN * mass or masses[0] - masses[2] > _SPREAD * mass:
         return None
     Q = U @ Vt
     near = nearest_permutation(Q)

@@ -75,17 +75,19 @@ def _step(spectra: Spectra) -> tuple[float, float]:
     change = np.gradient(spectra.zeta, grid.dt, axis=0)
     away = (grid.t - 0.5 * (grid.t[0] + grid.t[-1]))[:, None]
     count = len(spectra.of.frequency)
+    free = spectra.signals if grid.load is None else spectra.signals[:, :1]
+    k = free.shape[1]
     moves = [signal_spectrum(grid, spectra.taper, x, count) for x in (away * change, change)]
     gram, right = np.zeros((2, 2)), np.zeros(2)
     for c, C in enumerate(fit.coefficients):
         weight = np.sqrt(spectra.of.weight / fit.power[spectra.of.band, c])[:, None]
-        columns = np.column_stack([spectra.signals, *(x @ C for x in moves)])
+        columns = np.column_stack([free, *(x @ C for x in moves)])
         left = (spectra.wrench[:, c] - spectra.signals @ C)[:, None]
         y = (np.hstack([columns, left]) * weight).view(np.float64).reshape(count, -1, 2)
         y = y.transpose(0, 2, 1).reshape(2 * count, -1)
         G = y.T @ y
         # What is left when the coefficients have taken their part.
-        rest = G[16:, 16:] - G[16:, :16] @ np.linalg.pinv(G[:16, :16], 1e-12, True) @ G[:16, 16:]
+        rest = G[k:, k:] - G[k:, :k] @ np.linalg.pinv(G[:k, :k], 1e-12, True) @ G[:k, k:]
         gram += rest[:2, :2]
         right += rest[:2, 2]
     inverse = np.linalg.pinv(gram, 1e-12, True)

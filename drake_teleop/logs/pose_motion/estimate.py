@@ -8,6 +8,8 @@
    and with the transform between pose and sensor free (`rigid`).
 
 A record longer than `SEARCHED` is searched in its liveliest part only, and fitted as a whole.
+Where the load is known (`motion_of_load`) the wrench that it explains best takes the saturated
+model's place: short records and slow motions do, which do not show 16 coefficients.
 """
 
 from __future__ import annotations
@@ -39,6 +41,7 @@ from drake_teleop.logs.pose_motion.saturated import (
     REACH,
     Spectra,
     best_spacing,
+    delay_deviation,
     first_guess,
     for_search,
     saturated,
@@ -60,7 +63,7 @@ _WALD, _DEVIATIONS = 50.0, 5.0
 _SHARE_OF_RATE = 0.45
 # Gaps of the poses that splines cannot bridge, and how far from them accelerations are wrong [s].
 _GAP, _BESIDE = 0.1, 0.4
-_FEWEST = 100
+_FEWEST, _FEWEST_OF_LOAD = 100, 32
 _NOTHING = 1e-3
 _UNTURNED = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -99,39 +102,51 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseEstimate:
+class PoseMotion:
+    """The motion of poses, with the knots and the delay that suit a wrench best.
+
+    Attributes:
+        splines: of the poses.
+        delay_s: of the motion behind the wrench [s].
+        delay_deviation: its standard deviation [s]; inf if the record does not determine it.
+        clock_rate: by how much the poses' clock is faster than the wrench's, such as 5e-5, if that
+            shows and the delay was not given; the splines are on the clock of the wrench.
+        imu_agrees: whether an IMU beside the poses tells the same; True without one.
+    """
+
+    splines: PoseSplines
+    delay_s: float
+    delay_deviation: float
+    clock_rate: float
+    imu_agrees: bool
+
+    @property
+    def spacing(self) -> float:
+        """Distance of the knots [s]."""
+        return self.splines.spacing
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate(PoseMotion):
     """What a wrench and poses say.
 
     Attributes:
         fit: the load with the frame as described, or as estimated if it was left to the data.
-        delay_s: of the motion behind the wrench [s].
-        delay_deviation: its standard deviation [s].
-        clock_rate: by how much the poses' clock is faster than the wrench's, such as 5e-5, if that
-            shows and the delay was not given; the splines are on the clock of the wrench.
         frame: of the poses, from the fit in which it is free.
         free: that fit.
         seen: what the saturated model says.
-        spacing: distance of the knots [s].
-        splines: of the poses.
         t: (M,) about 100 Hz [s].
         rejected: (M,) where something else acts than the load.
         note: what a user has to know; mostly empty.
-        imu_agrees: whether an IMU beside the poses tells the same; True without one.
     """
 
     fit: RigidFit
-    delay_s: float
-    delay_deviation: float
-    clock_rate: float
     frame: Frame
     free: RigidFit
     seen: ReadOff
-    spacing: float
-    splines: PoseSplines
     t: Array
     rejected: NDArray[np.bool_]
     note: str
-    imu_agrees: bool
 
     @property
     def theta(self) -> Array:
@@ -178,20 +193,17 @@ def estimate_from_poses(
         DrakeTeleopError: for arrays of another shape, or if fewer than 100 instants remain.
     """
     with one_blas_thread():
-        t = checked("t", t, np.size(t))
-        wrench = checked("wrench", wrench, len(t), 6)
-        gravity = checked("gravity_W", gravity_W, 3)
-        grid, poses = Grid.of(t, wrench), poses.continued()
-        guess = near if delay is None else delay
-        if (_base_taper(grid, poses, lost, guess) > 0.5).sum() < _FEWEST:
-            raise DrakeTeleopError(
-                "wrench and poses have too little in common",
-                remedy="record longer, without interruptions",
-            )
-        top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
-        splines, spectra, rejected, rate, note, agrees = _searched(
-            grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu
+        grid, poses, gravity, top = _prepared(
+            t, wrench, poses, gravity_W, near if delay is None else delay, lost, _FEWEST
         )
+        guess = near if delay is None else delay
+        chosen = _chosen(grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu)
+        splines, late = chosen.splines, chosen.last.delay
+        base = _base_taper(grid, splines.poses, lost, late)
+        spectra = spectra_of(splines, grid, base, gravity, late, top)
+        rejected, note = disturbed(spectra, grid, base, splines.spacing)
+        taper = without(base, rejected, grid.dt)
+        spectra = spectra_of(splines, grid, taper, gravity, late, top)
         Z = spectra.moments()
         Q = noise_moments(splines, grid, spectra.taper, spectra.zeta, spectra.of, splines.noise())
         levels = wandering(Z, spectra.of)
@@ -210,23 +222,91 @@ def estimate_from_poses(
         everything[16] = delay is None
         free = fit if (fixed == everything).all() else fitted(_freed(fit, start, seen), everything)
         return PoseEstimate(
-            fit=fit,
+            splines=splines,
             delay_s=spectra.delay + fit.state.tau,
-            delay_deviation=float(np.sqrt(fit.covariance[16, 16])),
-            clock_rate=rate,
+            delay_deviation=float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free)))),
+            clock_rate=chosen.rate,
+            imu_agrees=chosen.agrees,
+            fit=fit,
             frame=_frame(free, start),
             free=free,
             seen=seen,
-            spacing=splines.spacing,
-            splines=splines,
             t=grid.t,
             rejected=rejected,
             note=note,
-            imu_agrees=agrees,
         )
 
 
-def _searched(
+def motion_of_load(
+    t: ArrayLike,
+    wrench: ArrayLike,
+    poses: Poses,
+    gravity_W: ArrayLike,
+    load: Array,
+    *,
+    delay: float | None = None,
+    lost: NDArray[np.bool_] | None = None,
+    imu: Inertial | None = None,
+) -> PoseMotion:
+    """The motion with which an identified load explains a wrench best, contacts left out.
+
+    Args:
+        t, wrench, poses, gravity_W, delay, lost, imu: as of `estimate_from_poses`, P being S.
+        load: (6, 16) as of `load_coefficients`.
+
+    Raises:
+        DrakeTeleopError: for arrays of another shape, or if fewer than 32 instants remain.
+    """
+    with one_blas_thread():
+        guess = 0.0 if delay is None else delay
+        prepared = _prepared(t, wrench, poses, gravity_W, guess, lost, _FEWEST_OF_LOAD, load)
+        grid, poses, gravity, top = prepared
+        chosen = _chosen(grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu)
+        return PoseMotion(
+            splines=chosen.splines,
+            delay_s=chosen.last.delay,
+            delay_deviation=0.0 if delay is not None else delay_deviation(chosen.last),
+            clock_rate=chosen.rate,
+            imu_agrees=chosen.agrees,
+        )
+
+
+def _prepared(
+    t: ArrayLike,
+    wrench: ArrayLike,
+    poses: Poses,
+    gravity_W: ArrayLike,
+    delay: float,
+    lost: NDArray[np.bool_] | None,
+    fewest: int,
+    load: Array | None = None,
+) -> tuple[Grid, Poses, Array, float]:
+    """The grid, the poses with continuous signs, gravity (3,) and the highest frequency [Hz]."""
+    t = checked("t", t, np.size(t))
+    wrench = checked("wrench", wrench, len(t), 6)
+    gravity = checked("gravity_W", gravity_W, 3)
+    grid, poses = Grid.of(t, wrench, load), poses.continued()
+    if (_base_taper(grid, poses, lost, delay) > 0.5).sum() < fewest:
+        raise DrakeTeleopError(
+            "wrench and poses have too little in common",
+            remedy="record longer, without interruptions",
+        )
+    top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
+    return grid, poses, gravity, top
+
+
+@dataclass(frozen=True, eq=False)
+class _Chosen:
+    """Splines of all poses; spectra of the part that was searched, with the delay; the rate of the
+    poses' clock; and whether an IMU agrees."""
+
+    splines: PoseSplines
+    last: Spectra
+    rate: float
+    agrees: bool
+
+
+def _chosen(
     grid: Grid,
     poses: Poses,
     lost: NDArray[np.bool_] | None,
@@ -236,8 +316,8 @@ def _searched(
     *,
     known: bool,
     imu: Inertial | None = None,
-) -> tuple[PoseSplines, Spectra, NDArray[np.bool_], float, str, bool]:
-    """Splines with the knots, and spectra with the delay and taper, that are used."""
+) -> _Chosen:
+    """Splines with the knots, and spectra with the delay, that are used."""
     part = _liveliest(grid)
     some = replace(grid, t=grid.t[part], wrench=_rows(grid, part))
     near = _within(poses, some)
@@ -262,12 +342,8 @@ def _searched(
     aid = chosen.aid
     if aid is not None and imu is not None and len(near.t) < len(poses.t):
         aid = aid_of(PoseSplines(poses, first_spacing), imu, gravity)  # of the whole record
-    splines, base = PoseSplines(poses, spacing, aid), _base_taper(grid, poses, lost, late)
-    spectra = spectra_of(splines, grid, base, gravity, late, top)
-    rejected, note = disturbed(spectra, grid, base, spacing)
-    taper = without(base, rejected, grid.dt)
-    spectra = spectra_of(splines, grid, taper, gravity, late, top)
-    return splines, spectra, rejected, rate, note, agrees
+    last = spectra_of(chosen.at(spacing), some, clear, gravity, late, top)
+    return _Chosen(PoseSplines(poses, spacing, aid), last, rate, agrees)
 
 
 def _rows(grid: Grid, part: slice) -> Array:

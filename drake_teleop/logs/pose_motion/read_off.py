@@ -103,7 +103,9 @@ def _ratio(a: Array, g: Array, variances_a: Array, variances_g: Array) -> tuple[
     kappa = 0.0
     for _ in range(_ROUNDS):
         weight = 1.0 / (v_a + kappa**2 * v_g)
-        information = float(weight @ np.maximum(g * g - v_g, 0.0)) + 1e-300
+        information = float(weight @ np.maximum(g * g - v_g, 0.0))
+        if not information > 0.0:  # gravity is not seen
+            return np.nan, np.inf
         kappa = float(weight @ (a * g)) / information
     return kappa, information**-0.5
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from drake_teleop.load.arrays import Array
 from drake_teleop.logs.pose_motion.saturated import ROUNDING, Spectra
 from drake_teleop.logs.pose_motion.spectra import Grid, distance
+from drake_teleop.logs.pose_motion.splines import ACCELERATED
 
 NOTHING_REJECTED = (
     "the residual is large where the load moves and small where it rests, so that disturbances"
@@ -35,7 +36,9 @@ def disturbed(
     """(M,) where something else acts, and what a user has to know of it.
 
     Nothing is rejected if that raises some standard deviation of the coefficients 2.5 times as much
-    as the loss of as many samples at random would: then it is the motion that is rejected.
+    as the loss of as many samples at random would: then it is the motion that is rejected. Of an
+    identified load only the offsets are fitted, and its inertial force takes the coefficients'
+    place in this.
 
     Args:
         spectra: of the record with this taper, which knows nothing of disturbances.
@@ -48,7 +51,11 @@ def disturbed(
     inside = taper > 0.5
     size = np.sqrt(np.mean(x**2, axis=0))
     used = size > 1e-9 * size[0]
-    x = x[:, used] / size[used]
+    if grid.load is None:
+        x = moving = x[:, used] / size[used]
+    else:
+        y, moving = y - x @ grid.load.T, x[:, ACCELERATED] @ grid.load[:3, ACCELERATED].T
+        x, moving = x[:, :1] / size[0], np.linalg.norm(moving, axis=1, keepdims=True)
     weights = inside.astype(float)
     for _ in range(_FITS):
         before = weights
@@ -65,7 +72,7 @@ def disturbed(
     if not rejected.any():
         return rejected, ""
     rejected = distance(rejected) * grid.dt <= max(_MARGIN, spacing)
-    if _loss(x, inside, inside & ~rejected) > _MOST_LOSS:
+    if _loss(moving, inside, inside & ~rejected) > _MOST_LOSS:
         return np.zeros(len(x), bool), NOTHING_REJECTED
     return rejected, ""
 

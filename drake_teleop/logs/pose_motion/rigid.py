@@ -43,7 +43,7 @@ from drake_teleop.load.batch.moments import coefficients
 from drake_teleop.logs.pose_motion.levels import Levels
 from drake_teleop.logs.pose_motion.saturated import Saturated, least_power
 from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH
-from drake_teleop.logs.pose_motion.splines import SIGNALS
+from drake_teleop.logs.pose_motion.splines import GRAVITY, SIGNALS
 from drake_teleop.vectors import cross_matrix
 
 PARAMETERS = 23
@@ -134,6 +134,26 @@ def _centripetal(r: Array) -> Array:
 
 
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
+    """(6, 16) coefficients of the signals of P in the wrench of a load, if P is S.
+
+    Args:
+        phi: (10,) the load.
+        removed_weight: (4,) mass and first moment whose weight the wrench does not contain.
+    """
+    C = _coefficients_of(phi)
+    if removed_weight is not None:
+        weight = _coefficients_of(np.concatenate([removed_weight, np.zeros(6)]))
+        C[:, GRAVITY] -= weight[:, GRAVITY]
+    return C
+
+
+def _coefficients_of(phi: Array) -> Array:
+    theta = np.concatenate([np.zeros(6), phi])
+    M = motion_map(np.eye(3), np.zeros(3))[:, :SIGNALS]
+    return np.asarray(np.einsum("cjk,j->ck", coefficients(), theta) @ M)
 
 
 def _turned_products(R: Array) -> Array:

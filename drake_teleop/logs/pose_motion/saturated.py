@@ -56,7 +56,7 @@ _RANK, _FULL_RANK = 1e-12, 1e-8
 # Corners of a wandering offset [Hz], and by how much one has to lower a channel's L.
 _CORNERS = tuple(0.05 * 2.0**k for k in range(9))
 _WORTH = 3.0
-_FINER = 0.84
+_FINER, _FINER_OF_LOAD, _DETERMINED = 0.84, 0.92, 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,26 +91,33 @@ def _powers(Z: Array) -> Array:
     return np.diagonal(Z[:, FORCES, FORCES], axis1=1, axis2=2)
 
 
-def _fitted(zz: Array, zf: Array, ff: Array, levels: Levels) -> Saturated:
+def _fitted(
+    zz: Array, zf: Array, ff: Array, levels: Levels, load: Array | None = None
+) -> Saturated:
     """`saturated`, of moments of the signals with themselves and with the wrench, and its powers.
 
     Args:
         zz, zf, ff: (..., bands, 16, 16), (..., bands, 16, 6) and (bands, 6). What comes back has
             the dimensions before the bands too: many fits cost little more than one.
         levels: of the noise.
+        load: (6, 16) coefficients that are fixed but for those of the constant; None: all are free.
     """
+    floor = _least(ff, levels.sizes)
+    if load is not None:
+        explained = zz @ load.T
+        ff = ff - np.sum((2.0 * zf - explained) * load.T, axis=-2)
+        zf, zz = (zf - explained)[..., :1, :], zz[..., :1, :1]
     size = np.diagonal(zz.sum(axis=-3), axis1=-2, axis2=-1)
     constant = zz[..., 0, 0].sum(axis=-1)[..., None]
     scale = np.where(size > 1e-18 * constant, 1.0 / np.sqrt(size + 1e-300), 0.0)
     both = scale[..., :, None] * scale[..., None, :]
     zz, zf = zz * both[..., None, :, :], zf * scale[..., None, :, None]
-    floor = _least(ff, levels.sizes)
-    power = np.maximum(ff / levels.sizes[:, None], floor)
-    power = np.broadcast_to(power.mean(axis=0), (*zf.shape[:-2], 6))
+    power = np.maximum(ff / levels.sizes[:, None], floor).mean(axis=-2, keepdims=True)
+    power = np.broadcast_to(power, (*zf.shape[:-2], 6))
     flat = zz.reshape(*zz.shape[:-2], -1)
     for _ in range(_ITERATIONS):
         weight = 1.0 / power
-        gram = (np.swapaxes(weight, -1, -2) @ flat).reshape(*zz.shape[:-3], 6, SIGNALS, SIGNALS)
+        gram = (np.swapaxes(weight, -1, -2) @ flat).reshape(*zz.shape[:-3], 6, *zz.shape[-2:])
         right = np.swapaxes(np.sum(zf * weight[..., None, :], axis=-3), -1, -2)
         inverse = _inverses(gram)
         C = (inverse @ right[..., None])[..., 0]
@@ -185,9 +192,11 @@ class Spectra:
 
     @cached_property
     def chopped(self) -> bool:
-        """Whether the taper is low between its ends too."""
+        """Whether the taper is low between its ends too. Its ends as well would hold a known load's
+        delay, which has nothing else to be told from."""
         inside = np.flatnonzero(self.taper > 0.5)
-        return bool(len(inside) > 0 and len(inside) <= inside[-1] - inside[0])
+        edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
+        return bool(edged or self.grid.load is not None)
 
     def at(self, delay: float) -> Spectra:
         """The same with the signals, but not `zeta`, moved to another delay.
@@ -212,8 +221,16 @@ class Spectra:
         return moments(self.signals, self.wrench, self.of, rates)
 
     def fit(self) -> Saturated:
-        """The fit of all coefficients to the wrench, with noise that is level."""
-        return saturated(moments(self.signals, self.wrench, self.of), Levels.flat(self.of))
+        """The fit of all coefficients to the wrench, with noise that is level.
+
+        Of those of the constant alone if the load is known.
+        """
+        Z, load = moments(self.signals, self.wrench, self.of), self.grid.load
+        parts = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _powers(Z)
+        fit = _fitted(*parts, Levels.flat(self.of), load)
+        if load is None:
+            return fit
+        return replace(fit, coefficients=np.hstack([fit.coefficients, load[:, 1:]]))
 
     def costs(self, delays: Array) -> Array:
         """(D,) L of the fits at these delays (D,)."""
@@ -223,7 +240,8 @@ class Spectra:
         else:
             zz, zf = self._moved(np.asarray(delays))
         power = np.abs(self.wrench) ** 2
-        return _fitted(zz, zf, self.of.sums(power), Levels.flat(self.of)).costs.sum(axis=-1)
+        fits = _fitted(zz, zf, self.of.sums(power), Levels.flat(self.of), self.grid.load)
+        return fits.costs.sum(axis=-1)
 
     def _moved(self, delays: Array) -> tuple[Array, Array]:
         """(D, bands, 16, 16) and (D, bands, 16, 6) moments at delays (D,), the taper whole.
@@ -292,6 +310,21 @@ def best_delay(spectra: Spectra, reach: float, finest: float = _FINEST) -> tuple
     return float(at[best]), float(costs[best])
 
 
+def delay_deviation(spectra: Spectra) -> float:
+    """Standard deviation of their delay [s]; inf if the record does not determine it.
+
+    It does if L rises on either side of the delay, and by at least 25 within `REACH`.
+    """
+    reach = min(REACH, 0.1 * float(spectra.grid.t[-1] - spectra.grid.t[0]))
+    beside = np.array([-_NEARLY, 0.0, _NEARLY])
+    left, least, right = spectra.costs(spectra.delay + beside)
+    far = spectra.costs(spectra.delay + np.arange(-reach, reach, _COARSE))
+    bend = left - 2.0 * least + right
+    if bend <= 0.0 or far.max() - least < _DETERMINED or far.min() < least - 1.0:
+        return np.inf
+    return float(_NEARLY / np.sqrt(bend))
+
+
 def first_guess(
     few: Choice,
     grid: Grid,
@@ -328,9 +361,9 @@ def best_spacing(
 ) -> tuple[Choice, float, float]:
     """What the splines are fitted to, distance of their knots [s], and delay [s], of the least L.
 
-    Knots are then a little closer than where L is least: the fit takes noise that they pass into
-    account, but not motion that they do not. The delay is nearly right at first and, unless it is
-    known, found again.
+    Knots are then a little closer than where L is least: a fit of the load takes noise that they
+    pass into account, but not motion that they do not, and of a load that is known that motion
+    looks like contact. The delay is nearly right at first and, unless it is known, found again.
     """
     start = spectra_of(choices[0].at(SPACINGS[0]), grid, taper, gravity_W, delay, top)
     found = []
@@ -346,7 +379,8 @@ def best_spacing(
         found.append(min(costs + [(cost(h), h) for h in between]))
     least = min(range(len(found)), key=lambda k: found[k])
     few = choices[least]
-    best = max(_FINER * found[least][1], FEWEST_PER_KNOT / few.rate)
+    finer = _FINER if grid.load is None else _FINER_OF_LOAD
+    best = max(finer * found[least][1], FEWEST_PER_KNOT / few.rate)
     if not known:
         last = start.with_motion(few.at(best), gravity_W, delay)
         delay, _ = best_delay(last, 3 * _COARSE)

@@ -51,19 +51,22 @@ class Grid:
         t: (M,) evenly spaced, about 100 Hz [s].
         wrench: (N, 6), every `stride`th at an instant of `t`, N = M stride.
         stride: samples of the wrench from one instant to the next.
+        load: (6, 16) coefficients of the signals in the wrench of an identified load; None if the
+            load is unknown.
     """
 
     t: Array
     wrench: Array
     stride: int
+    load: Array | None = None
 
     @classmethod
-    def of(cls, t: Array, wrench: Array) -> Grid:
+    def of(cls, t: Array, wrench: Array, load: Array | None = None) -> Grid:
         """From evenly spaced samples (N,), (N, 6)."""
         dt = (t[-1] - t[0]) / (len(t) - 1)
         stride = max(1, int(1.0 / (_GRID * dt) + 1e-6))
         rows = len(t) // stride
-        return cls(t[0] + stride * dt * np.arange(rows), wrench[: rows * stride], stride)
+        return cls(t[0] + stride * dt * np.arange(rows), wrench[: rows * stride], stride, load)
 
     @property
     def dt(self) -> float:

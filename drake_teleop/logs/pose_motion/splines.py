@@ -32,6 +32,8 @@ FEWEST_PER_KNOT = 2.0
 """Poses between two knots, at least, on average."""
 SIGNALS = 16
 """Columns of `PoseSplines.signals`."""
+GRAVITY, ACCELERATED = slice(4, 7), [1, 2, 3, *range(7, 16)]
+"""Which of them are gravity, and which are zero at rest."""
 # Frequencies times h between which the residual shows the noise: above what the splines pass.
 _NOISE_BAND = (0.7, 1.5)
 _CHUNK = 2**17
@@ -132,6 +134,8 @@ class PoseSplines:
         if aid is None:
             return BSpline(knots, solveh_banded(gram, right), DEGREE)
         columns = []
+        later = aid.t - self._start
+        inside = (later >= knots[0]) & (later <= knots[-1])
         for part, order, rows, pose, own in zip(
             (slice(0, 3), slice(3, 7)),
             (2, 1),
@@ -143,7 +147,7 @@ class PoseSplines:
             band, side = gram, right[:, part]
             if rows is not None:
                 weight = pose * self.rate / (own * aid.rate)
-                more, other = _normal_of_rates(aid.t - self._start, rows, knots, order)
+                more, other = _normal_of_rates(later[inside], rows[inside], knots, order)
                 band, side = gram + weight * more, side + weight * other
             columns.append(solveh_banded(band, side))
         return BSpline(knots, np.hstack(columns), DEGREE)
@@ -151,6 +155,10 @@ class PoseSplines:
     def quaternion(self, t: Array) -> Array:
         """(N, 4) at times t, nearly of unit length."""
         return np.asarray(self._at(t, 0)[:, 3:])
+
+    def position(self, t: Array) -> Array:
+        """(N, 3) at times t [m]."""
+        return np.asarray(self._at(t, 0)[:, :3])
 
     def _at(self, t: Array, order: int) -> Array:
         at = np.clip(t, self.poses.t[0], self.poses.t[-1]) - self._start
@@ -183,11 +191,19 @@ class PoseSplines:
         a, minus_g, omega, alpha = self._motion(t, gravity_W)
         return a + minus_g, omega, alpha
 
+    def gravity(self, t: Array, gravity_W: Array) -> Array:
+        """(N, 3) gravity in the axes of P at times t [m/s^2]."""
+        out = np.empty((len(t), 3))
+        for part in _parts(len(t)):
+            q = self.quaternion(t[part])
+            down = np.broadcast_to(gravity_W, out[part].shape)
+            out[part] = _in_P(q, np.sum(q * q, axis=1, keepdims=True), down)
+        return out
+
     def _motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
         """(N, 3) a, -g, omega and alpha."""
         out = np.empty((4, len(t), 3))
-        for start in range(0, len(t), _CHUNK):
-            part = slice(start, start + _CHUNK)
+        for part in _parts(len(t)):
             out[:, part] = self._motion_at(t[part], gravity_W)
         return out[0], out[1], out[2], out[3]
 

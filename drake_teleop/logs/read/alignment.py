@@ -232,6 +232,9 @@ def undelayed(log: Log, delay_s: float) -> Log:
             remedy="give a shorter one, or auto",
         )
     s, omega, alpha = (resample(at[known], log.t, x) for x in log.motion)
+    gravity, R_WS = (
+        None if x is None else resample(at[known], log.t, x) for x in (log.gravity, log.R_WS)
+    )
     bridged = None
     if log.bridged is not None:
         # A gap may be one of the wrench or one of the motion: where either would now be.
@@ -242,6 +245,8 @@ def undelayed(log: Log, delay_s: float) -> Log:
         specific_force=s,
         angular_velocity=omega,
         angular_acceleration=alpha,
+        gravity=gravity,
+        R_WS=R_WS,
         bridged=bridged,
     )
 
@@ -259,6 +264,26 @@ def measured(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
     if log.bridged is None:
         return np.ones(len(log), bool)
     return ~widened(log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt)))
+
+
+def ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
+    """(N,) samples within `length_s`, or a period of a low-pass, of either end of the record.
+
+    At most a quarter of the samples at either end; none of static poses.
+
+    Args:
+        log: the log.
+        length_s: [s].
+        cutoff_hz: of the low-pass; None for none.
+    """
+    out = np.zeros(len(log), bool)
+    if log.static:
+        return out
+    if cutoff_hz is not None and cutoff_hz < 0.5 / log.dt:
+        length_s = max(length_s, 1.0 / cutoff_hz)
+    count = min(math.ceil(length_s / log.dt - 1e-6), len(log) // 4)
+    out[:count] = out[len(out) - count :] = True
+    return out
 
 
 def widened(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:

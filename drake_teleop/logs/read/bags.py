@@ -25,7 +25,9 @@ a sensor does not have them. Messages that hold `transforms` (TF) are taken apar
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
+import resource
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -34,18 +36,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.errors import DrakeTeleopError, install_extra
 from drake_teleop.logs.read.description import Imu, Pose, Static, Wrench
 from drake_teleop.logs.read.tables import Table, read_table
+from drake_teleop.texts import yaml_text
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 SUFFIXES = (".mcap", ".db3", ".bag")
 _LONGEST_ARRAY = 64
+_BLOCK, _RECEIVED = 10_000, "received at"
+# Of MCAP: what a chunk is, and how much larger than the file all of them may be [bytes].
+_CHUNK, _MOST_RATIO, _MOST_UNPACKED = 6, 200, 100_000_000
+_MOST_MEMORY = 1_500_000_000  # bytes
+_TOO_LARGE, _CUT = "unpacks to more than can be read", "cut it, or write the topics one by one"
 _GROUPS = {
     "force": "force",
     "torque": "torque",
@@ -131,16 +138,16 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
                 where=str(path),
                 remedy=f"its topics are {', '.join(known)}",
             )
-        pairs = [
+        pairs = (
             (received, part)
             for connection, received, raw in reader.messages(connections)
             for part in _parts(reader.deserialize(raw, connection.msgtype))
-        ]
-    pairs = _of_child(pairs, child_frame, f"{path}:{topic}")
-    if not pairs:
+        )
+        blocks = _blocks(pairs, child_frame, f"{path}:{topic}")
+    if not blocks:
         raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
-    received = np.array([time for time, _ in pairs]) * 1e-9
-    columns = _columns([part for _, part in pairs])
+    columns = _joined(blocks)
+    received = columns.pop(_RECEIVED)
     absent = _take_absent(columns)
     columns |= _short(columns)
     columns["received"] = received
@@ -191,11 +198,11 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
     if "wrench" in draft or not draft:
         draft["wrench"] = {"file": file, "topic": "FILL IN"} | draft.get("wrench", {}) | {"sign": 1}
     head = [
-        "# DRAFT, guessed from the types of topics by `drake-teleop inspect`: check every line,",
-        "# above all wrench.sign and the frames, and inspect it.",
-        f"# Other topics that would do: {', '.join(others) or 'none'}.",
+        "DRAFT, guessed from the types of topics by `drake-teleop inspect`: check every line,",
+        "above all wrench.sign and the frames, and inspect it.",
+        f"Other topics that would do: {', '.join(others) or 'none'}.",
     ]
-    return "\n".join(head) + "\n" + yaml.safe_dump(draft, sort_keys=False)
+    return yaml_text(draft, head=head)
 
 
 def topic_missing(path: Path) -> DrakeTeleopError:
@@ -224,14 +231,19 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         raise DrakeTeleopError(
             "bags are read by the library rosbags, which is not installed",
             where=str(path),
-            remedy="install the extra `ros`: pip install '.[ros]' in the clone of this project",
+            remedy=install_extra("ros"),
         ) from error
     try:
+        for file in path.iterdir() if path.is_dir() else [path]:
+            if file.suffix.lower() == ".mcap":
+                _check_unpacked(file)
         standard = get_typestore(Stores.LATEST)
-        with AnyReader([path], default_typestore=standard) as reader:
+        with _little_memory(), AnyReader([path], default_typestore=standard) as reader:
             yield reader
     except DrakeTeleopError:
         raise
+    except MemoryError:
+        raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT) from None
     # A damaged file fails somewhere in rosbags, or in the libraries below it, in many ways.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
@@ -240,25 +252,75 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         ) from error
 
 
+def _check_unpacked(path: Path) -> None:
+    """Refuse an MCAP file whose chunks say that they are far larger than measured data get."""
+    total, most = 0, path.stat().st_size * _MOST_RATIO + _MOST_UNPACKED
+    with path.open("rb") as file:
+        file.seek(8)
+        while len(head := file.read(33)) == 33:  # of a record; of a chunk with times and size
+            length = int.from_bytes(head[1:9], "little")
+            total += int.from_bytes(head[25:33], "little") if head[0] == _CHUNK else 0
+            file.seek(min(length - 24, most), 1)
+            if total > most:
+                raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT)
+
+
+@contextmanager
+def _little_memory() -> Iterator[None]:
+    """MemoryError for more than `_MOST_MEMORY` more, whatever a compressed block unpacks to."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+    except OSError:  # not on Linux, which alone keeps such a limit
+        yield
+        return
+    most = pages * resource.getpagesize() + _MOST_MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (most if soft < 0 else min(most, soft), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
 def _parts(message: Any) -> list[Any]:
     return getattr(message, "transforms", [message])
 
 
-def _of_child(
-    pairs: list[tuple[int, Any]], child_frame: str | None, where: str
-) -> list[tuple[int, Any]]:
-    children = sorted({getattr(part, "child_frame_id", "") for _, part in pairs})
-    if child_frame is None and len(children) <= 1:
-        return pairs
-    if child_frame not in children:
-        named = ", ".join(filter(None, children))
-        what = "several child frames" if child_frame is None else f"no child frame {child_frame!r}"
+def _blocks(
+    pairs: Iterator[tuple[int, Any]], child_frame: str | None, where: str
+) -> list[dict[str, NDArray]]:
+    """The columns of every so many messages, which take a tenth of the memory of the messages."""
+    children: set[str] = set()
+    blocks: list[dict[str, NDArray]] = []
+
+    def of_child() -> Iterator[tuple[int, Any]]:
+        for received, part in pairs:
+            children.add(getattr(part, "child_frame_id", ""))
+            if child_frame in (None, getattr(part, "child_frame_id", "")):
+                yield received, part
+
+    found = of_child()
+    while block := list(itertools.islice(found, _BLOCK)):
+        received = {_RECEIVED: np.array([time for time, _ in block]) * 1e-9}
+        blocks.append(_columns([part for _, part in block]) | received)
+    if (child_frame is None and len(children) > 1) or (child_frame and child_frame not in children):
+        named = ", ".join(sorted(filter(None, children)))
+        what = f"no child frame {child_frame!r}" if child_frame else "several child frames"
         raise DrakeTeleopError(
             f"has {what}",
             where=where,
             remedy=f"give child_frame, one of {named}" if named else "leave it out",
         )
-    return [(time, part) for time, part in pairs if part.child_frame_id == child_frame]
+    return blocks
+
+
+def _joined(blocks: list[dict[str, NDArray]]) -> dict[str, NDArray]:
+    """The columns that all blocks have, with as many numbers in a row."""
+    return {
+        name: np.concatenate([block[name] for block in blocks])
+        for name, values in blocks[0].items()
+        if all(name in b and b[name].shape[1:] == values.shape[1:] for b in blocks)
+    }
 
 
 def _columns(messages: list[Any]) -> dict[str, NDArray]:

@@ -49,6 +49,7 @@ _ARRAYS = (
     "angular_acceleration",
     "gravity",
     "bridged",
+    "R_WS",
 )
 
 
@@ -71,6 +72,13 @@ class Log:
         source: the file, for messages.
         posed: the poses themselves, on the clock of `t`, where they have positions.
         gain_std: standard deviation of the sensor's gains, as stated.
+        R_WS: (N, 3, 3) orientation of S, where `gravity` is from it.
+        gravity_W: (3,) gravity in the world [m/s^2], likewise.
+        one_sided_s: length of either end in which derivatives have samples on one side only [s].
+        described: the description, with what was found in the place of `auto`.
+        free: parts of `drake_teleop.logs.causes.model.Model` that the description leaves to the
+            data: "gravity" for `gravity: auto`, "weight" for `wrench.weight: removed`.
+        resolution: step of the file's numbers of force and torque [N, N m], of static poses.
 
     Raises:
         DrakeTeleopError: if the arrays do not fit each other, hold NaN or infinity, or `t` does not
@@ -89,6 +97,12 @@ class Log:
     source: str = "log"
     posed: Posed | None = None
     gain_std: float = 0.0
+    R_WS: NDArray[np.float64] | None = None
+    gravity_W: NDArray[np.float64] | None = None
+    one_sided_s: float = 0.0
+    described: Description | None = None
+    free: tuple[str, ...] = ()
+    resolution: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         n = len(self.t)
@@ -100,6 +114,7 @@ class Log:
             "angular_acceleration": (n, 3),
             "gravity": (n, 3),
             "bridged": (n,),
+            "R_WS": (n, 3, 3),
         }
         for name, shape in shapes.items():
             value = getattr(self, name)

@@ -4,7 +4,9 @@
 in the file                              taken as
 ======================================== =========================================================
 `;`, tab, or spaces                      the separator, where a line has no other; with the first
-                                         two a number may have a decimal comma
+                                         two, or in quotes, a number may have a decimal comma
+lines at the end without a cell          not there
+lines that end in CR alone               lines
 lines before the header that begin       comments, but for one right before the numbers that has
 with `#`                                 as many names: the header, as `numpy.savetxt` writes it
 UTF-16 with its mark, UTF-8 with one     text, as spreadsheets save it
@@ -28,6 +30,10 @@ if TYPE_CHECKING:
 _LOOKED_AT = 2**16  # bytes that tell all this
 _TELLING = 1000  # rows that tell what is in a column, if it is numbers
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_RETURN = re.compile(rb"\r(?!\n)")
+_EMPTY = b' \t,;\r\n\x00\x1a"'  # of which lines without a cell are made
+_QUOTED_NUMBER = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
+_THOUSANDS = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
 _QUOTED = re.compile('"[^"]*"')
 _DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 
@@ -50,6 +56,8 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     if head.startswith(_UTF_16):
         source = path.read_text("utf-16").encode()
         head = source[:_LOOKED_AT]
+    if (text := _repaired(path, source, head)) is not None:
+        source, head = text, text[:_LOOKED_AT]
     lines = head.decode("utf-8", "replace").lstrip("\ufeff").splitlines()
     before = _comments(lines)
     rest = lines[before:]
@@ -74,6 +82,28 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     if names is not None:
         frame.columns = names
     return frame, before + (2 if header else 1)
+
+
+def _repaired(path: Path, source: Path | bytes, head: bytes) -> bytes | None:
+    """The text with line feeds and decimal points and no empty end; None if it has them already."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _LOOKED_AT))
+        tail = file.read() if isinstance(source, Path) else source
+    returns, commas = bool(_RETURN.search(head)), _QUOTED_NUMBER.findall(head)
+    # "1,500" alone may be 1500.
+    commas = [found for found in commas if not _THOUSANDS.fullmatch(b",".join(found))]
+    if not (returns or commas or _end(tail) < len(tail)):
+        return None
+    text = path.read_bytes() if isinstance(source, Path) else source
+    text = _RETURN.sub(b"\n", text) if returns else text
+    text = _QUOTED_NUMBER.sub(rb"\1.\2", text) if commas else text
+    return text[: _end(text)]
+
+
+def _end(text: bytes) -> int:
+    """The number of bytes before the lines without a cell at the end."""
+    line = text.find(b"\n", len(text.rstrip(_EMPTY)))
+    return len(text) if line < 0 else line + 1
 
 
 def _parsed(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:

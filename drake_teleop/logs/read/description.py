@@ -4,7 +4,7 @@ YAML files that say it, with units and frames.
 
 Every field is documented in docs/logs.md. A number x of a file becomes a quantity in S by
 
-    x_S = sign * R_S,stream * (x - bias) * unit
+    x_S = sign * R_S,stream * scale * (x - bias) * unit
 
 so a bias is in the unit and the axes of the file.
 """
@@ -41,12 +41,15 @@ from drake_teleop.logs.read.description_fields import (
     ImuFrame,
     Number,
     Place,
+    Scale,
     Turn,
     Vector,
+    Weight,
 )
 from drake_teleop.texts import read_yaml
 
 STANDARD_GRAVITY = 9.80665
+NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
 _LARGEST_GRAVITY = 100.0
 
 UNITS = {
@@ -108,40 +111,40 @@ class Time(_Strict):
         return self
 
 
-class Force(_Strict):
+class _Quantity(_Strict):
+    columns: tuple[Column, ...]
+    scale: Scale = (1.0, 1.0, 1.0)
+
+
+class Force(_Quantity):
     """Columns of a force and their unit."""
 
-    columns: tuple[Column, ...]
     unit: Literal["N", "lbf"] = "N"
 
 
-class Torque(_Strict):
+class Torque(_Quantity):
     """Columns of a torque and their unit."""
 
-    columns: tuple[Column, ...]
     unit: Literal["N m", "N mm", "lbf in"] = "N m"
 
 
-class Acceleration(_Strict):
+class Acceleration(_Quantity):
     """Columns of a linear acceleration, their unit, and what it reads of none."""
 
-    columns: tuple[Column, ...]
     unit: Literal["m/s^2", "g", "mm/s^2"] = "m/s^2"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
-class AngularVelocity(_Strict):
+class AngularVelocity(_Quantity):
     """Columns of an angular velocity, their unit, and what it reads of none."""
 
-    columns: tuple[Column, ...]
     unit: Literal["rad/s", "deg/s"] = "rad/s"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
-class AngularAcceleration(_Strict):
+class AngularAcceleration(_Quantity):
     """Columns of an angular acceleration, their unit, and what it reads of none."""
 
-    columns: tuple[Column, ...]
     unit: Literal["rad/s^2", "deg/s^2"] = "rad/s^2"
     bias: Vector = (0.0, 0.0, 0.0)
 
@@ -155,10 +158,9 @@ class Orientation(_Strict):
     inverse: bool = Field(default=False, description="the columns hold R_SW, the world in S")
 
 
-class Position(_Strict):
+class Position(_Quantity):
     """Columns of a position and their unit."""
 
-    columns: tuple[Column, ...]
     unit: Literal["m", "mm"] = "m"
 
 
@@ -226,6 +228,7 @@ class Wrench(_Recorded):
     torque: Torque
     sign: Literal[1, -1] = 1
     frame: Frame = "sensor"
+    weight: Weight = None
     gain_std: GainStd = 0.0
 
 
@@ -311,6 +314,7 @@ class Static(_Stream):
     torque: Torque
     sign: Literal[1, -1] = 1
     frame: Frame = "sensor"
+    weight: Weight = None
     gravity: Acceleration | None = Field(default=None, description="g_S in S")
     specific_force: Acceleration | None = Field(
         default=None, description="what an accelerometer reads at rest, -g_S, in S"
@@ -322,6 +326,11 @@ class Static(_Stream):
     def _one_of(self) -> Static:
         if sum(x is not None for x in (self.gravity, self.specific_force, self.orientation)) != 1:
             raise ValueError("give one of gravity (in S), specific_force (in S), orientation")
+        if self.weight == "removed":
+            raise ValueError(
+                "weight: removed leaves nothing of a load at rest: record it in motion, or give"
+                " [m, m c_x, m c_y, m c_z] of the payload in the robot's controller"
+            )
         return self
 
 
@@ -340,8 +349,10 @@ class Description(_Strict):
 
     @model_validator(mode="after")
     def _complete(self) -> Description:
-        if np.abs(self.gravity).max() > _LARGEST_GRAVITY:
+        if np.abs(self.gravity_W).max() > _LARGEST_GRAVITY:
             raise ValueError(f"gravity is beyond {_LARGEST_GRAVITY:g} m/s^2")
+        if self.gravity == "auto" and (self.pose is None or self.imu is not None):
+            raise ValueError("gravity: auto is found from a wrench with a pose and no imu")
         if self.static is not None:
             if self.wrench or self.imu or self.pose:
                 raise ValueError("static poses stand alone: remove wrench, imu and pose")
@@ -362,12 +373,23 @@ class Description(_Strict):
             raise ValueError("imu.frame: auto compares the IMU with a pose: add pose")
         if self.pose is not None and self.pose.automatic and self.wrench.frame == "base":
             raise ValueError("pose: auto needs a wrench in the axes of the sensor, not in base")
+        self._check_weight(self.wrench)
         return self
+
+    def _check_weight(self, wrench: Wrench) -> None:
+        if wrench.weight is not None and self.pose is None:
+            raise ValueError("wrench.weight follows from the orientation: add pose")
+        pose = self.pose is not None and self.pose.automatic
+        kinds = {"pose: auto": pose, "gravity: auto": self.gravity == "auto"}
+        kinds["wrench.weight"] = wrench.weight is not None
+        both = [name for name, present in kinds.items() if present]
+        if len(both) > 1:
+            raise ValueError(f"{' and '.join(both)} cannot be combined: give one of them alone")
 
     @property
     def gravity_W(self) -> NDArray[np.float64]:
-        """(3,) gravity in W [m/s^2]."""
-        return np.array(self.gravity)
+        """(3,) gravity in W [m/s^2]; straight down for `auto`."""
+        return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
     def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
         """Poses of S with what else is described of them, and what an IMU tells of S."""
@@ -378,7 +400,7 @@ class Description(_Strict):
 
     def scale(self, unit: str) -> float:
         """SI value of a unit; "g" is the magnitude of this description's gravity."""
-        return float(np.linalg.norm(self.gravity)) if unit == "g" else UNITS[unit]
+        return float(np.linalg.norm(self.gravity_W)) if unit == "g" else UNITS[unit]
 
 
 def json_schema() -> str:

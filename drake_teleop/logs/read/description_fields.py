@@ -11,6 +11,7 @@ from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
 
 ROTATION_TOLERANCE = 0.01
 """Entries of R^T R may be off those of the identity by this."""
+_LEAST_SCALE = 1e-12
 
 
 def _frame(value: Any) -> Any:
@@ -43,9 +44,26 @@ def _place(value: Any) -> Any:
     return value
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
 def _gravity(value: Any) -> Any:
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        value = [0.0, 0.0, -float(value)]
+    if isinstance(value, str) and value != "auto":
+        raise ValueError("must be a number, three numbers [m/s^2], or auto")
+    return [0.0, 0.0, -float(value)] if _is_number(value) else value
+
+
+def _scale(value: Any) -> Any:
+    factors = value if isinstance(value, (list, tuple)) else [value]
+    if any(_is_number(x) and abs(x) < _LEAST_SCALE for x in factors):
+        raise ValueError(f"must be at least {_LEAST_SCALE:g} in size")
+    return [float(value)] * 3 if _is_number(value) else value
+
+
+def _weight(value: Any) -> Any:
+    if value is not None and value != "removed" and not isinstance(value, (list, tuple)):
+        raise ValueError("must be removed, or four numbers [m, m c_x, m c_y, m c_z] [kg, kg m]")
     return value
 
 
@@ -64,14 +82,31 @@ GainStd = Annotated[
         " calibration says",
     ),
 ]
+_NUMBERS: list[dict[str, Any]] = [
+    {"type": "number"},
+    {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
+]
 _GRAVITY_SCHEMA = {
-    "anyOf": [
-        {"type": "number"},
-        {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
-    ],
-    "description": "magnitude, or the vector in the world, m/s^2",
+    "anyOf": [*_NUMBERS, {"type": "string", "const": "auto"}],
+    "description": "magnitude, or the vector in the world, m/s^2; auto: the direction is found",
 }
-Gravity = Annotated[Vector, BeforeValidator(_gravity), WithJsonSchema(_GRAVITY_SCHEMA)]
+Gravity = Annotated[
+    Vector | Literal["auto"], BeforeValidator(_gravity), WithJsonSchema(_GRAVITY_SCHEMA)
+]
+_SCALE_SCHEMA = {
+    "anyOf": _NUMBERS,
+    "description": "factor on the numbers of the file, or one for each column; -1 for another sign",
+}
+Scale = Annotated[Vector, BeforeValidator(_scale), WithJsonSchema(_SCALE_SCHEMA)]
+Four = Annotated[tuple[Number, Number, Number, Number], Field(strict=False)]
+Weight = Annotated[
+    Four | Literal["removed"] | None,
+    BeforeValidator(_weight),
+    Field(
+        description="that the robot has subtracted: removed if it is the load's, or that of a"
+        " payload, [m, m c_x, m c_y, m c_z] in S, kg and kg m"
+    ),
+]
 Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_frame)]
 ImuFrame = Annotated[Literal["sensor", "base", "auto"] | Rotation, BeforeValidator(_imu_frame)]
 Turn = Annotated[Literal["auto"] | Rotation | None, BeforeValidator(_turn)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,14 @@ from drake_teleop.logs.read.alignment import (
     spacing,
     uniform_times,
 )
+from drake_teleop.logs.read.auto_gravity import describe_gravity
 from drake_teleop.logs.read.auto_mounting import describe_mounting
 from drake_teleop.logs.read.auto_pose import describe_pose_frame
 from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, gaps, read_clock
 from drake_teleop.logs.read.description import (
+    NO_YAML,
     Description,
     Imu,
     Orientation,
@@ -36,9 +39,10 @@ from drake_teleop.logs.read.description import (
     load_description,
 )
 from drake_teleop.logs.read.orientations import Orientations
+from drake_teleop.logs.read.removed_weight import restored, weight_of
 from drake_teleop.logs.read.rotations import nearest_rotation, quaternions, rotation_matrices
 from drake_teleop.logs.read.streams import LARGEST, Stream, at_S, in_S, on_clock, turned_wrench
-from drake_teleop.logs.read.tables import FORMATS, Table, read_table
+from drake_teleop.logs.read.tables import FORMATS, Table, decimal_step, read_table
 
 MINIMUM_SAMPLES = 16
 MINIMUM_POSES = 3
@@ -127,6 +131,7 @@ class _Reader:
         self._bandwidth_hz = bandwidth_hz
         self._notes: list[str] = []
         self._gaps: list[NDArray[np.float64]] = []
+        self._one_sided_s = 0.0
         self._tables = dict(tables or {})
 
     def log(self, *, keep_origin: bool = False, differentiate: bool = True) -> Log:
@@ -135,6 +140,11 @@ class _Reader:
                 self._notes.append("each row is taken for a pose at rest")
             return self._static(self._description.static)
         assert self._description.wrench is not None
+        weight = self._description.wrench.weight
+        parts = {"gravity": self._description.gravity == "auto", "weight": weight == "removed"}
+        free = tuple(name for name, known in parts.items() if known)
+        if self._description.gravity == "auto":
+            self._find(describe_gravity)
         if self._description.pose is not None and self._description.pose.automatic:
             self._find(describe_pose_frame, differentiate=False)
         if self._description.imu is not None and self._description.imu.automatic:
@@ -148,11 +158,17 @@ class _Reader:
         streams = [stream for stream in (imu, pose) if stream is not None]
         t = self._common_time(wrench_t, streams)
         log = self._assembled(t, resample(t, wrench_t, wrench), imu, pose)
-        log = replace(log, gain_std=self._description.wrench.gain_std)
+        log = replace(log, gain_std=self._description.wrench.gain_std, free=free)
+        log = replace(log, described=self._description)
         if pose is not None and pose.raw is not None:
             told = None if imu is None else imu.told
             log = replace(log, posed=self._description.posed(pose.raw, told))
-        return log if keep_origin else log.earlier(float(wrench_t[0]))
+        log = log if keep_origin else log.earlier(float(wrench_t[0]))
+        if not isinstance(weight, tuple):
+            return log
+        without = self._description.wrench.model_copy(update={"weight": None})
+        other = self._description.model_copy(update={"wrench": without})
+        return restored(log, np.array(weight), self._another(other))
 
     def _find(
         self,
@@ -161,17 +177,20 @@ class _Reader:
         differentiate: bool = True,
     ) -> None:
         """Puts what the data say in the place of `auto`."""
-        for name in ("wrench", "imu", "pose"):
-            if (stream := getattr(self._description, name)) is not None:
-                self._table(stream)
         self._description, notes = describe(
             self._description,
             self._source,
-            lambda description: _Reader(description, self._source, 30.0, self._tables).log(
-                differentiate=differentiate
-            ),
+            partial(self._another, differentiate=differentiate),
         )
         self._notes += notes
+
+    def _another(self, description: Description, *, differentiate: bool = True) -> Log:
+        """The log with another description of the same files."""
+        for name in ("wrench", "imu", "pose"):
+            if (stream := getattr(self._description, name)) is not None:
+                self._table(stream)
+        reader = _Reader(description, self._source, 30.0, self._tables)
+        return reader.log(differentiate=differentiate)
 
     def _table(self, stream: Wrench | Imu | Pose | Static) -> Table:
         if stream.source not in self._tables:
@@ -202,8 +221,13 @@ class _Reader:
         where = f"{self._source}:{name}.{field}.columns"
         values = table.numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
-        values *= sign * self._description.scale(quantity.unit)
-        table.check_size(values, *LARGEST[field], where)
+        values *= sign * self._description.scale(quantity.unit) * np.array(quantity.scale)
+        of_table = f" ({NO_YAML})" if Path(self._source).suffix.lower() in FORMATS else ""
+        remedy = (
+            f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
+            " else check column and unit, or delete the row"
+        )
+        table.check_size(values, *LARGEST[field], where, remedy)
         return values
 
     def _pose(self, stream: Pose, *, differentiate: bool) -> Stream:
@@ -221,6 +245,7 @@ class _Reader:
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
                 return Stream("pose", t, raw=raw)
         dt = spacing(t)
+        self._differentiated(dt)
         raw_R = rotation_matrices(quaternion, "quaternion_wxyz")
         R_WS = nearest_rotation(resample(t, clock.t, raw_R))
         acceleration = np.zeros(3)
@@ -277,6 +302,7 @@ class _Reader:
         s = vectors("specific_force", stream.sign)
         omega, alpha = vectors("angular_velocity"), vectors("angular_acceleration")
         if omega is not None and alpha is None:
+            self._differentiated(dt)
             alpha = smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
@@ -329,6 +355,8 @@ class _Reader:
                     remedy="give static.orientation instead of gravity or specific_force",
                 )
             wrench = turned_wrench(R_SW, wrench)
+        if isinstance(stream.weight, tuple):
+            wrench = wrench + weight_of(np.array(stream.weight), gravity)
         n = len(wrench)
         if n < MINIMUM_POSES:
             raise DrakeTeleopError(
@@ -341,7 +369,18 @@ class _Reader:
         notes = tuple(self._notes)
         index = np.arange(float(n))
         log = Log(index, wrench, *motion, gravity, True, notes=notes, source=self._source)
-        return replace(log, gain_std=stream.gain_std)
+        resolution = self._resolution(stream, table)
+        described = self._description
+        return replace(log, gain_std=stream.gain_std, described=described, resolution=resolution)
+
+    def _resolution(self, stream: Static, table: Table) -> tuple[float, float]:
+        """Step of the numbers of force and torque [N, N m]."""
+        force, torque = (
+            decimal_step(table.numbers(quantity.columns, 3, f"static.{field}", table.rows))
+            * self._description.scale(quantity.unit)
+            for field, quantity in (("force", stream.force), ("torque", stream.torque))
+        )
+        return force, torque
 
     def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
         """Strictly increasing times of a stream, and the rows of the table that they belong to."""
@@ -370,11 +409,17 @@ class _Reader:
                 f"{name}: {len(holes)} gaps, the longest of {stop - start:.3g} s at"
                 f" {start - t[0]:.3g} s; what lies in them and close by is not used"
             )
-            # A derivative has seen half a smoother's window.
-            window = SMOOTHER_WINDOW / self._bandwidth_hz if self._bandwidth_hz else 0.0
-            seen = max(4 * float(np.median(np.diff(t))), 0.5 * window)
+            seen = self._half_window(float(np.median(np.diff(t))))
             self._gaps.append(holes + np.array([-seen, seen]))
         return clock
+
+    def _half_window(self, dt: float) -> float:
+        """How far to either side a derivative has seen [s]."""
+        window = SMOOTHER_WINDOW / self._bandwidth_hz if self._bandwidth_hz else 0.0
+        return max(4 * dt, 0.5 * window)
+
+    def _differentiated(self, dt: float) -> None:
+        self._one_sided_s = max(self._one_sided_s, self._half_window(dt))
 
     def _orientations(
         self, name: str, orientation: Orientation, table: Table, rows: int
@@ -425,7 +470,7 @@ class _Reader:
                     return on_clock(t, stream, values)
             return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
-        gravity = None
+        gravity, R_WS = None, None
         if pose is not None and pose.R_WS is not None:
             R_WS = nearest_rotation(on_clock(t, pose, pose.R_WS))
             gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
@@ -438,9 +483,12 @@ class _Reader:
             *(t, wrench, signal("specific_force"), signal("angular_velocity")),
             signal("angular_acceleration"),
             gravity=gravity,
+            R_WS=R_WS,
+            gravity_W=None if R_WS is None else self._description.gravity_W,
             bridged=self._bridged(t),
             notes=tuple(self._notes),
             source=self._source,
+            one_sided_s=self._one_sided_s,
         )
 
     def _bridged(self, t: NDArray[np.float64]) -> NDArray[np.bool_] | None:

@@ -13,12 +13,12 @@ from collections import UserDict
 from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError, reading
+from drake_teleop.errors import DrakeTeleopError, reading, refuse_fork
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.mat_file import read_mat
 
@@ -29,7 +29,10 @@ _TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
 FORMATS = (*_TEXT, ".parquet", ".npz", ".mat")
 LARGEST = 1e25
 """Numbers beyond are none that were measured, in whatever unit: nanoseconds since 1970 are 2e18."""
+_CANONICAL = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
+_Column = TypeVar("_Column")
 _PARTS = 16  # numbers of an array that are columns of their own: up to a homogeneous matrix
+_MOST_DECIMALS = 12
 _LARGE = 2**24
 """Numbers in a table that are more than is kept in memory, where the file's format allows it."""
 
@@ -144,7 +147,12 @@ class Table:
         return numbers[:, 0]
 
     def check_size(
-        self, values: NDArray[np.float64], largest: float, unit: str, where: str
+        self,
+        values: NDArray[np.float64],
+        largest: float,
+        unit: str,
+        where: str,
+        remedy: str = "check the column and its unit, or delete the row",
     ) -> None:
         """Refuses what cannot have been measured, and would be beyond all floats when squared.
 
@@ -153,6 +161,7 @@ class Table:
             largest: size of a value, in the unit.
             unit: for the message.
             where: the field, for the message.
+            remedy: for the message.
 
         Raises:
             DrakeTeleopError: naming the first row with a number that is larger, but not infinite.
@@ -167,7 +176,7 @@ class Table:
                 f"{worst:g} {unit}".rstrip() + f" in row {first + self.first_row} of"
                 f" {self.path.name} is outside {-largest:g} to {largest:g}",
                 where=where,
-                remedy="check the column and its unit, or delete the row",
+                remedy=remedy,
             )
 
     def _column(self, name: str, where: str) -> NDArray[np.float64]:
@@ -211,6 +220,15 @@ class Table:
         )
 
 
+def decimal_step(values: NDArray[np.float64]) -> float:
+    """Largest power of ten, 1 at most, of which all values are multiples; 0 if there is none."""
+    for decimals in range(_MOST_DECIMALS if values.any() else 0):
+        error = np.abs(values - np.round(values, decimals))
+        if (error <= 4.0 * np.finfo(float).eps * np.abs(values)).all():
+            return float(10.0**-decimals)
+    return 0.0
+
+
 def read_table(path: Path, *, header: bool = True) -> Table:
     """Reads a file of one of the `FORMATS`, told apart by its suffix.
 
@@ -230,6 +248,7 @@ def read_table(path: Path, *, header: bool = True) -> Table:
         )
     if not os.path.isfile(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
+    refuse_fork()
     with reading(path, f"check that it is a valid {path.suffix} file"):
         arrays = {".npz": _read_npz, ".mat": read_mat}.get(path.suffix.lower())
         table = _read_frame(path, header) if arrays is None else _table_of(path, arrays(path))
@@ -243,13 +262,16 @@ def _read_frame(path: Path, header: bool) -> Table:
 
     if path.suffix.lower() == ".parquet":
         names = list(pl.read_parquet_schema(path))
-        lazy = _ParquetColumns(path, dict(zip(_stripped(names), names, strict=True)))
+        lazy = _ParquetColumns(
+            path, _with_canonical(dict(zip(_stripped(names), names, strict=True)))
+        )
         small = len(names) * pl.scan_parquet(path).select(pl.len()).collect().item() <= _LARGE
         return Table(path, dict(lazy) if small else lazy)
     frame, first_row = read_csv(path, header)
     names = [name if header else str(i) for i, name in enumerate(frame.columns)]
     found = [_frame_column(series) for series in frame.get_columns()]
-    return Table(path, dict(zip(_stripped(names), found, strict=True)), first_row)
+    columns = dict(zip(_stripped(names), found, strict=True))
+    return Table(path, _with_canonical(columns), first_row)
 
 
 def _stripped(names: list[str]) -> list[str]:
@@ -257,6 +279,13 @@ def _stripped(names: list[str]) -> list[str]:
     if len(set(stripped)) < len(names):
         raise ValueError("two of its columns have names that differ in spaces alone")
     return stripped
+
+
+def _with_canonical(columns: dict[str, _Column]) -> dict[str, _Column]:
+    """The columns, and under their canonical names those of a canonical log in other letters."""
+    small = {name.lower(): column for name, column in columns.items()}
+    canonical = len(small) == len(columns) and _CANONICAL.issubset(small)
+    return small | columns if canonical and not _CANONICAL.issubset(columns) else columns
 
 
 class _ParquetColumns(UserDict[str, Any]):
@@ -287,6 +316,7 @@ def _frame_column(series: pl.Series) -> NDArray:
 
 
 def _table_of(path: Path, arrays: dict[str, NDArray]) -> Table:
+    arrays = {name: array for name, array in arrays.items() if len(array)}
     parts = {
         f"{name}[{k}]": array.reshape(len(array), -1)[:, k]
         for name, array in arrays.items()
@@ -320,6 +350,8 @@ def _as_numbers(
             numbers[row] = np.nan if cell is None else float(cell)
         except (TypeError, ValueError) as error:
             raise bad(row, cell) from error
+        if isinstance(cell, str) and "_" in cell:  # which Python reads over
+            raise bad(row, cell)
     return numbers
 
 

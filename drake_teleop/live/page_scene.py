@@ -1,0 +1,113 @@
+"""3D scene of a drive for its page: the objects once, and then where they are.
+
+Meshcat makes the objects before the drive listens, and is closed at once: its port accepts input
+from any page, and malformed input ends the process.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.math import RigidTransform
+
+from drake_teleop.errors import one_line
+from drake_teleop.film import quiet_drake
+from drake_teleop.replay import ReplayScene
+from drake_teleop.scenario import Scenario
+
+Rows = dict[str, NDArray[np.float64]]
+
+_ANY = (Exception, SystemExit)  # the second is a failed assertion of Drake
+
+# Of the page that Meshcat writes: its commands in base64, and files that they name.
+_COMMAND = re.compile(r'fetch\("data:application/octet-binary;base64,([^"]*)"\)')
+_FILE = re.compile(r'^casAssets\["([^"]*)"\] = "([^"]*)";$', re.M)
+
+
+class PageScene:
+    """3D scene of one scenario. A drive whose scene fails goes on without it.
+
+    Attributes:
+        name: of the scene in the page's addresses.
+        objects: JSON for the page: {"commands": [base64], "files": {address: data URL}}.
+        failure: why there is no scene; "" if there is one.
+
+    Args:
+        name: as above.
+        scenario: that is driven.
+        forces: whether arrows show the forces.
+    """
+
+    def __init__(self, name: str, scenario: Scenario, *, forces: bool = True) -> None:
+        self.name, self.objects, self.failure = name, b"{}", ""
+        arrows = ("measured_wrench_S", "contact_wrench_S") if forces else ()
+        recorded = ("slave_state", "master_state", *arrows)
+        try:
+            with quiet_drake():
+                meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
+            self._scene = ReplayScene(meshcat, scenario, recorded)
+            self.objects = _objects(meshcat.StaticHtml())
+            self._scene.canvas = _Moves()  # Meshcat may be destroyed by this thread only: now
+        except _ANY as error:
+            self._fail(error)
+
+    def show(self, rows: Rows) -> dict[str, Any]:
+        """Return what a frame contains of the scene, at the last of some rows of a log.
+
+        Returns:
+            "view": the name, "no_view": the failure, and "moves" with "poses" {path: 4x4 matrix by
+            columns} and "sizes" {path: [x, y, z]} of everything that moves.
+        """
+        moves = {} if self.failure else self._moves(rows)
+        return {"view": self.name, "no_view": self.failure, "moves": moves}
+
+    def _moves(self, rows: Rows) -> dict[str, Any]:
+        moves = _Moves()
+        try:
+            self._scene.canvas = moves
+            self._scene.show(0.0, rows, -1)
+        except _ANY as error:
+            if all(np.isfinite(values[-1]).all() for values in rows.values()):
+                self._fail(error)
+            return {}
+        return moves.rounded()
+
+    def _fail(self, error: BaseException) -> None:
+        self.failure = one_line(f"no 3D scene: {error}")
+        print(f"warning: {self.failure}; the drive continues without it", file=sys.stderr)
+
+
+class _Moves:
+    """Collects poses and sizes in the place of Meshcat."""
+
+    def __init__(self) -> None:
+        self._poses: dict[str, NDArray[np.float64]] = {}
+        self._sizes: dict[str, list[float]] = {}
+
+    def SetTransform(self, path: str, X_ParentPath: RigidTransform, time: float) -> None:
+        self._poses[path] = X_ParentPath.GetAsMatrix4()
+
+    def SetProperty(self, path: str, property: str, value: list[float], time: float) -> None:
+        self._sizes[path] = [round(x, 4) for x in value]
+
+    def rounded(self) -> dict[str, Any]:
+        """Return both for JSON; nothing if a pose is not finite."""
+        matrices = np.array([*self._poses.values()]).round(5)
+        if not np.isfinite(matrices).all():
+            return {}
+        columns = matrices.swapaxes(1, 2).reshape(-1, 16).tolist()
+        return {"poses": dict(zip(self._poses, columns, strict=True)), "sizes": self._sizes}
+
+
+def _objects(html: str) -> bytes:
+    """Return the scene of a static page of Meshcat."""
+    commands = _COMMAND.findall(html)
+    if not commands:
+        raise ValueError("Drake's Meshcat writes its static page in an unknown form")
+    return json.dumps({"commands": commands, "files": dict(_FILE.findall(html))}).encode()

@@ -1,0 +1,115 @@
+"""A log with the motion that explains the wrench of an identified load best, without its delay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.logs.pose_motion.rigid import load_coefficients
+from drake_teleop.logs.read.alignment import ends, low_pass, undelayed
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.delay import delay_of
+from drake_teleop.logs.read.reading import read_log
+from drake_teleop.logs.spline_motion import clock_note, motion_of_known_load, moved_by_splines
+from drake_teleop.one_thread import one_blas_thread
+
+
+@dataclass(frozen=True)
+class AlignedLog:
+    """A log whose motion is at the instants of its wrench.
+
+    Attributes:
+        log: the log.
+        delay_s: of the motion that was recorded behind the wrench [s].
+        source: of the delay: "estimated", "given", "load" or "static".
+        differentiated: the same with motion that is differentiated, if required.
+        edge: (N,) samples whose motion or low-pass has measurements on one side only.
+
+    Where the weight is removed from the wrench, the specific force is the acceleration alone.
+    """
+
+    log: Log
+    delay_s: float
+    source: str
+    differentiated: Log | None
+    edge: NDArray[np.bool_]
+
+
+def aligned_log(
+    path: str | Path,
+    phi: NDArray[np.float64],
+    usual_s: float,
+    cutoff_hz: float | None,
+    delay: str | float,
+    differentiate: bool,
+    weight_removed: bool = False,
+) -> AlignedLog:
+    """The log with the motion of splines of its poses if they have positions.
+
+    With an IMU beside them the IMU's motion is used if the load explains the wrench better with it.
+
+    Args:
+        path, cutoff_hz, delay: as of `eliminate_log`.
+        phi: (10,) of the load.
+        usual_s: the delay of a record that does not determine it [s].
+        differentiate: whether `AlignedLog.differentiated` is required.
+        weight_removed: whether the robot has removed the weight of the load from the wrench.
+
+    Raises:
+        DrakeTeleopError: if the weight is removed and the log has no orientation.
+    """
+    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
+    weight_removed = weight_removed or "weight" in log.free
+    smooth = None
+    coefficients = load_coefficients(phi, phi[:4] if weight_removed else None)
+    with one_blas_thread():
+        found = motion_of_known_load(log, delay, coefficients, usual_s)
+    if found is not None:
+        motion, source = found
+        moved, one_sided = moved_by_splines(log, motion)
+        moved = replace(moved, notes=(*moved.notes, *clock_note(motion)))
+        plain = undelayed(log, motion.delay_s) if differentiate else None
+        if weight_removed:
+            moved = _accelerated(moved)
+            plain = None if plain is None else _accelerated(plain)
+        edge = one_sided | ends(moved, 0.0, cutoff_hz)
+        smooth = AlignedLog(moved, motion.delay_s, source, plain, edge)
+        if log.posed is None or log.posed.imu is None:
+            return smooth
+    elif log.posed is not None and not differentiate:
+        log = read_log(path, bandwidth_hz=cutoff_hz)
+    log = _accelerated(log) if weight_removed else log
+    delay_s, source = delay_of(log, cutoff_hz, delay, phi)
+    if source == "undetermined":
+        delay_s, source = usual_s, "load"
+    log = undelayed(log, delay_s)
+    other = AlignedLog(log, delay_s, source, log, ends(log, log.one_sided_s, cutoff_hz))
+    if smooth is None or _spread(other, phi, cutoff_hz) < _spread(smooth, phi, cutoff_hz):
+        return other
+    return smooth
+
+
+def _accelerated(log: Log) -> Log:
+    """The log with the acceleration in the place of the specific force."""
+    if log.gravity is None:
+        raise DrakeTeleopError(
+            "the weight of the load is removed from the wrench: its inertia cannot be told from"
+            " gravity without an orientation",
+            where=log.source,
+            remedy="add pose, or record the wrench without payload compensation",
+        )
+    return replace(log, specific_force=log.specific_force + log.gravity)
+
+
+def _spread(aligned: AlignedLog, phi: NDArray[np.float64], cutoff_hz: float | None) -> float:
+    """Logarithm of the widths that half of what the load leaves lies within, of all channels."""
+    log = aligned.log
+    left = low_pass(contact_wrench(log.wrench, np.zeros(6), *log.motion, phi), log.dt, cutoff_hz)
+    left = np.sort(left[~aligned.edge], axis=0)
+    half = len(left) // 2
+    return float(np.log((left[half:] - left[: len(left) - half]).min(axis=0) + 1e-12).sum())

@@ -1,0 +1,190 @@
+"""Lines of a log description that correct the causes named in its record.
+
+A line states the resulting value: that of the description with all causes corrected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.logs.causes.cause import CHANNELS, Cause
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.description import NO_YAML, Description
+from drake_teleop.logs.read.tables import FORMATS
+
+Fields = dict[str, Any]
+"""Value of each field that a cause may correct, by its name in a description."""
+_HEAVIEST_KG = 1000.0
+_SIGN, _FRAME, _WEIGHT, _GRAVITY = "wrench.sign", "wrench.frame", "wrench.weight", "gravity"
+_FORCE, _TORQUE = "wrench.force.scale", "wrench.torque.scale"
+_PLACES = ("pose.position_in_sensor", "imu.position")
+_TURNS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
+_DIGITS = {_GRAVITY: 4, _PLACES[0]: 5, _PLACES[1]: 5}
+_OTHERWISE = {
+    "axes": "correct the columns of wrench.force and wrench.torque",
+    "sensor rotation": "correct the mounting or the frame of the pose",
+    "pose frame": "add the position to pose, or an accelerometer",
+}
+
+
+def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
+    """Add the lines that correct them to the messages of causes.
+
+    Args:
+        causes: of a log.
+        log: as it was read, with its description.
+        by_pose: whether the positions of poses determine the acceleration, not an IMU.
+    """
+    texts = _corrected(causes, log, by_pose)[1]
+    return tuple(
+        replace(cause, message=f"{cause.message}; {text}") if text else cause
+        for cause, text in zip(causes, texts, strict=True)
+    )
+
+
+def doubted_force_unit(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
+    """Say which fields to set if a mass is beyond that of any load of a wrist sensor."""
+    if abs(mass) < _HEAVIEST_KG or log.described is None or log.described.wrench is None:
+        return None
+    fields = _corrected(causes, log, by_pose=True)[0]
+    ratio = fields[_TORQUE] / fields[_FORCE]
+    text = _written(_TORQUE, ratio)
+    return (
+        f"a mass of {mass:.3g} kg is implausible: the force is probably not in"
+        f" {log.described.wrench.force.unit}; set {_FORCE} to the value of one unit of the file"
+        f" (a power of ten that gives a load of a few kg: {10.0 ** -round(np.log10(abs(mass))):g})"
+        f" and {_TORQUE} to {text} times that{_where(log)}"
+    )
+
+
+def _corrected(causes: Sequence[Cause], log: Log, by_pose: bool) -> tuple[Fields, list[str]]:
+    """Return all fields, and for each cause the lines that correct it."""
+    assert log.described is not None
+    fields = _fields(log.described, by_pose)
+    column = _columns(fields[_FRAME])
+    touched: list[list[str]] = []
+    for cause in causes:
+        before = {name: _written(name, value) for name, value in fields.items()}
+        if cause.name == "gain":
+            _gain(fields, cause.values, column)
+        elif cause.name in _CORRECTIONS:
+            _CORRECTIONS[cause.name](fields, cause.values)
+        touched.append([k for k, x in before.items() if _written(k, fields[k]) != x])
+    texts = []
+    for cause, names in zip(causes, touched, strict=True):
+        lines = " and ".join(f"{name}: {_written(name, fields[name])}" for name in names)
+        otherwise = _OTHERWISE.get(cause.name, "")
+        texts.append(f"set {lines}{_where(log)}" if lines else otherwise)
+    return fields, texts
+
+
+def _where(log: Log) -> str:
+    return f" ({NO_YAML})" if Path(log.source).suffix.lower() in FORMATS else ""
+
+
+def _fields(description: Description, by_pose: bool) -> Fields:
+    wrench, imu, pose = description.wrench, description.imu, description.pose
+    assert wrench is not None
+    frame: Any = np.eye(3) if wrench.frame == "sensor" else wrench.frame
+    weight: Any = (0.0, 0.0, 0.0, 0.0) if wrench.weight is None else wrench.weight
+    out: Fields = {
+        _SIGN: wrench.sign,
+        _FRAME: frame if isinstance(frame, str) else np.array(frame),
+        _FORCE: np.array(wrench.force.scale),
+        _TORQUE: np.array(wrench.torque.scale),
+        _WEIGHT: weight if isinstance(weight, str) else np.array(weight),
+        _GRAVITY: description.gravity_W,
+    }
+    if imu is not None and imu.specific_force is not None and not by_pose:
+        out["imu.position"] = np.array(imu.position)
+    elif pose is not None and pose.position is not None:
+        out["pose.position_in_sensor"] = np.array(pose.position_in_sensor)
+    if wrench.frame == "base":
+        return out
+    if pose is not None:
+        name = "rotation_in_sensor" if pose.frame == "sensor" else "frame"
+        out[f"pose.{name}"] = np.eye(3) if pose.R_SP is None else pose.R_SP
+    if imu is not None and imu.frame != "base":
+        out["imu.frame"] = np.eye(3) if imu.frame == "sensor" else np.array(imu.frame)
+    return out
+
+
+def _columns(frame: Any) -> list[int] | None:
+    """Column of the file behind each axis of S, if its axes are signed axes of the file."""
+    if isinstance(frame, str) or (np.abs(frame).max(axis=1) < 1.0 - 1e-6).any():
+        return None
+    return [int(j) for j in np.abs(frame).argmax(axis=1)]
+
+
+def _written(name: str, value: Any) -> str:
+    if isinstance(value, (str, int)):
+        return str(value)
+    if name in (_FRAME, "imu.frame") and np.allclose(value, np.eye(3), atol=1e-6):
+        return "sensor"
+    if name in (_FORCE, _TORQUE):
+        factors = [f"{x:.6g}" for x in value]
+        return factors[0] if len(set(factors)) == 1 else f"[{', '.join(factors)}]"
+    exact = np.round(value, _DIGITS.get(name, 6)) + 0.0
+    return str((exact.astype(int) if (exact == np.round(exact)).all() else exact).tolist())
+
+
+def _axes(fields: Fields, values: dict[str, Any]) -> None:
+    Q = np.array(values["matrix"])
+    sign = 1 if np.linalg.det(Q) > 0.0 else -1
+    base = isinstance(fields[_FRAME], str)
+    if base and not (sign * np.eye(3) == Q).all():
+        return
+    fields[_SIGN] = sign * fields[_SIGN]
+    if not base:
+        fields[_FRAME] = sign * Q.T @ fields[_FRAME]
+
+
+def _rotation(fields: Fields, values: dict[str, Any]) -> None:
+    """Rotate all motion to the axes of the wrench, which are those of S."""
+    R = Rotation.from_rotvec(values["rotation_vector"]).as_matrix()
+    for name in {*_TURNS, *_PLACES} & set(fields):
+        fields[name] = R @ fields[name]
+
+
+def _gravity(fields: Fields, values: dict[str, Any]) -> None:
+    true = np.array(values["gravity"])
+    fields[_GRAVITY] = true * np.linalg.norm(fields[_GRAVITY]) / np.linalg.norm(true)
+
+
+def _removed(fields: Fields, values: dict[str, Any]) -> None:
+    fields[_WEIGHT] = "removed"
+
+
+def _factor(fields: Fields, values: dict[str, Any]) -> None:
+    fields[_TORQUE] = fields[_TORQUE] / values["factor"]
+
+
+def _gain(fields: Fields, values: dict[str, Any], column: list[int] | None) -> None:
+    if column is None:
+        return
+    c = CHANNELS.index(values["channel"])
+    scale = fields[_FORCE if c < 3 else _TORQUE] = fields[_FORCE if c < 3 else _TORQUE].copy()
+    scale[column[c % 3]] /= values["gain"]
+
+
+def _frame(fields: Fields, values: dict[str, Any]) -> None:
+    for name in _PLACES:
+        if name in fields:
+            fields[name] = fields[name] + values["position_in_sensor"]
+
+
+_CORRECTIONS: dict[str, Callable[[Fields, dict[str, Any]], None]] = {
+    "axes": _axes,
+    "sensor rotation": _rotation,
+    "gravity direction": _gravity,
+    "weight removed": _removed,
+    "payload configured": _removed,  # an estimate of it would count as exact
+    "torque factor": _factor,
+    "pose frame": _frame,
+}

@@ -1,0 +1,274 @@
+"""Extensions of a model, in the order of plausibility, and what makes each of them a finding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.logs.causes.changes import change
+from drake_teleop.logs.causes.contacts import contact_spans
+from drake_teleop.logs.causes.instants import FORCES, ONE, G, R, S
+from drake_teleop.logs.causes.model import Model
+from drake_teleop.logs.causes.state import State
+
+ORDER = (
+    "axes",
+    "gravity",
+    "weight",
+    "torque factor",
+    "offsets",
+    "load",
+    "linear drift",
+    "gain",
+    "frame",
+    "rotation",
+    "contact",
+    "cable",
+    "drift",
+)
+"""Of candidates with nearly the same likelihood the first is taken."""
+_FACTORS = (10.0, 100.0, 1000.0, 8.850746, 4.448222, 9.80665, 98.0665, 1.355818, 12.0, 39.37008)
+FACTORS = tuple(
+    sign * ratio
+    for sign in (1.0, -1.0)
+    for ratio in (1.0, *_FACTORS, *(1.0 / x for x in _FACTORS))
+    if sign * ratio != 1.0
+)
+"""Known ratios of units and signs between torque and force."""
+_HALF, _IMPOSSIBLE = 0.5, 1000.0
+_TILT_DEG, _GRAVITY_SHARE = 0.25, 0.05
+_MASS_SHARE, _MOMENT = 0.02, 0.004
+_GAIN, _MOST_GAIN, _SHIFT, _ROTATION_DEG = 0.003, 0.25, 0.010, 1.0
+_SURE, _FARTHEST, _STIFFEST = 10.0, 1.5, 1000.0  # 1, m, N/m
+_DRIFT_LEVELS = 3.0
+_FACTOR_SHARE, _FACTOR_MOST = 0.02, 0.06
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An extension that was fitted.
+
+    Attributes:
+        name: one of `ORDER`.
+        state: the larger model.
+        score: twice the gain of the log likelihood, less what its parameters cost.
+    """
+
+    name: str
+    state: State
+    score: float
+
+
+def candidates(state: State, first: bool) -> Iterator[Candidate]:
+    """Fit the extensions that a state allows and keep those of sufficient effect.
+
+    Args:
+        state: the model so far.
+        first: whether it is the rigid load alone.
+    """
+    model, data = state.model, state.data
+    if first:
+        yield from _axes(state)
+    if data.gravity_W is not None:
+        if "gravity" not in model.parts:
+            yield from _best(state, "gravity", [tilted(state), None], _tilted_enough)
+        if "weight" not in model.parts and data.lively:
+            yield from _best(state, "weight", [None], _weight_enough)
+    if "torque factor" not in model.parts and data.lively:
+        yield from _factor(state)
+    for kind in ("offsets", "load"):
+        found = change(state, kind)
+        if found is not None:
+            yield _candidate(kind, state, found, times=1)
+    if not {"linear drift", "drift"} & set(model.parts):
+        yield from _best(state, "linear drift", [None], _drift_enough)
+    for c in range(6):
+        if c not in model.gains:
+            larger = state.extended(replace(model, gains=(*model.gains, c)))
+            if _GAIN < abs(part(larger, f"gain {c}")[0][0]) < _MOST_GAIN:
+                yield _candidate("gain", state, larger)
+    if "frame" not in model.parts and data.lively:
+        yield from _best(state, "frame", [None], _shifted_enough)
+    if first and not model.parts:
+        yield from _best(state, "rotation", [None], _rotated_enough)
+    spans = contact_spans(state)
+    if spans and spans != state.spans:
+        larger = State.of(data, model, state.x, spans)
+        ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
+        yield _candidate("contact", state, larger, more=6 + 2 * ends)
+    if data.positions and "cable" not in model.parts and data.lively:
+        yield from _best(state, "cable", [None], lambda _: True)
+    if "drift" not in model.parts and "linear drift" not in model.parts:
+        yield from _best(state, "drift", [None], _drift_enough)
+
+
+def _candidate(
+    name: str, state: State, larger: State, *, times: int = 0, more: int = 0
+) -> Candidate:
+    rows = float(state.data.used.sum())
+    cost = larger.model.size - state.model.size + more
+    score = 2.0 * (larger.likelihood - state.likelihood) - cost * np.log(rows)
+    if times:
+        score += (0.5 * cost - 2.0 * times) * np.log(rows)
+    return Candidate(name, larger, float(score))
+
+
+def _best(
+    state: State, part: str, starts: list[Array | None], enough: Callable[[State], bool]
+) -> Iterator[Candidate]:
+    model = state.model.extended(part)
+    fits = [state.extended(model, start) for start in starts]
+    best = max(fits, key=lambda x: x.likelihood)
+    if enough(best):
+        yield _candidate(part, state, best)
+
+
+def negative(state: State) -> bool:
+    """Whether the mass is below zero by more than its interval."""
+    return bool(state.x[6] < -4.0 * np.sqrt(state.fit.covariance[6, 6]))
+
+
+def plausible(state: State) -> bool:
+    """Whether the parts of a model are what they can be in a laboratory."""
+    if negative(state):
+        return False
+    parts, deviation = state.model.parts, float(np.sqrt(state.fit.covariance[6, 6]))
+    if "weight" in parts:
+        removed = part(state, "weight")[0][0]
+        # A robot adds no weight, and without inertia there is nothing to compare it with.
+        if removed < -0.01 * state.x[6] or state.x[6] < _SURE * deviation:
+            return False
+    if "frame" in parts and np.linalg.norm(part(state, "frame")[0]) > _FARTHEST:
+        return False
+    if "cable" in parts:
+        if state.x[6] < _SURE * deviation:
+            return False
+        K = part(state, "cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+        return bool(np.abs(np.linalg.eigvalsh(K)).max() < _STIFFEST)
+    return True
+
+
+def part(state: State, name: str) -> tuple[Array, Array]:
+    """Values of an extension and their covariance."""
+    where = state.model.slices[name]
+    return state.x[where], state.fit.covariance[where, where]
+
+
+def _tilted_enough(state: State) -> bool:
+    assert state.data.gravity_W is not None
+    given = state.data.gravity_W
+    true = given - part(state, "gravity")[0]
+    size, right = float(np.linalg.norm(true)), float(np.linalg.norm(given))
+    cosine = float(true @ given) / (size * right)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return bool(angle > _TILT_DEG and abs(size / right - 1.0) < _GRAVITY_SHARE)
+
+
+def tilted(state: State) -> Array | None:
+    """Start of a large tilt, from the force alone: f = o + m a + R u with u = -m g."""
+    y = state.data.only(state.rows.used).y
+    sums = y.T @ y
+    width = len(sums)
+    J = np.zeros((7, 3, width))
+    for i in range(3):
+        J[i, i, ONE] = 1.0
+        J[3, i, S.start + i] = J[3, i, G.start + i] = 1.0
+        J[4:, i, R.start + 3 * i : R.start + 3 * i + 3] = np.eye(3)
+    force = np.eye(width)[FORCES][:3]
+    gram = np.einsum("pci,ij,qcj->pq", J, sums, J)
+    right = np.einsum("pci,ij,cj->p", J, sums, state.model.axes.T @ force)
+    found = np.linalg.lstsq(gram, right, rcond=1e-12)[0]
+    u = found[4:]
+    given = state.data.gravity_W
+    assert given is not None
+    size = float(np.linalg.norm(u))
+    if size == 0.0:
+        return None
+    model = state.model.extended("gravity")
+    x = model.start(state.x, state.model)
+    x[6] = size / float(np.linalg.norm(given))
+    x[7:16] = 0.0
+    x[model.slices["gravity"]] = given + u / size * np.linalg.norm(given)
+    return x
+
+
+def _weight_enough(state: State) -> bool:
+    removed, _ = part(state, "weight")
+    mass = abs(state.x[6])
+    moment = np.linalg.norm(removed[1:]) / max(mass, 1e-9)
+    return bool(removed[0] > _MASS_SHARE * mass or moment > _MOMENT)
+
+
+def _shifted_enough(state: State) -> bool:
+    return bool(np.linalg.norm(part(state, "frame")[0]) > _SHIFT)
+
+
+def _rotated_enough(state: State) -> bool:
+    return bool(np.degrees(np.linalg.norm(part(state, "rotation")[0])) > _ROTATION_DEG)
+
+
+def _drift_enough(state: State) -> bool:
+    name = "drift" if "drift" in state.model.parts else "linear drift"
+    rows = part(state, name)[0].reshape(6, -1)
+    return bool((np.abs(rows).sum(axis=1) > _DRIFT_LEVELS * state.data.white).any())
+
+
+def _factor(state: State) -> Iterator[Candidate]:
+    """The known ratio of the greatest likelihood, then refined."""
+    found = []
+    for factor in (1.0, *FACTORS):
+        model = replace(state.model, factor=factor)
+        found.append(state.extended(model, state.x, steps=2))
+    best = max(found, key=lambda x: x.likelihood)
+    if best is found[0]:
+        return
+    best = state.extended(best.model, best.x)
+    if 2.0 * (best.likelihood - state.likelihood) < 20.0:
+        return
+    free = best.extended(best.model.extended("torque factor"))
+    value, covariance = part(free, "torque factor")
+    limit = min(_FACTOR_SHARE + 4.0 * np.sqrt(covariance[0, 0]), _FACTOR_MOST)
+    if abs(value[0]) < limit:
+        yield _candidate("torque factor", state, best, more=1)
+
+
+def _axes(state: State) -> Iterator[Candidate]:
+    """The signed permutation that explains the force best, by mass and first moment alone."""
+    from itertools import permutations, product
+
+    y = state.data.only(state.rows.used).y[:, state.model.columns]
+    sums = y.T @ y
+    sums = sums - np.outer(sums[:, ONE], sums[ONE]) / sums[0, 0]
+    # m s + alpha x h + omega x (omega x h) of the three axes of S, and a weight that was removed
+    model = Model(parts=state.model.parts)
+    used = [6, 7, 8, 9]
+    if "weight" in model.parts:
+        used.append(model.slices["weight"].start)
+    J = model.derivative(np.zeros(model.size))[used, :3]
+    force = np.eye(len(sums))[FORCES][:3]
+    gram = np.einsum("pci,ij,qcj->pq", J, sums, J)
+    cross = np.einsum("pci,ij,dj->cdp", J, sums, force)  # axis c of S, channel d
+    total = float(np.trace(sums[FORCES, FORCES][:3, :3]))
+    inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
+    best: tuple[float, Array] = (np.inf, np.eye(3))
+    plain = total
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            Q = np.zeros((3, 3))
+            Q[range(3), order] = signs
+            right = np.einsum("dc,cdp->p", Q, cross)
+            found = inverse @ right
+            left = total - float(right @ found) if found[0] > 0.0 else total
+            if (np.eye(3) == Q).all():
+                plain = left
+            elif left < best[0]:
+                best = (left, Q)
+    if best[0] < _HALF * plain:
+        larger = state.extended(replace(state.model, axes=best[1]), np.zeros(state.model.size))
+        if larger.x[6] > 0.0:
+            found = _candidate("axes", state, larger, more=3)
+            # A negative mass is impossible, however well it explains the wrench.
+            yield replace(found, score=found.score + (_IMPOSSIBLE if negative(state) else 0.0))

@@ -1,0 +1,272 @@
+"""Causes of a misfit in words: name, time, value with interval, and the line that corrects it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.load.identification import worth_stating
+from drake_teleop.load.inertia import mass_com_inertia
+from drake_teleop.logs.causes.candidates import part
+from drake_teleop.logs.causes.state import State
+
+_NEAR_S, _SHORT_S = 0.8, 1.2
+CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
+CHANGES = ("zero change", "load change")
+"""Causes after which a record has no single load with constant offsets."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One reason why a rigid load with constant offsets does not explain a wrench.
+
+    Attributes:
+        name: "axes", "gravity direction", "weight removed", "payload configured",
+            "torque factor", "zero change", "load change", "drift", "gain", "pose frame",
+            "sensor rotation", "contact", "cable" or "no load".
+        message: cause, value with its interval, and what to change beside the description.
+        start_s: time from which it acts, since the start of the record [s]; None: throughout.
+        stop_s: time until which it acts [s]; None: to the end.
+        values: figures by name, in SI.
+    """
+
+    name: str
+    message: str
+    start_s: float | None = None
+    stop_s: float | None = None
+    values: dict[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A part of a record with one load.
+
+    Attributes:
+        start_s, stop_s: since the start of the record [s].
+        phi: (10,) the load about So in S.
+        covariance: (16, 16) of [offsets; phi].
+    """
+
+    start_s: float
+    stop_s: float
+    phi: Array
+    covariance: Array
+
+    @property
+    def identifiable(self) -> NDArray[np.bool_]:
+        """(16,) whether the stretch determines a parameter of [offsets; phi] well enough."""
+        return worth_stating(np.sqrt(np.diag(self.covariance)), self.phi)
+
+
+def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
+    """The causes in the model of a state but for the given parts, in the order of their times."""
+    model, out = state.model, []
+    if not (model.axes == np.eye(3)).all():
+        out.append(_axes(model.axes))
+    makers = {
+        "gravity": _gravity,
+        "weight": _weight,
+        "frame": _frame,
+        "rotation": _rotation,
+        "cable": _cable,
+        "linear drift": _drift,
+        "drift": _drift,
+    }
+    out += [makers[name](state) for name in model.parts if name in makers and name not in given]
+    if model.factor != 1.0:
+        out.append(_factor(state))
+    out += [_gain(state, c) for c in model.gains]
+    changes = [_change(state, i) for i in range(len(model.steps))]
+    changes += [_contact(*span) for span in state.spans if not _beside(span, model.times)]
+    return out + sorted(changes, key=lambda x: x.start_s or 0.0)
+
+
+def stretches(state: State, covariance: Array) -> list[Stretch]:
+    """The loads of a record whose load changes; of another, none.
+
+    Args:
+        state: the model.
+        covariance: (16, 16) of [offsets; phi] of the first stretch.
+    """
+    loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
+    if not loads:
+        return []
+    first, last = float(state.data.t[0]), float(state.data.t[-1])
+    ratio = np.sqrt(np.diag(covariance) / np.diag(state.fit.covariance)[:16])
+    map_ = np.zeros((16, state.model.size))
+    map_[:, :16] = np.eye(16)
+    out, start = [], first
+    for time, i in [*sorted(loads), (last, -1)]:
+        spread = map_ @ state.fit.covariance @ map_.T * np.outer(ratio, ratio)
+        out.append(Stretch(start, time, (map_ @ state.x)[6:], spread))
+        if i >= 0:
+            map_ = map_.copy()
+            map_[6:, state.model.slices[f"step {i}"]] = np.eye(10)
+        start = time
+    return out
+
+
+def _vector(x: Array, unit: str, digits: str = ".3g") -> str:
+    return f"[{', '.join(format(float(v), digits) for v in x)}] {unit}"
+
+
+def _axes(Q: Array) -> Cause:
+    rows = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in Q]
+    what = f"x, y, z of the wrench are {', '.join(rows)} of the motion"
+    if (-np.eye(3) == Q).all():
+        what = "the wrench has the opposite sign"
+    return Cause("axes", what, values={"axes": rows, "matrix": Q.tolist()})
+
+
+def _gravity(state: State) -> Cause:
+    assert state.data.gravity_W is not None
+    change, covariance = part(state, "gravity")
+    given = state.data.gravity_W
+    true = given - change
+    cosine = true @ given / np.linalg.norm(true) / np.linalg.norm(given)
+    angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    size = float(np.linalg.norm(true))
+    across = np.eye(3) - np.outer(true, true) / size**2
+    spread = float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
+    wide = float(np.degrees(np.sqrt(spread) / size))
+    return Cause(
+        "gravity direction",
+        f"gravity is {angle:.2f} deg (+- {1.96 * wide:.2g}) off the described direction in the base"
+        " of the arm",
+        values={"angle_deg": angle, "gravity": true.tolist()},
+    )
+
+
+def _weight(state: State) -> Cause:
+    removed, covariance = part(state, "weight")
+    deviation = float(np.sqrt(covariance[0, 0]))
+    mass = float(state.x[6])
+    own = float(np.sqrt(state.fit.covariance[6, 6]))
+    values = {"removed_mass": float(removed[0]), "removed_moment": removed[1:].tolist()}
+    if abs(removed[0] - mass) < 0.02 * mass + 4.0 * np.hypot(deviation, own):
+        return Cause(
+            "weight removed",
+            "the weight is already removed from the wrench, and the inertia of"
+            f" {mass:.4g} kg (+- {1.96 * own:.2g}) remains",
+            values=values,
+        )
+    com = removed[1:] / removed[0] if removed[0] else np.zeros(3)
+    return Cause(
+        "payload configured",
+        f"the weight of a payload of {removed[0]:.4g} kg (+- {1.96 * deviation:.2g}) at"
+        f" {_vector(1e3 * com, 'mm in S')} is already removed from the wrench, but the inertia is"
+        f" that of {mass:.4g} kg: the payload in the robot's controller is not that of the load",
+        values=values,
+    )
+
+
+def _factor(state: State) -> Cause:
+    factor = state.model.factor
+    if factor == -1.0:
+        what = "the torque has the opposite sign"
+    else:
+        what = f"the torque is {factor:.6g} times that which belongs to the force"
+    return Cause(
+        "torque factor",
+        f"{what}: unit or sign is wrong",
+        values={"factor": factor},
+    )
+
+
+def _gain(state: State, c: int) -> Cause:
+    value, covariance = part(state, f"gain {c}")
+    wide = 1.96 * float(np.sqrt(covariance[0, 0]))
+    return Cause(
+        "gain",
+        f"{CHANNELS[c]} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than the other"
+        " channels allow; calibrate the sensor",
+        values={"channel": CHANNELS[c], "gain": 1.0 + float(value[0])},
+    )
+
+
+def _frame(state: State) -> Cause:
+    r, covariance = part(state, "frame")
+    wide = 1e3 * 1.96 * np.sqrt(np.diag(covariance))
+    return Cause(
+        "pose frame",
+        f"the pose is that of a point at {_vector(-1e3 * r, 'mm in S')} (+- {wide.max():.2g} mm),"
+        " not of the sensor",
+        values={"position_in_sensor": (-r).tolist()},
+    )
+
+
+def _rotation(state: State) -> Cause:
+    rho, covariance = part(state, "rotation")
+    angle = float(np.degrees(np.linalg.norm(rho)))
+    wide = float(np.degrees(np.sqrt(np.diag(covariance).max())))
+    return Cause(
+        "sensor rotation",
+        f"the sensor is rotated by {angle:.2f} deg (+- {1.96 * wide:.2g}) against the motion, about"
+        f" {_vector(rho / (np.linalg.norm(rho) + 1e-12), 'in S', '.2f')}",
+        values={"rotation_vector": rho.tolist()},
+    )
+
+
+def _drift(state: State) -> Cause:
+    name = "drift" if "drift" in state.model.parts else "linear drift"
+    rows = part(state, name)[0].reshape(6, -1)
+    size = 2.0 * np.abs(rows).sum(axis=1)
+    return Cause(
+        "drift",
+        f"the offsets drift by up to {size[:3].max():.2g} N and {size[3:].max():.2g} N m within the"
+        " record; the stated offsets are their means: let the sensor warm up",
+        values={"range": size.tolist()},
+    )
+
+
+def _cable(state: State) -> Cause:
+    K = part(state, "cable")[0][3:9]
+    stiffness = float(np.abs(np.linalg.eigvalsh(K[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]])).max())
+    return Cause(
+        "cable",
+        f"something pulls at the load with a force that depends on the position (about"
+        f" {stiffness:.2g} N/m): a cable or hose; guide it so that it is slack",
+        values={"stiffness": stiffness},
+    )
+
+
+def _change(state: State, i: int) -> Cause:
+    step, (values, covariance) = state.model.steps[i], part(state, f"step {i}")
+    when = f"from t = {step.time:.2f} s on"
+    if step.kind == "offsets":
+        return Cause(
+            "zero change",
+            f"{when} the sensor has another zero: {_vector(values[:3], 'N')},"
+            f" {_vector(values[3:], 'N m')} are added (a tare in the record); the stated offsets"
+            " are those before",
+            start_s=step.time,
+            values={"change": values.tolist()},
+        )
+    mass, com = float(values[0]), mass_com_inertia(values)[1] if values[0] else np.zeros(3)
+    wide = 1.96 * float(np.sqrt(covariance[0, 0]))
+    what = "added" if mass > 0.0 else "removed"
+    return Cause(
+        "load change",
+        f"{when} there is another load: {abs(mass):.4g} kg (+- {wide:.2g}) at"
+        f" {_vector(1e3 * com, 'mm in S')} are {what}; the load is given for each stretch",
+        start_s=step.time,
+        values={"mass_change": mass, "com_of_change": np.asarray(com).tolist()},
+    )
+
+
+def _beside(span: tuple[float, float], times: tuple[float, ...]) -> bool:
+    """Whether a short contact is that of the hand which changes the load."""
+    near = any(span[0] - _NEAR_S < time < span[1] + _NEAR_S for time in times)
+    return near and span[1] - span[0] < _SHORT_S
+
+
+def _contact(start: float, stop: float) -> Cause:
+    return Cause(
+        "contact",
+        f"from t = {start:.2f} to {stop:.2f} s something touches the load; the stretch is not used",
+        start_s=start,
+        stop_s=stop,
+    )

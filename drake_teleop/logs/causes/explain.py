@@ -1,0 +1,100 @@
+"""Why a wrench is not that of a rigid load: test, search, and the load within the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.logs.causes.cause import Cause, Stretch, causes_of, stretches
+from drake_teleop.logs.causes.instants import Instants
+from drake_teleop.logs.causes.intervals import block_deviations, covariance_of
+from drake_teleop.logs.causes.model import DELAY, LOAD
+from drake_teleop.logs.causes.search import Later, explained, search
+from drake_teleop.logs.causes.state import State
+from drake_teleop.one_thread import one_blas_thread
+
+_NO_MASS, _NO_MASS_DEVIATIONS, _SURE = 0.010, 4.0, 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What acts on a sensor, as far as a record shows it.
+
+    Attributes:
+        causes: what acts beside a rigid load with constant offsets; empty if nothing does.
+        explained: whether the residual is the sensor's noise.
+        theta: (16,) [offsets; phi] within the model; of the first stretch if the load changes.
+        covariance: (16, 16) of theta.
+        blocks: (16,) deviations by leaving out parts of the record.
+        delay_s: of the motion behind the wrench, in addition to what `instants` had [s].
+        loads: the loads of a record whose load changes.
+        removed_weight: (4,) [m, m c] whose weight is already removed, or None.
+        given: parts of the model that are known to act, and are no causes.
+        state: model and residual.
+    """
+
+    causes: tuple[Cause, ...]
+    explained: bool
+    theta: Array
+    covariance: Array
+    blocks: Array
+    delay_s: float
+    loads: tuple[Stretch, ...]
+    removed_weight: Array | None
+    state: State
+    given: tuple[str, ...] = ()
+
+    @property
+    def several_gains(self) -> bool:
+        """Whether gains stand for errors of the whole matrix of gains."""
+        model = self.state.model
+        others = {"rotation", "cable"} & set(model.parts)
+        return len(model.gains) > 1 or bool(model.gains and others)
+
+
+def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] = ()) -> Explanation:
+    """Test whether a rigid load explains a record, and find what else acts if it does not.
+
+    Args:
+        data: the record.
+        later: returns the record with the motion of a delay [s] more.
+        given: parts of `Model` that are known to act, such as "weight".
+    """
+    with one_blas_thread():
+        state, late, rejected = search(data, later, given)
+        covariance = covariance_of(state, rejected)
+        causes = causes_of(state, given)
+        if not causes and _no_load(state, covariance):
+            causes = [_nothing_mounted(state, covariance)]
+        removed = None
+        if "weight" in state.model.parts:
+            removed = state.x[state.model.slices["weight"]]
+        return Explanation(
+            causes=tuple(causes),
+            explained=explained(state),
+            theta=state.x[LOAD],
+            covariance=covariance,
+            blocks=block_deviations(state),
+            delay_s=late + float(state.x[DELAY]),
+            loads=tuple(stretches(state, covariance)),
+            removed_weight=removed,
+            state=state,
+            given=given,
+        )
+
+
+def _no_load(state: State, covariance: Array) -> bool:
+    mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
+    least = max(_NO_MASS_DEVIATIONS * deviation, min(_NO_MASS, _SURE * deviation))
+    return bool(mass < least and deviation < 0.1)
+
+
+def _nothing_mounted(state: State, covariance: Array) -> Cause:
+    most = abs(float(state.x[6])) + 1.96 * float(np.sqrt(covariance[6, 6]))
+    return Cause(
+        "no load",
+        f"there is no load above {1e3 * most:.2g} g on the sensor: the record gives its offsets",
+        values={"mass_limit": most},
+    )

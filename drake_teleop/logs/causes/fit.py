@@ -1,0 +1,101 @@
+"""Gauss-Newton for a model, with autoregressive noise of order 4 in each channel.
+
+Noise and parameters are estimated in turn, for every model anew. The first two steps are
+unweighted: noise that is fitted to the residual of a smaller model takes the misfit for slow noise,
+and the larger model then has nothing to explain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.logs.causes.instants import FORCES, ORDER
+from drake_teleop.logs.causes.model import Model
+from drake_teleop.logs.causes.rows import Rows
+
+_STEPS, _CONVERGED, _PLAIN_STEPS = 12, 0.02, 2
+_RIDGE, _FLOOR = 1e-11, 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A model fitted to rows.
+
+    Attributes:
+        model: the model.
+        rows: what it was fitted to.
+        x: (size,) its parameters.
+        covariance: (size, size) by the noise; huge where nothing determines a parameter.
+        residual: (6, W) coefficients of the residual in y.
+        filters: (6, 5) of the noise: white = sum over d of filters[c, d] noise[n - d].
+        power: (6,) variance of that white noise.
+    """
+
+    model: Model
+    rows: Rows
+    x: Array
+    covariance: Array
+    residual: Array
+    filters: Array
+    power: Array
+
+    @property
+    def likelihood(self) -> float:
+        """Logarithm of the likelihood, but for a constant."""
+        return -0.5 * len(self.rows.whole) * float(np.log(self.power).sum())
+
+    def normal(self, model: Model, x: Array) -> tuple[Array, Array]:
+        """Gram and right-hand side of a step of a model from x, whose residual is this fit's."""
+        whitened = self.rows.whitened(self.filters) / self.power[:, None, None]
+        J = model.derivative(x).transpose(1, 0, 2)
+        weighted = J @ whitened
+        gram = (weighted @ J.transpose(0, 2, 1)).sum(axis=0)
+        right = (weighted @ self.residual[:, :, None]).sum(axis=0)[:, 0]
+        return 0.5 * (gram + gram.T), right
+
+
+def fit(model: Model, rows: Rows, start: Array | None = None, *, steps: int = _STEPS) -> Fit:
+    """Fit a model.
+
+    Args:
+        model: the model.
+        rows: with columns for its steps.
+        start: (size,) parameters to begin with.
+        steps: at most; the first two take the noise for white.
+    """
+    x = np.zeros(model.size) if start is None else start
+    count = max(float(rows.used.sum()), 1.0)
+    total = (rows.data.y[rows.used][:, FORCES] ** 2).sum(axis=0) / count
+    both = total.reshape(2, 3).sum(axis=1).repeat(3)
+    floor = np.maximum(_FLOOR * both, 1e-30)
+    filters = np.zeros((6, ORDER + 1))
+    filters[:, 0] = 1.0
+    found = Fit(model, rows, x, np.zeros(0), model.residual(x), filters, np.maximum(both, floor))
+    for step in range(steps):
+        gram, right = found.normal(model, x)
+        inverse = inverted(gram)
+        move = inverse @ right
+        move /= max(1.0, float(np.max(np.abs(move) / model.limits)))
+        x = x + move
+        residual = model.residual(x)
+        order = 0 if step + 1 < _PLAIN_STEPS else ORDER
+        filters, power = rows.noise(residual, floor, order)
+        found = Fit(model, rows, x, inverse, residual, filters, power)
+        still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGED
+        if still and step > _PLAIN_STEPS:
+            break
+    return found
+
+
+def inverted(gram: Array) -> Array:
+    """Inverse of a Gram matrix with a small ridge on its scaled diagonal."""
+    diagonal = np.diag(gram)
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-14 * diagonal.max() + 1e-300))
+    scaled = gram * np.outer(scale, scale)
+    scaled[np.diag_indices(len(gram))] += _RIDGE
+    values, vectors = np.linalg.eigh(scaled)
+    values = np.maximum(values, _RIDGE)
+    return np.asarray(scale[:, None] * ((vectors / values) @ vectors.T) * scale)

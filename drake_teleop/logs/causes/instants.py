@@ -1,0 +1,205 @@
+"""Wrench and motion as block means at about 50 Hz, and their sums of products by block and lag.
+
+All columns of all models in this package are linear in the signals of one instant,
+
+    y = [1, s, g, alpha, products of omega, F, dF/dt, R, R p, time],
+
+with s the specific force of So, g gravity, R = R_SW and p the position of S in the world. The means
+over a block are exact, because the models are linear in y and white noise stays white. The sums
+
+    G_d = sum of (y_n y_{n-d}^T + y_{n-d} y_n^T),   d = 0 ... 4 (G_0 once),
+
+contain everything that a fit with autoregressive noise of order 4 needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.load.arrays import Array
+
+ORDER = 4
+"""Of the autoregressive noise."""
+ONE, S, G, ALPHA, PRODUCTS = 0, slice(1, 4), slice(4, 7), slice(7, 10), slice(10, 16)
+FORCES, RATES, R, RP, TIME = (
+    slice(16, 22),
+    slice(22, 28),
+    slice(28, 37),
+    slice(37, 64),
+    slice(64, 67),
+)
+WIDTH = 67
+MOTION = np.r_[0:16, 28:37]
+"""Columns that a load's wrench depends on; a step has these again, multiplied by u(t - t1)."""
+_RATE, _MOST = 50.0, 20_000
+_BLOCK_S, _BLOCKS, _FEWEST_ROWS = 0.25, 320, 5
+_EXACT, _LIVELY = 5, 4.0
+_FINEST = 1e-4  # of the wrench: no sensor has less noise
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+Motion = Callable[[Array], tuple[Array, ...]]
+"""Of times (K,): s, omega, alpha (K, 3), and, if known, R_WS (K, 3, 3) and p (K, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Instants:
+    """Block means of a record.
+
+    Attributes:
+        t: (M,) middle of each block [s].
+        y: (M, WIDTH) signals; 0 in rows that are not used.
+        used: (M,) rows without gaps and edges.
+        white: (6,) standard deviation of the wrench's white noise in a block mean.
+        gravity_W: (3,) [m/s^2], or None if the orientation is unknown.
+        positions: whether p is known.
+        shake: standard deviation of the acceleration in a block mean, of noise alone [m/s^2].
+    """
+
+    t: Array
+    y: Array
+    used: NDArray[np.bool_]
+    white: Array
+    gravity_W: Array | None
+    positions: bool
+    shake: float = 0.0
+
+    @cached_property
+    def lively(self) -> bool:
+        """Whether the record accelerates enough to tell inertia from weight."""
+        a = (self.y[:, S] + self.y[:, G])[self.used]
+        return bool(np.sqrt(a.var(axis=0).max()) > _LIVELY * self.shake)
+
+    @property
+    def dt(self) -> float:
+        """Time from one instant to the next [s]."""
+        return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
+
+    @cached_property
+    def block(self) -> int:
+        """Rows of a block."""
+        least = -(-len(self.t) // _BLOCKS)
+        return max(least, _FEWEST_ROWS, round(_BLOCK_S / self.dt))
+
+    def only(self, used: NDArray[np.bool_]) -> Instants:
+        """The same with the rows `used` (M,) alone."""
+        return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
+
+    def with_steps(self, times: tuple[float, ...]) -> Array:
+        """(M, WIDTH + 25 len(times)) y, and its motion after each time."""
+        parts = [self.y]
+        for time in times:
+            share = np.clip((self.t - time) / self.dt + 0.5, 0.0, 1.0)
+            parts.append(self.y[:, MOTION] * share[:, None])
+        return np.hstack(parts)
+
+    def sums(self, y: Array, *, rows: int, lags: int = ORDER + 1) -> Array:
+        """(blocks, lags, W, W) of y (M, W), in blocks of so many rows."""
+        width = y.shape[1]
+        count = -(-len(y) // rows)
+        padded = np.zeros((lags - 1 + count * rows, width))
+        padded[lags - 1 : lags - 1 + len(y)] = y
+        now = padded[lags - 1 :].reshape(count, rows, width)
+        out = np.empty((count, lags, width, width))
+        for d in range(lags):
+            before = padded[lags - 1 - d : len(padded) - d].reshape(count, rows, width)
+            np.matmul(now.transpose(0, 2, 1), before, out=out[:, d])
+            if d:
+                out[:, d] += out[:, d].transpose(0, 2, 1).copy()
+        return out
+
+
+def instants(
+    t: Array,
+    wrench: Array,
+    motion: Motion | tuple[Array, ...],
+    gravity_W: Array | None,
+    lost: NDArray[np.bool_] | None = None,
+    shake: float = 0.0,
+) -> Instants:
+    """Block means of a record.
+
+    Args:
+        t: (N,) evenly spaced [s].
+        wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
+        motion: a function of time, or what it returns at `t`.
+        gravity_W: (3,) [m/s^2]; None if `motion` has no orientation.
+        lost: (N,) samples that do not count.
+        shake: as in `Instants`.
+    """
+    dt = float(t[-1] - t[0]) / (len(t) - 1)
+    size = max(1, round(1.0 / (_RATE * dt)), -(-len(t) // _MOST))
+    rows = len(t) // size
+    t, wrench = t[: rows * size], wrench[: rows * size]
+    middle = t.reshape(rows, size).mean(axis=1)
+    y = np.zeros((rows, WIDTH))
+    y[:, ONE] = 1.0
+    y[:, FORCES] = wrench.reshape(rows, size, 6).mean(axis=1)
+    y[1:-1, RATES] = (y[2:, FORCES] - y[:-2, FORCES]) / (2.0 * size * dt)
+    positions = _put_motion(y, t, size, motion, gravity_W)
+    y[:, TIME] = _legendre(np.linspace(-1.0, 1.0, rows))
+    used = np.ones(rows, bool)
+    used[[0, -1]] = False
+    if lost is not None:
+        used &= ~lost[: rows * size].reshape(rows, size).any(axis=1)
+    white = np.median(np.abs(np.diff(wrench, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0)
+    spread = np.sqrt(wrench.var(axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
+    white = np.maximum(white, _FINEST * spread)
+    out = Instants(middle, y, used, white / np.sqrt(size), gravity_W, positions, shake)
+    return out.only(used)
+
+
+def _put_motion(
+    y: Array,
+    t: Array,
+    size: int,
+    motion: Motion | tuple[Array, ...],
+    gravity_W: Array | None,
+) -> bool:
+    """Write the columns of the motion into y; return whether positions are known."""
+    rows = len(y)
+    if not callable(motion):
+        columns = _columns([x[: rows * size] for x in motion], gravity_W)
+        _put(y, columns.reshape(rows, size, -1).mean(axis=1))
+        return len(motion) == 5
+    if size <= _EXACT:
+        found = motion(t)
+        columns = _columns(found, gravity_W)
+        _put(y, columns.reshape(rows, size, -1).mean(axis=1))
+        return len(found) == 5
+    # Simpson's rule over a width that has the variance of `size` samples.
+    dt = float(t[-1] - t[0]) / (len(t) - 1)
+    middle = t.reshape(rows, size).mean(axis=1)
+    half = 0.5 * dt * np.sqrt(size**2 - 1.0)
+    total = np.zeros(())
+    for shift, weight in ((-half, 1.0), (0.0, 4.0), (half, 1.0)):
+        found = motion(middle + shift)
+        total = total + weight / 6.0 * _columns(found, gravity_W)
+    _put(y, total)
+    return len(found) == 5
+
+
+def _put(y: Array, columns: Array) -> None:
+    y[:, 1:16] = columns[:, :15]
+    y[:, R.start : R.start + columns.shape[1] - 15] = columns[:, 15:]
+
+
+def _columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
+    """(K, 15, 24 or 51) s, g, alpha, products of omega, R_SW, R_SW p."""
+    s, omega, alpha = motion[:3]
+    products = np.stack([omega[:, i] * omega[:, k] for i, k in _PAIRS], axis=1)
+    if len(motion) == 3 or gravity_W is None:
+        return np.hstack([s, np.zeros_like(s), alpha, products])
+    R_SW = np.swapaxes(motion[3], 1, 2)
+    parts = [s, R_SW @ gravity_W, alpha, products, R_SW.reshape(-1, 9)]
+    if len(motion) == 5:
+        parts.append((R_SW[:, :, :, None] * motion[4][:, None, None, :]).reshape(-1, 27))
+    return np.hstack(parts)
+
+
+def _legendre(x: Array) -> Array:
+    return np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)

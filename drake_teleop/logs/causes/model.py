@@ -1,0 +1,260 @@
+"""A rigid load and what else acts: the wrench as a function of few parameters.
+
+The measured wrench of an instant is
+
+    F = o + tau dF/dt + D [V(s + R_SW d + A r, omega, alpha) phi - V(-g, 0, 0)[:, :4] w + cable] + e
+
+with offsets o, remaining delay tau, and extensions: gravity off by -d in the world, a pose frame
+displaced by r (A r = alpha x r + omega x (omega x r)), weight w = [m, m c] that the robot has
+removed, a cable R_SW (f0 + K p) that acts at a, drift, steps of offsets or load. D has the axes Q
+of the wrench, a small rotation, a factor of the torque and gains of single channels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.load.arrays import Array
+from drake_teleop.load.batch.moments import coefficients
+from drake_teleop.logs.causes.instants import (
+    ALPHA,
+    FORCES,
+    MOTION,
+    ONE,
+    PRODUCTS,
+    RATES,
+    RP,
+    TIME,
+    WIDTH,
+    G,
+    R,
+    S,
+)
+
+LOAD, DELAY = slice(0, 16), 16
+"""Where the 16 parameters [offsets; phi] and the delay are."""
+_SIZES = {
+    "gravity": 3,
+    "weight": 4,
+    "torque factor": 1,
+    "frame": 3,
+    "rotation": 3,
+    "linear drift": 6,
+    "drift": 18,
+    "cable": 12,
+}
+_LIMITS = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
+"""Largest change of a parameter in a step [m, rad, 1]."""
+_R_OF_STEP = slice(16, 25)
+_LARGEST_DELAY = 0.03  # s, in a step
+_SMALL = 1e-4  # rad, of the numerical derivative by a rotation
+# (6, 10, 12) V of s, alpha and the products of omega.
+_V = coefficients()[:, 6:, 7:19]
+_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+
+
+@dataclass(frozen=True)
+class Step:
+    """A change at `time` [s] of the "offsets" (6) or of the "load" (10)."""
+
+    kind: str
+    time: float
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return 6 if self.kind == "offsets" else 10
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Which extensions are active.
+
+    Attributes:
+        parts: names of `_SIZES`.
+        gains: channels of which the gain is free.
+        steps: changes, in the order of their columns.
+        axes: (3, 3) Q, a signed permutation.
+        factor: of the torque, on which "torque factor" builds.
+    """
+
+    parts: tuple[str, ...] = ()
+    gains: tuple[int, ...] = ()
+    steps: tuple[Step, ...] = ()
+    axes: Array = field(default_factory=lambda: np.eye(3))
+    factor: float = 1.0
+
+    def extended(self, part: str) -> Model:
+        """The same with one more part."""
+        return self if part in self.parts else replace(self, parts=(*self.parts, part))
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Where the parameters of each extension are."""
+        out, at = {}, DELAY + 1
+        sizes = [(name, _SIZES[name]) for name in self.parts]
+        sizes += [(f"gain {c}", 1) for c in self.gains]
+        sizes += [(f"step {i}", step.size) for i, step in enumerate(self.steps)]
+        for name, size in sizes:
+            out[name] = slice(at, at + size)
+            at += size
+        return out
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return max([DELAY + 1, *(x.stop for x in self.slices.values())])
+
+    @cached_property
+    def columns(self) -> NDArray[np.intp]:
+        """Columns of y with its steps that the wrench depends on."""
+        wide = bool({"gravity", "cable"} & set(self.parts))
+        kept = np.ones(WIDTH + len(MOTION) * len(self.steps), bool)
+        if not wide:
+            kept[R], kept[RP] = False, False
+            for i in range(len(self.steps)):
+                kept[_after(i)][_R_OF_STEP] = False
+        return np.flatnonzero(kept)
+
+    @cached_property
+    def limits(self) -> Array:
+        """(size,) largest change of each parameter in a step."""
+        out = np.full(self.size, np.inf)
+        out[DELAY] = _LARGEST_DELAY
+        for name, where in self.slices.items():
+            out[where] = _LIMITS.get(name.split(" ")[0] if "gain" in name else name, np.inf)
+        return out
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Of the steps [s]."""
+        return tuple(step.time for step in self.steps)
+
+    def start(self, x: Array, of: Model) -> Array:
+        """(size,) parameters x of another model, 0 where it has none."""
+        out = np.zeros(self.size)
+        out[: DELAY + 1] = x[: DELAY + 1]
+        for name, where in self.slices.items():
+            if name in of.slices:
+                out[where] = x[of.slices[name]]
+        return out
+
+    def wrench(self, x: Array) -> Array:
+        """(B, 6, W) coefficients of the wrench in y, with parameters x (B, size)."""
+        width, parts = WIDTH + len(MOTION) * len(self.steps), self.slices
+        motion = self._motion(x)
+        out = np.zeros((len(x), 6, width))
+        out[..., :WIDTH] = _load(x[:, 6:16]) @ motion
+        for i, step in enumerate(self.steps):
+            if step.kind == "load":
+                out[..., _after(i)] = _load(x[:, parts[f"step {i}"]]) @ motion[..., MOTION]
+        if "weight" in parts:
+            static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _V[:, :4, :3])
+            out[..., G] += static  # - V(-g) w
+        if "cable" in parts:
+            out[..., :WIDTH] += _cable(x[:, parts["cable"]])
+        turned = self._turned(x)
+        out[:, :3], out[:, 3:] = turned @ out[:, :3], turned @ out[:, 3:]
+        factor = np.full(len(x), self.factor)
+        if "torque factor" in parts:
+            factor = factor * (1.0 + x[:, parts["torque factor"].start])
+        out[:, 3:] *= factor[:, None, None]
+        for c in self.gains:
+            out[:, c] *= 1.0 + x[:, parts[f"gain {c}"]]
+        self._add_constants(out, x)
+        return out
+
+    def _add_constants(self, out: Array, x: Array) -> None:
+        """Add what is not the load's: offsets, their changes and drift, and the delay."""
+        channels = np.arange(6)
+        out[:, :, ONE] += x[:, :6]
+        out[:, channels, RATES.start + channels] += x[:, DELAY, None]
+        for i, step in enumerate(self.steps):
+            if step.kind == "offsets":
+                out[:, :, _after(i).start] += x[:, self.slices[f"step {i}"]]
+        for name, degree in (("linear drift", 1), ("drift", 3)):
+            if name in self.slices:
+                rows = x[:, self.slices[name]].reshape(-1, 6, degree)
+                out[:, :, TIME.start : TIME.start + degree] += rows
+
+    def _motion(self, x: Array) -> Array:
+        """(B or 1, 12, WIDTH) s, alpha and the products of omega as functions of y."""
+        parts = self.slices
+        varied = "gravity" in parts or "frame" in parts
+        M = np.zeros((len(x) if varied else 1, 12, WIDTH))
+        for rows, where in ((slice(0, 3), S), (slice(3, 6), ALPHA), (slice(6, 12), PRODUCTS)):
+            M[:, rows, where] = np.eye(rows.stop - rows.start)
+        if "gravity" in parts:
+            d = x[:, parts["gravity"]]
+            for i in range(3):
+                M[:, i, R.start + 3 * i : R.start + 3 * i + 3] += d
+        if "frame" in parts:
+            r = x[:, parts["frame"]]
+            M[:, :3, ALPHA] -= _cross(r)
+            M[:, :3, PRODUCTS] += _centripetal(r)
+        return M
+
+    def _turned(self, x: Array) -> Array:
+        """(B or 1, 3, 3) rotation of the wrench."""
+        if "rotation" not in self.slices:
+            return self.axes[None]
+        return Rotation.from_rotvec(x[:, self.slices["rotation"]]).as_matrix() @ self.axes
+
+    def derivative(self, x: Array) -> Array:
+        """(size, 6, k) of the wrench's coefficients in `columns` by the parameters x (size,).
+
+        They are linear in each parameter but the rotation, so that differences are exact.
+        """
+        steps = np.ones(self.size)
+        if "rotation" in self.slices:
+            steps[self.slices["rotation"]] = _SMALL
+        moves = np.diag(steps)
+        both = self.wrench(np.vstack([x + moves, x - moves]))
+        change = both[: self.size] - both[self.size :]
+        return np.asarray(change[..., self.columns] / (2.0 * steps[:, None, None]))
+
+    def residual(self, x: Array) -> Array:
+        """(6, k) coefficients of the residual in `columns`."""
+        out = -self.wrench(x[None])[0]
+        out[np.arange(6), FORCES.start + np.arange(6)] += 1.0
+        return np.asarray(out[:, self.columns])
+
+
+def _after(i: int) -> slice:
+    """Columns of the motion after step i."""
+    return slice(WIDTH + len(MOTION) * i, WIDTH + len(MOTION) * (i + 1))
+
+
+def _load(phi: Array) -> Array:
+    return np.einsum("bj,cjk->bck", phi, _V)
+
+
+def _cable(x: Array) -> Array:
+    """(B, 6, WIDTH) of f0 (3), K (6, upper triangle), a (3)."""
+    out = np.zeros((len(x), 6, WIDTH))
+    K = x[:, 3:9][:, _SYMMETRIC]
+    for i in range(3):
+        out[:, i, R.start + 3 * i : R.start + 3 * i + 3] = x[:, :3]
+        out[:, i, RP.start + 9 * i : RP.start + 9 * i + 9] = K.reshape(-1, 9)
+    out[:, 3:] = _cross(x[:, 9:]) @ out[:, :3]
+    return out
+
+
+def _cross(r: Array) -> Array:
+    """(B, 3, 3) with M v = r x v."""
+    out = np.zeros((len(r), 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[:, k, j], out[:, j, k] = r[:, i], -r[:, i]
+    return out
+
+
+def _centripetal(r: Array) -> Array:
+    """(B, 3, 6) with M [products of omega] = omega x (omega x r)."""
+    (x, y, z), o = r.T, np.zeros(len(r))
+    rows = [[o, -x, -x, y, z, o], [-y, o, -y, x, o, z], [-z, -z, o, o, x, y]]
+    return np.moveaxis(np.array(rows), -1, 0)

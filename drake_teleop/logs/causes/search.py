@@ -1,0 +1,147 @@
+"""The absolute test of a fit, and the search for what else acts where it fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from drake_teleop.logs.causes.candidates import (
+    ORDER,
+    Candidate,
+    candidates,
+    negative,
+    plausible,
+    tilted,
+)
+from drake_teleop.logs.causes.contacts import contact_of_steps, phases, shrunk
+from drake_teleop.logs.causes.delay import free_delay
+from drake_teleop.logs.causes.instants import Instants
+from drake_teleop.logs.causes.model import DELAY, Model
+from drake_teleop.logs.causes.state import State
+
+ROUNDS = 4
+Later = Callable[[float], Instants]
+_LATE, _LATEST, _SAME, _MOVES = 5e-4, 0.3, 0.004, 4  # s
+LOUD, IMPLAUSIBLE, SCORE = 1.25, 2.2, 20.0
+"""Limits of the absolute test: residual over white noise, `State.probe`, `State.score`."""
+_NAMED, _NEAR, _SHARE = 40.0, 25.0, 0.02
+_FIFTH, _COLOURED, _SMALLER, _CERTAIN = 0.2, 15.0, 0.9, 1000.0
+_SMOOTH = 1.35
+"""Largest probe of good records; what is left beyond it could resemble any cause."""
+_FLEXIBLE, _WIDE, _WIDE_SHARE = ("cable", "drift"), 80.0, 0.1
+"""Causes whose many columns resemble others, and the margin by which they have to win."""
+
+
+def explained(state: State) -> bool:
+    """Whether the residual is the sensor's noise: size, smooth columns, and likely extensions."""
+    if negative(state) or state.loudness > LOUD or state.probe > IMPLAUSIBLE:
+        return False
+    model = state.model
+    parts = ["frame", "linear drift", "rotation"]
+    if state.data.gravity_W is not None:
+        parts += ["gravity", "weight"]
+    larger = [model.extended(name) for name in parts if name not in model.parts]
+    larger += [replace(model, gains=(*model.gains, c)) for c in range(6) if c not in model.gains]
+    return all(state.score(x) < SCORE for x in larger)
+
+
+Found = tuple[State, float, list[Candidate]]
+
+
+def search(data: Instants, later: Later | None = None, given: tuple[str, ...] = ()) -> Found:
+    """Find the model that explains a record.
+
+    A delay that was estimated with a wrong model may be wrong. If nothing explains the record, the
+    search starts again from the delay that the motion has in the least squares of all signals.
+
+    Args:
+        data: the record.
+        later: returns the record with the motion of a delay [s] more.
+        given: parts of the model from the start.
+
+    Returns:
+        the model, the delay that was added [s], and the candidates that the last round rejected.
+    """
+    found = _search(_begun(data, given), 0.0, later)
+    settled = found[0].probe < _SMOOTH and found[0].loudness < _COLOURED
+    if later is None or settled or explained(found[0]):
+        return found
+    late = free_delay(data)
+    if abs(late - found[1]) < _SAME:
+        return found
+    other = _search(_begun(later(late), given), late, later)
+    better = explained(other[0]) or other[0].likelihood > found[0].likelihood + _NAMED
+    return other if better else found
+
+
+def _begun(data: Instants, given: tuple[str, ...]) -> State:
+    state = State.of(data, Model(parts=given))
+    start = tilted(state) if "gravity" in given else None
+    return state if start is None else State.of(data, state.model, start)
+
+
+def _search(state: State, late: float, later: Later | None) -> Found:
+    """Add the most plausible extension until the record is explained or nothing explains more."""
+    state, late = _in_time(state, late, later)
+    last: list[Candidate] = []
+    for number in range(ROUNDS):
+        if explained(state):
+            return state, late, []
+        found = candidates(state, first=number == 0)
+        last = [x for x in found if plausible(x.state) and _effective(x, state)]
+        winner = _winner(last) or _long_contact(state, last)
+        if winner is None:
+            break
+        larger = contact_of_steps(winner.state)
+        if winner.name == "contact":
+            larger = phases(larger) or shrunk(larger)
+        state, late = _in_time(larger, late, later)
+        last = [x for x in last if x is not winner]
+        if winner.name == "cable":
+            return state, late, []
+    return state, late, last
+
+
+def _in_time(state: State, late: float, later: Later | None) -> tuple[State, float]:
+    """Take the remaining delay out of the motion, which the model has to first order only."""
+    for _ in range(_MOVES):
+        if later is None or abs(state.x[DELAY]) < _LATE or abs(late) > _LATEST:
+            break
+        late += float(state.x[DELAY])
+        x = state.x.copy()
+        x[DELAY] = 0.0
+        state = State.of(later(late), state.model, x, state.spans)
+    return state, late
+
+
+def _long_contact(state: State, found: list[Candidate]) -> Candidate | None:
+    """A contact without which the residual is a fifth.
+
+    The likelihood does not show a long and smooth contact: coloured noise predicts it as well.
+    """
+    for candidate in found:
+        if candidate.name == "contact" and candidate.state.loudness < _FIFTH * state.loudness:
+            return candidate
+    return None
+
+
+def _effective(candidate: Candidate, state: State) -> bool:
+    """Whether the residual shrinks or becomes more like noise, and not its likelihood alone."""
+    other = candidate.state
+    better = other.loudness < _SMALLER * state.loudness or other.probe < _SMALLER * state.probe
+    return bool(better or negative(state) or candidate.score > _CERTAIN)
+
+
+def _winner(found: list[Candidate]) -> Candidate | None:
+    """The most plausible of the candidates with nearly the best score.
+
+    What it leaves has to be small for its score: a large misfit resembles many causes a little.
+    """
+    best = max([x.score for x in found], default=0.0)
+    if best < _NAMED:
+        return None
+    top = max(found, key=lambda x: x.score).name
+    margin = max(_NEAR, _SHARE * best) if top not in _FLEXIBLE else max(_WIDE, _WIDE_SHARE * best)
+    near = [x for x in found if x.score > max(_NAMED, best - margin)]
+    first = min(near, key=lambda x: ORDER.index(x.name))
+    return first if first.score > _NAMED * max(1.0, first.state.probe / _SMOOTH) ** 1.5 else None

@@ -1,0 +1,139 @@
+"""The motion of S at the times of a log's wrench, by splines of its poses: one for all commands.
+
+`pose_motion` chooses the splines by the wrench. Near the first and the last pose, and beside gaps,
+a spline has poses on one side only. Its acceleration is up to 60 times as noisy there; from two
+knots on it is at most twice as noisy as elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.pose_motion.estimate import (
+    PoseEstimate,
+    PoseMotion,
+    estimate_from_poses,
+    motion_of_load,
+)
+from drake_teleop.logs.read.alignment import undelayed
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.delay import delay_of
+
+_DELAY_KNOWN = 0.005  # s, standard deviation
+_KNOTS = 2.0
+_Motion = TypeVar("_Motion", bound=PoseMotion)
+
+
+def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
+    """Motion and load of a log with poses, and the source of the delay.
+
+    Args:
+        log: as it was read.
+        delay: of the motion behind the wrench [s], or "auto".
+
+    Raises:
+        DrakeTeleopError: if too little of the record can be used, or for another delay.
+    """
+    return _with_delay(log, delay, lambda late: _estimate(log, late), 0.0, "undetermined")
+
+
+def motion_of_known_load(
+    log: Log, delay: str | float, load: NDArray[np.float64], usual_s: float
+) -> tuple[PoseMotion, str] | None:
+    """The motion with which an identified load explains a log best, and the source of the delay.
+
+    None without poses that have positions, for a record that is too short, and if an IMU beside the
+    poses measures another motion.
+
+    Args:
+        log, delay: as of `motion_and_load`.
+        load: (6, 16) as of `drake_teleop.logs.pose_motion.rigid.load_coefficients`.
+        usual_s: the delay of a record that does not determine it [s].
+    """
+    posed = log.posed
+    if posed is None or log.static:
+        return None
+    arrays = log.t, log.wrench, posed.poses, posed.gravity_W, load
+
+    def chosen(late: float | None) -> PoseMotion:
+        return motion_of_load(*arrays, delay=late, lost=log.bridged, imu=posed.imu)
+
+    with suppress(DrakeTeleopError):  # too short
+        found, source = _with_delay(log, delay, chosen, usual_s, "load")
+        return (found, source) if found.imu_agrees else None
+    return None
+
+
+def _with_delay(
+    log: Log,
+    delay: str | float,
+    motion: Callable[[float | None], _Motion],
+    usual_s: float,
+    usual: str,
+) -> tuple[_Motion, str]:
+    """The motion with the delay that is given, or that the record determines, or the usual one."""
+    known, source = (None, "estimated") if delay == "auto" else delay_of(log, None, delay)
+    found = motion(known)
+    if known is None and not found.delay_deviation < _DELAY_KNOWN:
+        return motion(usual_s), usual
+    return found, source
+
+
+def _estimate(log: Log, delay: float | None) -> PoseEstimate:
+    assert log.posed is not None
+    return estimate_from_poses(
+        log.t,
+        log.wrench,
+        log.posed.poses,
+        log.posed.gravity_W,
+        delay=delay,
+        gain=log.gain_std,
+        lost=log.bridged,
+        imu=log.posed.imu,
+    )
+
+
+def moved_by_splines(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
+    """The log with motion and gravity of the splines at the times of its wrench.
+
+    Returns:
+        the log without the delay, and (N,) its samples within two knots of an end or a gap of the
+        poses.
+    """
+    assert log.posed is not None
+    moved, splines = undelayed(log, found.delay_s), found.splines
+    t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
+    s, omega, alpha = splines.motion(t, gravity_W)
+    moved = replace(
+        moved,
+        specific_force=s,
+        angular_velocity=omega,
+        angular_acceleration=alpha,
+        gravity=splines.gravity(t, gravity_W),
+    )
+    stamps, margin = splines.poses.t, _KNOTS * splines.spacing
+    gaps = np.flatnonzero(np.diff(stamps) > splines.spacing)
+    ends = stamps[np.concatenate([[0], gaps, gaps + 1, [len(stamps) - 1]])]
+    change = np.zeros(len(t) + 1)
+    np.add.at(change, np.searchsorted(t, ends - margin), 1.0)
+    np.add.at(change, np.searchsorted(t, ends + margin), -1.0)
+    return moved, np.cumsum(change[:-1]) > 0.0
+
+
+def clock_note(found: PoseMotion) -> list[str]:
+    """That the clock of the poses runs at another rate than that of the wrench, if it does."""
+    if not found.clock_rate:
+        return []
+    side = "faster" if found.clock_rate > 0.0 else "slower"
+    return [
+        f"the clock of the pose runs {1e6 * abs(found.clock_rate):.0f} millionths {side} than"
+        " that of the wrench, which is taken out; to say so, multiply pose.time.scale (1 by"
+        f" default) by {1.0 / (1.0 + found.clock_rate):.6f}"
+    ]

@@ -1,0 +1,68 @@
+"""The sample log with a sensor that is not connected, or a clock that is coarse."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs.check import conventions
+from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.sample import sample_log_command
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory):
+    """A sample log, to be spoilt."""
+    folder = tmp_path_factory.mktemp("sample")
+    sample_log_command(folder, quiet=True)
+    return folder, pl.read_csv(folder / "free_wrench.csv"), pl.read_csv(folder / "free_pose.csv")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("wrench_ms", "pose_ms"), [(100, 0), (200, 0), (0, 100), (100, 100)])
+def test_the_load_is_identified_though_the_stamps_are_coarse(tables, wrench_ms, pose_ms):
+    """What questions the fit thins the rows, and their stamps, too."""
+    folder, wrench, pose = tables
+    if wrench_ms:
+        wrench = wrench.with_columns((pl.col("time") / wrench_ms).floor() * wrench_ms)
+    if pose_ms:
+        step = 1e-3 * pose_ms
+        pose = pose.with_columns((pl.col("uptime") / step).floor() * step)
+    wrench.write_csv(folder / "free_wrench.csv")
+    pose.write_csv(folder / "free_pose.csv")
+    found = identify_log(folder / "free.yaml").identification
+    assert found.mass == pytest.approx(0.95, abs=2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [DrakeTeleopError, OverflowError, np.linalg.LinAlgError])
+def test_a_check_that_fails_is_no_error_of_the_log(tables, error, monkeypatch):
+    folder, wrench, pose = tables
+    wrench.write_csv(folder / "free_wrench.csv")
+    pose.write_csv(folder / "free_pose.csv")
+
+    def fail(*_):
+        raise error("of our own")
+
+    monkeypatch.setattr(conventions, "check_log", fail)
+    monkeypatch.setattr(conventions, "_doubted", lambda *_: True)
+    assert identify_log(folder / "free.yaml").identification.mass == pytest.approx(0.95, abs=2e-3)
+
+
+@pytest.mark.parametrize("change", [0.0, 1e-9])
+@pytest.mark.parametrize("value", [3.5, -1e4, 0.0])
+@pytest.mark.slow
+def test_a_wrench_that_never_changes_is_said_to(tables, change, value):
+    """By a sensor that is not connected, whose driver repeats one value."""
+    folder, wrench, pose = tables
+    names = [name for name in wrench.columns if name != "time"]
+    noise = change * np.random.default_rng(0).normal(size=len(wrench))
+    same = wrench.with_columns(*(pl.Series(name, value + value * noise) for name in names))
+    same.write_csv(folder / "free_wrench.csv")
+    pose.write_csv(folder / "free_pose.csv")
+    with pytest.raises(DrakeTeleopError, match=r"the same in all samples|is the sensor connected"):
+        identify_log(folder / "free.yaml")
+    inspect_command(folder / "free.yaml", folder / "inspected", quiet=True)

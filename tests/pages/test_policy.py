@@ -1,0 +1,46 @@
+"""The policy of a page: its own scripts run and no others, nothing is loaded."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+
+import numpy as np
+import pytest
+
+from drake_teleop.film import Film
+from drake_teleop.pages.html import render
+from drake_teleop.pages.policy import policy
+
+CODE = "const a = 1;\nlet b = 'é';"
+
+
+def hashed(script: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
+
+
+@pytest.mark.parametrize("tag", ["<script>", '<script type="text/javascript">', "<script id=a>"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_scripts_are_allowed_by_what_is_in_them(tag, end):
+    """As a browser reads them: with line feeds alone."""
+    page = f"<body>{tag}{CODE}</script><p>{tag}other()</script>".replace("\n", end)
+    parts = dict(part.split(" ", 1) for part in policy(page).split("; "))
+    assert parts["script-src"].split() == [hashed(CODE), hashed("other()")]
+    assert parts["default-src"] == parts["base-uri"] == parts["form-action"] == "'none'"
+
+
+def test_a_server_is_named_and_a_file_reaches_nothing():
+    served = dict(part.split(" ", 1) for part in policy("", "127.0.0.1:80").split("; "))
+    assert served["connect-src"].split() == ["'self'", "ws://127.0.0.1:80", "data:", "blob:"]
+    assert served["script-src"].split() == ["'self'"]
+    assert "http" not in policy("<script>x</script>") and "'self'" not in policy("")
+
+
+def test_films_and_reports_have_one(tmp_path):
+    film = Film("x", np.arange(2.0), 1.0)
+    film.write(tmp_path / "x.html", lambda meshcat: lambda time, frame: None)
+    page = (tmp_path / "x.html").read_text(encoding="utf-8")
+    head, _, rest = page.partition("<title>")
+    assert policy(page) in head and "<script" not in head and rest.count("<script") >= 3
+    report = render("drake_teleop.pages", "page.html.j2")
+    assert "default-src 'none'" in report.partition("<title>")[0]

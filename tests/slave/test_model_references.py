@@ -1,0 +1,314 @@
+"""Files that a model names are read inside its folder and packages; nothing ends the process."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.slave import model_references
+from drake_teleop.slave.model_references import ModelFiles
+from drake_teleop.slave.models import ParsedModel, ParseModel
+
+SOLID = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+LINK = """<link name="l"><inertial><mass>1</mass><inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz>
+</inertia></inertial></link>"""
+URDF_LINK = """<link name="l"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0"
+iyy="1" iyz="0" izz="1"/></inertial><visual><geometry><mesh filename="{mesh}"/></geometry></visual>
+</link>"""
+OUTSIDE = "outside the model's folder"
+
+
+def parse(path: Path, packages: tuple[Path, ...] = ()) -> ParsedModel:
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    found = ParseModel(plant, path, "l", packages)
+    plant.Finalize()
+    return found
+
+
+def urdf(mesh: str) -> str:
+    return f'<robot name="r">{URDF_LINK.format(mesh=mesh)}</robot>'
+
+
+def sdf(inside: str) -> str:
+    return f'<sdf version="1.9"><model name="m">{inside}</model></sdf>'
+
+
+def including(uri: str) -> str:
+    return sdf(f"<include><uri>{uri}</uri></include>")
+
+
+def mjcf(inside: str) -> str:
+    return f'<mujoco model="m">{inside}</mujoco>'
+
+
+def directive(file: str, kind: str = "add_model") -> str:
+    name = "name: m, " if kind == "add_model" else ""
+    return f"directives: [{kind}: {{{name}file: '{file}'}}]"
+
+
+def gltf(**more: object) -> dict:
+    corners, faces = (0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1), (0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3)
+    data = base64.b64encode(struct.pack("<12f12H", *corners, *faces)).decode()
+    views = [{"buffer": 0, "byteLength": 48}, {"buffer": 0, "byteOffset": 48, "byteLength": 24}]
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+        {"bufferView": 1, "componentType": 5123, "count": 12, "type": "SCALAR"},
+    ]
+    accessors[0] |= {"min": [0, 0, 0], "max": [1, 1, 1]}
+    return {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "buffers": [{"uri": f"data:application/octet-stream;base64,{data}", "byteLength": 72}],
+        "bufferViews": views, "accessors": accessors,
+    } | more  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Of a model, beside a file that is somebody else's."""
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    (tmp_path / "other.sdf").write_text(sdf('<link name="l"/>'))
+    (tmp_path / "solid.obj").write_text(SOLID)
+    (tmp_path / "model").mkdir()
+    return tmp_path / "model"
+
+
+def write(folder: Path, **files: str | dict) -> Path:
+    """The first of some files, whose names have _ for the point."""
+    paths = [folder / name.replace("_", ".", 1) for name in files]
+    for path, content in zip(paths, files.values(), strict=True):
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return paths[0]
+
+
+TWICE = '"images": [{"uri": "../secret.png", "uri": "x"}]'
+IMAGES = {
+    "absolute": lambda folder: gltf(images=[{"uri": str(folder.parent / "secret.png")}]),
+    "relative": lambda _: gltf(images=[{"uri": "../secret.png"}]),
+    "encoded": lambda _: gltf(images=[{"uri": "..%2Fsecret.png"}]),
+    "file": lambda folder: gltf(images=[{"uri": f"file://{folder.parent}/secret.png"}]),
+    "buffer": lambda _: gltf(buffers=[{"uri": "../secret.png", "byteLength": 6}]),
+    "extension": lambda _: gltf(extensions={"x": {"y": [{"uri": "../secret.png"}]}}),
+    "password": lambda _: gltf(images=[{"uri": "/etc/passwd"}]),
+    "device": lambda _: gltf(buffers=[{"uri": "/dev/zero", "byteLength": 72}]),
+    "twice": lambda _: (
+        json.dumps(gltf())[:-1] + ', "images": [{"uri": "../secret.png", "uri": "x"}]}'
+    ),
+}
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_a_gltf_reads_no_file_outside(folder: Path, name: str) -> None:
+    path = write(folder, a_urdf=urdf("x.gltf"), x_gltf=IMAGES[name](folder))
+    assert any(OUTSIDE in words for words in parse(path).assumptions)
+
+
+def test_a_binary_gltf_reads_no_file_outside(folder: Path) -> None:
+    text = json.dumps(gltf(images=[{"uri": "../secret.png"}])).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON")
+    (folder / "x.glb").write_bytes(head + text)
+    with pytest.raises(DrakeTeleopError, match=OUTSIDE):
+        ModelFiles(write(folder, a_urdf=urdf("x.glb")), ()).check(folder / "x.glb")
+
+
+@pytest.mark.parametrize(
+    ("library", "texture"),
+    [
+        ("x.mtl", "../secret.png"),
+        ("x.mtl", "-bm 1 {root}/secret.png"),
+        ("../x.mtl", "y.png"),
+        ("/etc/passwd", ""),
+    ],
+)
+def test_an_obj_reads_no_material_and_no_texture_outside(
+    folder: Path, library: str, texture: str
+) -> None:
+    path = write(folder, a_urdf=urdf("x.obj"), x_obj=f"mtllib {library}\n{SOLID}")
+    if texture:
+        (folder / library).write_text(f"newmtl a\nmap_Kd {texture.format(root=folder.parent)}\n")
+    assert any(OUTSIDE in words for words in parse(path).assumptions)
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        *("../solid.obj", "{root}/solid.obj", "file://{root}/solid.obj", "link.obj"),
+        *("package://home/solid.obj", "package://../solid.obj", "package://away/solid.obj"),
+    ],
+)
+def test_a_mesh_outside_is_left_out_and_the_remedy_named(tmp_path: Path, where: str) -> None:
+    home = tmp_path / "home"
+    (home / "model").mkdir(parents=True)
+    (home / "solid.obj").write_text(SOLID)
+    (home / "model" / "link.obj").symlink_to(home / "solid.obj")
+    (home / "model" / "away").symlink_to(home)
+    path = write(home / "model", a_urdf=urdf(where.format(root=home)))
+    (words,) = [words for words in parse(path).assumptions if "shapes" in words]
+    assert "--package-path" in words
+    if where.startswith(("package://..", "package://away")):
+        return
+    assert not any("shapes" in words for words in parse(path, (home,)).assumptions)
+    (home / "package.xml").touch()  # a ROS package, as its author made it
+    assert not any("shapes" in words for words in parse(path).assumptions)
+
+
+def circle(text: Callable[[str], str], *names: str) -> dict[str, str]:
+    """Files that name each other."""
+    others = (*names[1:], names[0])
+    return {name.replace(".", "_"): text(other) for name, other in zip(names, others, strict=True)}
+
+
+INCLUDES: dict[str, tuple[Callable[[Path], dict[str, str]], str]] = {
+    "sdf itself": (lambda _: circle(including, "a.sdf"), "names itself"),
+    "sdf in a circle": (lambda _: circle(including, "a.sdf", "b.sdf", "c.sdf"), "names itself"),
+    "sdf by file": (lambda f: {"a_sdf": including(f"file://{f}/a.sdf")}, "names itself"),
+    "sdf outside": (lambda _: {"a_sdf": including("../other.sdf")}, OUTSIDE),
+    "a fifo": (lambda _: {"a_sdf": including("fifo.sdf")}, "which is no file"),
+    "mjcf itself": (
+        lambda _: circle(lambda to: mjcf(f'<include file="{to}"/>'), "a.xml"),
+        "names itself",
+    ),
+    "mjcf in a circle": (
+        lambda _: circle(
+            lambda to: mjcf(f'<worldbody><include file="{to}"/></worldbody>'), "a.xml", "b.xml"
+        ),
+        "names itself",
+    ),
+    "mjcf mesh": (
+        lambda _: {"a_xml": mjcf('<asset><mesh file="../solid.obj"/></asset>')},
+        OUTSIDE,
+    ),
+    "mjcf device": (
+        lambda _: {"a_xml": mjcf('<asset><mesh file="/dev/zero"/></asset>')},
+        OUTSIDE,
+    ),
+    "mjcf mesh in a folder": (
+        lambda f: {
+            "a_xml": mjcf(
+                f'<asset><mesh file="solid.obj"/></asset><compiler meshdir="{f.parent}"/>'
+            )
+        },
+        OUTSIDE,
+    ),
+    "mjcf texture of an include": (
+        lambda _: {
+            "a_xml": mjcf('<include file="b.xml"/><include file="c.xml"/>'),
+            "b_xml": mjcf('<asset><texture file="secret.png"/></asset>'),
+            "c_xml": mjcf('<compiler texturedir=".."/>'),
+        },
+        OUTSIDE,
+    ),
+    "directives themselves": (
+        lambda f: circle(lambda to: directive(f"file://{f}/{to}", "add_directives"), "a.yaml"),
+        "names itself",
+    ),
+    "directives through a folder that is not there": (
+        lambda f: {"a_yaml": directive(f"file://{f}/none/../a.yaml", "add_directives")},
+        "names itself",
+    ),
+    "directives in a circle": (
+        lambda f: circle(
+            lambda to: directive(f"file://{f}/{to}", "add_directives"), "a.yaml", "b.yaml"
+        ),
+        "names itself",
+    ),
+    "directives outside": (
+        lambda f: {"a_yaml": directive(f"file://{f.parent}/other.sdf")},
+        OUTSIDE,
+    ),
+    "directives, a mesh outside": (
+        lambda f: {"a_yaml": directive(f"file://{f}/b.urdf"), "b_urdf": urdf("../solid.obj")},
+        OUTSIDE,
+    ),
+    "package of Drake": (
+        lambda _: {"a_yaml": directive(f"package://drake/{'../' * 30}etc/passwd")},
+        OUTSIDE,
+    ),
+    "thrice as many each time": (
+        lambda _: (
+            {
+                f"m{k}_sdf": sdf(
+                    "".join(
+                        f"<include><name>{name}</name><uri>m{k + 1}.sdf</uri></include>"
+                        for name in "abc"
+                    )
+                )
+                for k in range(12)
+            }
+            | {"m12_sdf": sdf(LINK)}
+        ),
+        "takes more than 2000 files",
+    ),
+    "a long way": (
+        lambda _: (
+            {f"m{k}_sdf": including(f"m{k + 1}.sdf") for k in range(300)} | {"m300_sdf": sdf(LINK)}
+        ),
+        "is nested too deeply",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", INCLUDES)
+def test_an_include_that_may_not_be_is_one_line(folder: Path, name: str) -> None:
+    make, says = INCLUDES[name]
+    os.mkfifo(folder / "fifo.sdf")
+    path = write(folder, **make(folder))
+    with pytest.raises(DrakeTeleopError, match=says):
+        parse(path)
+
+
+def test_a_file_where_the_process_is_is_none_of_the_model(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Drake looks there for what included files include."""
+    monkeypatch.chdir(folder.parent)
+    path = write(folder, a_sdf=including("b.sdf"), b_sdf=including("other.sdf"))
+    with pytest.raises(DrakeTeleopError, match=OUTSIDE):
+        parse(path)
+
+
+def test_too_large_files_are_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(folder, a_urdf=urdf("x.gltf"), x_gltf=gltf())
+    monkeypatch.setattr(model_references, "_MAX_TEXT", 400)
+    assert any("takes more than" in words for words in parse(path).assumptions)
+    monkeypatch.setattr(model_references, "_MAX_TEXT", 100)
+    with pytest.raises(DrakeTeleopError, match=r"a\.urdf: takes more than"):
+        parse(path)
+
+
+@pytest.mark.parametrize("name", ["model", "robots #2", "a b%20", "ä:b"])
+def test_files_inside_are_read_wherever_the_process_is(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / name
+    for inner in ("parts", "inner"):
+        (folder / inner).mkdir(parents=True)
+    materials = "newmtl a\nmap_Kd a.png\n"
+    solid = f"mtllib solid.mtl\n{SOLID}"
+    write(folder / "parts", solid_obj=solid, solid_mtl=materials, a_png="")
+    config = "<model><sdf version='1.9'>a.sdf</sdf></model>"
+    write(folder / "inner", model_config=config, a_sdf=sdf(LINK))
+    monkeypatch.chdir(tmp_path)
+    path = write(folder, a_urdf=urdf("parts/solid.obj"))
+    assert not any("shapes" in words for words in parse(path).assumptions)
+    for k, uri in enumerate(("inner", "inner/a.sdf", "model://inner")):
+        path = write(folder, **{f"b{k}_sdf": including(uri)})
+        assert parse(path).sensor_frame.name() == "l"
+    body = '<body name="l"><geom type="mesh" mesh="solid"/></body>'
+    asset = '<asset><mesh name="solid" file="solid.obj"/></asset>'
+    path = write(
+        folder,
+        c_xml=mjcf(f'<include file="d.xml"/><worldbody>{body}</worldbody>'),
+        d_xml=mjcf(f'<compiler meshdir="parts"/>{asset}'),
+    )
+    assert parse(path).sensor_frame.name() == "l"
