@@ -24,6 +24,7 @@ import time
 import traceback
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -128,12 +129,17 @@ def numbers(result: IdentifiedLog, record: CauseRecord) -> dict[str, Any]:
     whole = _best(result.identification, [phi for phi, _ in truth.loads], truth.offsets)
     if not parts:
         return whole
-    t, verdicts = np.asarray(result.log.t) - result.log.t[0], []
+    verdicts = []
     for part in parts:
-        start, stop = t[part.start], t[min(part.stop, len(t)) - 1]
-        shared = [min(stop, b) - max(start, a) for _, (a, b) in truth.loads]
+        shared = [min(part.stop_s, b) - max(part.start_s, a) for _, (a, b) in truth.loads]
         phi = truth.loads[int(np.argmax(shared))][0]
-        verdicts.append(_best(part.load, [phi], truth.offsets))
+        load = replace(
+            result.identification,
+            phi=part.phi,
+            covariance=part.covariance,
+            identifiable=part.identifiable,
+        )
+        verdicts.append(_best(load, [phi], truth.offsets))
     return _added(verdicts) | {"false": whole["false"] + _added(verdicts)["false"]}
 
 

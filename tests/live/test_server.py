@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import socket
 import threading
@@ -178,10 +179,10 @@ def test_no_client_ends_a_drive_or_holds_up_its_end(scenario, load, monkeypatch,
 @pytest.mark.slow
 def test_a_drive_ends_while_another_scene_identifies_its_load(scenario, load, monkeypatch):
     """However long that would take: it looks at the clock whenever it tells how far it is."""
-    asked = threading.Event()
+    asked, drives = threading.Event(), itertools.count()
 
     def identify(_, progress):
-        if progress is True:
+        if next(drives) == 0:
             return load
         told = progress("Identify the load")
         while True:

@@ -243,6 +243,7 @@ def test_file_round_trip(tmp_path, poses_only):
         *("phi", "offsets", "covariance", "identifiable", "mass", "com", "inertia_com"),
         *("physically_consistent", "condition_number", "delay_s", "residual_rms", "method"),
         *("samples", "verdicts", "degrees_of_freedom", "prior_dominated"),
+        "weight_removed",
     }
     assert document["mass"] == result.mass
     nulls = [i for i in range(16) if document["covariance"][i][i] is None]
