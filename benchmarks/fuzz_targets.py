@@ -39,7 +39,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.bags import read_topic, topics_of
 from drake_teleop.logs.read.reading import read_log

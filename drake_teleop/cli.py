@@ -374,7 +374,7 @@ def inspect(log: Path, out: Path, quiet: bool) -> None:
     LOG is a canonical log, a log description (.yaml), or a table of any columns, for which a draft
     description is written. Rates, gaps, noise, saturation and suspected errors of convention.
     """
-    from drake_teleop.logs.check.inspection import inspect_command
+    from drake_teleop.logs.inspection import inspect_command
 
     inspect_command(log, out, quiet=quiet)
 

@@ -14,7 +14,7 @@ from drake_teleop.silence import silent_stderr
 
 _POLARS_USED_IN: list[int] = []  # the first process
 
-LONGEST_LINE = 300
+LONGEST_LINE = 1000
 """Characters of a line that the command line says about an error."""
 
 

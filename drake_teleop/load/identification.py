@@ -285,21 +285,6 @@ def com_deviations(phi: Array, covariance: Array) -> Array:
     return np.where(unknown[0] | unknown[1:], np.inf, np.sqrt(np.maximum(squares, 0.0)))
 
 
-def with_weight(load: Identification, path: str | Path) -> Identification:
-    """Return a load of a wrench that contains its weight.
-
-    Raises:
-        DrakeTeleopError: if the robot had removed the weight.
-    """
-    if load.weight_removed:
-        raise DrakeTeleopError(
-            "is true: this command subtracts weight and inertia, and cannot subtract inertia alone",
-            where=f"{path}:weight_removed",
-            remedy="use a wrench without the robot's payload compensation, or `eliminate`",
-        )
-    return load
-
-
 def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
     """(16,) whether a parameter is known to 5 % of what is natural for the load (module docstring).
 

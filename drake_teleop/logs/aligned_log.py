@@ -75,15 +75,15 @@ def aligned_log(
         moved = replace(moved, notes=(*moved.notes, *clock_note(motion)))
         plain = undelayed(log, motion.delay_s) if differentiate else None
         if weight_removed:
-            moved = _accelerated(moved)
-            plain = None if plain is None else _accelerated(plain)
+            moved = accelerated(moved)
+            plain = None if plain is None else accelerated(plain)
         edge = one_sided | ends(moved, 0.0, cutoff_hz)
         smooth = AlignedLog(moved, motion.delay_s, source, plain, edge)
         if log.posed is None or log.posed.imu is None:
             return smooth
     elif log.posed is not None and not differentiate:
         log = read_log(path, bandwidth_hz=cutoff_hz)
-    log = _accelerated(log) if weight_removed else log
+    log = accelerated(log) if weight_removed else log
     delay_s, source = delay_of(log, cutoff_hz, delay, phi)
     if source == "undetermined":
         delay_s, source = usual_s, "load"
@@ -94,15 +94,24 @@ def aligned_log(
     return smooth
 
 
-def _accelerated(log: Log) -> Log:
-    """The log with the acceleration in the place of the specific force."""
+def without_orientation(where: str) -> DrakeTeleopError:
+    """Return the error for a wrench without the load's weight and a motion without orientation."""
+    return DrakeTeleopError(
+        "the robot has removed the weight of the load from the wrench, and without an orientation"
+        " gravity cannot be subtracted from the measured acceleration",
+        where=where,
+        remedy="add poses, or use the wrench without payload compensation",
+    )
+
+
+def accelerated(log: Log) -> Log:
+    """Return the log with the acceleration in the place of the specific force.
+
+    Raises:
+        DrakeTeleopError: if the log has no orientation.
+    """
     if log.gravity is None:
-        raise DrakeTeleopError(
-            "the weight of the load is removed from the wrench: its inertia cannot be told from"
-            " gravity without an orientation",
-            where=log.source,
-            remedy="add pose, or record the wrench without payload compensation",
-        )
+        raise without_orientation(log.source)
     return replace(log, specific_force=log.specific_force + log.gravity)
 
 

@@ -15,7 +15,7 @@ delay_source           "given", "estimated" (from this record), "load" (of the l
                        "static" (poses at rest have none)
 notes                  what had to be assumed, and the findings, in words
 findings               list of name and message: suspected errors of the description; see
-                       `drake_teleop.logs.check.inspection`. Only looked for if the fit is poor
+                       `drake_teleop.logs.inspection`. Only looked for if the fit is poor
 ====================== ==========================================================================
 
 ====================== ==========================================================================

@@ -68,6 +68,7 @@ class IdentifiedLog:
         causes: what acts beside a rigid load with constant offsets, with times and values; the load
             is then that within the model that has them, at the start of the record.
         loads: the load of each stretch, if it changes within the record.
+        delay_deviation_s: standard deviation of an estimated delay [s]; nan if it is unknown.
     """
 
     log: Log
@@ -79,6 +80,7 @@ class IdentifiedLog:
     findings: tuple[Finding, ...] = ()
     causes: tuple[Cause, ...] = ()
     loads: tuple[Stretch, ...] = ()
+    delay_deviation_s: float = float("nan")
 
     def __repr__(self) -> str:
         return repr(self.identification)
@@ -219,7 +221,16 @@ def _identified(
     base = base_parameters(fit.equations)
     loads = () if why is None else why.loads
     return IdentifiedLog(
-        log, result, predicted, source, fit.rejected, base, findings, causes, loads
+        log,
+        result,
+        predicted,
+        source,
+        fit.rejected,
+        base,
+        findings,
+        causes,
+        loads,
+        delay_deviation_s=float("nan") if motion is None else motion.delay_deviation,
     )
 
 

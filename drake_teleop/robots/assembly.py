@@ -24,6 +24,7 @@ import numpy as np
 
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.identification import Identification
+from drake_teleop.logs.aligned_log import without_orientation
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW, smoother
 from drake_teleop.logs.read.rotations import quaternions, rotation_matrices
 from drake_teleop.robots.compensator import DRIFT, JUMP_S, STALE_S
@@ -48,10 +49,11 @@ class Window:
     Args:
         cutoff_hz: see the module; None for the shortest window.
         X_FS: (7,) pose of the sensor in the frame whose poses come.
+        gravity_W: (3,) [m/s^2].
     """
 
-    def __init__(self, cutoff_hz: float | None, X_FS: Array) -> None:
-        self._cutoff_hz, self._dt = cutoff_hz, 0.0
+    def __init__(self, cutoff_hz: float | None, X_FS: Array, gravity_W: Array = _GRAVITY) -> None:
+        self._cutoff_hz, self._dt, self._gravity_W = cutoff_hz, 0.0, gravity_W
         self._weights, self._size = np.zeros((3, 1)), 1
         self._R_FS, self._p_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0], X_FS[4:]
         self._steps: list[float] = []
@@ -118,7 +120,7 @@ class Window:
             return np.concatenate([smooth, first[3:]])
         R_WS = rows[self._size // 2, :9].reshape(3, 3)
         omega, alpha = R_WS.T @ first[:9].reshape(3, 3), R_WS.T @ (2.0 * second[:9]).reshape(3, 3)
-        s = R_WS.T @ (2.0 * second[9:] - _GRAVITY)
+        s = R_WS.T @ (2.0 * second[9:] - self._gravity_W)
         return np.concatenate([s, _axis(omega), _axis(alpha)])
 
 
@@ -156,6 +158,11 @@ class Assembly:
         delay_s: by how much the motion's stamps come behind the wrench's [s].
         follow: a load whose wrench tells how that delay changes; None: it stays.
         X_FS: (7,) [w, x, y, z] and position [m] of the sensor in the frame that is posed.
+        weight_removed: the robot has removed the weight from the wrench. The readings then have the
+            acceleration in the place of the specific force.
+
+    Raises:
+        DrakeTeleopError: if the weight is removed and the motion is an IMU's.
 
     Attributes:
         lag_s: by how much readings come late, if poses come often enough for the window [s].
@@ -171,12 +178,15 @@ class Assembly:
         delay_s: float = 0.0,
         follow: Identification | None = None,
         X_FS: Array = NOWHERE,
+        weight_removed: bool = False,
     ) -> None:
+        if weight_removed and parts.told == IMU:
+            raise without_orientation("the source")
         self._parts, self._delay, self.dt = parts, delay_s, parts.dt
         self._follower = None
         if follow is not None:
             self._follower = DelayFollower(follow, self.dt, cutoff_hz, delay_s)
-        self._window = Window(cutoff_hz, X_FS)
+        self._window = Window(cutoff_hz, X_FS, np.zeros(3) if weight_removed else _GRAVITY)
         self.lag_s = max(0.0, delay_s)
         if cutoff_hz is not None:
             self.lag_s = max(0.0, 0.5 * SMOOTHER_WINDOW / cutoff_hz + delay_s)

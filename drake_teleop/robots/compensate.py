@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_teleop.load.arrays import Array
-from drake_teleop.load.identification import Identification, with_weight
+from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.changes import Changes
 from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
@@ -143,7 +143,7 @@ def compensate_command(
     Raises:
         DrakeTeleopError: if one of them cannot be used.
     """
-    found = with_weight(Identification.load(load), load)
+    found = Identification.load(load)
     readings = source_of(
         source,
         found,

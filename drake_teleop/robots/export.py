@@ -37,7 +37,7 @@ import numpy as np
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array
-from drake_teleop.load.identification import PARAMETERS, Identification, with_weight
+from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
 from drake_teleop.texts import yaml_text
 
@@ -119,6 +119,13 @@ def export(
             f"{to!r} is no target", where="export", remedy=f"one of {', '.join(FORMATS)}"
         )
     format = FORMATS[to]
+    if found.weight_removed and format.of_sensor:
+        raise DrakeTeleopError(
+            f"the robot has removed the load's weight from the wrench, and {to} would subtract it"
+            " once more",
+            where="export",
+            remedy="use a wrench without the robot's payload compensation, or `compensate`",
+        )
     moved = R_FS is not None or p_FoSo_F is not None
     if moved and format.of_sensor:
         raise DrakeTeleopError(
@@ -159,7 +166,7 @@ def export_command(
     Raises:
         DrakeTeleopError: as `Identification.load` and `export`.
     """
-    found = with_weight(Identification.load(identification), identification)
+    found = Identification.load(identification)
     if sensor_pose is None:
         return export(found, to, sign=sign)
     roll, pitch, yaw = np.radians(sensor_pose[3:])

@@ -15,6 +15,7 @@ import numpy as np
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
+from drake_teleop.logs.aligned_log import accelerated
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.logs.read.alignment import measured, undelayed
 from drake_teleop.logs.read.delay import delay_of
@@ -28,6 +29,7 @@ class LogSource:
     Args:
         path: canonical table or log description.
         load: whose wrench tells the delay; None leaves wrench and motion as they were recorded.
+            If the robot had removed its weight, the specific force is the acceleration alone.
         cutoff_hz, delay: as of `eliminate_log`.
         real_time: in the log's own time; else as fast as they are taken.
         chunk: readings at once.
@@ -54,6 +56,7 @@ class LogSource:
             raise DrakeTeleopError("poses at rest have no order in time", where=str(path))
         delay_s = 0.0
         if load is not None:
+            log = accelerated(log) if load.weight_removed else log
             delay_s, source = delay_of(log, cutoff_hz, delay, usable_phi(load)[0])
             if source == "undetermined":
                 delay_s = load.delay_s

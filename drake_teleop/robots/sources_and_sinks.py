@@ -9,6 +9,7 @@ from typing import Any
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.arrays import Array
 from drake_teleop.load.identification import Identification
+from drake_teleop.logs.aligned_log import without_orientation
 from drake_teleop.robots.assembly import NOWHERE, Assembly, pose_of
 from drake_teleop.robots.joints import Arm, PosedByJoints
 from drake_teleop.robots.lines import LineSink, LineSource
@@ -67,8 +68,14 @@ def source_of(
         if isinstance(delay, str):
             delay = 0.0 if load is None else load.delay_s
         parts = _parts(address, rate_hz, motion, arm)
-        how = {"cutoff_hz": cutoff_hz, "delay_s": delay, "follow": follow}
-        return Assembly(parts, X_FS=_pose(sensor_pose), **how)  # type: ignore[arg-type]
+        return Assembly(
+            parts,
+            cutoff_hz=cutoff_hz,
+            delay_s=delay,
+            follow=follow,
+            X_FS=_pose(sensor_pose),
+            weight_removed=load is not None and load.weight_removed,
+        )
     if motion is not None or sensor_pose is not None or arm is not None:
         raise DrakeTeleopError(
             "tells the motion of the sensor itself",
@@ -81,6 +88,8 @@ def source_of(
         return LogSource(path, load, **options)  # type: ignore[arg-type]
     if kind not in ("-", "udp"):
         raise DrakeTeleopError("is no source", where=address, remedy=_SOURCES)
+    if load is not None and load.weight_removed:
+        raise without_orientation(address)
     dt = _period(rate_hz, address)
     return LineSource(sys.stdin.fileno(), dt) if kind == "-" else UdpSource(address, dt)
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.inspection import inspect_command
 
 PHI = phi_from_mass_com_inertia(3.13, [0.01, -0.02, 0.12], np.diag([0.02, 0.018, 0.006]))
 OFFSETS = np.array([3.0, -2.0, 7.0, 0.1, 0.2, -0.3])

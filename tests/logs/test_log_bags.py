@@ -19,7 +19,7 @@ from known_motion import Motion, motion_at, quaternions
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read import bags
 from drake_teleop.logs.read.bags import is_bag, read_topic, topics_of

@@ -8,7 +8,7 @@ import pytest
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.check import conventions
-from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.sample import sample_log_command
 

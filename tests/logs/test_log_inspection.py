@@ -18,8 +18,9 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.cli import main
+from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.logs.check.draft import draft_description
-from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
@@ -337,3 +338,15 @@ def test_the_mounting_of_a_real_imu_is_found(ntnu: Path, tmp_path: Path) -> None
     np.testing.assert_allclose(summary["mounting"]["R_SI"], NTNU_FRAME, atol=0.03)
     assert summary["mounting"]["right_angled"]
     assert summary["delay_s"] == pytest.approx(0.006, abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("streams", [{}, {"pose": False}])
+def test_identify_takes_no_reversed_gravity_for_axes_and_a_torque_factor(
+    tmp_path: Path, streams: dict[str, bool]
+) -> None:
+    """Mirrored axes explain the weight, but not that the inertia would be negative."""
+    columns = good()
+    planted.reversed_gravity(columns)
+    with pytest.raises(DrakeTeleopError, match=r"gravity is reversed; set imu\.sign: -1"):
+        identify_log(written(tmp_path, columns, **streams))

@@ -20,7 +20,7 @@ from test_log_commands import GRAVITY, describe_poses, describe_record
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.inspection import inspect_command
+from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read import auto_mounting
 from drake_teleop.logs.read.description import Description, load_description

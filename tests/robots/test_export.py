@@ -219,3 +219,13 @@ def test_the_command(tmp_path, capsys):
         assert printed.err.splitlines() == [f"warning: {text}" for text in warnings]
     (choice,) = (p.type for p in cli.commands["export"].params if p.name == "to")
     assert tuple(choice.choices) == tuple(FORMATS)
+
+
+@pytest.mark.parametrize("to", sorted(FORMATS))
+def test_a_weight_that_the_robot_has_removed_is_not_subtracted_once_more(to) -> None:
+    weightless = dataclasses.replace(FOUND, weight_removed=True)
+    if FORMATS[to].of_sensor:
+        with pytest.raises(DrakeTeleopError, match=f"{to} would subtract it once more"):
+            export(weightless, to)
+    else:
+        assert export(weightless, to) == export(FOUND, to)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,9 +11,11 @@ from test_compensator import OFFSETS, PHI, load
 
 from drake_teleop.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.parts import Parts
+from drake_teleop.robots.sources_and_sinks import source_of
 from drake_teleop.robots.streams import IMU, POSE, WRENCH, Flag, Part, Reading
 
 DT, GRAVITY = 0.001, np.array([0.0, 0.0, 9.81])
@@ -89,6 +92,24 @@ def test_the_motion_is_that_of_the_wrenchs_instant(lost) -> None:
     assert not any(row.contact.any() for row in out if row.flags)
     left = np.array([row.contact for row in out if not row.flags])
     assert len(left) > 200 and np.abs(left).max() < 0.03  # of 17 N
+
+
+def test_the_inertia_alone_is_subtracted_where_the_robot_has_removed_the_weight() -> None:
+    """The weight is that of the same orientation, so that only mass times acceleration is left."""
+    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS, weight_removed=True)
+    found = [each for each in played(assembly, 0.4) if not each.flags]
+    rest, left = np.zeros(3), []
+    for each in found:
+        R_WS = rotation_matrices(truth(each.t)[0][None, :4], "quaternion_wxyz")[0] @ turn(1, 0.6)
+        weight = non_contact_wrench(R_WS.T @ GRAVITY, rest, rest, PHI)
+        motion = np.split(each.values[6:], 3)
+        left.append(each.values[:6] - weight - OFFSETS - non_contact_wrench(*motion, PHI))
+    assert len(left) > 200 and np.abs(left).max() < 0.03
+    with pytest.raises(DrakeTeleopError, match="without an orientation"):
+        Assembly(Parts(Told(WRENCH, IMU)), weight_removed=True)
+    weightless = dataclasses.replace(load(), weight_removed=True)
+    with pytest.raises(DrakeTeleopError, match=r"udp://:0.*without an orientation"):
+        source_of("udp://:0", weightless, rate_hz=500.0)
 
 
 def test_two_clocks() -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_teleop.load.arrays import Array
+from drake_teleop.load.identification import natural_scale
 from drake_teleop.logs.causes.changes import change
 from drake_teleop.logs.causes.contacts import contact_spans
 from drake_teleop.logs.causes.instants import FORCES, ONE, G, R, S
@@ -44,6 +45,7 @@ _MASS_SHARE, _MOMENT = 0.02, 0.004
 _GAIN, _MOST_GAIN, _SHIFT, _ROTATION_DEG = 0.003, 0.25, 0.010, 1.0
 _SURE, _FARTHEST, _STIFFEST = 10.0, 1.5, 1000.0  # 1, m, N/m
 _DRIFT_LEVELS = 3.0
+_NEGATIVE_DEVIATIONS, _NEGATIVE_SHARE = 8.0, 0.1
 _FACTOR_SHARE, _FACTOR_MOST = 0.02, 0.06
 
 
@@ -127,8 +129,18 @@ def _best(
 
 
 def negative(state: State) -> bool:
-    """Whether the mass is below zero by more than its interval."""
-    return bool(state.x[6] < -4.0 * np.sqrt(state.fit.covariance[6, 6]))
+    """Whether the mass, or the inertia about an axis through So, is clearly below zero."""
+    if state.x[6] < -4.0 * np.sqrt(state.fit.covariance[6, 6]):
+        return True
+    i, j = np.triu_indices(3)
+    inertia = np.zeros((3, 3))
+    inertia[i, j] = inertia[j, i] = state.x[10:16]
+    least, axes = np.linalg.eigh(inertia)
+    # The derivative of n^T I n by the six entries.
+    slope = axes[i, 0] * axes[j, 0] * np.where(i == j, 1.0, 2.0)
+    deviation = float(np.sqrt(slope @ state.fit.covariance[10:16, 10:16] @ slope))
+    enough = _NEGATIVE_SHARE * natural_scale(state.x[6:16])[10] if state.x[6] else 0.0
+    return bool(least[0] < -max(_NEGATIVE_DEVIATIONS * deviation, enough))
 
 
 def plausible(state: State) -> bool:

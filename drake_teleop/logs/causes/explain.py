@@ -66,14 +66,15 @@ def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] =
         state, late, rejected = search(data, later, given)
         covariance = covariance_of(state, rejected)
         causes = causes_of(state, given)
-        if not causes and _no_load(state, covariance):
+        noise = explained(state)
+        if noise and not causes and _no_load(state, covariance):
             causes = [_nothing_mounted(state, covariance)]
         removed = None
         if "weight" in state.model.parts:
             removed = state.x[state.model.slices["weight"]]
         return Explanation(
             causes=tuple(causes),
-            explained=explained(state),
+            explained=noise,
             theta=state.x[LOAD],
             covariance=covariance,
             blocks=block_deviations(state),

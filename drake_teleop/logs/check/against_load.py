@@ -63,7 +63,7 @@ def against_load(description: Description, data: LogData) -> tuple[list[Finding]
     limit = min(limit, BELIEVABLE + given.noise)
     found = [entry for entry in found if entry[0].unexplained < limit]
     if not found and given.good:
-        return _lag(description, delay) if _shows(thin, delay) else [], delay
+        return lag_finding(description, delay) if _shows(thin, delay) else [], delay
     if not found:
         return _without_remedy(description, log, given, delay)
     least = 1.2 * min(fit.unexplained for fit, *_ in found) + 1e-9
@@ -73,10 +73,10 @@ def against_load(description: Description, data: LogData) -> tuple[list[Finding]
     if finding is None:  # The clock of the wrench, which the edit set to the nearest 20 ms.
         assert description.wrench is not None and edited.wrench is not None
         shift = edited.wrench.time.offset - description.wrench.time.offset + (delay or 0.0)
-        return _lag(description, shift), shift
+        return lag_finding(description, shift), shift
     others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
     message = "; just as possible: ".join([finding.message, *others.values()])
-    return [Finding(finding.name, message), *_lag(description, delay)], delay
+    return [Finding(finding.name, message), *lag_finding(description, delay)], delay
 
 
 def _shows(log: Log, delay: float | None) -> bool:
@@ -128,7 +128,7 @@ def _without_remedy(
         # A contact pulls at the delay.
         lost = fit.rejected if log.bridged is None else fit.rejected | log.bridged
         delay = estimate_delay(replace(log, bridged=lost), 30.0)
-    return _lag(description, delay), delay
+    return lag_finding(description, delay), delay
 
 
 def payload_finding(load: Identification, unexplained: float) -> Finding | None:
@@ -174,7 +174,8 @@ def _shifted(description: Description, log: Log) -> Iterator[tuple[None, Descrip
         yield None, edit_field(description, "wrench.time.offset", offset)
 
 
-def _lag(description: Description, delay: float | None) -> list[Finding]:
+def lag_finding(description: Description, delay: float | None) -> list[Finding]:
+    """Return what to change if the motion is `delay` seconds behind the wrench."""
     if delay is None or abs(delay) <= LAG or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"

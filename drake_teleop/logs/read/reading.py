@@ -377,7 +377,7 @@ class _Reader:
         """Step of the numbers of force and torque [N, N m]."""
         force, torque = (
             decimal_step(table.numbers(quantity.columns, 3, f"static.{field}", table.rows))
-            * self._description.scale(quantity.unit)
+            * (self._description.scale(quantity.unit) * np.abs(quantity.scale).max())
             for field, quantity in (("force", stream.force), ("torque", stream.torque))
         )
         return force, torque

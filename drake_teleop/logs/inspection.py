@@ -32,10 +32,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.errors import DrakeTeleopError, one_line
-from drake_teleop.logs.check.conventions import check_conventions
+from drake_teleop.logs.check.against_load import lag_finding
+from drake_teleop.logs.check.conventions import Conventions, check_conventions
 from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.check.load_fit import white_noise
+from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import shortest_gap
@@ -48,6 +50,10 @@ BANDWIDTH = 30.0
 REPEATED = 0.05
 """Repeated rows are mentioned from this share of all rows, or from a block of `BLOCK` rows."""
 BLOCK = 5
+_EFFECTS = ("lag", "units", "frame", "payload", "clock")
+"""Findings of conventions that a cause may have, too."""
+_SIGNIFICANT = 5.0
+"""Standard deviations above which a delay is a finding."""
 _QUANTITIES = (
     "force",
     "torque",
@@ -176,8 +182,8 @@ def _inspect(
     except DrakeTeleopError as error:
         findings.append(Finding("unusable", str(error)))
     else:
-        findings += found.findings
-        summary["delay_s"] = found.delay_s
+        more, summary["delay_s"] = _explained(description, source, found)
+        findings += more
         summary["fit"] = {"mass": found.fit.mass, "unexplained": found.fit.unexplained}
         if found.mounting is not None:
             summary["mounting"] = {
@@ -189,6 +195,33 @@ def _inspect(
                 "unexplained": found.mounting.unexplained,
             }
     summary["findings"] = [{"name": f.name, "message": f.message} for f in findings]
+
+
+def _explained(
+    description: Description, source: str, found: Conventions
+) -> tuple[list[Finding], float | None]:
+    """Return findings and delay: those of identification where it names causes, or is surer.
+
+    Errors of the motion, and axes, are found in the conventions; what else they name may be the
+    effect of a cause.
+    """
+    findings, delay = list(found.findings), found.delay_s
+    try:
+        identified = identify_log(source)
+    except DrakeTeleopError:  # which the findings explain, or `identify` reports
+        return findings, delay
+    deviation = identified.delay_deviation_s
+    if identified.causes and all(finding.name in _EFFECTS for finding in findings):
+        found_delay = identified.identification.delay_s if np.isfinite(deviation) else delay
+        return [Finding(cause.name, cause.message) for cause in identified.causes], found_delay
+    if identified.delay_source != "estimated" or not np.isfinite(deviation):
+        return findings, delay
+    findings = [finding for finding in findings if finding.name != "lag"]
+    if not findings:
+        delay = identified.identification.delay_s
+        if abs(delay) > _SIGNIFICANT * deviation:
+            findings += lag_finding(description, delay)
+    return findings, delay
 
 
 def _stream(
