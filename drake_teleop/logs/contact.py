@@ -129,6 +129,9 @@ def detect_contact(
 ) -> Detection | None:
     """Finds contact.
 
+    Without a log of free motion, what reaches the threshold for less than half a period of the low-
+    pass, and by less than a quarter, is no contact: the threshold is less certain than that.
+
     A contact lasts from where the statistic reaches the threshold to the last sample that is
     followed by a period of the low-pass in which it is low, and may swing. What rises slowly has
     its start where it is noticed, not where it left the floor; what rises at once has it up to a
@@ -170,6 +173,8 @@ def detect_contact(
     detector = ContactDetector(floor, threshold, statistic=statistic, hold=hold)
     values[inner] = statistics(floor, *judged)
     touched[inner] = _without_hold(detector.detect(*judged), hold)
+    if free is None:
+        _remove_marginal(touched, values[:, statistic_index(statistic)], threshold, hold)
     return Detection(
         floor=floor,
         statistic=statistic,
@@ -258,6 +263,15 @@ def _without_hold(touched: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
         if stop < len(touched):
             touched[stop - hold : stop] = False
     return touched
+
+
+def _remove_marginal(
+    touched: NDArray[np.bool_], values: NDArray[np.float64], threshold: float, hold: int
+) -> None:
+    """Clear contacts shorter than half a period whose statistic hardly exceeds the threshold."""
+    for start, stop in _spans(touched):
+        if 2 * (stop - start) < hold and values[start:stop].max() < MARGIN * threshold:
+            touched[start:stop] = False
 
 
 def _spans(touched: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -398,16 +398,7 @@ def test_ntnu_poses_give_mass_centre_and_offsets(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("record", "residual", "gravity_only"),
-    [
-        pytest.param(
-            *("1-baseline", 0.30, 0.58),
-            marks=pytest.mark.xfail(
-                reason="a contact is reported at 0.2 s since intervals of static poses are pooled",
-                strict=True,
-            ),
-        ),
-        ("2-vibrations", 0.32, 0.78),
-    ],
+    [("1-baseline", 0.30, 0.58), ("2-vibrations", 0.32, 0.78)],
 )
 def test_ntnu_records_without_their_non_contact_force(
     ntnu: Path, tmp_path: Path, record: str, residual: float, gravity_only: float
