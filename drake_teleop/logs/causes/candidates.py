@@ -46,7 +46,8 @@ _GAIN, _MOST_GAIN, _SHIFT, _ROTATION_DEG = 0.003, 0.25, 0.010, 1.0
 _SURE, _FARTHEST, _STIFFEST = 10.0, 1.5, 1000.0  # 1, m, N/m
 _DRIFT_LEVELS = 3.0
 _NEGATIVE_DEVIATIONS, _NEGATIVE_SHARE = 8.0, 0.1
-_FACTOR_SHARE, _FACTOR_MOST = 0.02, 0.06
+_FACTOR_SHARE, _FACTOR_MOST, _FACTOR_MOST_FAR = 0.02, 0.06, 0.2
+_SIMILAR, _AS_LIKELY = 0.2, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +131,9 @@ def _best(
 
 def negative(state: State) -> bool:
     """Whether the mass, or the inertia about an axis through So, is clearly below zero."""
-    if state.x[6] < -4.0 * np.sqrt(state.fit.covariance[6, 6]):
-        return True
+    mass, deviation = float(state.x[6]), float(np.sqrt(state.fit.covariance[6, 6]))
+    if mass < _SURE * deviation:
+        return mass < -4.0 * deviation
     i, j = np.triu_indices(3)
     inertia = np.zeros((3, 3))
     inertia[i, j] = inertia[j, i] = state.x[10:16]
@@ -139,7 +141,7 @@ def negative(state: State) -> bool:
     # The derivative of n^T I n by the six entries.
     slope = axes[i, 0] * axes[j, 0] * np.where(i == j, 1.0, 2.0)
     deviation = float(np.sqrt(slope @ state.fit.covariance[10:16, 10:16] @ slope))
-    enough = _NEGATIVE_SHARE * natural_scale(state.x[6:16])[10] if state.x[6] else 0.0
+    enough = _NEGATIVE_SHARE * natural_scale(state.x[6:16])[10]
     return bool(least[0] < -max(_NEGATIVE_DEVIATIONS * deviation, enough))
 
 
@@ -229,12 +231,13 @@ def _drift_enough(state: State) -> bool:
 
 
 def _factor(state: State) -> Iterator[Candidate]:
-    """The known ratio of the greatest likelihood, then refined."""
+    """The most usual known ratio of nearly the greatest likelihood, then refined."""
     found = []
     for factor in (1.0, *FACTORS):
         model = replace(state.model, factor=factor)
         found.append(state.extended(model, state.x, steps=2))
-    best = max(found, key=lambda x: x.likelihood)
+    most = max(x.likelihood for x in found)
+    best = next(x for x in found if x.likelihood > most - _AS_LIKELY)
     if best is found[0]:
         return
     best = state.extended(best.model, best.x)
@@ -242,7 +245,10 @@ def _factor(state: State) -> Iterator[Candidate]:
         return
     free = best.extended(best.model.extended("torque factor"))
     value, covariance = part(free, "torque factor")
-    limit = min(_FACTOR_SHARE + 4.0 * np.sqrt(covariance[0, 0]), _FACTOR_MOST)
+    # A displaced pose frame resembles any factor, but has to be far away to resemble a large one.
+    far = not _SIMILAR < best.model.factor < 1.0 / _SIMILAR
+    most = _FACTOR_MOST_FAR if far else _FACTOR_MOST
+    limit = min(_FACTOR_SHARE + 4.0 * np.sqrt(covariance[0, 0]), most)
     if abs(value[0]) < limit:
         yield _candidate("torque factor", state, best, more=1)
 

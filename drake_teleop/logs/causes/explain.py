@@ -9,9 +9,9 @@ import numpy as np
 from drake_teleop.load.arrays import Array
 from drake_teleop.logs.causes.cause import Cause, Stretch, causes_of, stretches
 from drake_teleop.logs.causes.instants import Instants
-from drake_teleop.logs.causes.intervals import block_deviations, covariance_of
+from drake_teleop.logs.causes.intervals import block_deviations, covariance_of, gain_covariance
 from drake_teleop.logs.causes.model import DELAY, LOAD
-from drake_teleop.logs.causes.search import Later, explained, search
+from drake_teleop.logs.causes.search import Later, explained, search, settled
 from drake_teleop.logs.causes.state import State
 from drake_teleop.one_thread import one_blas_thread
 
@@ -27,7 +27,7 @@ class Explanation:
         explained: whether the residual is the sensor's noise.
         theta: (16,) [offsets; phi] within the model; of the first stretch if the load changes.
         covariance: (16, 16) of theta.
-        blocks: (16,) deviations by leaving out parts of the record.
+        blocks: (16,) deviations by leaving out parts of the record, and by errors of gains.
         delay_s: of the motion behind the wrench, in addition to what `instants` had [s].
         loads: the loads of a record whose load changes.
         removed_weight: (4,) [m, m c] whose weight is already removed, or None.
@@ -67,7 +67,7 @@ def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] =
         covariance = covariance_of(state, rejected)
         causes = causes_of(state, given)
         noise = explained(state)
-        if noise and not causes and _no_load(state, covariance):
+        if not causes and (noise or settled(state)) and _no_load(state, covariance):
             causes = [_nothing_mounted(state, covariance)]
         removed = None
         if "weight" in state.model.parts:
@@ -77,7 +77,7 @@ def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] =
             explained=noise,
             theta=state.x[LOAD],
             covariance=covariance,
-            blocks=block_deviations(state),
+            blocks=np.sqrt(block_deviations(state) ** 2 + np.diag(gain_covariance(state))),
             delay_s=late + float(state.x[DELAY]),
             loads=tuple(stretches(state, covariance)),
             removed_weight=removed,

@@ -4,6 +4,7 @@ The covariance of generalised least squares holds for stationary noise. Leaving 
 parts of the record shows the rest: with f the root mean square of block deviation over stated
 deviation, all sixteen deviations grow by f / 1.15 if f > 1.5. A probe above 1.35 widens all of
 them further, and every candidate that the search rejected adds its distance from the estimate.
+Errors of the 36 gains of the sensor, if the residual shows any, add their effects.
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ from dataclasses import replace
 import numpy as np
 
 from drake_teleop.load.arrays import Array
+from drake_teleop.load.batch.covariance import ARM
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.logs.causes.candidates import Candidate
 from drake_teleop.logs.causes.fit import inverted
+from drake_teleop.logs.causes.instants import FORCES
 from drake_teleop.logs.causes.model import LOAD
 from drake_teleop.logs.causes.rows import Rows
 from drake_teleop.logs.causes.state import State
@@ -24,7 +27,9 @@ from drake_teleop.logs.causes.state import State
 _GROUPS = 12
 _TOLERATED, _USUAL = 1.5, 1.15
 _PROBE, _PROBE_SLOPE = 1.35, 3.0
-_CONSIDERED, _BELIEVED = 6.0, 15.0
+_CONSIDERED, _BELIEVED, _CALMER = 6.0, 15.0, 0.5
+_FLEXIBLE = 1.5
+_GAINS, _GAINS_SHOWN = np.geomspace(1e-4, 0.1, 31), 20.0
 
 
 def covariance_of(state: State, rejected: Sequence[Candidate] = ()) -> Array:
@@ -36,13 +41,51 @@ def covariance_of(state: State, rejected: Sequence[Candidate] = ()) -> Array:
     final = np.maximum(factor * deviations, blocks)
     squares = final**2
     for candidate in rejected:
-        if candidate.score > _CONSIDERED:
-            other = candidate.state
-            own = np.diag(other.fit.covariance)[LOAD]
-            apart = (other.x[LOAD] - state.x[LOAD]) ** 2 + own
-            squares = squares + min(1.0, candidate.score / _BELIEVED) * apart
+        other = candidate.state
+        share = min(1.0, candidate.score / _BELIEVED) if candidate.score > _CONSIDERED else 0.0
+        if other.loudness < _CALMER * state.loudness:
+            share = 1.0  # coloured noise predicts a misfit as well
+        own = np.diag(other.fit.covariance)[LOAD]
+        squares = squares + share * ((other.x[LOAD] - state.x[LOAD]) ** 2 + own)
     ratio = np.sqrt(squares) / deviations
-    return np.asarray(out * np.outer(ratio, ratio))
+    return np.asarray(out * np.outer(ratio, ratio) + gain_covariance(state))
+
+
+def gain_covariance(state: State) -> Array:
+    """(16, 16) of [offsets; phi] by errors of all gains, as large as the residual shows them.
+
+    The 36 errors have one standard deviation, a torque's as at `ARM`: the largest that is nearly
+    the most likely one, or 0 if the likelihood without any is nearly the same.
+    """
+    fit, rows = state.fit, state.rows
+    weights = rows.whitened(fit.filters) / fit.power[:, None, None]
+    unit = np.repeat([1.0, ARM], 3)
+    # The wrench of the model: the noise of a reading is that of the residual, too.
+    wrench = (rows.columns == np.arange(FORCES.start, FORCES.stop)[:, None]) - fit.residual
+    J, inverse = state.model.derivative(state.x), fit.covariance
+    mixed, gram, right = np.zeros((len(J), 36)), np.zeros((36, 36)), np.zeros(36)
+    for c in range(6):
+        own = slice(6 * c, 6 * c + 6)
+        of_gains = wrench * (unit[c] / unit)[:, None]
+        weighted = of_gains @ weights[c]
+        mixed[:, own] = J[:, c] @ weighted.T
+        gram[own, own] = weighted @ of_gains.T
+        right[own] = weighted @ fit.residual[c]
+    schur = gram - mixed.T @ inverse @ mixed
+    values, vectors = np.linalg.eigh(0.5 * (schur + schur.T))
+    shown = values > 1e-9 * values[-1]
+    seen, squares = values[shown], (vectors[:, shown].T @ right) ** 2 / values[shown]
+
+    def gained(std: float) -> float:
+        more = std * std * seen
+        return float(np.sum(squares * more / (1.0 + more) - np.log1p(more)))
+
+    likely = np.array([gained(std) for std in _GAINS])
+    if likely.max() < _GAINS_SHOWN:
+        return np.zeros((16, 16))
+    largest = _GAINS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
+    effects = largest * (inverse @ mixed)[LOAD]
+    return np.asarray(effects @ effects.T)
 
 
 def misfit_factor(state: State, blocks: Array) -> float:
@@ -53,6 +96,8 @@ def misfit_factor(state: State, blocks: Array) -> float:
     if shown.any():
         spread = float(np.sqrt(np.mean((blocks[shown] / deviations[shown]) ** 2)))
         factor = spread / _USUAL if spread > _TOLERATED else 1.0
+    if "cable" in state.model.parts:
+        factor *= _FLEXIBLE  # a spring is a cable to first order
     return factor * (1.0 + _PROBE_SLOPE * max(0.0, state.probe - _PROBE))
 
 

@@ -25,7 +25,8 @@ _LATE, _LATEST, _SAME, _MOVES = 5e-4, 0.3, 0.004, 4  # s
 LOUD, IMPLAUSIBLE, SCORE = 1.25, 2.2, 20.0
 """Limits of the absolute test: residual over white noise, `State.probe`, `State.score`."""
 _NAMED, _NEAR, _SHARE = 40.0, 25.0, 0.02
-_FIFTH, _COLOURED, _SMALLER, _CERTAIN = 0.2, 15.0, 0.9, 1000.0
+_HALF, _FIFTH, _COLOURED, _SMALLER, _CERTAIN = 0.5, 0.2, 15.0, 0.9, 1000.0
+_ATTENUATED = 1.0 / 3.0
 _SMOOTH = 1.35
 """Largest probe of good records; what is left beyond it could resemble any cause."""
 _FLEXIBLE, _WIDE, _WIDE_SHARE = ("cable", "drift"), 80.0, 0.1
@@ -63,8 +64,7 @@ def search(data: Instants, later: Later | None = None, given: tuple[str, ...] = 
         the model, the delay that was added [s], and the candidates that the last round rejected.
     """
     found = _search(_begun(data, given), 0.0, later)
-    settled = found[0].probe < _SMOOTH and found[0].loudness < _COLOURED
-    if later is None or settled or explained(found[0]):
+    if later is None or settled(found[0]) or explained(found[0]):
         return found
     late = free_delay(data)
     if abs(late - found[1]) < _SAME:
@@ -72,6 +72,11 @@ def search(data: Instants, later: Later | None = None, given: tuple[str, ...] = 
     other = _search(_begun(later(late), given), late, later)
     better = explained(other[0]) or other[0].likelihood > found[0].likelihood + _NAMED
     return other if better else found
+
+
+def settled(state: State) -> bool:
+    """Whether the residual may be coloured noise of the sensor: no smooth signal explains it."""
+    return state.probe < _SMOOTH and state.loudness < _COLOURED
 
 
 def _begun(data: Instants, given: tuple[str, ...]) -> State:
@@ -87,19 +92,35 @@ def _search(state: State, late: float, later: Later | None) -> Found:
     for number in range(ROUNDS):
         if explained(state):
             return state, late, []
-        found = candidates(state, first=number == 0)
+        found = _without_attenuation(list(candidates(state, first=number == 0)))
         last = [x for x in found if plausible(x.state) and _effective(x, state)]
         winner = _winner(last) or _long_contact(state, last)
         if winner is None:
-            break
+            other = _phases(state, last)
+            if other is None:
+                break
+            state, late = _in_time(other, late, later)
+            continue
         larger = contact_of_steps(winner.state)
         if winner.name == "contact":
             larger = phases(larger) or shrunk(larger)
+        elif larger.spans != winner.state.spans:
+            larger = phases(larger) or larger
         state, late = _in_time(larger, late, later)
         last = [x for x in last if x is not winner]
         if winner.name == "cable":
             return state, late, []
     return state, late, last
+
+
+def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
+    """Remove a cable if a weight above the inertial mass explains nearly as much.
+
+    Noise of the accelerations makes the inertial mass too small, where little but noise accelerates
+    the load. The columns of a cable explain that, too.
+    """
+    best = max((x.score for x in found if x.name == "weight" and not plausible(x.state)), default=0)
+    return [x for x in found if x.name != "cable" or best < _ATTENUATED * x.score]
 
 
 def _in_time(state: State, late: float, later: Later | None) -> tuple[State, float]:
@@ -122,6 +143,14 @@ def _long_contact(state: State, found: list[Candidate]) -> Candidate | None:
     for candidate in found:
         if candidate.name == "contact" and candidate.state.loudness < _FIFTH * state.loudness:
             return candidate
+    return None
+
+
+def _phases(state: State, found: list[Candidate]) -> State | None:
+    """Other loads and offsets in the place of a contact without which the residual is a half."""
+    for candidate in found:
+        if candidate.name == "contact" and candidate.state.loudness < _HALF * state.loudness:
+            return phases(candidate.state)
     return None
 
 
