@@ -2,7 +2,7 @@
 
 Feeds damaged inputs, made by grammar from good ones, to every reader (`fuzz_targets.py`,
 `fuzz_mutations.py`). A case is a finding if it raises anything but a DrakeTeleopError of one line
-of at most 300 characters, if a warning or anything else reaches stderr, if it takes more than 5 s
+of at most 1000 characters, if a warning or anything else reaches stderr, if it takes more than 5 s
 of CPU (or a minute in all) or more than 4 GB, or if its process dies.
 
     python benchmarks/fuzz.py [--seconds 60] [--seed 0] [--only scenario,sdf] [--json FILE]

@@ -157,7 +157,10 @@ def _phases(state: State, found: list[Candidate]) -> State | None:
 def _effective(candidate: Candidate, state: State) -> bool:
     """Whether the residual shrinks or becomes more like noise, and not its likelihood alone."""
     other = candidate.state
-    better = other.loudness < _SMALLER * state.loudness or other.probe < _SMALLER * state.probe
+    smaller = other.loudness < _SMALLER * state.loudness
+    if candidate.name == "cable":
+        return smaller  # its force is far above the noise
+    better = smaller or other.probe < _SMALLER * state.probe
     return bool(better or negative(state) or candidate.score > _CERTAIN)
 
 
