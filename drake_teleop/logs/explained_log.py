@@ -83,7 +83,22 @@ def _shake(splines: PoseSplines) -> float:
 
 
 def explained_load(load: Identification, why: Explanation) -> Identification:
-    """Return the load within the model that explains the wrench, or its intervals widened."""
+    """Return the load within the model that explains the wrench, or its intervals widened.
+
+    Noise of an IMU's angular acceleration makes the inertia too small by its share of the variance;
+    that share of the inertia is in its deviations.
+    """
+    load = _explained_load(load, why)
+    if why.state.data.gravity_W is not None:
+        return load
+    extra = np.zeros(16)
+    extra[10:] = why.state.data.alpha_noise_share * np.abs(load.phi[[4, 7, 9]]).max()
+    covariance = load.covariance + np.diag(extra**2)
+    known = load.identifiable & worth_stating(np.sqrt(np.diag(covariance)), load.phi)
+    return replace(load, covariance=covariance, identifiable=known)
+
+
+def _explained_load(load: Identification, why: Explanation) -> Identification:
     if not why.causes and not why.given:
         if why.explained:
             return load

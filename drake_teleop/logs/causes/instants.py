@@ -38,7 +38,7 @@ MOTION = np.r_[0:16, 28:37]
 """Columns that a load's wrench depends on; a step has these again, multiplied by u(t - t1)."""
 _RATE, _MOST = 50.0, 20_000
 _BLOCK_S, _BLOCKS, _FEWEST_ROWS = 0.25, 320, 5
-_EXACT, _LIVELY = 5, 4.0
+_EXACT, _LIVELY, _NOISY_SHARE = 5, 4.0, 1.0 / 64.0
 _FINEST = 1e-4  # of the wrench: no sensor has less noise
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
@@ -71,8 +71,17 @@ class Instants:
     @cached_property
     def lively(self) -> bool:
         """Whether the record accelerates enough to tell inertia from weight."""
+        if self.gravity_W is None:
+            return self.alpha_noise_share < _NOISY_SHARE
         a = (self.y[:, S] + self.y[:, G])[self.used]
         return bool(np.sqrt(a.var(axis=0).max()) > _LIVELY * self.shake)
+
+    @cached_property
+    def alpha_noise_share(self) -> float:
+        """Share of noise in the variance of the angular acceleration, about the liveliest axis."""
+        alpha = self.y[self.used, ALPHA]
+        noise = np.median(np.abs(np.diff(alpha, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0)
+        return float((noise**2 / np.maximum(alpha.var(axis=0), 1e-12)).min())
 
     @property
     def dt(self) -> float:
