@@ -20,6 +20,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import savgol_filter
 
 from drake_teleop.load.arrays import Array
 
@@ -39,6 +40,7 @@ MOTION = np.r_[0:16, 28:37]
 _RATE, _MOST = 50.0, 20_000
 _BLOCK_S, _BLOCKS, _FEWEST_ROWS = 0.25, 320, 5
 _EXACT, _LIVELY, _NOISY_SHARE = 5, 4.0, 1.0 / 64.0
+_WIDTHS = (5, 9, 15, 25)  # of smoothers of a noisy angular acceleration
 _FINEST = 1e-4  # of the wrench: no sensor has less noise
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
@@ -58,6 +60,8 @@ class Instants:
         gravity_W: (3,) [m/s^2], or None if the orientation is unknown.
         positions: whether p is known.
         shake: standard deviation of the acceleration in a block mean, of noise alone [m/s^2].
+        alpha_noise_share: of the variance of an IMU's angular acceleration, about the liveliest
+            axis, before it was smoothed.
     """
 
     t: Array
@@ -67,6 +71,7 @@ class Instants:
     gravity_W: Array | None
     positions: bool
     shake: float = 0.0
+    alpha_noise_share: float = 0.0
 
     @cached_property
     def lively(self) -> bool:
@@ -75,13 +80,6 @@ class Instants:
             return self.alpha_noise_share < _NOISY_SHARE
         a = (self.y[:, S] + self.y[:, G])[self.used]
         return bool(np.sqrt(a.var(axis=0).max()) > _LIVELY * self.shake)
-
-    @cached_property
-    def alpha_noise_share(self) -> float:
-        """Share of noise in the variance of the angular acceleration, about the liveliest axis."""
-        alpha = self.y[self.used, ALPHA]
-        noise = np.median(np.abs(np.diff(alpha, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0)
-        return float((noise**2 / np.maximum(alpha.var(axis=0), 1e-12)).min())
 
     @property
     def dt(self) -> float:
@@ -158,8 +156,27 @@ def instants(
     white = np.median(np.abs(np.diff(wrench, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0)
     spread = np.sqrt(wrench.var(axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
     white = np.maximum(white, _FINEST * spread)
-    out = Instants(middle, y, used, white / np.sqrt(size), gravity_W, positions, shake)
+    share = _smooth_alpha(y, used) if gravity_W is None else 0.0
+    out = Instants(middle, y, used, white / np.sqrt(size), gravity_W, positions, shake, share)
     return out.only(used)
+
+
+def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
+    """Smooth an angular acceleration that is noisy, as far as it needs; return its noise share."""
+    alpha = y[used][:, ALPHA]
+    share = _noise_share(alpha)
+    for width in _WIDTHS:
+        if _noise_share(alpha) < _NOISY_SHARE or width >= len(alpha):
+            break
+        alpha = savgol_filter(y[used][:, ALPHA], width, 2, axis=0)
+    y[np.flatnonzero(used)[:, None], np.arange(ALPHA.start, ALPHA.stop)] = alpha
+    return share
+
+
+def _noise_share(x: Array) -> float:
+    """Least share of white noise in the variance of the columns of x, by third differences."""
+    noise = np.median(np.abs(np.diff(x, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0)
+    return float((noise**2 / np.maximum(x.var(axis=0), 1e-12)).min())
 
 
 def _put_motion(
