@@ -40,7 +40,7 @@ FACTORS = tuple(
 )
 """Known ratios of units and signs between torque and force."""
 _HALF, _IMPOSSIBLE = 0.5, 1000.0
-_TILT_DEG, _GRAVITY_SHARE, _KNOWN_SHARE, _UNCERTAIN = 0.25, 0.05, 0.02, 0.01
+_TILT_DEG, _GRAVITY_SHARE, _KNOWN_SHARE = 0.25, 0.05, 0.02
 _MASS_SHARE, _MOMENT = 0.02, 0.004
 _GAIN, _MOST_GAIN, _SHIFT, _ROTATION_DEG = 0.003, 0.25, 0.010, 1.0
 _SURE, _FARTHEST, _STIFFEST = 10.0, 1.5, 1000.0  # 1, m, N/m
@@ -178,10 +178,9 @@ def _tilted_enough(state: State) -> bool:
     size, right = float(np.linalg.norm(true)), float(np.linalg.norm(given))
     cosine = float(true @ given) / (size * right)
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    direction = true / size
-    deviation = np.sqrt(direction @ part(state, "gravity")[1] @ direction) / right
     # Noise of the accelerations changes the size alone.
-    share = _GRAVITY_SHARE if deviation > _UNCERTAIN else _KNOWN_SHARE
+    turned = np.radians(angle) > abs(size / right - 1.0)
+    share = _GRAVITY_SHARE if turned else _KNOWN_SHARE
     return bool(angle > _TILT_DEG and abs(size / right - 1.0) < share)
 
 
