@@ -29,7 +29,8 @@ _TOLERATED, _USUAL = 1.5, 1.15
 _PROBE, _PROBE_SLOPE = 1.35, 3.0
 _CONSIDERED, _BELIEVED, _CALMER = 6.0, 15.0, 0.5
 _FLEXIBLE = 1.5
-_GAINS, _GAINS_SHOWN = np.geomspace(1e-4, 0.1, 31), 20.0
+_GAINS, _GAINS_SHOWN, _GAINS_SHARE = np.geomspace(1e-4, 0.1, 31), 20.0, 0.5
+_GAINS_MOST = 0.025
 
 
 def covariance_of(state: State, rejected: Sequence[Candidate] = ()) -> Array:
@@ -55,7 +56,8 @@ def gain_covariance(state: State) -> Array:
     """(16, 16) of [offsets; phi] by errors of all gains, as large as the residual shows them.
 
     The 36 errors have one standard deviation, a torque's as at `ARM`: the largest that is nearly
-    the most likely one, or 0 if the likelihood without any is nearly the same.
+    the most likely one; 0 if the likelihood without any is nearly the same, if they explain less
+    than half of what smooth columns do, or if no sensor has errors as large.
     """
     fit, rows = state.fit, state.rows
     weights = rows.whitened(fit.filters) / fit.power[:, None, None]
@@ -81,7 +83,9 @@ def gain_covariance(state: State) -> Array:
         return float(np.sum(squares * more / (1.0 + more) - np.log1p(more)))
 
     likely = np.array([gained(std) for std in _GAINS])
-    if likely.max() < _GAINS_SHOWN:
+    of_gains = squares.sum() > _GAINS_SHARE * state.smooth_gain[0]
+    plausible = _GAINS[int(likely.argmax())] < _GAINS_MOST
+    if likely.max() < _GAINS_SHOWN or not of_gains or not plausible:
         return np.zeros((16, 16))
     largest = _GAINS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
     effects = largest * (inverse @ mixed)[LOAD]

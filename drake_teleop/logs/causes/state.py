@@ -95,6 +95,12 @@ class State:
         The columns are all signals in each channel alone, offsets of six parts of the record, R and
         springs in the world: about 45 in each channel. Near 1 or below for noise of any colour.
         """
+        gain, freedom = self.smooth_gain
+        return gain / max(1, freedom - self.model.size)
+
+    @cached_property
+    def smooth_gain(self) -> tuple[float, int]:
+        """Gain of twice the log likelihood by the smooth columns of `probe`, and their number."""
         columns = self.data.y[:, self._smooth()]
         if self.data.positions:
             columns = np.hstack([columns, self.data.y[:, RP] @ _springs().T])
@@ -108,7 +114,7 @@ class State:
             white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
             solved, rank = gain_of(x.T @ x, x.T @ white)
             gain, freedom = gain + solved / self.fit.power[c], freedom + rank
-        return gain / max(1, freedom - self.model.size)
+        return gain, freedom
 
     def _smooth(self) -> list[int]:
         used = list(range(PRODUCTS.stop))
