@@ -35,7 +35,7 @@ from drake_teleop.errors import DrakeTeleopError, one_line
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import Conventions, check_conventions
 from drake_teleop.logs.check.draft import draft_description
-from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.finding import EFFECTS, Finding
 from drake_teleop.logs.check.load_fit import white_noise
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
@@ -50,8 +50,6 @@ BANDWIDTH = 30.0
 REPEATED = 0.05
 """Repeated rows are mentioned from this share of all rows, or from a block of `BLOCK` rows."""
 BLOCK = 5
-_EFFECTS = ("lag", "units", "frame", "payload", "clock")
-"""Findings of conventions that a cause may have, too."""
 _SIGNIFICANT = 5.0
 """Standard deviations above which a delay is a finding."""
 _QUANTITIES = (
@@ -211,7 +209,7 @@ def _explained(
     except DrakeTeleopError:  # which the findings explain, or `identify` reports
         return findings, delay
     deviation = identified.delay_deviation_s
-    if identified.causes and all(finding.name in _EFFECTS for finding in findings):
+    if identified.causes and all(finding.name in EFFECTS for finding in findings):
         found_delay = identified.identification.delay_s if np.isfinite(deviation) else delay
         return [Finding(cause.name, cause.message) for cause in identified.causes], found_delay
     if identified.delay_source != "estimated" or not np.isfinite(deviation):

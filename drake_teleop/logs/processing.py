@@ -23,7 +23,7 @@ from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
 from drake_teleop.logs.cause_lines import doubted_force_unit
 from drake_teleop.logs.causes.cause import Cause, Stretch
-from drake_teleop.logs.check.conventions import check_log, question_fit
+from drake_teleop.logs.check.conventions import check_log, errors_of_description, question_fit
 from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.contact import (
     Detection,
@@ -199,6 +199,13 @@ def _identified(
     if why is not None and log.gain_std > 0.0 and {x.name for x in why.causes} <= _BY_GAINS:
         why = replace(why, causes=(), explained=True, loads=())
     causes: tuple[Cause, ...] = ()
+    errors: tuple[Finding, ...] = ()
+    if why is not None and why.causes and not why.noise:
+        errors = errors_of_description(Path(path))
+    if errors:
+        why = None
+        known = result.identifiable & np.repeat([True, False], [6, 10])
+        result = replace(result, identifiable=known)
     if why is not None:
         result = explained_load(result, why)
         causes = named_frame(why, other[0]) if other else why.causes
@@ -209,7 +216,9 @@ def _identified(
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
     findings = tuple(Finding(cause.name, cause.message) for cause in causes)
-    if not causes and not raw.free:
+    if errors:
+        findings = errors
+    elif not causes and not raw.free:
         findings = question_fit(Path(path), log, result, predicted, known_delay) or other
     doubt = doubted_force_unit(result.mass, causes, raw)
     if doubt is not None:

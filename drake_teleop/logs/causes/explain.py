@@ -47,6 +47,11 @@ class Explanation:
     given: tuple[str, ...] = ()
 
     @property
+    def noise(self) -> bool:
+        """Whether the residual is the sensor's noise, which may be coloured."""
+        return self.explained or settled(self.state)
+
+    @property
     def several_gains(self) -> bool:
         """Whether gains stand for errors of the whole matrix of gains."""
         model = self.state.model

@@ -12,6 +12,8 @@ from drake_teleop.load.arrays import Array
 from drake_teleop.logs.causes.instants import ORDER, Instants
 from drake_teleop.logs.causes.model import Model
 
+_FEWEST_OF_NOISE = 50
+"""Rows that an autoregression is fitted to."""
 Spans = tuple[tuple[float, float], ...]
 """(start, stop) of contacts [s]."""
 
@@ -84,7 +86,7 @@ class Rows:
         history = np.stack([e[self.whole - d] for d in range(ORDER + 1)], axis=2)
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)
         products /= max(len(self.whole), 1)
-        if order == 0:
+        if order == 0 or len(self.whole) < _FEWEST_OF_NOISE:
             return filters, np.maximum(products[:, 0, 0], floor)
         inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(ORDER)
         inner += 1e-300 * np.eye(ORDER)

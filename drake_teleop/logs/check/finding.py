@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+EFFECTS = ("lag", "units", "frame", "payload")
+"""Findings that may be the effect of a cause, such as drift."""
 CLOCK = 0.05
 """Larger disagreements of clocks are no lag of a filter, but of the clocks [s]."""
 
