@@ -103,7 +103,7 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
         if why.explained:
             return load
         stated = np.sqrt(np.diag(load.covariance))
-        ratio = np.maximum(1.0, why.blocks / np.maximum(stated, 1e-300))
+        ratio = np.maximum(1.0, why.deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
         if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _SPREAD:
             return load

@@ -9,7 +9,7 @@ import numpy as np
 from drake_teleop.load.arrays import Array
 from drake_teleop.logs.causes.cause import Cause, Stretch, causes_of, stretches
 from drake_teleop.logs.causes.instants import Instants
-from drake_teleop.logs.causes.intervals import block_deviations, covariance_of, gain_covariance
+from drake_teleop.logs.causes.intervals import covariance_of, misfit_deviations
 from drake_teleop.logs.causes.model import DELAY, LOAD
 from drake_teleop.logs.causes.search import Later, explained, search, settled
 from drake_teleop.logs.causes.state import State
@@ -27,7 +27,7 @@ class Explanation:
         explained: whether the residual is the sensor's noise.
         theta: (16,) [offsets; phi] within the model; of the first stretch if the load changes.
         covariance: (16, 16) of theta.
-        blocks: (16,) deviations by leaving out parts of the record, and by errors of gains.
+        deviations: (16,) of theta by what remains unexplained (`misfit_deviations`).
         delay_s: of the motion behind the wrench, in addition to what `instants` had [s].
         loads: the loads of a record whose load changes.
         removed_weight: (4,) [m, m c] whose weight is already removed, or None.
@@ -39,7 +39,7 @@ class Explanation:
     explained: bool
     theta: Array
     covariance: Array
-    blocks: Array
+    deviations: Array
     delay_s: float
     loads: tuple[Stretch, ...]
     removed_weight: Array | None
@@ -82,7 +82,7 @@ def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] =
             explained=noise,
             theta=state.x[LOAD],
             covariance=covariance,
-            blocks=np.sqrt(block_deviations(state) ** 2 + np.diag(gain_covariance(state))),
+            deviations=misfit_deviations(state, rejected),
             delay_s=late + float(state.x[DELAY]),
             loads=tuple(stretches(state, covariance)),
             removed_weight=removed,

@@ -28,7 +28,7 @@ _GROUPS = 12
 _TOLERATED, _USUAL = 1.5, 1.15
 _PROBE, _PROBE_SLOPE = 1.35, 3.0
 _CONSIDERED, _BELIEVED, _CALMER = 6.0, 15.0, 0.5
-_FLEXIBLE = 1.5
+_FLEXIBLE, _LOUD, _IMPLAUSIBLE = 1.5, 15.0, 2.2
 _GAINS, _GAINS_SHOWN, _GAINS_SHARE = np.geomspace(1e-4, 0.1, 31), 20.0, 0.5
 _GAINS_MOST = 0.025
 
@@ -39,17 +39,31 @@ def covariance_of(state: State, rejected: Sequence[Candidate] = ()) -> Array:
     deviations = np.sqrt(np.diag(out))
     blocks = block_deviations(state)
     factor = misfit_factor(state, blocks)
-    final = np.maximum(factor * deviations, blocks)
-    squares = final**2
+    squares = np.maximum(factor * deviations, blocks) ** 2 + _doubt(state, rejected)
+    ratio = np.sqrt(squares) / deviations
+    return np.asarray(out * np.outer(ratio, ratio) + gain_covariance(state))
+
+
+def misfit_deviations(state: State, rejected: Sequence[Candidate] = ()) -> Array:
+    """(16,) deviations of a rigid load by leaving out parts, and by what may act beside it."""
+    blocks = block_deviations(state)
+    if state.loudness > _LOUD and state.probe > _IMPLAUSIBLE:
+        blocks = blocks * (1.0 + _PROBE_SLOPE * (state.probe - _PROBE))
+    variance = blocks**2 + _doubt(state, rejected) + np.diag(gain_covariance(state))
+    return np.asarray(np.sqrt(variance))
+
+
+def _doubt(state: State, rejected: Sequence[Candidate]) -> Array:
+    """(16,) squared distances of the estimates of candidates that are not excluded."""
+    squares = np.zeros(16)
     for candidate in rejected:
         other = candidate.state
         share = min(1.0, candidate.score / _BELIEVED) if candidate.score > _CONSIDERED else 0.0
         if other.loudness < _CALMER * state.loudness:
             share = 1.0  # coloured noise predicts a misfit as well
         own = np.diag(other.fit.covariance)[LOAD]
-        squares = squares + share * ((other.x[LOAD] - state.x[LOAD]) ** 2 + own)
-    ratio = np.sqrt(squares) / deviations
-    return np.asarray(out * np.outer(ratio, ratio) + gain_covariance(state))
+        squares += share * ((other.x[LOAD] - state.x[LOAD]) ** 2 + own)
+    return squares
 
 
 def gain_covariance(state: State) -> Array:

@@ -93,8 +93,8 @@ def _search(state: State, late: float, later: Later | None) -> Found:
         if explained(state):
             return state, late, []
         found = _without_attenuation(list(candidates(state, first=number == 0)))
-        last = [x for x in found if plausible(x.state) and _effective(x, state)]
-        winner = _winner(last) or _long_contact(state, last)
+        last = [x for x in found if plausible(x.state)]
+        winner = _winner([x for x in last if _effective(x, state)]) or _calmer(state, last)
         if winner is None:
             other = _phases(state, last)
             if other is None:
@@ -135,15 +135,15 @@ def _in_time(state: State, late: float, later: Later | None) -> tuple[State, flo
     return state, late
 
 
-def _long_contact(state: State, found: list[Candidate]) -> Candidate | None:
-    """A contact without which the residual is a fifth.
+def _calmer(state: State, found: list[Candidate]) -> Candidate | None:
+    """The most plausible candidate whose residual is a fifth, or nearly the smallest of them.
 
-    The likelihood does not show a long and smooth contact: coloured noise predicts it as well.
+    The likelihood does not show a large and smooth misfit: coloured noise predicts it as well.
     """
-    for candidate in found:
-        if candidate.name == "contact" and candidate.state.loudness < _FIFTH * state.loudness:
-            return candidate
-    return None
+    calm = [x for x in found if x.state.loudness < _FIFTH * state.loudness]
+    least = min([x.state.loudness for x in calm], default=0.0)
+    near = [x for x in calm if x.state.loudness < 2.0 * least]
+    return min(near, key=lambda x: ORDER.index(x.name), default=None)
 
 
 def _phases(state: State, found: list[Candidate]) -> State | None:
