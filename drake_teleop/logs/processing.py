@@ -23,7 +23,7 @@ from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
 from drake_teleop.logs.cause_lines import doubted_force_unit
 from drake_teleop.logs.causes.cause import Cause, Stretch
-from drake_teleop.logs.check.conventions import check_log, errors_of_description, question_fit
+from drake_teleop.logs.check.conventions import check_log, errors_of_motion, question_fit
 from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.contact import (
     Detection,
@@ -201,7 +201,7 @@ def _identified(
     causes: tuple[Cause, ...] = ()
     errors: tuple[Finding, ...] = ()
     if why is not None and why.causes and not why.noise:
-        errors = errors_of_description(Path(path))
+        errors = errors_of_motion(Path(path))
     if errors:
         why = None
         known = result.identifiable & np.repeat([True, False], [6, 10])

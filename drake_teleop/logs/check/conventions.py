@@ -23,7 +23,7 @@ from drake_teleop.logs.check.against_pose import against_pose
 from drake_teleop.logs.check.against_position import position_finding
 from drake_teleop.logs.check.channels import channel_findings
 from drake_teleop.logs.check.edits import in_other_unit, unit_findings
-from drake_teleop.logs.check.finding import CLOCK, EFFECTS, Finding
+from drake_teleop.logs.check.finding import CLOCK, OF_MOTION, Finding
 from drake_teleop.logs.check.imu_alone import against_itself
 from drake_teleop.logs.check.load_fit import EXPLAINED, LoadFit, load_fit, unexplained_share
 from drake_teleop.logs.check.log_data import LogData
@@ -130,9 +130,9 @@ def question_fit(
     return tuple(found)
 
 
-def errors_of_description(path: Path) -> tuple[Finding, ...]:
-    """Return what `check_log` finds, without findings that a cause may have as well."""
-    return tuple(x for x in _findings(path, None) if x.name not in EFFECTS)
+def errors_of_motion(path: Path) -> tuple[Finding, ...]:
+    """Return the errors of the described motion that `check_log` finds."""
+    return tuple(x for x in _findings(path, None) if x.name in OF_MOTION)
 
 
 def _findings(path: Path, doubted: Log | None) -> list[Finding]:

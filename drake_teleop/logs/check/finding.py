@@ -6,6 +6,11 @@ from dataclasses import dataclass
 
 EFFECTS = ("lag", "units", "frame", "payload")
 """Findings that may be the effect of a cause, such as drift."""
+OF_MOTION = (
+    *("clock", "reversed gravity", "inverted orientation", "quaternion order", "degrees"),
+    "base axes",
+)
+"""Errors of the described motion, which resemble causes."""
 CLOCK = 0.05
 """Larger disagreements of clocks are no lag of a filter, but of the clocks [s]."""
 
