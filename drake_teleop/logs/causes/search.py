@@ -140,7 +140,7 @@ def _calmer(state: State, found: list[Candidate]) -> Candidate | None:
 
     The likelihood does not show a large and smooth misfit: coloured noise predicts it as well.
     """
-    stiff = [x for x in found if x.name not in _FLEXIBLE]
+    stiff = [x for x in found if x.name not in (*_FLEXIBLE, "linear drift")]
     calm = [x for x in stiff if x.state.loudness < _FIFTH * state.loudness]
     least = min([x.state.loudness for x in calm], default=0.0)
     near = [x for x in calm if x.state.loudness < 2.0 * least]
