@@ -29,6 +29,8 @@ _HALF, _FIFTH, _COLOURED, _SMALLER, _CERTAIN = 0.5, 0.2, 15.0, 0.9, 1000.0
 _ATTENUATED = 1.0 / 3.0
 _SMOOTH = 1.35
 """Largest probe of good records; what is left beyond it could resemble any cause."""
+_SMOOTH_ONES = ("axes", "gravity", "weight", "torque factor", "contact")
+"""Causes whose misfit may be as smooth as coloured noise."""
 _FLEXIBLE, _WIDE, _WIDE_SHARE = ("cable", "drift"), 80.0, 0.1
 """Causes whose many columns resemble others, and the margin by which they have to win."""
 
@@ -140,8 +142,8 @@ def _calmer(state: State, found: list[Candidate]) -> Candidate | None:
 
     The likelihood does not show a large and smooth misfit: coloured noise predicts it as well.
     """
-    stiff = [x for x in found if x.name not in (*_FLEXIBLE, "linear drift")]
-    calm = [x for x in stiff if x.state.loudness < _FIFTH * state.loudness]
+    calm = [x for x in found if x.name in _SMOOTH_ONES]
+    calm = [x for x in calm if x.state.loudness < _FIFTH * state.loudness]
     least = min([x.state.loudness for x in calm], default=0.0)
     near = [x for x in calm if x.state.loudness < 2.0 * least]
     return min(near, key=lambda x: ORDER.index(x.name), default=None)
