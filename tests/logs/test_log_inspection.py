@@ -350,3 +350,10 @@ def test_identify_takes_no_reversed_gravity_for_axes_and_a_torque_factor(
     planted.reversed_gravity(columns)
     with pytest.raises(DrakeTeleopError, match=r"gravity is reversed; set imu\.sign: -1"):
         identify_log(written(tmp_path, columns, **streams))
+
+
+@pytest.mark.parametrize("streams", [{}, {"pose": False}, {"imu": False}])
+def test_a_wrench_that_never_changes_is_named(tmp_path: Path, streams: dict[str, bool]) -> None:
+    columns = good()
+    columns["force"][:], columns["torque"][:] = 1.0, 0.1
+    assert set(findings(tmp_path, columns, **streams)) == {"dead channel"}

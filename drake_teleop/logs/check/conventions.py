@@ -92,7 +92,7 @@ def question_fit(
             explains less than half of the wrench, or the accelerometer is in another unit, and a
             finding says what to change.
     """
-    if (np.ptp(log.wrench, axis=0) <= _SAME * np.abs(log.wrench).max()).all():
+    if _never_changes(log):
         raise DrakeTeleopError(
             "the wrench is the same in all samples: no load can be identified",
             where=log.source,
@@ -194,8 +194,15 @@ def check_conventions(
     return replace(found, findings=tuple(findings))
 
 
+def _never_changes(log: Log) -> bool:
+    return bool((np.ptp(log.wrench, axis=0) <= _SAME * np.abs(log.wrench).max()).all())
+
+
 def _check(data: LogData, description: Description) -> Conventions:
     log = data.read(description)
+    if _never_changes(log):
+        message = "the wrench is the same in all samples; check the sensor's cable and its driver"
+        return Conventions((Finding("dead channel", message),), LoadFit(1.0, 0.0), None, None)
     if "gravity" in log.free and log.described is not None:  # found once, not for each edit
         description = description.model_copy(update={"gravity": log.described.gravity})
     dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
