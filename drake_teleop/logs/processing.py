@@ -200,7 +200,7 @@ def _identified(
         why = replace(why, causes=(), explained=True, loads=())
     causes: tuple[Cause, ...] = ()
     errors: tuple[Finding, ...] = ()
-    if why is not None and why.causes and not why.noise:
+    if why is not None and why.causes and why.misfit:
         errors = errors_of_motion(Path(path))
     if errors:
         why = None

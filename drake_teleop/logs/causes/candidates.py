@@ -47,7 +47,7 @@ _SURE, _FARTHEST, _STIFFEST = 10.0, 1.5, 1000.0  # 1, m, N/m
 _DRIFT_LEVELS = 3.0
 _NEGATIVE_DEVIATIONS, _NEGATIVE_SHARE = 8.0, 0.1
 _FACTOR_SHARE, _FACTOR_MOST, _FACTOR_MOST_FAR = 0.02, 0.06, 0.2
-_SIMILAR, _AS_LIKELY = 0.2, 1.0
+_SIMILAR, _AS_LIKELY, _FACTOR_STEPS = 0.2, 1.0, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +238,7 @@ def _factor(state: State) -> Iterator[Candidate]:
     found = []
     for factor in (1.0, *FACTORS):
         model = replace(state.model, factor=factor)
-        found.append(state.extended(model, state.x, steps=2))
+        found.append(state.extended(model, state.x, steps=_FACTOR_STEPS))
     most = max(x.likelihood for x in found)
     best = next(x for x in found if x.likelihood > most - _AS_LIKELY)
     if best is found[0]:

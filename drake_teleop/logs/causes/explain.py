@@ -11,7 +11,7 @@ from drake_teleop.logs.causes.cause import Cause, Stretch, causes_of, stretches
 from drake_teleop.logs.causes.instants import Instants
 from drake_teleop.logs.causes.intervals import covariance_of, misfit_deviations
 from drake_teleop.logs.causes.model import DELAY, LOAD
-from drake_teleop.logs.causes.search import Later, explained, search, settled
+from drake_teleop.logs.causes.search import Later, clearly_wrong, explained, search, settled
 from drake_teleop.logs.causes.state import State
 from drake_teleop.one_thread import one_blas_thread
 
@@ -47,9 +47,9 @@ class Explanation:
     given: tuple[str, ...] = ()
 
     @property
-    def noise(self) -> bool:
-        """Whether the residual is the sensor's noise, which may be coloured."""
-        return self.explained or settled(self.state)
+    def misfit(self) -> bool:
+        """Whether the residual is clearly not the sensor's noise, even if that is coloured."""
+        return not self.explained and clearly_wrong(self.state)
 
     @property
     def several_gains(self) -> bool:

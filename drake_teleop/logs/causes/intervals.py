@@ -28,7 +28,7 @@ _GROUPS = 12
 _TOLERATED, _USUAL = 1.5, 1.15
 _PROBE, _PROBE_SLOPE = 1.35, 3.0
 _CONSIDERED, _BELIEVED, _CALMER = 6.0, 15.0, 0.5
-_FLEXIBLE, _LOUD, _IMPLAUSIBLE = 1.5, 15.0, 2.2
+_FLEXIBLE, _LOUD, _IMPLAUSIBLE, _MISFIT = 1.5, 15.0, 2.2, 5.0
 _GAINS, _GAINS_SHOWN, _GAINS_SHARE = np.geomspace(1e-4, 0.1, 31), 20.0, 0.5
 _GAINS_MOST = 0.025
 
@@ -47,7 +47,7 @@ def covariance_of(state: State, rejected: Sequence[Candidate] = ()) -> Array:
 def misfit_deviations(state: State, rejected: Sequence[Candidate] = ()) -> Array:
     """(16,) deviations of a rigid load by leaving out parts, and by what may act beside it."""
     blocks = block_deviations(state)
-    if state.loudness > _LOUD and state.probe > _IMPLAUSIBLE:
+    if state.probe > (_IMPLAUSIBLE if state.loudness > _LOUD else _MISFIT):
         blocks = blocks * (1.0 + _PROBE_SLOPE * (state.probe - _PROBE))
     variance = blocks**2 + _doubt(state, rejected) + np.diag(gain_covariance(state))
     return np.asarray(np.sqrt(variance))

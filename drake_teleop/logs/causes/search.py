@@ -81,6 +81,11 @@ def settled(state: State) -> bool:
     return state.probe < _SMOOTH and state.loudness < _COLOURED
 
 
+def clearly_wrong(state: State) -> bool:
+    """Whether smooth signals explain the residual, or it is far above any coloured noise."""
+    return state.probe > IMPLAUSIBLE or state.loudness > _COLOURED
+
+
 def _begun(data: Instants, given: tuple[str, ...]) -> State:
     state = State.of(data, Model(parts=given))
     start = tilted(state) if "gravity" in given else None
