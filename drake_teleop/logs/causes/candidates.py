@@ -48,6 +48,7 @@ _DRIFT_LEVELS = 3.0
 _NEGATIVE_DEVIATIONS, _NEGATIVE_SHARE = 8.0, 0.1
 _FACTOR_SHARE, _FACTOR_MOST, _FACTOR_MOST_FAR = 0.02, 0.06, 0.2
 _SIMILAR, _AS_LIKELY, _FACTOR_STEPS = 0.2, 1.0, 4
+_DOUBTFUL = 30.0  # a score that widens intervals and names nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,13 +236,13 @@ def _drift_enough(state: State) -> bool:
 
 def _factor(state: State) -> Iterator[Candidate]:
     """The most usual known ratio of nearly the greatest likelihood, then refined."""
-    found = []
+    fits = []
     for factor in (1.0, *FACTORS):
         model = replace(state.model, factor=factor)
-        found.append(state.extended(model, state.x, steps=_FACTOR_STEPS))
-    most = max(x.likelihood for x in found)
-    best = next(x for x in found if x.likelihood > most - _AS_LIKELY)
-    if best is found[0]:
+        fits.append(state.extended(model, state.x, steps=_FACTOR_STEPS))
+    most = max(x.likelihood for x in fits)
+    best = next(x for x in fits if x.likelihood > most - _AS_LIKELY)
+    if best is fits[0]:
         return
     best = state.extended(best.model, best.x)
     if 2.0 * (best.likelihood - state.likelihood) < 20.0:
@@ -252,8 +253,9 @@ def _factor(state: State) -> Iterator[Candidate]:
     far = not _SIMILAR < best.model.factor < 1.0 / _SIMILAR
     most = _FACTOR_MOST_FAR if far else _FACTOR_MOST
     limit = min(_FACTOR_SHARE + 4.0 * np.sqrt(covariance[0, 0]), most)
-    if abs(value[0]) < limit:
-        yield _candidate("torque factor", state, best, more=1)
+    found = _candidate("torque factor", state, best, more=1)
+    # A factor that is not quite a known one is no cause, but makes the load doubtful.
+    yield found if abs(value[0]) < limit else replace(found, score=min(found.score, _DOUBTFUL))
 
 
 def _axes(state: State) -> Iterator[Candidate]:
