@@ -28,7 +28,9 @@ _GROUPS = 12
 _TOLERATED, _USUAL = 1.5, 1.15
 _PROBE, _PROBE_SLOPE = 1.35, 3.0
 _CONSIDERED, _BELIEVED, _CALMER = 6.0, 15.0, 0.5
-_FLEXIBLE, _LOUD, _IMPLAUSIBLE, _MISFIT = 1.5, 15.0, 2.2, 5.0
+_FLEXIBLE, _LOUD, _IMPLAUSIBLE, _MISFIT = 1.5, 20.0, 2.2, 6.0
+_CHANGING = ("offsets", "load", "linear drift", "drift")
+"""Causes whose effect leaving out parts of the record shows."""
 _GAINS, _GAINS_SHOWN, _GAINS_SHARE = np.geomspace(1e-4, 0.1, 31), 20.0, 0.5
 _GAINS_MOST = 0.025
 
@@ -49,7 +51,8 @@ def misfit_deviations(state: State, rejected: Sequence[Candidate] = ()) -> Array
     blocks = block_deviations(state)
     if state.probe > (_IMPLAUSIBLE if state.loudness > _LOUD else _MISFIT):
         blocks = blocks * (1.0 + _PROBE_SLOPE * (state.probe - _PROBE))
-    variance = blocks**2 + _doubt(state, rejected) + np.diag(gain_covariance(state))
+    lasting = [x for x in rejected if x.name not in _CHANGING]
+    variance = blocks**2 + _doubt(state, lasting) + np.diag(gain_covariance(state))
     return np.asarray(np.sqrt(variance))
 
 
