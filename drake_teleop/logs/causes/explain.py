@@ -9,7 +9,12 @@ import numpy as np
 from drake_teleop.load.arrays import Array
 from drake_teleop.logs.causes.cause import Cause, Stretch, causes_of, stretches
 from drake_teleop.logs.causes.instants import Instants
-from drake_teleop.logs.causes.intervals import covariance_of, misfit_deviations
+from drake_teleop.logs.causes.intervals import (
+    block_deviations,
+    covariance_of,
+    gain_covariance,
+    misfit_deviations,
+)
 from drake_teleop.logs.causes.model import DELAY, LOAD
 from drake_teleop.logs.causes.search import Later, clearly_wrong, explained, search, settled
 from drake_teleop.logs.causes.state import State
@@ -69,7 +74,8 @@ def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] =
     """
     with one_blas_thread():
         state, late, rejected = search(data, later, given)
-        covariance = covariance_of(state, rejected)
+        blocks, gains = block_deviations(state), gain_covariance(state)
+        covariance = covariance_of(state, rejected, blocks, gains)
         causes = causes_of(state, given)
         noise = explained(state)
         if not causes and (noise or settled(state)) and _no_load(state, covariance):
@@ -82,7 +88,7 @@ def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] =
             explained=noise,
             theta=state.x[LOAD],
             covariance=covariance,
-            deviations=misfit_deviations(state, rejected),
+            deviations=misfit_deviations(state, rejected, blocks, gains),
             delay_s=late + float(state.x[DELAY]),
             loads=tuple(stretches(state, covariance)),
             removed_weight=removed,

@@ -28,36 +28,45 @@ _GROUPS = 12
 _TOLERATED, _USUAL = 1.5, 1.15
 _PROBE, _PROBE_SLOPE = 1.35, 3.0
 _CONSIDERED, _BELIEVED, _CALMER = 6.0, 15.0, 0.5
-_FLEXIBLE, _LOUD, _IMPLAUSIBLE, _MISFIT = 1.5, 20.0, 2.2, 6.0
+_CABLE_FACTOR, _LOUD, _IMPLAUSIBLE, _MISFIT = 1.5, 20.0, 2.2, 6.0
 _CHANGING = ("offsets", "load", "linear drift", "drift")
 """Causes whose effect leaving out parts of the record shows."""
 _GAINS, _GAINS_SHOWN, _GAINS_SHARE = np.geomspace(1e-4, 0.1, 31), 20.0, 0.5
 _GAINS_MOST = 0.025
 
 
-def covariance_of(state: State, rejected: Sequence[Candidate] = ()) -> Array:
-    """(16, 16) of [offsets; phi], widened by what the model leaves unexplained."""
+def covariance_of(
+    state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
+) -> Array:
+    """Return (16, 16) of [offsets; phi], widened by what the model leaves unexplained.
+
+    Args:
+        state: the model.
+        rejected: candidates of the last round.
+        blocks, gains: as of `block_deviations` and `gain_covariance`.
+    """
     out = state.fit.covariance[LOAD, LOAD].copy()
     deviations = np.sqrt(np.diag(out))
-    blocks = block_deviations(state)
     factor = misfit_factor(state, blocks)
-    squares = np.maximum(factor * deviations, blocks) ** 2 + _doubt(state, rejected)
+    squares = np.maximum(factor * deviations, blocks) ** 2
+    squares = squares + _squared_distances(state, rejected)
     ratio = np.sqrt(squares) / deviations
-    return np.asarray(out * np.outer(ratio, ratio) + gain_covariance(state))
+    return np.asarray(out * np.outer(ratio, ratio) + gains)
 
 
-def misfit_deviations(state: State, rejected: Sequence[Candidate] = ()) -> Array:
-    """(16,) deviations of a rigid load by leaving out parts, and by what may act beside it."""
-    blocks = block_deviations(state)
+def misfit_deviations(
+    state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
+) -> Array:
+    """Return (16,) deviations of a rigid load, as of `covariance_of`, where no cause is named."""
     if state.probe > (_IMPLAUSIBLE if state.loudness > _LOUD else _MISFIT):
         blocks = blocks * (1.0 + _PROBE_SLOPE * (state.probe - _PROBE))
     lasting = [x for x in rejected if x.name not in _CHANGING]
-    variance = blocks**2 + _doubt(state, lasting) + np.diag(gain_covariance(state))
+    variance = blocks**2 + _squared_distances(state, lasting) + np.diag(gains)
     return np.asarray(np.sqrt(variance))
 
 
-def _doubt(state: State, rejected: Sequence[Candidate]) -> Array:
-    """(16,) squared distances of the estimates of candidates that are not excluded."""
+def _squared_distances(state: State, rejected: Sequence[Candidate]) -> Array:
+    """Return (16,) squared distances of the estimates of candidates that are not excluded."""
     squares = np.zeros(16)
     for candidate in rejected:
         other = candidate.state
@@ -70,7 +79,7 @@ def _doubt(state: State, rejected: Sequence[Candidate]) -> Array:
 
 
 def gain_covariance(state: State) -> Array:
-    """(16, 16) of [offsets; phi] by errors of all gains, as large as the residual shows them.
+    """Return (16, 16) of [offsets; phi] by errors of all gains of the size that the residual shows.
 
     The 36 errors have one standard deviation, a torque's as at `ARM`: the largest that is nearly
     the most likely one; 0 if the likelihood without any is nearly the same, if they explain less
@@ -85,10 +94,10 @@ def gain_covariance(state: State) -> Array:
     mixed, gram, right = np.zeros((len(J), 36)), np.zeros((36, 36)), np.zeros(36)
     for c in range(6):
         own = slice(6 * c, 6 * c + 6)
-        of_gains = wrench * (unit[c] / unit)[:, None]
-        weighted = of_gains @ weights[c]
+        columns = wrench * (unit[c] / unit)[:, None]
+        weighted = columns @ weights[c]
         mixed[:, own] = J[:, c] @ weighted.T
-        gram[own, own] = weighted @ of_gains.T
+        gram[own, own] = weighted @ columns.T
         right[own] = weighted @ fit.residual[c]
     schur = gram - mixed.T @ inverse @ mixed
     values, vectors = np.linalg.eigh(0.5 * (schur + schur.T))
@@ -100,9 +109,9 @@ def gain_covariance(state: State) -> Array:
         return float(np.sum(squares * more / (1.0 + more) - np.log1p(more)))
 
     likely = np.array([gained(std) for std in _GAINS])
-    of_gains = squares.sum() > _GAINS_SHARE * state.smooth_gain[0]
+    explaining = squares.sum() > _GAINS_SHARE * state.smooth_gain[0]
     plausible = _GAINS[int(likely.argmax())] < _GAINS_MOST
-    if likely.max() < _GAINS_SHOWN or not of_gains or not plausible:
+    if likely.max() < _GAINS_SHOWN or not explaining or not plausible:
         return np.zeros((16, 16))
     largest = _GAINS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
     effects = largest * (inverse @ mixed)[LOAD]
@@ -118,7 +127,7 @@ def misfit_factor(state: State, blocks: Array) -> float:
         spread = float(np.sqrt(np.mean((blocks[shown] / deviations[shown]) ** 2)))
         factor = spread / _USUAL if spread > _TOLERATED else 1.0
     if "cable" in state.model.parts:
-        factor *= _FLEXIBLE  # a spring is a cable to first order
+        factor *= _CABLE_FACTOR  # a spring is a cable to first order
     return factor * (1.0 + _PROBE_SLOPE * max(0.0, state.probe - _PROBE))
 
 

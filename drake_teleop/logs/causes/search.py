@@ -29,7 +29,8 @@ _HALF, _FIFTH, _COLOURED, _SMALLER, _CERTAIN = 0.5, 0.2, 15.0, 0.9, 1000.0
 _ATTENUATED = 1.0 / 3.0
 _SMOOTH = 1.35
 """Largest probe of good records; what is left beyond it could resemble any cause."""
-_SMOOTH_ONES = ("axes", "gravity", "weight", "torque factor", "contact")
+_STEPS, _LARGER = ("offsets", "load"), 3.0
+_SMOOTH_CAUSES = ("axes", "gravity", "weight", "torque factor", "contact")
 """Causes whose misfit may be as smooth as coloured noise."""
 _FLEXIBLE, _WIDE, _WIDE_SHARE = ("cable", "drift"), 80.0, 0.1
 """Causes whose many columns resemble others, and the margin by which they have to win."""
@@ -101,7 +102,8 @@ def _search(state: State, late: float, later: Later | None) -> Found:
             return state, late, []
         found = _without_attenuation(list(candidates(state, first=number == 0)))
         last = [x for x in found if plausible(x.state)]
-        winner = _winner([x for x in last if _effective(x, state)]) or _calmer(state, last)
+        effective = [x for x in last if _effective(x, state)]
+        winner = _winner(effective) or _of_smallest_residual(state, last)
         if winner is None:
             other = _phases(state, last)
             if other is None:
@@ -142,12 +144,12 @@ def _in_time(state: State, late: float, later: Later | None) -> tuple[State, flo
     return state, late
 
 
-def _calmer(state: State, found: list[Candidate]) -> Candidate | None:
+def _of_smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
     """The most plausible candidate whose residual is a fifth, or nearly the smallest of them.
 
     The likelihood does not show a large and smooth misfit: coloured noise predicts it as well.
     """
-    calm = [x for x in found if x.name in _SMOOTH_ONES]
+    calm = [x for x in found if x.name in _SMOOTH_CAUSES]
     calm = [x for x in calm if x.state.loudness < _FIFTH * state.loudness]
     least = min([x.state.loudness for x in calm], default=0.0)
     near = [x for x in calm if x.state.loudness < 2.0 * least]
@@ -168,6 +170,8 @@ def _effective(candidate: Candidate, state: State) -> bool:
     smaller = other.loudness < _SMALLER * state.loudness
     if candidate.name == "cable":
         return smaller  # its force is far above the noise
+    if candidate.name not in _STEPS and other.loudness > _LARGER * state.loudness:
+        return False  # coloured noise explains the residual that the candidate makes
     better = smaller or other.probe < _SMALLER * state.probe
     return bool(better or negative(state) or candidate.score > _CERTAIN)
 

@@ -1,0 +1,74 @@
+"""Causes in records with known truth, made by a generator that does not use the package."""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from planted_causes import run
+
+pytestmark = pytest.mark.slow
+
+
+@cache
+def judged(kind: str, motion: str, sensor: str, seed: int) -> dict[str, Any]:
+    return run((kind, motion, sensor, seed))
+
+
+@pytest.mark.parametrize(
+    ("case", "names"),
+    [
+        (("zero change + load change", "fourier", "poses", 0), {"zero change", "load change"}),
+        (("zero change + load change", "pick", "imu", 3), {"zero change", "load change"}),
+        (("weight removed", "fourier", "imu", 5), {"weight removed"}),
+        (("torque factor", "fourier", "poses", 4), {"torque factor"}),
+        (("cable", "pick", "poses", 1), {"cable"}),
+        (("gravity direction", "pick", "poses", 2), {"gravity direction"}),
+        (("no load", "fourier", "imu", 3), {"no load"}),
+        (("wrist only", "pick", "poses", 9), set()),
+        (("wrist only", "pick", "poses", 21), set()),
+        (("none", "slow", "imu", 18), set()),
+        (("none", "slow", "imu", 56), set()),
+        (("none", "pick", "poses", 51), set()),
+    ],
+)
+def test_the_right_causes_are_named_and_no_number_is_certain_and_wrong(
+    case: tuple[str, str, str, int], names: set[str]
+) -> None:
+    found = judged(*case)
+    assert {name for name, *_ in found["named"]} == names
+    assert found["false"] == []
+    assert found["time_error"] is None or found["time_error"] < 0.1
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        ("gain matrix", "fourier", "poses", 3),
+        ("gain matrix", "pick", "poses", 0),
+        ("gain matrix", "pick", "poses", 2),
+        ("hysteresis", "pick", "poses", 1),
+        ("contact", "fourier", "imu", 0),
+        ("contact", "fourier", "imu", 2),
+        ("gain", "pick", "poses", 2),
+        ("torque factor", "fourier", "imu", 8),
+        ("none", "slow", "imu", 91),
+        ("zero change + load change", "pick", "poses", 2),
+    ],
+)
+def test_no_number_is_certain_and_wrong_where_the_cause_has_no_name(
+    case: tuple[str, str, str, int],
+) -> None:
+    assert judged(*case)["false"] == []
+
+
+def test_a_slow_record_of_an_imu_gives_mass_and_centre() -> None:
+    """Its angular acceleration is mostly noise."""
+    cover = judged("none", "slow", "imu", 31)["cover"]
+    assert cover["mass"][1] == 1 and cover["com"][1] == 3 and cover["inertia"][1] == 0
