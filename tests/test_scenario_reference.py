@@ -10,6 +10,7 @@ import jsonschema
 import pytest
 from pydrake.common.yaml import yaml_load
 
+from drake_teleop import scenario_reference
 from drake_teleop.channel.network import NetworkConfig
 from drake_teleop.cli import main
 from drake_teleop.environment.slot import Slot
@@ -18,7 +19,7 @@ from drake_teleop.operator.operator import MinimumJerk, Sine
 from drake_teleop.operator.task import Press
 from drake_teleop.resources import scenarios_dir
 from drake_teleop.scenario import LoadScenario, Scenario, ScenarioFromData, ScenarioNames
-from drake_teleop.scenario_reference import commented, json_schema, reference
+from drake_teleop.scenario_reference import commented, json_schema, reference, write_scenario
 from drake_teleop.sensor.presets import PRESETS
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -136,3 +137,17 @@ def test_the_schema_refuses_what_the_library_refuses(text: str, field: list[str 
         loaded(text)
     (error,) = SCHEMA.iter_errors(as_an_editor_sees_it(text))
     assert list(error.absolute_path) == field
+
+
+def test_a_scenario_that_would_be_read_as_another_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = LoadScenario("free_motion_force")
+    scenario.slave.model = "arm.sdf #2.sdf"
+    write_scenario(tmp_path / "whole.yaml", scenario)
+    unquoted = commented(scenario).replace("'arm.sdf #2.sdf'", "arm.sdf #2.sdf")
+    assert unquoted != commented(scenario)
+    monkeypatch.setattr(scenario_reference, "commented", lambda _: unquoted)
+    with pytest.raises(DrakeTeleopError, match="cannot be written"):
+        write_scenario(tmp_path / "cut.yaml", scenario)
+    assert not (tmp_path / "cut.yaml").exists()

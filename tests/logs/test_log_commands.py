@@ -374,6 +374,9 @@ def test_three_poses_are_not_exact(tmp_path: Path, decimals: int, least: float) 
     assert summary["com_std"][2] > 5e-5 and (decimals < 6 or summary["com_std"][2] < 2e-4)
     assert (np.array(summary["offsets_std"][:3]) > least / np.sqrt(12 * 3)).all()
     assert read_log(path).resolution == pytest.approx((10.0**-decimals, 1e-6))
+    static["force"]["scale"] = [-0.5, 2.0, 1.0]
+    path.write_text(yaml.safe_dump({"static": static}))
+    assert read_log(path).resolution == pytest.approx((2.0 * 10.0**-decimals, 1e-6))
 
 
 @pytest.mark.slow

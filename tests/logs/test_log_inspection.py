@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import UserDict
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.cli import main
 from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.logs import inspection
 from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
@@ -110,6 +112,20 @@ def test_a_lag_of_6_ms_is_named(tmp_path: Path) -> None:
     found = findings(tmp_path, good(delay_s=0.006))
     assert set(found) == {"lag"}
     assert "6.0 ms behind" in found["lag"]
+
+
+@pytest.mark.parametrize(("deviation", "names"), [(0.001, set()), (0.0005, {"lag"})])
+def test_a_lag_counts_from_five_standard_deviations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deviation: float, names: set[str]
+) -> None:
+    path = written(tmp_path, good())
+    found = replace(
+        identify_log(path), delay_source="estimated", delay_deviation_s=deviation, causes=()
+    )
+    found = replace(found, identification=replace(found.identification, delay_s=0.003))
+    monkeypatch.setattr(inspection, "identify_log", lambda _: found)
+    summary = inspect_command(path, tmp_path / "out", quiet=True)
+    assert {finding["name"] for finding in summary["findings"]} == names
 
 
 def test_an_inverse_orientation_is_read(tmp_path: Path) -> None:
