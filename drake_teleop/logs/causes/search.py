@@ -78,12 +78,12 @@ def search(data: Instants, later: Later | None = None, given: tuple[str, ...] = 
 
 
 def settled(state: State) -> bool:
-    """Whether the residual may be coloured noise of the sensor: no smooth signal explains it."""
+    """Return whether the residual may be coloured noise: no smooth signal explains it."""
     return state.probe < _SMOOTH and state.loudness < _COLOURED
 
 
 def clearly_wrong(state: State) -> bool:
-    """Whether smooth signals explain the residual, or it is far above any coloured noise."""
+    """Return whether smooth signals explain the residual, or it exceeds any coloured noise."""
     return state.probe > IMPLAUSIBLE or state.loudness > _COLOURED
 
 
@@ -123,10 +123,10 @@ def _search(state: State, late: float, later: Later | None) -> Found:
 
 
 def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
-    """Remove a cable if a weight above the inertial mass explains nearly as much.
+    """Remove the cable if a third of its score comes from an inertial mass below the weight's.
 
-    Noise of the accelerations makes the inertial mass too small, where little but noise accelerates
-    the load. The columns of a cable explain that, too.
+    Noise of the accelerations makes the inertial mass too small if the load hardly accelerates. The
+    columns of a cable explain this effect, too.
     """
     best = max((x.score for x in found if x.name == "weight" and not plausible(x.state)), default=0)
     return [x for x in found if x.name != "cable" or best < _ATTENUATED * x.score]
@@ -145,9 +145,10 @@ def _in_time(state: State, late: float, later: Later | None) -> tuple[State, flo
 
 
 def _of_smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
-    """The most plausible candidate whose residual is a fifth, or nearly the smallest of them.
+    """Return the most plausible candidate that reduces the residual to a fifth, or None.
 
-    The likelihood does not show a large and smooth misfit: coloured noise predicts it as well.
+    Only candidates with at most twice the smallest residual compete. The likelihood does not show a
+    large and smooth misfit, because coloured noise predicts it as well.
     """
     calm = [x for x in found if x.name in _SMOOTH_CAUSES]
     calm = [x for x in calm if x.state.loudness < _FIFTH * state.loudness]
@@ -157,7 +158,7 @@ def _of_smallest_residual(state: State, found: list[Candidate]) -> Candidate | N
 
 
 def _phases(state: State, found: list[Candidate]) -> State | None:
-    """Other loads and offsets in the place of a contact without which the residual is a half."""
+    """Replace a contact that halves the residual by changes of load and offsets that explain it."""
     for candidate in found:
         if candidate.name == "contact" and candidate.state.loudness < _HALF * state.loudness:
             return phases(candidate.state)
