@@ -233,7 +233,7 @@ def _unmoved(root: Element, sensor: str) -> set[str]:
 
     def way(link: str) -> list[str]:
         passed = [link]
-        while passed[-1] in joints:
+        while passed[-1] in joints and joints[passed[-1]][0] not in passed:  # a loop has no end
             passed.append(joints[passed[-1]][0])
         return passed
 

@@ -25,6 +25,7 @@ from drake_teleop.texts import read_yaml
 
 # Of all files, each counted as often as it is included; and bytes of each text.
 _MAX_FILES, _MAX_BYTES, _MAX_TEXT = 2000, 500_000_000, 50_000_000
+_LONGEST_NAME = 4096
 _MAX_DEPTH = 20  # of files that include each other
 _BINARY = (".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2", ".dae")
 _PACKAGE = "package.xml"
@@ -142,6 +143,9 @@ class ModelFiles:
         folders = {top / base for top in tops for base in self._bases}
         try:
             for address in self._addresses(path):
+                if len(address) > _LONGEST_NAME and path.suffix.lower() not in (".obj", ".mtl"):
+                    what = f"names a file by {len(address)} characters"  # which ends Drake
+                    raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
                 named = {self.file(address, folder) for folder in folders}
                 found = {file for each in named for file in _existing(each)}
                 yield from (each for each in found if each != path.parent)

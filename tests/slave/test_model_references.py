@@ -267,6 +267,29 @@ def test_an_include_that_may_not_be_is_one_line(folder: Path, name: str) -> None
         parse(path)
 
 
+def test_a_name_of_any_length_is_one_line(folder: Path) -> None:
+    """Drake's pattern for addresses ends the process on a long one."""
+    long = "file://" + "a" * 30_000
+    path = folder / "a.yaml"
+    path.write_text(f"directives: [add_directives: {{file: '{long}'}}]")
+    with pytest.raises(DrakeTeleopError, match="30007 characters"):
+        parse(path)
+
+
+def test_joints_in_a_circle_are_one_line(folder: Path) -> None:
+    moments = 'ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"'
+    inertia = f'<inertial><mass value="1"/><inertia {moments}/></inertial>'
+    links = "".join(f'<link name="{name}">{inertia}</link>' for name in "lab")
+    joints = "".join(
+        f'<joint name="{p}{c}" type="revolute"><parent link="{p}"/><child link="{c}"/></joint>'
+        for p, c in ("la", "ab", "bl")
+    )
+    path = folder / "a.urdf"
+    path.write_text(f'<robot name="r">{links}{joints}</robot>')
+    with pytest.raises(DrakeTeleopError):
+        parse(path)
+
+
 def test_a_file_where_the_process_is_is_none_of_the_model(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,6 +27,8 @@ def fit_with_offset(columns: Array, target: Array, independent: float) -> Fit | 
         target: (N, c)
         independent: how many of the N rows say something new.
     """
+    if len(columns) == 0:
+        return None
     columns, target = columns - columns.mean(axis=0), target - target.mean(axis=0)
     A, b = columns.reshape(-1, columns.shape[2]), target.ravel()
     size = np.linalg.norm(A, axis=0)
