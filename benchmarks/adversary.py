@@ -1,7 +1,7 @@
 """How much energy does each method give out to an adversary, and how fast does it throw the hand?
 
 `python benchmarks/adversary.py [--runs N] [--seed S] [--method M ...] [--json FILE]` lets
-`drake_teleop.comparison.one_dof` run for 12 s, N (10 000) times in all: as often with each method.
+`lab.comparison.one_dof` run for 12 s, N (10 000) times in all: as often with each method.
 Random are the network (loss alone and in bursts, jitter with and without reordering, outages, a
 delay that steps or swings), the hand (light to firm, a change of grip, let go), the wall (0.5 to
 50 kN/m; it stands, vanishes, jumps or swings) and the motion (slow presses, taps of 0.7 to 3 Hz,
@@ -39,8 +39,7 @@ import numpy as np
 from adversary_cases import FREE, STEPS, TIME, case_of, let_go_at, prepared, silences, smooth
 from numpy.typing import NDArray
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import (
+from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
     COMMAND,
     HAND,
@@ -52,8 +51,9 @@ from drake_teleop.comparison.one_dof import (
     operators_intent,
     run_one_dof,
 )
-from drake_teleop.passivity.ledger import LedgerConfig
-from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.ledger import LedgerConfig
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 
 CHARGED = 1.5  # s; later, the least energy is no longer that of the start
 LEAKS = -1e-6  # J, less is more than rounding

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.channel import network
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import PERIOD, REFERENCE
+from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE
+from drake_teleop.station.channel import network
+from drake_teleop.station.channel.network import NetworkConfig
 
 Array = NDArray[np.float64]
 Draw = Callable[[float], Any]

@@ -27,14 +27,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from drake_teleop.analysis import absolute_stability, delayed_loop, margins, transparency, two_port
-from drake_teleop.analysis.cut_loop import cut_loop, delay_margin, loop_response
-from drake_teleop.analysis.maps import StabilityMap, stability_map
-from drake_teleop.analysis.one_axis import OneAxis, device_impedance, environment_impedance
-from drake_teleop.analysis.period_map import Sampling, delay_steps
-from drake_teleop.analysis.sampled_loop import growth_rate, sampled_loop, sampled_two_port
-from drake_teleop.operator.operator import GRIPS
-from drake_teleop.sensor.sensor_chain import butterworth_sections
+from drake_teleop.lab.analysis import (
+    absolute_stability,
+    delayed_loop,
+    margins,
+    transparency,
+    two_port,
+)
+from drake_teleop.lab.analysis.cut_loop import cut_loop, delay_margin, loop_response
+from drake_teleop.lab.analysis.maps import StabilityMap, stability_map
+from drake_teleop.lab.analysis.one_axis import OneAxis, device_impedance, environment_impedance
+from drake_teleop.lab.analysis.period_map import Sampling, delay_steps
+from drake_teleop.lab.analysis.sampled_loop import growth_rate, sampled_loop, sampled_two_port
+from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
 

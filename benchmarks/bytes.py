@@ -82,7 +82,7 @@ SHORTER: dict[str, Command] = {
 """Of `COMMANDS`, for every combination."""
 IN_ONE_PROCESS = """
 import json, sys
-from drake_teleop.cli import main
+from drake_teleop.cli.main import main
 for words in json.loads(sys.argv[1]):
     try:
         main(words)

@@ -86,9 +86,9 @@ def turned(omega: Array, dt: float) -> Array:
 
 def excited(t: Array) -> Motion:
     """The motion of `excite` for the station's slave, period after period."""
-    from drake_teleop.excitation.excite import excite, sensor_motion
-    from drake_teleop.excitation.robot import RobotFromScenario
-    from drake_teleop.scenario import LoadScenario
+    from drake_teleop.lab.excitation.excite import excite, sensor_motion
+    from drake_teleop.lab.excitation.robot import RobotFromScenario
+    from drake_teleop.station.scenario import LoadScenario
 
     robot = RobotFromScenario(LoadScenario("contact_transition"))
     found = excite(robot, seed=0, progress=False)

@@ -20,25 +20,25 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from drake_teleop.analysis.delayed_loop import delay_margin, station_loop, unstable_poles
-from drake_teleop.analysis.linearization import linearize
-from drake_teleop.analysis.one_axis import OneAxis
-from drake_teleop.analysis.sampled_wall import passive_stiffness, stable_stiffness
-from drake_teleop.environment.sheet_spring import SheetSpring
-from drake_teleop.identification import slave_arm
+from drake_teleop.lab.analysis.delayed_loop import delay_margin, station_loop, unstable_poles
+from drake_teleop.lab.analysis.linearization import linearize
+from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.lab.analysis.sampled_wall import passive_stiffness, stable_stiffness
+from drake_teleop.lab.identification import slave_arm
 from drake_teleop.load.contact.memory import SIZE
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.contact.statistics import detection_update
-from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.sensor.presets import PRESETS
-from drake_teleop.sensor.sensor_chain import (
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.sensor.presets import PRESETS
+from drake_teleop.station.sensor.sensor_chain import (
     NOISE_SIZE,
     WristSensorConfig,
     read_into,
     sensor_chain,
 )
-from drake_teleop.simulation import MakeSimulator, advance
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station.simulation import MakeSimulator, advance
+from drake_teleop.station.station import MakeTeleopStation
 
 PERIOD = 1 / 8000  # [s] of the sensor
 N = 100  # cells of a grid in each direction

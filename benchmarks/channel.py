@@ -12,10 +12,10 @@ import argparse
 import json
 from pathlib import Path
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.passivity.methods import METHODS, PassivityConfig
-from drake_teleop.reproduction.speed import MakeMovingStation, cpu_seconds
-from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.lab.reproduction.speed import MakeMovingStation, cpu_seconds
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.station.scenario import LoadScenario, replace
 
 
 def main() -> None:

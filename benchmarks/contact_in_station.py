@@ -34,32 +34,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.channel.network import PRESETS
-from drake_teleop.estimation.contact_detection import ContactDetectionConfig
-from drake_teleop.identification import (
+from drake_teleop.common.progress import show_progress
+from drake_teleop.lab.identification import (
     identification_scenario,
     identify_load,
     sensor_samples,
     slave_arm,
 )
+from drake_teleop.lab.run_summary import in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.noise_floor import NoiseFloor
-from drake_teleop.operator.operator import OperatorConfig, Sine
-from drake_teleop.pages.progress import show_progress
-from drake_teleop.result import SimulationResult
-from drake_teleop.run import in_contact
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.arm import accelerations
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import PRESETS
+from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.station.operator.operator import OperatorConfig, Sine
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.arm import accelerations
+from drake_teleop.station.station import MakeTeleopStation
 
 Array = NDArray[np.float64]
 Known = tuple[Array, NoiseFloor]
 
 SEEDS = range(5)
 RUN_S, SEGMENT_S = 300.0, 10.0
-# Longest delay of the gamma distribution over its mean, in jitters: drake_teleop.channel.network.
+# Longest delay of the gamma distribution over its mean, in jitters (station.channel.network).
 TAIL = 6.0
 
 

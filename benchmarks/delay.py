@@ -1,7 +1,7 @@
 """How far does each method carry a delay, in one degree of freedom?
 
 `python benchmarks/delay.py [--json FILE] [--seeds N]` presses on a wall, holds, lets go and rests
-with `drake_teleop.comparison.one_dof` over networks with jitter 0, 25 and 50 % of the delay and
+with `drake_teleop.lab.comparison.one_dof` over networks with jitter 0, 25 and 50 % of the delay and
 loss 0, 10 and 30 %, with N (6) seeds each. Each method runs at the round trip that it is known to
 carry, `charged_tdpa` at several and before a stiffer wall, no method at 15 ms. A row has the worst
 of its runs: stable in how many, force error while holding (in the last 1.9 s of 5 s, and of 13 s:
@@ -22,8 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import (
+from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     Figures,
     Task,
@@ -31,7 +30,8 @@ from drake_teleop.comparison.one_dof import (
     operators_intent,
     run_one_dof,
 )
-from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.methods import PassivityConfig
 
 PAPER, STIFF = 5100.0, 20000.0  # N/m
 JITTER, LOSS = (0.0, 0.25, 0.5), (0.0, 0.1, 0.3)

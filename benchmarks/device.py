@@ -26,8 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.environment.wall import Wall
-from drake_teleop.identified_load import identified_load
+from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.device_guard import DeviceGuard, Limits
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, packed_state, unpacked_state
@@ -37,8 +36,9 @@ from drake_teleop.live.live import Live
 from drake_teleop.live.pace import without_collections
 from drake_teleop.live.session import Session, live_scenario
 from drake_teleop.live.virtual_device import VirtualDevice, tapping
-from drake_teleop.operator.operator import GRIPS
-from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.scenario import LoadScenario, replace
 
 LEAF, WALL = 5100 / 17.5, 6000.0  # N/m at the hand
 _TICK = 1e-3

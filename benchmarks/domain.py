@@ -1,6 +1,6 @@
 """Where does each method hold a wall: how stiff, by which grip, over how long a round trip?
 
-`python benchmarks/domain.py [--method M ...] [--json FILE]` lets `drake_teleop.comparison.one_dof`
+`python benchmarks/domain.py [--method M ...] [--json FILE]` lets `lab.comparison.one_dof`
 run its usual task over a constant delay: a hand presses 20 mm into a wall, holds for 5 s, lets go.
 Grips are light, medium and firm, walls 0.5 to 50 kN/m, round trips 1 ms to 2.6 s (there the hold is
 10 s longer); nothing is told of the hand. Stable is a run at rest within 0.5 mm, holding and
@@ -21,9 +21,15 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import REFERENCE, Task, figures, operators_intent, run_one_dof
-from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.lab.comparison.one_dof import (
+    REFERENCE,
+    Task,
+    figures,
+    operators_intent,
+    run_one_dof,
+)
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 
 GRIPS = {"light": (0.1, 2.0, 50.0), "medium": (0.25, 8.0, 250.0), "firm": (0.5, 20.0, 700.0)}
 WALLS = (500.0, 2500.0, 5100.0, 10e3, 20e3, 50e3)  # N/m

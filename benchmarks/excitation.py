@@ -24,16 +24,16 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from drake_teleop.excitation.check import check
-from drake_teleop.excitation.criteria import CRITERIA, Criterion
-from drake_teleop.excitation.design import MARGIN, design
-from drake_teleop.excitation.excite import best_checked, criteria_of, excite, sensor_motion
-from drake_teleop.excitation.problem import Problem, Task
-from drake_teleop.excitation.robot import Robot, RobotFromScenario
+from drake_teleop.lab.excitation.check import check
+from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
+from drake_teleop.lab.excitation.design import MARGIN, design
+from drake_teleop.lab.excitation.excite import best_checked, criteria_of, excite, sensor_motion
+from drake_teleop.lab.excitation.problem import Problem, Task
+from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.scenario import LoadScenario
+from drake_teleop.station.scenario import LoadScenario
 
 #: (criterion, period [s], soon [s], later [s]), five harmonics.
 ROWS = (

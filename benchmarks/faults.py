@@ -34,20 +34,21 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 
-from drake_teleop import station as station_module
-from drake_teleop.channel.channel import Channel
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import true_load
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.identification import true_load
 from drake_teleop.load.sample import TIME
-from drake_teleop.master.phantom import FORCE_LIMIT
-from drake_teleop.operator.operator import MinimumJerk, Sine
-from drake_teleop.passivity.methods import METHODS
-from drake_teleop.passivity.safe_state import STOP
-from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.sides import master, slave
-from drake_teleop.simulation import MakeSimulator, advance, read_log
-from drake_teleop.station import GetBlock, MakeTeleopStation
+from drake_teleop.station import master_side as master
+from drake_teleop.station import slave_side as slave
+from drake_teleop.station import station as station_module
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.master.phantom import FORCE_LIMIT
+from drake_teleop.station.operator.operator import MinimumJerk, Sine
+from drake_teleop.station.passivity.methods import METHODS
+from drake_teleop.station.passivity.safe_state import STOP
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.simulation import MakeSimulator, advance, read_log
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 Array = NDArray[np.float64]
 Change = Callable[[Array, float], None]

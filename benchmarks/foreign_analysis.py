@@ -30,24 +30,24 @@ sys.path.insert(0, str(Path(__file__).parent))
 from inverse_kinematics import described
 from stations import ARMS
 
-from drake_teleop.analysis.analyze import DIRECTIONS, closed, held_elsewhere, sampling_of
-from drake_teleop.analysis.cut_loop import cut_loop, dominant_multiplier
-from drake_teleop.analysis.figures import OMEGA, bounded_figures, held_by
-from drake_teleop.analysis.linearization import Linearization, hybrid_along, linearize
-from drake_teleop.analysis.one_axis import OneAxis
-from drake_teleop.analysis.period_map import Sampling
-from drake_teleop.analysis.sampled_loop import sampled_two_port
-from drake_teleop.analysis.task_direction import task_direction
-from drake_teleop.analysis.two_port import absorb
-from drake_teleop.environment.wall import Wall
-from drake_teleop.identification import slave_arm
-from drake_teleop.master.data_sheets import Master
-from drake_teleop.operator.operator import GRIPS, MinimumJerk
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.simulation import MakeSimulator
-from drake_teleop.slave.arm import jacobian
-from drake_teleop.slave.plant import NominalSlave
-from drake_teleop.station import GetBlock, MakeTeleopStation
+from drake_teleop.lab.analysis.analyze import DIRECTIONS, closed, held_elsewhere, sampling_of
+from drake_teleop.lab.analysis.cut_loop import cut_loop, dominant_multiplier
+from drake_teleop.lab.analysis.figures import OMEGA, bounded_figures, held_by
+from drake_teleop.lab.analysis.linearization import Linearization, hybrid_along, linearize
+from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.lab.analysis.period_map import Sampling
+from drake_teleop.lab.analysis.sampled_loop import sampled_two_port
+from drake_teleop.lab.analysis.task_direction import task_direction
+from drake_teleop.lab.analysis.two_port import absorb
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.operator.operator import GRIPS, MinimumJerk
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.simulation import MakeSimulator
+from drake_teleop.station.slave.arm import jacobian
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 DEVICES = {"rx90": "phantom_premium_15", "panda": "omega_6", "ur5": "geomagic_touch"}
 Array = Any

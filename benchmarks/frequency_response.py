@@ -17,16 +17,16 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.analysis.frequency_response import (
+from drake_teleop.lab.analysis.frequency_response import (
     MultiSine,
     measure_frequency_response,
     predict_frequency_response,
 )
-from drake_teleop.analysis.task_direction import task_direction
-from drake_teleop.environment.sheet_spring import SheetSpring
-from drake_teleop.identification import slave_arm
-from drake_teleop.operator.operator import MinimumJerk
-from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.lab.analysis.task_direction import task_direction
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.operator.operator import MinimumJerk
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 _UP = (0.0, 0.0, 1.0)
 _GAP, _DEPTH = 0.03, 0.03  # m, from the tip to the leaf; how deep it is pressed

@@ -52,8 +52,8 @@ if __name__ == "__main__":  # before libraries look
 from fuzz_targets import TARGETS, Target, target_of
 
 import drake_teleop
-from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
-from drake_teleop.pages.progress import show_progress
+from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.common.progress import show_progress
 
 _PACKAGE = str(Path(drake_teleop.__file__).parent)
 _CPU_SECONDS, _SECONDS, _BYTES = 5.0, 60.0, 4 << 30

@@ -30,17 +30,17 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop import new_station
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.resources import models_dir
+from drake_teleop.common.texts import read_json
+from drake_teleop.lab import new_station
 from drake_teleop.live.inputs import INPUTS, Inputs, read_inputs
 from drake_teleop.live.record import Record, made_by
-from drake_teleop.resources import models_dir
 from drake_teleop.robots import table
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import Compensated, Reading
-from drake_teleop.scenario import LoadScenario, Scenario
-from drake_teleop.slave.models import ParseModel, drakes_errors_said
-from drake_teleop.texts import read_json
+from drake_teleop.station.scenario import LoadScenario, Scenario
+from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
 
 _SECRET = b"what is in no model's folder, and in no page"
 _NAMES = (

@@ -28,10 +28,12 @@ from pydrake.math import RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop import cli
-from drake_teleop.channel import network
-from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
-from drake_teleop.excitation.robot import RobotFromModel
+from drake_teleop.cli import main as cli
+from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.common.resources import models_dir, scenarios_dir, studies_dir
+from drake_teleop.common.texts import read_json, yaml_data
+from drake_teleop.lab.excitation.robot import RobotFromModel
+from drake_teleop.lab.studies import study
 from drake_teleop.live.inputs import RANGES, Inputs, header, read_inputs
 from drake_teleop.live.inputs import row as inputs_row
 from drake_teleop.live.messages import SLOWEST, parse
@@ -43,22 +45,20 @@ from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.bags import read_topic, topics_of
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.passivity.packet import PACKET_SIZE
-from drake_teleop.resources import models_dir, scenarios_dir, studies_dir
-from drake_teleop.result import Signal, SimulationResult
 from drake_teleop.robots import udp
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.lines import read_line
 from drake_teleop.robots.streams import ONLY_SAID, Reading
-from drake_teleop.scenario import LoadScenario, ScenarioFromData
-from drake_teleop.scenario_reference import commented
-from drake_teleop.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.slave.models import ParseModel, drakes_errors_said
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.scene import Scene
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.studies import study
-from drake_teleop.texts import read_json, yaml_data
+from drake_teleop.station.channel import network
+from drake_teleop.station.passivity.packet import PACKET_SIZE
+from drake_teleop.station.result import Signal, SimulationResult
+from drake_teleop.station.scenario import LoadScenario, ScenarioFromData
+from drake_teleop.station.scenario_reference import commented
+from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
+from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.scene import Scene
+from drake_teleop.station.slave.slave_config import Slave
 
 _AXES = [f"{group}_{axis}" for group in ("f", "tau", "s", "omega", "alpha") for axis in "xyz"]
 

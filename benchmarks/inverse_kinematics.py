@@ -38,7 +38,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.slave.arm import (
+from drake_teleop.station.slave.arm import (
     PHI,
     ROTATION,
     SLIDES,
@@ -47,17 +47,21 @@ from drake_teleop.slave.arm import (
     forward_kinematics,
     jacobian,
 )
-from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.slave.inverse_kinematics import IkStatus, InverseKinematics, solve_pose_command
-from drake_teleop.slave.models import ParseModel
-from drake_teleop.slave.numeric_inverse_kinematics import (
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.inverse_kinematics import (
+    IkStatus,
+    InverseKinematics,
+    solve_pose_command,
+)
+from drake_teleop.station.slave.models import ParseModel
+from drake_teleop.station.slave.numeric_inverse_kinematics import (
     SINGULAR,
     STEPS,
     find_posture,
     follow_pose,
     turn_length,
 )
-from drake_teleop.slave.plant import ParseSlave, finalize
+from drake_teleop.station.slave.plant import ParseSlave, finalize
 
 Array = Any
 PERIOD = 5e-4

@@ -1,7 +1,7 @@
 """Does `ledger` hold its promises in the whole station, over what network, leaf, hand and sigma?
 
 `python benchmarks/ledger_in_station.py [--json FILE]` presses on a leaf as `compare-passivity` does
-(`drake_teleop.comparison.delayed_contact`): 4 networks, 2 leaves, 3 grips, sigma 0 and 1, 48 runs,
+(`lab.comparison.delayed_contact`): 4 networks, 2 leaves, 3 grips, sigma 0 and 1, 48 runs,
 each with the station's noisy sensor and its identified load, or with an ideal sensor and the true
 load (`--ideal`). `--network`, `--leaf`, `--grip`, `--sigma` choose some, `--method` another method.
 `--friction` is that of the arm's joints at the tool [N], by `--damping` the leaf damps [N s/m]. Of
@@ -33,22 +33,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.comparison.compare_passivity import station_base
-from drake_teleop.comparison.delayed_contact import LEAVES, delayed_contact, station_figures
-from drake_teleop.comparison.one_dof import ACTUAL, HAND, MOTOR
-from drake_teleop.comparison.station_accounts import load_work, start_energy, station_accounts
-from drake_teleop.identification import true_load
-from drake_teleop.identified_load import identified_load
-from drake_teleop.passivity.methods import METHODS, PassivityConfig
-from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import Scenario, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.arm import jacobian
-from drake_teleop.slave.joint_friction import dry_friction
-from drake_teleop.slave.plant import NominalSlave
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.lab.comparison.compare_passivity import station_base
+from drake_teleop.lab.comparison.delayed_contact import LEAVES, delayed_contact, station_figures
+from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, MOTOR
+from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
+from drake_teleop.lab.identification import true_load
+from drake_teleop.lab.identified_load import identified_load
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.arm import jacobian
+from drake_teleop.station.slave.joint_friction import dry_friction
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.station import MakeTeleopStation
 
 NETWORKS = ("lan", "internet", "geostationary", "lunar")
 GRIPS, SIGMAS = ("light", "medium", "firm"), (0.0, 1.0)

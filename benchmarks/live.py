@@ -26,17 +26,17 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.channel.network import PRESETS as NETWORK_PRESETS
-from drake_teleop.identified_load import identified_load
+from drake_teleop.common.progress import silent
+from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.choice_names import NETWORKS
 from drake_teleop.live.inputs import SLICE_MS
 from drake_teleop.live.live import FRAME, Live
 from drake_teleop.live.pace import without_collections
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.session import Session, live_scenario, read_drive, repeat
-from drake_teleop.pages.progress import silent
-from drake_teleop.passivity.methods import METHODS
-from drake_teleop.scenario import LoadScenario
+from drake_teleop.station.channel.network import PRESETS as NETWORK_PRESETS
+from drake_teleop.station.passivity.methods import METHODS
+from drake_teleop.station.scenario import LoadScenario
 
 DRIVES = 3
 

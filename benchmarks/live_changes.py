@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.identification import slave_arm
-from drake_teleop.identified_load import IdentifiedLoad, identified_load
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.choice_names import NAMES
 from drake_teleop.live.choices import chosen, filled_after
 from drake_teleop.live.session import Session, live_scenario
-from drake_teleop.scenario import LoadScenario, Scenario
-from drake_teleop.slave.arm import forward_kinematics
+from drake_teleop.station.scenario import LoadScenario, Scenario
+from drake_teleop.station.slave.arm import forward_kinematics
 
 AFTER = 0.7  # s
 

@@ -22,14 +22,14 @@ from pathlib import Path
 import numpy as np
 from browser import CHROMIUM, Page, opened
 
-from drake_teleop.identification import slave_arm
-from drake_teleop.identified_load import identified_load
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.hand import BEHIND
 from drake_teleop.live.live import TOUCH, Live
 from drake_teleop.live.server import LiveDrive, drive
 from drake_teleop.live.session import Session, live_scenario
-from drake_teleop.scenario import LoadScenario
-from drake_teleop.slave.arm import forward_kinematics
+from drake_teleop.station.scenario import LoadScenario
+from drake_teleop.station.slave.arm import forward_kinematics
 
 SPY = """window.effects = []; window.axes = [0, 0, 0, 0];
 navigator.getGamepads = () => [{connected: true, id: "spy", axes, buttons: [],

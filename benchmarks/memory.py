@@ -18,11 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.identification import true_load
-from drake_teleop.operator.operator import Sine
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.lab.identification import true_load
+from drake_teleop.station.operator.operator import Sine
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.station import MakeTeleopStation
 
 FIRST = 60.0  # s, whose growth is not counted: compilation, buffers, caches
 IN_MEMORY = 120.0  # s

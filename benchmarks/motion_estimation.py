@@ -28,25 +28,25 @@ from scipy.interpolate import make_interp_spline
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.sensor.motion_estimation import (
+from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_into,
     motion_estimator,
     path_delays,
 )
-from drake_teleop.sensor.presets import PRESETS
-from drake_teleop.sensor.sensor_chain import (
+from drake_teleop.station.sensor.presets import PRESETS
+from drake_teleop.station.sensor.sensor_chain import (
     NOISE_SIZE,
     WristSensorConfig,
     read_into,
     sensor_chain,
     without,
 )
-from drake_teleop.slave.arm import sensor_motion
-from drake_teleop.slave.home import R_WS_HOME, home_position
-from drake_teleop.slave.inverse_kinematics import nearest_branch
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
+from drake_teleop.station.slave.arm import sensor_motion
+from drake_teleop.station.slave.home import R_WS_HOME, home_position
+from drake_teleop.station.slave.inverse_kinematics import nearest_branch
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
 
 Array = NDArray[np.float64]
 

@@ -26,13 +26,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from inverse_kinematics import described
 
-from drake_teleop.identification import true_load
-from drake_teleop.operator.operator import Sine
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.simulation import MakeSimulator
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.slave.tool import Tool
-from drake_teleop.station import GetBlock, MakeTeleopStation
+from drake_teleop.lab.identification import true_load
+from drake_teleop.station.operator.operator import Sine
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.simulation import MakeSimulator
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 _TOOL = Tool(mass=1.5, com=[0.01, -0.02, 0.06], inertia=[4e-3, 3e-4, -2e-4, 5e-3, 1e-4, 2e-3])
 #: File, and the slave: the first carries what its model has.

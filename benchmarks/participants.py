@@ -2,7 +2,7 @@
 
     python benchmarks/participants.py [--participants 200] [--trials 40] [--json FILE]
 
-Each simulated participant does one condition of an experiment (`drake_teleop.experiment`): two
+Each simulated participant does one condition of an experiment (`drake_teleop.live.experiment`): two
 intervals, and the answer which of them had the stimulus. Its answers come from the level of the
 stimulus directly, by a psychometric function whose threshold (d' = 1) is drawn from the middle 90 %
 of the levels, log-uniform; no station runs. Counted is in how many the 95 % interval of the
@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from drake_teleop.experiment.psychometrics import Psi, correct_probability
+from drake_teleop.live.experiment.psychometrics import Psi, correct_probability
 
 LOW, HIGH = 0.2, 20.0
 """Range of the levels, N say."""

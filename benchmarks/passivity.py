@@ -26,9 +26,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from drake_teleop.channel.network import NetworkConfig, newest_packets
-from drake_teleop.passivity import methods, two_layer, wave
-from drake_teleop.passivity.memory import (
+from drake_teleop.station.channel.network import NetworkConfig, newest_packets
+from drake_teleop.station.passivity import methods, two_layer, wave
+from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     DAMPING,
@@ -40,14 +40,14 @@ from drake_teleop.passivity.memory import (
     STIFFNESS,
     own_memory,
 )
-from drake_teleop.passivity.methods import (
+from drake_teleop.station.passivity.methods import (
     AT_THE_MOTOR,
     METHODS,
     PassivityConfig,
     initial_memory,
     parameters,
 )
-from drake_teleop.passivity.packet import (
+from drake_teleop.station.passivity.packet import (
     INTEGRAL,
     PACKET_SIZE,
     WRENCH,

@@ -50,7 +50,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import PARAMETERS, Identification, natural_scale
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.processing import IdentifiedLog, identify_log

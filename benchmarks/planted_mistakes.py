@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from pose_noise import GRAVITY_W, MOTIONS, OFFSETS, PHI, kinematics
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.check.conventions import check_log
 

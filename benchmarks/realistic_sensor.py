@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from drake_teleop import scenario as scenarios
-from drake_teleop.identification import (
+from drake_teleop.lab.identification import (
     batch_identification,
     identify_load,
     sensor_samples,
@@ -39,10 +38,11 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import LoadScenario, Scenario
-from drake_teleop.sensor.motion_estimation import estimate_into, motion_estimator
-from drake_teleop.sensor.sensor_chain import (
+from drake_teleop.station import scenario as scenarios
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario, Scenario
+from drake_teleop.station.sensor.motion_estimation import estimate_into, motion_estimator
+from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
     PARTS,
@@ -51,8 +51,8 @@ from drake_teleop.sensor.sensor_chain import (
     sensor_chain,
     without,
 )
-from drake_teleop.simulation import simulate
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.station import MakeTeleopStation
 
 Array = NDArray[np.float64]
 

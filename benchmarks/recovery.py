@@ -1,7 +1,7 @@
 """Does every method recover from every random network, and never push harder than it may?
 
 `python benchmarks/recovery.py [--json FILE] [--networks N]` presses on a wall of 0.1 to 5 kN/m with
-`drake_teleop.comparison.one_dof` over N (10 000) pairs of random lines: delay up to 300 ms, jitter
+`lab.comparison.one_dof` over N (10 000) pairs of random lines: delay up to 300 ms, jitter
 up to 100 %, loss up to 50 %, bursts that lose 50 to 100 % and often last longer than the watchdog's
 0.1 s. At 4.5 s, in contact, the lines become good: 10 ms and no loss. The hand lets go and rests. A
 method has recovered if at the end the slave is within 2 mm of the hand, which is at rest within
@@ -23,8 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import (
+from drake_teleop.lab.comparison.one_dof import (
     PERIOD,
     REFERENCE,
     OneDofRun,
@@ -32,8 +31,9 @@ from drake_teleop.comparison.one_dof import (
     operators_intent,
     run_one_dof,
 )
-from drake_teleop.passivity.methods import METHODS, PassivityConfig
-from drake_teleop.passivity.safe_state import RESUME
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.station.passivity.safe_state import RESUME
 
 TASK = Task(swing=0.3, swung=1.5, press=2.0, pressed=2.6, release=6.5, released=7.1, end=10.0)
 GOOD_FROM, TIMEOUT, LIMIT = 4.5, 0.1, 5.0  # s, s, N

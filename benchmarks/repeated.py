@@ -21,14 +21,14 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.identified_load import identified_load
+from drake_teleop.common.progress import silent
+from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.choice_names import NETWORKS
 from drake_teleop.live.inputs import RANGES, SLICE_MS, Inputs
 from drake_teleop.live.session import Drive, Session, live_scenario, read_drive, repeat
-from drake_teleop.pages.progress import silent
-from drake_teleop.passivity.methods import METHODS
-from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import LoadScenario
+from drake_teleop.station.passivity.methods import METHODS
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario
 
 #: Choices, and from which share of the drive on they hold.
 CHOICES = (

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from peers import described
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log

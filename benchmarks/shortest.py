@@ -19,16 +19,16 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from drake_teleop.excitation.limits import empty_motions, motions_of, sensor_vectors
-from drake_teleop.excitation.robot import Robot, RobotFromScenario
-from drake_teleop.excitation.shortest import shortest
+from drake_teleop.lab.excitation.limits import empty_motions, motions_of, sensor_vectors
+from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
+from drake_teleop.lab.excitation.shortest import shortest
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import Tolerance, read_tolerance, sizes_of, values_of
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.scenario import LoadScenario, Scenario
-from drake_teleop.sensor.motion_estimation import estimate_into, motion_estimator
-from drake_teleop.sensor.sensor_chain import (
+from drake_teleop.station.scenario import LoadScenario, Scenario
+from drake_teleop.station.sensor.motion_estimation import estimate_into, motion_estimator
+from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
     read_into,

@@ -24,13 +24,13 @@ from pathlib import Path
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.operator.operator import MinimumJerk
-from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.reproduction.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.simulation import advance, simulate
-from drake_teleop.station import GetBlock, MakeTeleopStation
+from drake_teleop.lab.reproduction.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.operator.operator import MinimumJerk
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.simulation import advance, simulate
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 _TIGHT = {"simulation__max_step": 4e-5, "simulation__accuracy": 1e-10}
 _REPEATS, _PIECES = 5, 16

@@ -29,18 +29,19 @@ sys.path.insert(0, str(Path(__file__).parent))
 from inverse_kinematics import described
 from station import against_the_port, fastest
 
-from drake_teleop.identification import slave_arm
-from drake_teleop.master.data_sheets import FIGURES, LEADER, PHANTOM, Master
-from drake_teleop.master.leader_model import Leader
-from drake_teleop.operator.operator import Sine
-from drake_teleop.reproduction.speed import MakeBarePlant, MakeMovingStation
-from drake_teleop.resources import models_dir
-from drake_teleop.run import run_scenario, summarise
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.slave.arm import forward_kinematics
-from drake_teleop.slave.plant import NominalSlave
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.slave.tool import Ball, Tool
+from drake_teleop.common.resources import models_dir
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.lab.reproduction.speed import MakeBarePlant, MakeMovingStation
+from drake_teleop.lab.run import run_scenario
+from drake_teleop.lab.run_summary import summarise
+from drake_teleop.station.master.data_sheets import FIGURES, LEADER, PHANTOM, Master
+from drake_teleop.station.master.leader_model import Leader
+from drake_teleop.station.operator.operator import Sine
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.tool import Ball, Tool
 
 _SIGMA, _PUSHED = 0.5, 1.3  # Hz
 _DEEP = 0.005  # m, so far below the leaf is the tip's lower turn, as in Fig. 8

@@ -95,7 +95,7 @@ def measured(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def command(study: Path, out: Path, *options: str) -> list[str]:
-    start = "from drake_teleop.cli import main; main()"
+    start = "from drake_teleop.cli.main import main; main()"
     return [
         sys.executable,
         "-c",

@@ -24,11 +24,8 @@ from matplotlib.patches import FancyBboxPatch
 from nbclient import NotebookClient
 from scipy.signal import welch
 
-from drake_teleop.excitation.command import excite_command
-from drake_teleop.logs.detection import detect_log
-from drake_teleop.logs.processing import identify_log
-from drake_teleop.logs.sample import sample_log_command
-from drake_teleop.pages.style import (
+from drake_teleop.cli.excitation import excite_command
+from drake_teleop.common.style import (
     BLACK,
     BLUE,
     GREEN,
@@ -39,10 +36,13 @@ from drake_teleop.pages.style import (
     house_style,
     shade_contact,
 )
-from drake_teleop.reproduction.reproduce import reproduce_command
-from drake_teleop.sensor.presets import PRESETS
-from drake_teleop.sensor.sensor_chain import without
-from drake_teleop.sensor.sensor_noise import (
+from drake_teleop.lab.reproduction.reproduce import reproduce_command
+from drake_teleop.logs.detection import detect_log
+from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.sample import sample_log_command
+from drake_teleop.station.sensor.presets import PRESETS
+from drake_teleop.station.sensor.sensor_chain import without
+from drake_teleop.station.sensor.sensor_noise import (
     allan_deviation,
     predicted_allan_deviation,
     rest_record,

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drake_teleop import scenario_reference
 from drake_teleop.logs.read import description
+from drake_teleop.station import scenario_reference
 
 DOCS = Path(__file__).parent
 

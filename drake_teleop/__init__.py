@@ -1,8 +1,7 @@
 """Bilateral teleoperation with non-contact force scaling, on Drake.
 
-Everything that most users need is here; `drake_teleop.load`, `drake_teleop.station` and their
-neighbours hold the rest. A name is imported when it is first used, so that `import drake_teleop`
-costs nothing and a user with a log never waits for the simulator.
+The names that most users need are imported here, each at its first use: `import drake_teleop` is
+fast, and work with a log does not load the simulator.
 """
 
 from __future__ import annotations
@@ -10,11 +9,12 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from drake_teleop._version import __version__
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.version import __version__
 
 if TYPE_CHECKING:
-    from drake_teleop.identification import identify_load
+    from drake_teleop.lab.identification import identify_load
+    from drake_teleop.lab.run import run_scenario
     from drake_teleop.live.server import drive
     from drake_teleop.load.compensation import contact_wrench, scaled_wrench
     from drake_teleop.load.identification import Identification
@@ -22,11 +22,10 @@ if TYPE_CHECKING:
     from drake_teleop.load.regressor import non_contact_wrench, regressor
     from drake_teleop.logs.processing import eliminate_log, identify_log
     from drake_teleop.logs.read.reading import read_log
-    from drake_teleop.result import SimulationResult
-    from drake_teleop.run import run_scenario
-    from drake_teleop.scenario import LoadScenario, Scenario, ScenarioNames
-    from drake_teleop.simulation import simulate
-    from drake_teleop.station import MakeIdentificationStation, MakeTeleopStation
+    from drake_teleop.station.result import SimulationResult
+    from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioNames
+    from drake_teleop.station.simulation import simulate
+    from drake_teleop.station.station import MakeIdentificationStation, MakeTeleopStation
 
 __all__ = [
     "DrakeTeleopError",
@@ -53,8 +52,8 @@ __all__ = [
 ]
 
 _HOMES = {
-    "identification": ("identify_load",),
-    "run": ("run_scenario",),
+    "lab.identification": ("identify_load",),
+    "lab.run": ("run_scenario",),
     "live.server": ("drive",),
     "load.compensation": ("contact_wrench", "scaled_wrench"),
     "load.identification": ("Identification",),
@@ -62,10 +61,10 @@ _HOMES = {
     "load.regressor": ("non_contact_wrench", "regressor"),
     "logs.processing": ("eliminate_log", "identify_log"),
     "logs.read.reading": ("read_log",),
-    "result": ("SimulationResult",),
-    "scenario": ("LoadScenario", "Scenario", "ScenarioNames"),
-    "simulation": ("simulate",),
-    "station": ("MakeIdentificationStation", "MakeTeleopStation"),
+    "station.result": ("SimulationResult",),
+    "station.scenario": ("LoadScenario", "Scenario", "ScenarioNames"),
+    "station.simulation": ("simulate",),
+    "station.station": ("MakeIdentificationStation", "MakeTeleopStation"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -20,7 +20,7 @@ from sockets import open_to_others
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Libraries are installed as sources. What one process has compiled of them the others need not,
-# even if the surroundings forbid to keep it: to import drake_teleop.run takes 2.6 s then, not 7.
+# even if the surroundings forbid to keep it: importing lab.run takes 2.6 s then, not 7.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import pytest
 
-from drake_teleop.cli import main
+from drake_teleop.cli.main import main
 
 ROOT = Path(__file__).parents[1]
 PAGES = (

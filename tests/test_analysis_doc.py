@@ -9,24 +9,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_teleop.analysis.absolute_stability import (
+from drake_teleop.lab.analysis.absolute_stability import (
     range_of_grips,
     required_damping,
     stiffness_limit,
     worst_loads,
 )
-from drake_teleop.analysis.cut_loop import cut_loop, unstable_multipliers
-from drake_teleop.analysis.delay_limits import delay_independent_mass, tolerated_mass_error
-from drake_teleop.analysis.delayed_loop import held_device
-from drake_teleop.analysis.linearization import AXES, hybrid_along, linearize
-from drake_teleop.analysis.one_axis import OneAxis
-from drake_teleop.analysis.period_map import Sampling
-from drake_teleop.analysis.sampled_loop import sampled_two_port
-from drake_teleop.analysis.task_direction import OneAxisFromScenario, task_direction
-from drake_teleop.analysis.two_port import absorb, hybrid
-from drake_teleop.identification import slave_arm
-from drake_teleop.scenario import LoadScenario
-from drake_teleop.scenario import replace as with_values
+from drake_teleop.lab.analysis.cut_loop import cut_loop, unstable_multipliers
+from drake_teleop.lab.analysis.delay_limits import delay_independent_mass, tolerated_mass_error
+from drake_teleop.lab.analysis.delayed_loop import held_device
+from drake_teleop.lab.analysis.linearization import AXES, hybrid_along, linearize
+from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.lab.analysis.period_map import Sampling
+from drake_teleop.lab.analysis.sampled_loop import sampled_two_port
+from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, task_direction
+from drake_teleop.lab.analysis.two_port import absorb, hybrid
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.station.scenario import LoadScenario
+from drake_teleop.station.scenario import replace as with_values
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "analysis.md").read_text(encoding="utf-8")

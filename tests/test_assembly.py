@@ -19,32 +19,32 @@ from pydrake.multibody.tree import Frame, JacobianWrtVariable, MultibodyForces
 from pydrake.systems.framework import Context, DiagramBuilder
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.channel.network import BACKWARD, FORWARD, NetworkConfig, newest_packets
-from drake_teleop.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
-from drake_teleop.comparison.station_accounts import station_accounts
-from drake_teleop.estimation.contact_detection import ContactDetectionConfig
-from drake_teleop.estimation.load_estimator import LoadEstimatorConfig
+from drake_teleop.common.resources import models_dir
+from drake_teleop.lab.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
+from drake_teleop.lab.comparison.station_accounts import station_accounts
 from drake_teleop.load.contact.detection import NoiseFloor
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.online.watched import OTHER_LOAD
-from drake_teleop.master.phantom import serial_joint_angles
-from drake_teleop.operator.operator import OperatorConfig, Sine
-from drake_teleop.passivity.energy import port_work
-from drake_teleop.passivity.force_limit import ForceLimitConfig
-from drake_teleop.passivity.methods import METHODS, PassivityConfig
-from drake_teleop.resources import models_dir
-from drake_teleop.result import SimulationResult
-from drake_teleop.scaling.force_scaling import ForceScalingConfig
-from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
-from drake_teleop.scenario import Rates, Scenario, Simulation, replace
-from drake_teleop.sensor.motion_estimation import estimated_motion_std
-from drake_teleop.sensor.sensor_chain import NOISE_BLOCK
-from drake_teleop.simulation import MakeSimulator, advance, read_log
-from drake_teleop.slave.joint_control import JointControlConfig
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import BACKWARD, FORWARD, NetworkConfig, newest_packets
+from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
+from drake_teleop.station.master.phantom import serial_joint_angles
+from drake_teleop.station.operator.operator import OperatorConfig, Sine
+from drake_teleop.station.passivity.energy import port_work
+from drake_teleop.station.passivity.force_limit import ForceLimitConfig
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
+from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
+from drake_teleop.station.scenario import Rates, Scenario, Simulation, replace
+from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
+from drake_teleop.station.sensor.sensor_chain import NOISE_BLOCK
+from drake_teleop.station.simulation import MakeSimulator, advance, read_log
+from drake_teleop.station.slave.joint_control import JointControlConfig
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.station import MakeTeleopStation
 
 ALIGNMENT = [0.5, -0.4, 0.8]
 #: R_WB: roll, pitch and yaw about the fixed axes, one after the other.

@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 from matplotlib.figure import Figure
 
-from drake_teleop.film import Film
+from drake_teleop.station.film import Film
 
 # Learns while it moves, so that no identification comes first.
 SCENARIO = """
@@ -40,7 +40,7 @@ def benchmark() -> ModuleType:
 # Painting takes longest; the benchmark does it.
 NO_PICTURES = """
 from matplotlib.figure import Figure
-from drake_teleop.film import Film
+from drake_teleop.station.film import Film
 painted = Figure.savefig
 Figure.savefig = lambda _, path, **options: painted(Figure(figsize=(0.1, 0.1)), path, **options)
 Film._recorded = lambda self, make_scene: "<body></body>"

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numba.core.errors import NumbaWarning
 
-from drake_teleop import cli
-from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.cli import main as cli
+from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
 
 HEAVY = {"numpy", "scipy", "numba", "polars", "matplotlib", "pydrake", "jinja2", "pydantic", "yaml"}
 
@@ -42,7 +42,7 @@ def install(monkeypatch):
 def test_help_imports_nothing_heavy(arguments):
     code = (
         "import sys\n"
-        "from drake_teleop.cli import main\n"
+        "from drake_teleop.cli.main import main\n"
         f"try: main({arguments!r})\n"
         "except SystemExit as stop: status = stop.code\n"
         "print('modules', status, *sorted({name.split('.')[0] for name in sys.modules}))\n"
@@ -180,7 +180,7 @@ def test_warnings_are_for_those_who_write_programs(capsys, monkeypatch, recwarn)
         warnings.warn("slow", NumbaWarning, stacklevel=1)
         return []
 
-    monkeypatch.setattr("drake_teleop.scenario.ScenarioNames", names)
+    monkeypatch.setattr("drake_teleop.station.scenario.ScenarioNames", names)
     assert run_main(capsys, "scenario") == (0, "", "")
     assert not recwarn
 
@@ -197,7 +197,7 @@ def test_bad_input_is_one_error_line(capsys, install, exception, status, message
     def fail(*arguments, **options):
         raise exception
 
-    install("drake_teleop.run", "run_command", fail)
+    install("drake_teleop.lab.run", "run_command", fail)
     assert run_main(capsys, "run", "x") == (status, "", message + "\n")
 
 
@@ -205,7 +205,7 @@ def test_ctrl_c_is_status_130_and_no_traceback(capsys, install):
     def interrupt(*arguments, **options):
         raise KeyboardInterrupt
 
-    install("drake_teleop.run", "run_command", interrupt)
+    install("drake_teleop.lab.run", "run_command", interrupt)
     status, out, err = run_main(capsys, "run", "x")
     assert (status, out, err.split()) == (130, "", ["interrupted"])
 
@@ -214,15 +214,17 @@ def test_programming_mistakes_keep_their_traceback(install):
     def mistake(*arguments, **options):
         raise TypeError("a bug")
 
-    install("drake_teleop.run", "run_command", mistake)
+    install("drake_teleop.lab.run", "run_command", mistake)
     with pytest.raises(TypeError, match="a bug"):
         cli.main(["run", "x"])
 
 
 @pytest.mark.parametrize(("lines", "status"), [([], 0), (["Mass: beyond our bound"], 1)])
 def test_a_number_that_is_not_as_accepted_is_status_1(capsys, install, lines, status):
-    install("drake_teleop.reproduction.reproduce", "reproduce_command", lambda *_, **__: "figures")
-    install("drake_teleop.reproduction.report", "unaccepted", {"figures": lines}.get)
+    install(
+        "drake_teleop.lab.reproduction.reproduce", "reproduce_command", lambda *_, **__: "figures"
+    )
+    install("drake_teleop.lab.reproduction.report", "unaccepted", {"figures": lines}.get)
     assert run_main(capsys, "reproduce") == (status, "", "".join(f"{x}\n" for x in lines))
 
 
@@ -237,7 +239,7 @@ def test_many_runs_are_asked_for_where_somebody_can_answer(
         if yes is not True and not yes("100,200 runs. Begin?"):
             raise DrakeTeleopError("100,200 runs are many")
 
-    install("drake_teleop.studies.study", "study_command", study_command)
+    install("drake_teleop.lab.studies.study", "study_command", study_command)
     typing = io.StringIO(f"{typed}\n")
     typing.isatty = lambda: terminal
     monkeypatch.setattr("sys.stdin", typing)
@@ -253,10 +255,10 @@ def test_options_reach_the_commands(capsys, install):
     def note(*arguments, **options):
         calls.append((arguments, options))
 
-    install("drake_teleop.run", "run_command", note)
-    install("drake_teleop.reproduction.reproduce", "reproduce_command", note)
-    install("drake_teleop.reproduction.report", "unaccepted", lambda summary: [])
-    install("drake_teleop.logs.commands", "identify_command", note)
+    install("drake_teleop.lab.run", "run_command", note)
+    install("drake_teleop.lab.reproduction.reproduce", "reproduce_command", note)
+    install("drake_teleop.lab.reproduction.report", "unaccepted", lambda summary: [])
+    install("drake_teleop.cli.logs", "identify_command", note)
     status, out, err = run_main(
         capsys, "run", "contact_transition", "--seed", "7", "--fresh", "--quiet"
     )
@@ -266,7 +268,7 @@ def test_options_reach_the_commands(capsys, install):
     assert calls == [
         (
             ("contact_transition", Path("out/run")),
-            {"inputs": None, "seed": 7, "fresh": True, "quiet": True},
+            {"drive": None, "seed": 7, "fresh": True, "quiet": True},
         ),
         ((Path("out/r"),), {"seed": None, "quiet": False}),
         (
@@ -285,7 +287,7 @@ def test_options_reach_the_commands(capsys, install):
 def test_eliminate_hands_on_the_scaling_law(capsys, install):
     calls = []
     install(
-        "drake_teleop.logs.commands",
+        "drake_teleop.cli.logs",
         "eliminate_command",
         lambda *arguments, **options: calls.append((arguments, options)),
     )

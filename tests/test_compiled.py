@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 import drake_teleop
-from drake_teleop import _compiled, vectors
+from drake_teleop.common import compiled as _compiled
+from drake_teleop.common import vectors
 
 # `inner` reads a constant of another file, a module's function, one that comes after it, and
 # one that becomes part of its caller.
@@ -41,7 +42,7 @@ def _late(x, also=0.0):
 }
 HEAD = """import numpy as np
 from numba.extending import register_jitable
-from drake_teleop._compiled import njit
+from drake_teleop.common.compiled import njit
 """
 
 

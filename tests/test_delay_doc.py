@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drake_teleop.scenario import LoadScenario
+from drake_teleop.station.scenario import LoadScenario
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "delay.md").read_text(encoding="utf-8")

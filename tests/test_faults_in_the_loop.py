@@ -13,13 +13,13 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.fault import Fault
-from drake_teleop.identification import slave_arm
-from drake_teleop.run_warnings import run_warnings
-from drake_teleop.scenario import replace
-from drake_teleop.simulation import simulate
-from drake_teleop.station import GetBlock
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fault import Fault
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.station.run_warnings import run_warnings
+from drake_teleop.station.scenario import replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.station import GetBlock
 
 
 def load_faults() -> ModuleType:

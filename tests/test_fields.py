@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 import drake_teleop
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.fields import FieldInfo, fields_of
-from drake_teleop.operator.operator import OperatorConfig
-from drake_teleop.operator.task import KINDS
-from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.scaling.force_scaling import ForceScalingConfig
-from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
-from drake_teleop.studies.design import Factor, Study
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import FieldInfo, fields_of
+from drake_teleop.lab.studies.design import Factor, Study
+from drake_teleop.station.operator.operator import OperatorConfig
+from drake_teleop.station.operator.task import KINDS
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
+from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
 
 
 def everything(block: type) -> Iterator[tuple[type, FieldInfo]]:

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from drake_teleop.film import Film, Reading, frame_times
+from drake_teleop.station.film import Film, Reading, frame_times
 
 
 @pytest.mark.parametrize(

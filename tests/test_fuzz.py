@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 CASES = Path(__file__).parent / "fuzz_cases"

@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_teleop import identified_load as module
-from drake_teleop.estimation.contact_detection import ContactDetectionConfig
-from drake_teleop.identified_load import CACHE_VARIABLE, identified_load
+from drake_teleop.lab import identified_load as module
+from drake_teleop.lab.identified_load import CACHE_VARIABLE, identified_load
+from drake_teleop.lab.run import run_command, run_scenario
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.identification import Identification
-from drake_teleop.run import run_command, run_scenario
-from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 # Numbers that no short decimal stands for, of a load that is about the tool.
 RNG = np.random.default_rng(1)

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from drake_teleop.cli import main
+from drake_teleop.cli.main import main
 
 SCENARIOS = {
     "unknown block": ("wrist_senser: {ideal: true}", "wrist_sensor"),

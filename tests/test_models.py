@@ -9,8 +9,8 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.resources import models_dir
-from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.common.resources import models_dir
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 
 
 def parse(name: str):

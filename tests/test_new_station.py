@@ -13,18 +13,18 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 from shown import type_in
 
-from drake_teleop import new_station
-from drake_teleop.analysis.linearization import linearize
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import true_load
-from drake_teleop.new_station import find_place, new_command, plan_station
-from drake_teleop.resources import models_dir
-from drake_teleop.scenario import LoadScenario
-from drake_teleop.slave.forward_kinematics import pose_into
-from drake_teleop.slave.home import R_WS_HOME
-from drake_teleop.slave.inverse_kinematics import IkStatus
-from drake_teleop.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.resources import models_dir
+from drake_teleop.lab import new_station
+from drake_teleop.lab.analysis.linearization import linearize
+from drake_teleop.lab.identification import true_load
+from drake_teleop.lab.new_station import find_place, new_command, plan_station
+from drake_teleop.station.scenario import LoadScenario
+from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.slave.home import R_WS_HOME
+from drake_teleop.station.slave.inverse_kinematics import IkStatus
+from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
+from drake_teleop.station.slave.plant import NominalSlave
 
 ARM = models_dir() / "rx90.sdf"
 

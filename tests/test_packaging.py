@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 import drake_teleop
-from drake_teleop.errors import install_extra
+from drake_teleop.common.errors import install_extra
 
 ROOT = Path(__file__).parents[1]
 
@@ -26,13 +26,13 @@ from importlib.resources import files
 from pathlib import Path
 
 import drake_teleop
-from drake_teleop.errors import install_extra
-from drake_teleop.resources import models_dir, scenarios_dir
+from drake_teleop.common.errors import install_extra
+from drake_teleop.common.resources import models_dir, scenarios_dir
 
 home = Path(drake_teleop.__file__).parent
 assert home.parent.name == "site-packages", home
-assert models_dir() == home / "models" and scenarios_dir() == home / "scenarios"
-assert files("drake_teleop.reproduction").joinpath("report.html.j2").is_file()
+assert models_dir() == home / "models" and scenarios_dir() == home / "station" / "scenarios"
+assert files("drake_teleop.lab.reproduction").joinpath("report.html.j2").is_file()
 for name in drake_teleop.ScenarioNames():
     scenario = drake_teleop.LoadScenario(name)
     station = drake_teleop.MakeTeleopStation(scenario, load_estimate=[1.0] * 16)
@@ -67,7 +67,7 @@ def test_the_wheel_holds_what_the_repository_holds_and_nothing_else(wheel):
     python = {f"drake_teleop/{path}" for path in relative(ROOT / "drake_teleop")}
     models = {f"drake_teleop/models/{path}" for path in relative(ROOT / "models")}
     assert "drake_teleop/models/rx90.sdf" in models
-    assert "drake_teleop/scenarios/free_motion_force.yaml" in python
+    assert "drake_teleop/station/scenarios/free_motion_force.yaml" in python
     assert "drake_teleop/py.typed" in python
     assert {name for name in held if ".dist-info/" not in name} == python | models
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in held)

@@ -45,7 +45,7 @@ def test_type_checkers_see_the_names_where_they_are_at_run_time():
         ("import drake_teleop", {"numpy", "numba", "polars", "matplotlib", "pydrake"}),
         ("from drake_teleop import identify, scaled_wrench, read_log", {"pydrake"}),
         # What a process of a study begins with; its work may need less than a station.
-        ("import drake_teleop.studies.runs", {"numba", "matplotlib", "pydrake"}),
+        ("import drake_teleop.lab.studies.runs", {"numba", "matplotlib", "pydrake"}),
     ],
 )
 def test_nobody_pays_for_what_they_do_not_use(statement, foreign):

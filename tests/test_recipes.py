@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_teleop.identification import true_load
-from drake_teleop.scenario import LoadScenario
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.plant import NominalSlave
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.lab.identification import true_load
+from drake_teleop.station.scenario import LoadScenario
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.station import MakeTeleopStation
 
 ROOT = Path(__file__).parents[1]
 RECIPES = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -95,10 +95,10 @@ def test_a_station_with_the_new_method(copy):
         copy,
         """
 import numpy as np
-from drake_teleop.passivity.methods import METHODS
-from drake_teleop.scenario import ScenarioFromData
-from drake_teleop.simulation import simulate
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station.passivity.methods import METHODS
+from drake_teleop.station.scenario import ScenarioFromData
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.station import MakeTeleopStation
 
 assert "share" in METHODS
 
@@ -123,9 +123,9 @@ DRIVE = """
 from pathlib import Path
 from drake_teleop.live.inputs import Inputs
 from drake_teleop.live.session import Session, live_scenario, read_drive, repeat
-from drake_teleop.pages.progress import silent
-from drake_teleop.passivity.methods import METHODS
-from drake_teleop.scenario import ScenarioFromData
+from drake_teleop.common.progress import silent
+from drake_teleop.station.passivity.methods import METHODS
+from drake_teleop.station.scenario import ScenarioFromData
 
 folder = Path({folder!r})
 assert METHODS.index("tdpa") == {tdpa}
@@ -196,9 +196,9 @@ def test_a_station_with_the_new_environment(copy):
         copy,
         """
 import numpy as np
-from drake_teleop.scenario import ScenarioFromData
-from drake_teleop.simulation import simulate
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station.scenario import ScenarioFromData
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.station import MakeTeleopStation
 
 data = {
     "simulation": {"duration": 0.01, "settle": 0.0},

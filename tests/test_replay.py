@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
 
-from drake_teleop import film, replay
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import true_load
-from drake_teleop.replay import ReplayScene, replay_command, write_replay
-from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.scenario_reference import write_scenario
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.home import R_WS_HOME
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.identification import true_load
+from drake_teleop.station import film, replay
+from drake_teleop.station.replay import ReplayScene, replay_command, write_replay
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.scenario_reference import write_scenario
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.home import R_WS_HOME
+from drake_teleop.station.station import MakeTeleopStation
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.result import Signal, SimulationResult
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.result import Signal, SimulationResult
 
 XYZ = ("x", "y", "z")
 SPECS = (
@@ -158,7 +158,7 @@ def test_foreign_and_absent_files_are_one_clear_error(tmp_path):
     names = ["foreign.parquet", "text.parquet", "absent.parquet"]
     for spoilt in ("{", "3", '[{"name": "x"}]', "[" * 2000):
         names.append(f"{len(names)}.parquet")
-        metadata = {"drake_teleop.signals": spoilt}
+        metadata = {"drake_teleop.station.signals": spoilt}
         pl.DataFrame({"t": [0.0]}).write_parquet(tmp_path / names[-1], metadata=metadata)
     for name in names:
         with pytest.raises(DrakeTeleopError, match=f"{name}: is not a simulation result"):

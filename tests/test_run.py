@@ -10,17 +10,18 @@ import pytest
 from matplotlib.figure import Figure
 from shown import type_in
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import slave_arm
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.resources import scenarios_dir
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.lab.run import run_command
+from drake_teleop.lab.run_summary import _detection_figures, in_contact
 from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.processing import identify_log
-from drake_teleop.resources import scenarios_dir
-from drake_teleop.result import Signal, SimulationResult
-from drake_teleop.run import _detection_figures, in_contact, run_command
-from drake_teleop.scenario import LoadScenario
-from drake_teleop.signals import SIGNALS
+from drake_teleop.station.result import Signal, SimulationResult
+from drake_teleop.station.scenario import LoadScenario
+from drake_teleop.station.signals import SIGNALS
 
 # Learns while it moves, so that no identification comes first.
 QUICK = """
@@ -61,7 +62,7 @@ def identification(tmp_path_factory):
 @pytest.fixture
 def quick(tmp_path, monkeypatch):
     """Runs QUICK, with further lines, into a new folder, without its picture: that takes longer."""
-    monkeypatch.setattr("drake_teleop.run.overview", lambda result: Figure())
+    monkeypatch.setattr("drake_teleop.lab.run.overview", lambda result: Figure())
 
     def run(name: str, more: str = "", seed: int | None = None, quiet: bool = True):
         path = tmp_path / "quick.yaml"

@@ -7,21 +7,21 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.channel.network import NetworkConfig, longest_delay
-from drake_teleop.identification import slave_arm
-from drake_teleop.master.phantom import FORCE_LIMIT, HOME, WRIST_TORQUE_LIMIT, jacobian_into
-from drake_teleop.operator.operator import MinimumJerk, OperatorConfig
-from drake_teleop.passivity.ledger import LedgerConfig
-from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.result import SimulationResult
-from drake_teleop.run_warnings import behind, hunts, run_warnings, spans_of, turns
-from drake_teleop.scenario import Scenario, Simulation, replace
-from drake_teleop.sensor.presets import PRESETS
-from drake_teleop.signals import SIGNALS
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.arm import SLIDES
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import NetworkConfig, longest_delay
+from drake_teleop.station.master.phantom import FORCE_LIMIT, HOME, WRIST_TORQUE_LIMIT, jacobian_into
+from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
+from drake_teleop.station.passivity.ledger import LedgerConfig
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.run_warnings import behind, hunts, run_warnings, spans_of, turns
+from drake_teleop.station.scenario import Scenario, Simulation, replace
+from drake_teleop.station.sensor.presets import PRESETS
+from drake_teleop.station.signals import SIGNALS
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.arm import SLIDES
+from drake_teleop.station.station import MakeTeleopStation
 
 T = np.arange(3001) / 1000
 ARM = slave_arm(Scenario())

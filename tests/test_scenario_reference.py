@@ -10,17 +10,22 @@ import jsonschema
 import pytest
 from pydrake.common.yaml import yaml_load
 
-from drake_teleop import scenario_reference
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.cli import main
-from drake_teleop.environment.slot import Slot
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.operator.operator import MinimumJerk, Sine
-from drake_teleop.operator.task import Press
-from drake_teleop.resources import scenarios_dir
-from drake_teleop.scenario import LoadScenario, Scenario, ScenarioFromData, ScenarioNames
-from drake_teleop.scenario_reference import commented, json_schema, reference, write_scenario
-from drake_teleop.sensor.presets import PRESETS
+from drake_teleop.cli.main import main
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.resources import scenarios_dir
+from drake_teleop.station import scenario_reference
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.environment.slot import Slot
+from drake_teleop.station.operator.operator import MinimumJerk, Sine
+from drake_teleop.station.operator.task import Press
+from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioFromData, ScenarioNames
+from drake_teleop.station.scenario_reference import (
+    commented,
+    json_schema,
+    reference,
+    write_scenario,
+)
+from drake_teleop.station.sensor.presets import PRESETS
 
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.identification import slave_arm
-from drake_teleop.master import phantom
-from drake_teleop.scenario import LoadScenario, Rates, ScenarioNames, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.station.master import phantom
+from drake_teleop.station.scenario import LoadScenario, Rates, ScenarioNames, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.station import MakeTeleopStation
 
 MOVEMENTS = ("free_motion_force", "free_motion_torque", "contact_transition", "peg_in_slot")
 TASKS = ("insert", "press", "reach", "touch")

@@ -15,16 +15,16 @@ import sockets
 import yaml
 from sockets import THIS_MACHINE, listening, open_to_others
 
-from drake_teleop import identified_load
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.film import Film
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab import identified_load
+from drake_teleop.lab.studies.study import LoadStudy, study_command
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.tables import read_table
-from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import LoadScenario
-from drake_teleop.studies.study import LoadStudy, study_command
+from drake_teleop.station.film import Film
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario
 
 ROOT = Path(__file__).parents[1]
 RUNS_WHAT_IT_READS = re.compile(
@@ -34,15 +34,15 @@ RUNS_WHAT_IT_READS = re.compile(
 )
 EXPLAINED = {
     # The compiled code of this package, which lies where its .pyc files lie; see the file itself.
-    ("_compiled.py", "pickle"), ("_compiled.py", "pickles"),
+    ("common/compiled.py", "pickle"), ("common/compiled.py", "pickles"),
     # Of NumPy's formats those without objects.
-    ("identified_load.py", "np.load"), ("identified_load.py", "allow_pickle"),
+    ("lab/identified_load.py", "np.load"), ("lab/identified_load.py", "allow_pickle"),
     ("logs/read/tables.py", "np.load"), ("logs/read/tables.py", "allow_pickle"),
     # Processes that this one starts: what they say to each other goes through pipes.
-    ("studies/processes.py", "joblib"), ("comparison/compare_passivity.py", "joblib"),
-    ("studies/runs.py", "pickled"),
+    ("lab/studies/processes.py", "joblib"), ("lab/comparison/compare_passivity.py", "joblib"),
+    ("lab/studies/runs.py", "pickled"),
     # A module of the package by its name.
-    ("passivity/methods.py", "import_module"),
+    ("station/passivity/methods.py", "import_module"),
     ("__init__.py", "import_module"),
     # A child of this package's own code, with a host's name as its argument.
     ("robots/rtde.py", "subprocess"),
@@ -55,8 +55,8 @@ LISTENS = re.compile(
     r"|\bserve\("
 )
 LISTENING = {
-    ("film.py", 'Meshcat(MeshcatParams(host="localhost", port=0))'),
-    ("studies/processes.py", "Client("),
+    ("station/film.py", 'Meshcat(MeshcatParams(host="localhost", port=0))'),
+    ("lab/studies/processes.py", "Client("),
     # Who is let in: tests/live/test_server.py.
     ("live/page_scene.py", 'Meshcat(MeshcatParams(host="localhost", port=0))'),
     ("live/server.py", "asyncio"),
@@ -78,25 +78,26 @@ WRITES = re.compile(
 )
 WRITING = {
     # To memory.
-    ("pages/style.py", ".savefig"),
+    ("common/style.py", ".savefig"),
     # What is kept for the next time, whole or not at all; and a temporary folder.
-    ("_compiled.py", ".touch"), ("_compiled.py", ".write_bytes"), ("_compiled.py", "os.replace"),
-    ("identified_load.py", 'open("wb'), ("identified_load.py", "np.savez"),
-    ("slave/meshes.py", ".write_text"),
+    ("common/compiled.py", ".touch"), ("common/compiled.py", ".write_bytes"),
+    ("common/compiled.py", "os.replace"),
+    ("lab/identified_load.py", 'open("wb'), ("lab/identified_load.py", "np.savez"),
+    ("station/slave/meshes.py", ".write_text"),
     # A line for each change of a drive's inputs, which is to outlive the process.
     ("live/record.py", 'open("x'),
     # To memory, and then into the file with the wrenches that have come before.
     ("robots/table.py", ".write_csv"),
     # Under another name, until it was read back.
-    ("new_station.py", ".write_text"),
+    ("lab/new_station.py", ".write_text"),
     # Figures, where --json says.
     ("live/device_client.py", ".write_text"),
     # A mark of one byte more.
-    ("studies/store.py", 'open("ab'),
+    ("lab/studies/store.py", 'open("ab'),
     ("robots/changes.py", "json.dump"),  # to the process that asked
     # Functions of the package that write by `writing.py`.
-    ("run.py", ".save"), ("logs/commands.py", ".save"), ("excitation/command.py", ".save"),
-    ("reproduction/reproduce.py", ".save"), ("reproduction/reproduce.py", ".write_parquet"),
+    ("lab/run.py", ".save"), ("cli/logs.py", ".save"), ("cli/excitation.py", ".save"),
+    ("lab/reproduction/reproduce.py", ".save"), ("lab/reproduction/reproduce.py", ".write_parquet"),
 }  # fmt: skip
 
 
@@ -187,7 +188,7 @@ STUDY = (
 def test_a_pickle_that_is_planted_in_a_study_is_not_run(tmp_path, monkeypatch):
     """Under every name that a study has, or ever had."""
     monkeypatch.setattr(
-        "drake_teleop.studies.study.StationWork.__call__",
+        "drake_teleop.lab.studies.study.StationWork.__call__",
         lambda self, values, seed: {"hand_work_J": 1.0},
     )
     path, out, done = tmp_path / "study.yaml", tmp_path / "out", tmp_path / "done"

@@ -10,20 +10,20 @@ import pytest
 from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.estimation.contact_detection import ContactDetectionConfig
-from drake_teleop.identification import true_load
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.identification import true_load
 from drake_teleop.load.contact.noise_floor import NoiseFloor
-from drake_teleop.operator.operator import OperatorConfig, Sine, intent_at
-from drake_teleop.operator.task import Touch
-from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
-from drake_teleop.sides.channel import MakeChannel
-from drake_teleop.sides.master import MakeMasterSide
-from drake_teleop.sides.slave import MakeSlaveSide
-from drake_teleop.signals import SIGNALS
-from drake_teleop.simulation import MakeSimulator, simulate
-from drake_teleop.station import GetBlock, MakeTeleopStation
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel_side import MakeChannel
+from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.station.master_side import MakeMasterSide
+from drake_teleop.station.operator.operator import OperatorConfig, Sine, intent_at
+from drake_teleop.station.operator.task import Touch
+from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
+from drake_teleop.station.signals import SIGNALS
+from drake_teleop.station.simulation import MakeSimulator, simulate
+from drake_teleop.station.slave_side import MakeSlaveSide
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 PAGE = (Path(__file__).parents[1] / "docs" / "station.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| (\w+) \| `(\w+)` \| (in|out) \| (\d+) \| (.*?) \|", PAGE, re.M)

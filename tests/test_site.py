@@ -18,9 +18,9 @@ from shown import shell_blocks
 from sphinx.domains.python import ObjectEntry, PythonDomain
 
 import drake_teleop
-from drake_teleop.cli import cli
-from drake_teleop.scenario import LoadScenario
-from drake_teleop.studies.study import LoadStudy
+from drake_teleop.cli.main import cli
+from drake_teleop.lab.studies.study import LoadStudy
+from drake_teleop.station.scenario import LoadScenario
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -12,26 +12,26 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder
 
-from drake_teleop.environment.sheet_spring import SheetSpring
-from drake_teleop.environment.slot import Slot
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.estimation.contact_detection import ContactDetectionConfig
-from drake_teleop.identification import identify_load
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.identification import identify_load
 from drake_teleop.load.compensation import scaled_wrench
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.master import phantom
-from drake_teleop.master.data_sheets import JointFriction
-from drake_teleop.operator.operator import MinimumJerk, OperatorConfig, Sine
-from drake_teleop.operator.task import Touch
-from drake_teleop.scenario import LoadScenario, Scenario, Simulation, replace
-from drake_teleop.signals import SIGNALS
-from drake_teleop.simulation import MakeSimulator, advance, simulate
-from drake_teleop.slave.arm import MOTION_SIZE, sensor_motion
-from drake_teleop.slave.inverse_kinematics import IkStatus
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.environment.slot import Slot
+from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.station.master import phantom
+from drake_teleop.station.master.data_sheets import JointFriction
+from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
+from drake_teleop.station.operator.task import Touch
+from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
+from drake_teleop.station.signals import SIGNALS
+from drake_teleop.station.simulation import MakeSimulator, advance, simulate
+from drake_teleop.station.slave.arm import MOTION_SIZE, sensor_motion
+from drake_teleop.station.slave.inverse_kinematics import IkStatus
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
 
 FORCE_SCALE = 1 / 17.5
 MASS = 3.13

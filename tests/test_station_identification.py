@@ -7,14 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drake_teleop import identification
-from drake_teleop.identification import batch_identification, slave_arm
+from drake_teleop.lab import identification
+from drake_teleop.lab.identification import batch_identification, slave_arm
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.slave.payload import Payload
-from drake_teleop.slave.slave_config import Slave
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
+from drake_teleop.station.slave.payload import Payload
+from drake_teleop.station.slave.slave_config import Slave
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 400.0])

@@ -14,13 +14,13 @@ import polars as pl
 import pytest
 from shown import hearing_ctrl_c
 
-from drake_teleop import simulation
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.operator.operator import OperatorConfig, Sine
-from drake_teleop.result import Signal, SimulationResult
-from drake_teleop.scenario import Scenario, replace
-from drake_teleop.simulation import MakeSimulator, advance, read_log, simulate
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station import simulation
+from drake_teleop.station.operator.operator import OperatorConfig, Sine
+from drake_teleop.station.result import Signal, SimulationResult
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.simulation import MakeSimulator, advance, read_log, simulate
+from drake_teleop.station.station import MakeTeleopStation
 
 SCENARIO = replace(
     Scenario(),

@@ -8,16 +8,24 @@ import math
 import numpy as np
 import pytest
 
-from drake_teleop.identification import slave_arm
-from drake_teleop.measure_names import TASK_MEASURES
-from drake_teleop.operator.decision import FEELING, MOVING, OVER, PRESSING, SEEKING, STATE, WAITING
-from drake_teleop.operator.operator import OperatorConfig
-from drake_teleop.operator.task import Insert, Press, Reach, Touch
-from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import Scenario, replace
-from drake_teleop.signals import SIGNALS
-from drake_teleop.slave.home import home_position
-from drake_teleop.task_measures import task_failure, task_measures
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.station.measure_names import TASK_MEASURES
+from drake_teleop.station.operator.decision import (
+    FEELING,
+    MOVING,
+    OVER,
+    PRESSING,
+    SEEKING,
+    STATE,
+    WAITING,
+)
+from drake_teleop.station.operator.operator import OperatorConfig
+from drake_teleop.station.operator.task import Insert, Press, Reach, Touch
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.signals import SIGNALS
+from drake_teleop.station.slave.home import home_position
+from drake_teleop.station.task_measures import task_failure, task_measures
 
 T = np.arange(0.0, 4.0 + 1e-9, 1e-3)
 START, END, CONTACT, NOTICED = 0.5, 3.0, 1.5, 1.75  # s, in the log

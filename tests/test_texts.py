@@ -9,17 +9,17 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError, one_line
+from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError, one_line
+from drake_teleop.common.texts import read_json, read_yaml, yaml_data, yaml_text
+from drake_teleop.lab.studies.study import LoadStudy
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.tables import read_table
-from drake_teleop.master.data_sheets import Master
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.scenario_reference import write_scenario
-from drake_teleop.studies.study import LoadStudy
-from drake_teleop.texts import read_json, read_yaml, yaml_data, yaml_text
+from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.scenario_reference import write_scenario
 
 ALIASES = "a: &a [1, 1]\n" + "\n".join(
     f"{to}: &{to} [{', '.join([f'*{of}'] * 20)}]" for of, to in zip("abcd", "bcde", strict=True)
@@ -173,7 +173,7 @@ def identified():
 
 
 def test_a_huge_file_is_not_read_to_its_end(monkeypatch, tmp_path):
-    monkeypatch.setattr("drake_teleop.texts._MOST_VALUES", 100)
+    monkeypatch.setattr("drake_teleop.common.texts._MOST_VALUES", 100)
     path = tmp_path / "x.yaml"
     expected = "(line 201: there are more than 100 values)"  # and not: a bracket that is not closed
     assert expected in message(read_yaml, path, "- 1\n" * 250 + "[")

@@ -8,7 +8,7 @@ from numba import njit
 from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 from pydrake.symbolic import MakeVectorVariable
 
-from drake_teleop import vectors
+from drake_teleop.common import vectors
 from drake_teleop.load.regressor import non_contact_wrench, non_contact_wrench_into, regressor
 
 a, b, c = np.array([[0.3, -1.2, 2.5], [-0.7, 0.4, 1.1], [5.0, -6.0, 7.0]])

@@ -16,14 +16,8 @@ import polars as pl
 import pytest
 from matplotlib.figure import Figure
 
-from drake_teleop import run as runs
-from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
-from drake_teleop.film import Film
-from drake_teleop.logs import sample
-from drake_teleop.result import Signal, SimulationResult
-from drake_teleop.scenario import LoadScenario
-from drake_teleop.studies import study as studies
-from drake_teleop.writing import (
+from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.common.writing import (
     CannotWrite,
     make_folder,
     output_folder,
@@ -33,6 +27,12 @@ from drake_teleop.writing import (
     write_table,
     write_text,
 )
+from drake_teleop.lab import run as runs
+from drake_teleop.lab.studies import study as studies
+from drake_teleop.logs import sample
+from drake_teleop.station.film import Film
+from drake_teleop.station.result import Signal, SimulationResult
+from drake_teleop.station.scenario import LoadScenario
 
 TABLE = pl.DataFrame({"x": np.random.default_rng(0).random(5000)})
 

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 
 import drake_teleop as dt
-from drake_teleop.analysis.linearization import linearize, linearize_station
-from drake_teleop.excitation.robot import RobotFromScenario
-from drake_teleop.identification import true_load
-from drake_teleop.identified_load import identified_load
+from drake_teleop.lab.analysis.linearization import linearize, linearize_station
+from drake_teleop.lab.excitation.robot import RobotFromScenario
+from drake_teleop.lab.identification import true_load
+from drake_teleop.lab.identified_load import identified_load
+from drake_teleop.lab.studies.study import LoadStudy
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.scenario import replace
-from drake_teleop.sides.channel import MakeChannel
-from drake_teleop.sides.master import MakeMasterSide
-from drake_teleop.sides.slave import MakeSlaveSide
-from drake_teleop.simulation import simulate
-from drake_teleop.studies.study import LoadStudy
+from drake_teleop.station.channel_side import MakeChannel
+from drake_teleop.station.master_side import MakeMasterSide
+from drake_teleop.station.scenario import replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave_side import MakeSlaveSide
 
 N3, N6, N10 = np.ones((4, 3)), np.ones((4, 6)), np.ones(10)
 NAME: Any = "free_motion_force"

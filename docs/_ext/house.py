@@ -9,7 +9,7 @@ import matplotlib as mpl
 from matplotlib import pyplot as plt
 from sphinx_gallery.scrapers import figure_rst
 
-from drake_teleop.pages.style import PAGE_DPI, house_style
+from drake_teleop.common.style import PAGE_DPI, house_style
 
 with house_style():
     _HOUSE = dict(mpl.rcParams)

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import drake_teleop as dt
-from drake_teleop.pages.style import shade_contact
+from drake_teleop.common.style import shade_contact
 
 result = dt.run_scenario(dt.LoadScenario("contact_transition"), progress=False).result
 touched = np.linalg.norm(result["true_contact_wrench_W"], axis=1) > 0

@@ -8,9 +8,9 @@ round trip of 50 ms. Below zero the station has given out more than it was given
 
 import matplotlib.pyplot as plt
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import ACTUAL, HAND, REFERENCE, run_one_dof
-from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, REFERENCE, run_one_dof
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.methods import PassivityConfig
 
 figure, panels = plt.subplots(1, 2, figsize=(8.5, 3.2))
 for axes, method in zip(panels, ("none", "ledger"), strict=True):

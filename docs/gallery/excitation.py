@@ -11,9 +11,9 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from drake_teleop.excitation.excite import excite
-from drake_teleop.excitation.robot import RobotFromModel
-from drake_teleop.sensor.presets import PRESETS
+from drake_teleop.lab.excitation.excite import excite
+from drake_teleop.lab.excitation.robot import RobotFromModel
+from drake_teleop.station.sensor.presets import PRESETS
 
 robot = RobotFromModel(
     Path("arm.urdf"), "sensor", PRESETS["ati_mini45"], acceleration=(10.0,), payload=1.5

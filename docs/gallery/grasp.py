@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import drake_teleop as dt
-from drake_teleop.identified_load import identified_load
+from drake_teleop.lab.identified_load import identified_load
 
 empty = dt.LoadScenario("free_motion_force")
 holding = dt.LoadScenario("free_motion_force")

@@ -9,9 +9,9 @@ ones had.
 
 import matplotlib.pyplot as plt
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import ACTUAL, HAND, REFERENCE, run_one_dof
-from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, REFERENCE, run_one_dof
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.methods import PassivityConfig
 
 lossy = NetworkConfig(delay=0.05, jitter=0.3, loss=0.33, burst=0.05, burst_loss=0.9)
 run = run_one_dof(REFERENCE, PassivityConfig(method="ledger"), lossy)

@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import drake_teleop as dt
-from drake_teleop.identified_load import identified_load
+from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.choice_names import METHODS, NETWORKS
 from drake_teleop.live.session import Session, live_scenario
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import matplotlib.pyplot as plt
 import numpy as np
 
-from drake_teleop.channel.network import FORWARD, PRESETS, newest_packets
+from drake_teleop.station.channel.network import FORWARD, PRESETS, newest_packets
 
 period, steps = 1e-3, np.arange(3000)
 networks = {name: PRESETS[name] for name in ("wan", "internet", "geostationary")}

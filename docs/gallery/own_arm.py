@@ -9,7 +9,7 @@ tool: a block of 1.8 kg. Both are identified before the run, as everything else.
 import matplotlib.pyplot as plt
 
 import drake_teleop as dt
-from drake_teleop.slave.tool import Tool
+from drake_teleop.station.slave.tool import Tool
 
 scenario = dt.LoadScenario("free_motion_force")
 scenario.slave.model = "arm.urdf"

@@ -9,10 +9,10 @@ gives.
 
 import matplotlib.pyplot as plt
 
-from drake_teleop.channel.network import PRESETS
-from drake_teleop.comparison.one_dof import REFERENCE, figures, run_one_dof
-from drake_teleop.pages.style import BLUE, GREY
-from drake_teleop.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.common.style import BLUE, GREY
+from drake_teleop.lab.comparison.one_dof import REFERENCE, figures, run_one_dof
+from drake_teleop.station.channel.network import PRESETS
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 
 columns = 3
 figure, panels = plt.subplots(3, columns, figsize=(9, 6), sharex=True, sharey=True)

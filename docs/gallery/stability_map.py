@@ -13,9 +13,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import drake_teleop as dt
-from drake_teleop.analysis.maps import stability_map
-from drake_teleop.analysis.period_map import Sampling
-from drake_teleop.analysis.task_direction import OneAxisFromScenario
+from drake_teleop.lab.analysis.maps import stability_map
+from drake_teleop.lab.analysis.period_map import Sampling
+from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 
 scenario = dt.LoadScenario("contact_transition")
 scenario.operator.grip = "medium"

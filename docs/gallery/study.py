@@ -11,8 +11,8 @@ from pathlib import Path
 
 import polars as pl
 
-from drake_teleop.studies.pictures import main_effects
-from drake_teleop.studies.study import LoadStudy, study_command
+from drake_teleop.lab.studies.pictures import main_effects
+from drake_teleop.lab.studies.study import LoadStudy, study_command
 
 folder = Path(tempfile.mkdtemp())
 (folder / "study.yaml").write_text("""

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import drake_teleop as dt
-from drake_teleop.task_measures import task_measures
+from drake_teleop.station.task_measures import task_measures
 
 figure, panels = plt.subplots(2, 1, figsize=(7, 4.4), sharex=True)
 for axes, sigma in zip(panels, (0.0, 1.0), strict=True):

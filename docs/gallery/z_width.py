@@ -10,8 +10,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import drake_teleop as dt
-from drake_teleop.analysis.sampled_wall import passive_stiffness, stable_stiffness
-from drake_teleop.analysis.task_direction import OneAxisFromScenario
+from drake_teleop.lab.analysis.sampled_wall import passive_stiffness, stable_stiffness
+from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 
 axis = OneAxisFromScenario(dt.LoadScenario("contact_transition"), (0.0, 0.0, 1.0))
 mass, b = axis.hand_mass + axis.device_mass, axis.hand_damping + axis.device_damping

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from drake_teleop.channel.network import PRESETS as NETWORK_PRESETS
-from drake_teleop.operator.operator import GRIPS
-from drake_teleop.passivity.methods import METHODS
-from drake_teleop.scenario import Scenario
-from drake_teleop.sensor.presets import PRESETS as SENSOR_PRESETS
+from drake_teleop.station.channel.network import PRESETS as NETWORK_PRESETS
+from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.passivity.methods import METHODS
+from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 
 OWN = "as in the scenario"
 NETWORKS = (OWN, *NETWORK_PRESETS, "custom")

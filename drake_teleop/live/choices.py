@@ -11,19 +11,19 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.channel.network import longest_delay
-from drake_teleop.estimation.contact_detection import ContactDetectionConfig
-from drake_teleop.identified_load import IdentifiedLoad
+from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.choice_names import NETWORKS, OWN, SENSORS
 from drake_teleop.live.inputs import Inputs
-from drake_teleop.operator.operator import GRIPS
-from drake_teleop.passivity.methods import METHODS
-from drake_teleop.passivity.safe_state import RESUME
-from drake_teleop.scenario import Scenario, replace
-from drake_teleop.sensor.presets import PRESETS as SENSOR_PRESETS
-from drake_teleop.slave.payload import Payload
-from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import longest_delay
+from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.passivity.methods import METHODS
+from drake_teleop.station.passivity.safe_state import RESUME
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
+from drake_teleop.station.slave.payload import Payload
+from drake_teleop.station.slave.plant import NominalSlave
 
 Array = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop._compiled import njit
-from drake_teleop.fault import MEANINGS, Fault
-from drake_teleop.identification import slave_arm
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.fault import MEANINGS, Fault
+from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.inputs import RANGES, Inputs
-from drake_teleop.scenario import Scenario
-from drake_teleop.slave.arm import forward_kinematics
-from drake_teleop.slave.inverse_kinematics import IkStatus
+from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
 Array = NDArray[np.float64]
 

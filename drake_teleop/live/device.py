@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.robots.udp import THIS_MACHINE
 

@@ -21,7 +21,7 @@ from typing import Protocol
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.device_guard import DeviceGuard, Limits
 from drake_teleop.live.device_packets import (
     LONGEST,
@@ -33,8 +33,8 @@ from drake_teleop.live.device_packets import (
 )
 from drake_teleop.live.haply import HaplyDevice
 from drake_teleop.live.virtual_device import VirtualDevice, tapping
-from drake_teleop.operator.operator import GRIPS
 from drake_teleop.robots.udp import endpoint
+from drake_teleop.station.operator.operator import GRIPS
 
 _PERIOD, _LATE = 1e-3, 0.1  # s
 _REMEMBERED = 100_000  # ticks

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.quaternions import conjugate, logarithm, multiply
 from drake_teleop.live.device_guard import SILENT
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
@@ -25,7 +26,6 @@ from drake_teleop.live.device_packets import (
     unpacked_state,
 )
 from drake_teleop.live.inputs import ANGLE, LENGTH
-from drake_teleop.quaternions import conjugate, logarithm, multiply
 from drake_teleop.robots.udp import endpoint, listening
 
 _MOST = 256  # packets at once

@@ -19,20 +19,20 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
-from drake_teleop._compiled import njit
-from drake_teleop.fault import Fault, sound
-from drake_teleop.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.fault import Fault, sound
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.live.handing_on import GoesOver
-from drake_teleop.master.data_sheets import LEADER, PHANTOM, Master
-from drake_teleop.master.numbers import PEAK_FORCE, PEAK_TORQUE
-from drake_teleop.operator.operator import HandImpedance
-from drake_teleop.passivity.packet import limit
-from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
-from drake_teleop.scaling.kinematic_scaling import KinematicScaling
-from drake_teleop.scenario import Scenario, replace
-from drake_teleop.sides.master import CLUTCH_PERIOD
-from drake_teleop.sides.ports import export
-from drake_teleop.slave.plant import start_pose
+from drake_teleop.station.master.data_sheets import LEADER, PHANTOM, Master
+from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
+from drake_teleop.station.master_side import CLUTCH_PERIOD
+from drake_teleop.station.operator.operator import HandImpedance
+from drake_teleop.station.passivity.packet import limit
+from drake_teleop.station.scaling.kinematic_scaling import KinematicScaling
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.slave.plant import start_pose
+from drake_teleop.station.wiring import export
 
 Array = NDArray[np.float64]
 

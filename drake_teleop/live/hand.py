@@ -15,19 +15,19 @@ from pydrake.systems.framework import (
     DiagramBuilder,
 )
 
-from drake_teleop._compiled import njit
-from drake_teleop.lifetime import ONE_DICT
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.lifetime import ONE_DICT
+from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
+from drake_teleop.common.vectors import cross, plus, plus_cross, put, three, times
 from drake_teleop.live.handing_on import GoesOver
-from drake_teleop.operator.operator import (
+from drake_teleop.station.master_side import MakeMasterSide
+from drake_teleop.station.operator.operator import (
     HandImpedance,
     Operator,
     OperatorConfig,
     hand_wrench_into,
 )
-from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
-from drake_teleop.scenario import Scenario
-from drake_teleop.sides.master import MakeMasterSide
-from drake_teleop.vectors import cross, plus, plus_cross, put, three, times
+from drake_teleop.station.scenario import Scenario
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.device_guard import Limits
 from drake_teleop.live.device_packets import CLUTCH_OPEN, DeviceState, Place, believable
 

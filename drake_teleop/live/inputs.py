@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop._version import __version__
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.quaternions import exponential, logarithm
+from drake_teleop.common.texts import read_text
+from drake_teleop.common.version import __version__
 from drake_teleop.live.choice_names import NAMES, NETWORKS, SENSORS, first_choices
-from drake_teleop.operator.operator import GRIPS
-from drake_teleop.passivity.methods import METHODS
-from drake_teleop.quaternions import exponential, logarithm
-from drake_teleop.scenario import Scenario
-from drake_teleop.texts import read_text
+from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.passivity.methods import METHODS
+from drake_teleop.station.scenario import Scenario
 
 Array = NDArray[np.float64]
 

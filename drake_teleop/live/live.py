@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from pydrake.math import RollPitchYaw
 
-from drake_teleop.errors import DrakeTeleopError, one_line
-from drake_teleop.identified_load import IdentifiedLoad
+from drake_teleop.common.errors import DrakeTeleopError, one_line
+from drake_teleop.common.writing import CannotWrite
+from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.choice_names import NAMES
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceLink
@@ -27,8 +28,7 @@ from drake_teleop.live.messages import parse
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.scenes import SCENES
 from drake_teleop.live.session import Session
-from drake_teleop.scenario import Scenario
-from drake_teleop.writing import CannotWrite
+from drake_teleop.station.scenario import Scenario
 
 Show = Callable[[dict[str, np.ndarray]], dict[str, Any]]
 """Returns what a frame contains of the 3D scene, at the newest of some rows of a log."""

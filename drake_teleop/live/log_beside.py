@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pydrake.systems.analysis import Simulator
 
-from drake_teleop.result import SimulationResult
-from drake_teleop.simulation import LogOnDisk
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.simulation import LogOnDisk
 
 
 class LogBeside(LogOnDisk):

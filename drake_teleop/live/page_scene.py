@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
-from drake_teleop.errors import one_line
-from drake_teleop.film import quiet_drake
-from drake_teleop.replay import ReplayScene
-from drake_teleop.scenario import Scenario
+from drake_teleop.common.errors import one_line
+from drake_teleop.station.film import quiet_drake
+from drake_teleop.station.replay import ReplayScene
+from drake_teleop.station.scenario import Scenario
 
 Rows = dict[str, NDArray[np.float64]]
 

@@ -10,12 +10,12 @@ from importlib.metadata import version
 from io import TextIOWrapper
 from pathlib import Path
 
-from drake_teleop._version import __version__
-from drake_teleop.identified_load import IdentifiedLoad, write_load
+from drake_teleop.common.version import __version__
+from drake_teleop.common.writing import make_folder, naming, write_text
+from drake_teleop.lab.identified_load import IdentifiedLoad, write_load
 from drake_teleop.live.inputs import INPUTS, Inputs, header, row
-from drake_teleop.scenario import Scenario
-from drake_teleop.scenario_reference import write_scenario
-from drake_teleop.writing import make_folder, naming, write_text
+from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.scenario_reference import write_scenario
 
 LOAD, SCENARIO = "load.npz", "scenario.yaml"
 #: If this file exists, the hand's place in the inputs is that of a device.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drake_teleop.environment.wall import Wall
 from drake_teleop.live.session import live_scenario
-from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 #: Scene -> a shipped scenario; "own" is what the drive was begun with.
 _SHIPPED = {

@@ -33,9 +33,11 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.estimation.contact_detection import ContactDetectionConfig
-from drake_teleop.identified_load import IdentifiedLoad, identified_load
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.policy import policy
+from drake_teleop.common.progress import Progress, Stage, show_progress
+from drake_teleop.common.writing import make_folder
+from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device import DrivenBy
 from drake_teleop.live.external_master import with_device
@@ -45,10 +47,8 @@ from drake_teleop.live.pace import without_collections
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenes import SCENES, scene
 from drake_teleop.live.session import Session, live_scenario
-from drake_teleop.pages.policy import policy
-from drake_teleop.pages.progress import Progress, Stage, show_progress
-from drake_teleop.scenario import LoadScenario, Scenario, check_scenario
-from drake_teleop.writing import make_folder
+from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 
 _HOST = "127.0.0.1"
 _MOST_CLIENTS = 8

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import InitializeParams
 from pydrake.systems.framework import Context
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identified_load import IdentifiedLoad, read_load
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.progress import Progress
+from drake_teleop.lab.identified_load import IdentifiedLoad, read_load
 from drake_teleop.live.choices import BLEND, chosen, filled_after, known_estimate
 from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
@@ -29,12 +30,11 @@ from drake_teleop.live.inputs import INPUTS, SLICE_MS, Inputs, read_inputs
 from drake_teleop.live.log_beside import LogBeside
 from drake_teleop.live.record import DEVICE, LOAD, SCENARIO, Record, made_by
 from drake_teleop.live.steps import take_short_steps_in_contact
-from drake_teleop.pages.progress import Progress
-from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.signals import LOG, SIGNALS, signal_of
-from drake_teleop.simulation import MakeSimulator, advance, columns, read_log
-from drake_teleop.station import GetBlock, MakeTeleopStation
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.signals import LOG, SIGNALS, signal_of
+from drake_teleop.station.simulation import MakeSimulator, advance, columns, read_log
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 #: Of a log on disk: two seconds. A longer part takes longer to copy, which a driver would notice; a
 #: file of its own takes 10 ms of CPU however short it is.
@@ -345,12 +345,18 @@ class Drive:
         load: what the station knew of its load.
         changes: of the inputs, with their times [ms]; the last is the end.
         device: whether a haptic device was its hand.
+        folder: of the recording.
     """
 
     scenario: Scenario
     load: IdentifiedLoad | None
     changes: Sequence[tuple[int, Inputs]]
     device: bool = False
+    folder: Path = Path()
+
+    def repeat(self, progress: Progress, log: Path | None = None) -> SimulationResult:
+        """Simulate the drive again, see the function `repeat`."""
+        return repeat(self, progress, log)
 
 
 def read_drive(folder: str | Path) -> Drive:
@@ -367,7 +373,7 @@ def read_drive(folder: str | Path) -> Drive:
     if not known or (load is None and (folder / LOAD).exists()):
         raise DrakeTeleopError("is damaged, or no load of a drive", where=str(folder / LOAD))
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
-    return Drive(driven, load, changes, (folder / DEVICE).exists())
+    return Drive(driven, load, changes, (folder / DEVICE).exists(), folder)
 
 
 def repeat(

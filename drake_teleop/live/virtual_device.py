@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from drake_teleop.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIPS
 
 _STEPS = 10  # a millisecond
 

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.inertia import pseudo_inertia
 

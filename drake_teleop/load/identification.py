@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError, expect
-from drake_teleop.load.arrays import Array, checked, learnt
+from drake_teleop.common.arrays import Array, checked, learnt
+from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.writing import write_json
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
-from drake_teleop.writing import write_json
 
 VERDICTS = ("identified", "weakly", "not", "prior")
 """What `Identification.verdicts` may say of a parameter."""
@@ -308,7 +308,7 @@ def natural_scale(phi: Array) -> Array:
 
 
 def _read_json(path: str | Path) -> dict[str, Any]:
-    from drake_teleop.texts import read_json  # PyYAML takes its time to start
+    from drake_teleop.common.texts import read_json  # PyYAML takes its time to start
 
     if not os.path.exists(path):
         raise DrakeTeleopError(

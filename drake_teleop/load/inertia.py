@@ -17,8 +17,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked
+from drake_teleop.common.arrays import Array, checked
+from drake_teleop.common.errors import DrakeTeleopError
 
 # Rounding of phi and of the eigenvalues, so that rods, plates and points count as consistent.
 _ROUNDING = 1e-12

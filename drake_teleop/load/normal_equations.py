@@ -48,9 +48,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import fdtrc
 
-from drake_teleop._compiled import njit
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked, checked_rows, number, positive
+from drake_teleop.common.arrays import Array, checked, checked_rows, number, positive
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import METHODS, Identification, worth_stating
 from drake_teleop.load.regressor import regressor_into
 

@@ -19,9 +19,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop._compiled import njit
-from drake_teleop.load.arrays import Array, checked, checked_rows
-from drake_teleop.vectors import apply, cross, plus, symmetric, three, times
+from drake_teleop.common.arrays import Array, checked, checked_rows
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.vectors import apply, cross, plus, symmetric, three, times
 
 
 @njit(cache=True)

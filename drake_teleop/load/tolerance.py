@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import mass_com_inertia
 
 QUANTITIES = ("mass", "com", "inertia")

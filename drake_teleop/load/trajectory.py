@@ -9,8 +9,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.writing import write_text
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.writing import write_text
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ class FourierTrajectory:
 
     def save(self, path: str | Path, joint_names: tuple[str, ...]) -> None:
         """Writes the coefficients as YAML: `frequency`, and by joint `q0`, `rho`, `delta`."""
-        from drake_teleop.texts import yaml_text
+        from drake_teleop.common.texts import yaml_text
 
         joints = {
             name: {"q0": float(q0), "rho": rho.tolist(), "delta": delta.tolist()}
@@ -93,7 +93,7 @@ class FourierTrajectory:
         Raises:
             DrakeTeleopError: naming file and field, if that cannot be a trajectory.
         """
-        from drake_teleop.texts import read_yaml
+        from drake_teleop.common.texts import read_yaml
 
         data = read_yaml(path)
         try:

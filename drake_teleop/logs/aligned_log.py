@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
 from drake_teleop.logs.read.alignment import ends, low_pass, undelayed
@@ -16,7 +17,6 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.spline_motion import clock_note, motion_of_known_load, moved_by_splines
-from drake_teleop.one_thread import one_blas_thread
 
 
 @dataclass(frozen=True)

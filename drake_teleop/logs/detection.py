@@ -1,6 +1,6 @@
-"""What `drake-teleop detect` does: contact in a log, above the noise floor of free motion.
+"""Detection of contact in a log, above the noise floor of free motion.
 
-Names in the summary (and in summary.json) beside those that it has in common with `eliminate`;
+Names in the summary of `drake-teleop detect` beside those that it has in common with `eliminate`;
 forces in N, torques in N m, frame S:
 
 ====================== ==========================================================================
@@ -31,19 +31,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.contact.noise_floor import STATISTICS
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.contact import FEWEST, Detection, contacts_of
-from drake_teleop.logs.figures import common_figures, plain
-from drake_teleop.logs.printing import print_results
+from drake_teleop.logs.contact import FEWEST, Detection
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
-from drake_teleop.writing import output_folder, write_json, write_picture, write_table
 
 if TYPE_CHECKING:
-    import polars as pl
+    pass
 
 
 @dataclass(frozen=True)
@@ -104,53 +100,7 @@ def detect_log(
     return DetectedLog(**vars(found.detection), eliminated=found)
 
 
-def detect_command(
-    log: Path,
-    out: Path,
-    *,
-    load: Path | None = None,
-    free: Path | None = None,
-    statistic: str = "level",
-    cutoff_hz: float = 30.0,
-    delay: str | float = "auto",
-    quiet: bool = False,
-) -> dict[str, Any]:
-    """`detect_log`, writing detection.parquet, detection.png and summary.json.
-
-    The Parquet table has `t`, the three statistics, `contact_f_x` and so on, `in_contact`, and
-    `edge` for samples that are not judged.
-
-    Returns:
-        the summary; its names are explained at the top of this module.
-    """
-    found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
-    eliminated = found.eliminated
-    summary = common_figures(log, eliminated, cutoff_hz, eliminated.delay_s) | {
-        "load": None if load is None else str(load),
-        "free": None if free is None else str(free),
-        "free_s": found.free_s,
-        "statistic": statistic,
-        "threshold": found.threshold,
-        "noise": found.floor.noise,
-        "per_acceleration": found.floor.per_acceleration,
-        "above_threshold": found.above.mean(),
-        "in_contact": found.touched.mean(),
-        "force_threshold": found.force_threshold,
-        "above_force_threshold": _above_force(eliminated, found.force_threshold),
-        "contacts": contacts_of(eliminated.log.t, eliminated.contact, found.touched),
-    }
-    summary["notes"] += found.notes
-    summary = plain(summary)
-    with output_folder(out):
-        write_table(out / "detection.parquet", _table(found))
-        write_picture(out / "detection.png", draw_detection(found))
-        write_json(out / "summary.json", summary)
-    if not quiet:
-        _print_detection(summary, out)
-    return summary
-
-
-def _above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
+def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
     wrenches = {
         "raw": found.measured - found.measured[0],
         "gravity_only": found.gravity_only,
@@ -164,20 +114,9 @@ def _above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
     }
 
 
-def _table(found: DetectedLog) -> pl.DataFrame:
-    import polars as pl
-
-    from drake_teleop.logs.read.canonical import WRENCH
-
-    columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
-    columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTICS)}
-    columns |= {f"contact_{c}": found.eliminated.contact[:, i] for i, c in enumerate(WRENCH)}
-    return pl.DataFrame(columns | {"in_contact": found.touched, "edge": found.eliminated.edge})
-
-
 def draw_detection(found: DetectedLog) -> Any:
     """|F| without and with the load's own on top; below, the statistic and its threshold."""
-    from drake_teleop.pages.style import BLACK, BLUE, ORANGE, Picture, house_style, shade_contact
+    from drake_teleop.common.style import BLACK, BLUE, ORANGE, Picture, house_style, shade_contact
 
     eliminated = found.eliminated
     inner = ~eliminated.edge
@@ -207,33 +146,3 @@ def draw_detection(found: DetectedLog) -> Any:
         figure.legend(loc="outside lower center", ncols=3)
         figure.suptitle(Path(eliminated.log.source).name, x=0.01, ha="left", fontsize=11)
     return figure
-
-
-def _print_detection(summary: dict[str, Any], out: Path) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=f"Contact in {Path(summary['log']).name}", title_justify="left")
-    for heading in ("from [s]", "to [s]", "|F| [N]", "|tau| [N m]", "pushed along"):
-        table.add_column(escape(heading), justify="right")
-    for c in summary["contacts"]:
-        push = "" if c["push"] is None else " ".join(f"{x:+.2f}" for x in c["push"])
-        table.add_row(
-            f"{c['start_s']:.3f}", f"{c['stop_s']:.3f}", f"{c['peak_N']:.3g}",
-            f"{c['peak_Nm']:.3g}", push,
-        )  # fmt: skip
-    if not summary["contacts"]:
-        table.add_row("none", *[""] * 4)
-    said = {"raw": "measured", "gravity_only": "without the weight", "eliminated": "contact"}
-    shares = ", ".join(
-        f"{said[name]} {100 * share:.2g} %"
-        for name, share in summary["above_force_threshold"].items()
-        if share is not None
-    )
-    figures = (
-        f"above the threshold ({summary['statistic']} {summary['threshold']:.3g})"
-        f" {100 * summary['above_threshold']:.2g} % of the time, in contact"
-        f" {100 * summary['in_contact']:.2g} %\n"
-        f"|F| above {summary['force_threshold']:.3g} N, of the time: {shares}"
-    )
-    print_results(table, figures, summary, out)

@@ -31,7 +31,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError, one_line
+from drake_teleop.common.errors import DrakeTeleopError, one_line
+from drake_teleop.common.writing import make_folder, output_folder, write_json, write_text
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import Conventions, check_conventions
 from drake_teleop.logs.check.draft import draft_description
@@ -43,7 +44,6 @@ from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import shortest_gap
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.tables import Table, read_table
-from drake_teleop.writing import make_folder, output_folder, write_json, write_text
 
 BANDWIDTH = 30.0
 """Gaps are those that matter below this frequency [Hz]."""

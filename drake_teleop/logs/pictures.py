@@ -12,11 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from drake_teleop.load.batch.uncertainty import intervals
-from drake_teleop.load.identification import VERDICTS, Identification, natural_scale
-from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
-from drake_teleop.logs.read.canonical import Log
-from drake_teleop.pages.style import (
+from drake_teleop.common.style import (
     BLACK,
     BLUE,
     GREEN,
@@ -28,7 +24,11 @@ from drake_teleop.pages.style import (
     house_style,
     shade_contact,
 )
-from drake_teleop.writing import whole_file
+from drake_teleop.common.writing import whole_file
+from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.identification import VERDICTS, Identification, natural_scale
+from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
+from drake_teleop.logs.read.canonical import Log
 
 _CHANNELS = ("$f_x$", "$f_y$", "$f_z$", r"$\tau_x$", r"$\tau_y$", r"$\tau_z$")
 _SYMBOLS = (

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import number
+from drake_teleop.common.arrays import number
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, check_method, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta
@@ -44,7 +45,6 @@ from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, und
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.one_thread import one_blas_thread
 
 _BY_GAINS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated errors of the gains explain."""

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from drake_teleop.common.html import embedded, render
+from drake_teleop.common.writing import write_text
 from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.pictures import VERDICT_WORDS
 from drake_teleop.logs.processing import IdentifiedLog
-from drake_teleop.pages.html import embedded, render
-from drake_teleop.writing import write_text
 
 # Eq. (7): symbol, index, unit as printed, and how many of it an SI unit has.
 _PARAMETERS = (

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.texts import yaml_text
+from drake_teleop.common.writing import output_folder, write_json, write_table, write_text
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.figures import plain
 from drake_teleop.logs.read.description import STANDARD_GRAVITY, UNITS
-from drake_teleop.texts import yaml_text
-from drake_teleop.writing import output_folder, write_json, write_table, write_text
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from urllib.parse import parse_qsl, urlsplit
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 
 
 class Address:

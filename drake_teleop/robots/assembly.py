@@ -22,7 +22,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import without_orientation
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW, smoother

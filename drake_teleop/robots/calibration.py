@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of

@@ -11,19 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.writing import set_aside
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.changes import Changes
 from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
 from drake_teleop.robots.detector import Detector
-from drake_teleop.robots.joints import arm_of
+from drake_teleop.robots.joints import SensorPoseOfJoints
 from drake_teleop.robots.lines import names_of
 from drake_teleop.robots.sources_and_sinks import is_file, sink_of, source_of
 from drake_teleop.robots.streams import Compensated, Sink, Source
 from drake_teleop.robots.udp import THIS_MACHINE, listening
 from drake_teleop.robots.watch import Watch
-from drake_teleop.writing import set_aside
 
 _IDLE_S = 0.01  # between wrenches of zero while nothing comes
 
@@ -122,9 +122,7 @@ def compensate_command(
     delay: str | float = "auto",
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
-    model: Path | None = None,
-    sensor_frame: str | None = None,
-    package_paths: tuple[Path, ...] = (),
+    arm: SensorPoseOfJoints | None = None,
 ) -> None:
     """The command `compensate`; what there is to know goes to stderr.
 
@@ -138,7 +136,7 @@ def compensate_command(
             reported with its time, see `drake_teleop.robots.changes`.
         free: log of free motion, whose noise floor contact is told by, see `Detector`.
         control: port of `Control`.
-        model, sensor_frame, package_paths: of the arm whose joints tell the motion, see `arm_of`.
+        arm: kinematics, if the source delivers joint positions instead of poses.
 
     Raises:
         DrakeTeleopError: if one of them cannot be used.
@@ -153,7 +151,7 @@ def compensate_command(
         real_time=real_time,
         motion=motion,
         sensor_pose=sensor_pose,
-        arm=arm_of(model, sensor_frame, package_paths),
+        arm=arm,
     )
     limits: Array | None = None if largest is None else np.repeat(largest, 3)
     compensator = Compensator(

@@ -35,11 +35,11 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.texts import yaml_text
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
-from drake_teleop.texts import yaml_text
 
 STANDARD_GRAVITY = 9.80665  #: m/s^2, for a weight in N
 

@@ -11,12 +11,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from drake_teleop.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.writing import make_folder, naming
 from drake_teleop.logs.read.canonical import WRENCH
 from drake_teleop.robots.lines import names_of
 from drake_teleop.robots.streams import Compensated
 from drake_teleop.robots.udp import endpoint
-from drake_teleop.writing import make_folder, naming
 
 PORT = 8765
 TOPIC = "/wrench"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from drake_teleop._compiled import njit
+from drake_teleop.common.compiled import njit
 from drake_teleop.load.compensation import scaled_wrench_into
 
 NOT_FINITE, TOO_LARGE, AT_RANGE = 1, 2, 4

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.pace import Pace
 from drake_teleop.robots.streams import WRENCH, Flag, Part

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots.streams import IMU, POSE, WRENCH, Part, PartSource
 
 

@@ -19,16 +19,16 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.texts import yaml_text
+from drake_teleop.common.writing import write_table, write_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.robots.compensator import JUMP_S
 from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Flag, Part, Reading
-from drake_teleop.texts import yaml_text
-from drake_teleop.writing import write_table, write_text
 
 _WRONG = Flag.DAMAGED | Flag.NOT_FINITE | Flag.OUT_OF_RANGE | Flag.SATURATED | Flag.GAP
 _COLUMNS = {

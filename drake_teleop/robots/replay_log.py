@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import accelerated
 from drake_teleop.logs.processing import usable_phi

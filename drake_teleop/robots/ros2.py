@@ -13,7 +13,7 @@ import json
 import struct
 from typing import Any
 
-from drake_teleop.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, install_extra
 from drake_teleop.robots.address import Address
 
 PORT = 7447

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.ros2 import (
     PORT,

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array
-from drake_teleop.quaternions import multiply, rotate
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.quaternions import multiply, rotate
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.ros2 import (
     PORT,

@@ -18,8 +18,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError, install_extra
-from drake_teleop.quaternions import exponential
+from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.quaternions import exponential
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.rtde_reader import SAMPLE
 from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part

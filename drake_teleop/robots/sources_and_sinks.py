@@ -6,12 +6,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import without_orientation
 from drake_teleop.robots.assembly import NOWHERE, Assembly, pose_of
-from drake_teleop.robots.joints import Arm, PosedByJoints
+from drake_teleop.robots.joints import PosedByJoints, SensorPoseOfJoints
 from drake_teleop.robots.lines import LineSink, LineSource
 from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.recording import PartRecorder, Recorder, Records
@@ -43,7 +43,7 @@ def source_of(
     real_time: bool = False,
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
-    arm: Arm | None = None,
+    arm: SensorPoseOfJoints | None = None,
 ) -> Source:
     """The source at an address: udp, posed, rtde, netft, zenoh, - for stdin, or replay:LOG.
 
@@ -101,7 +101,7 @@ def recorded(
     real_time: bool = False,
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
-    arm: Arm | None = None,
+    arm: SensorPoseOfJoints | None = None,
 ) -> tuple[Any, Records[Any]]:
     """What `calibrate` reads, readings or parts as they come, and who keeps them.
 
@@ -185,7 +185,9 @@ def _of_parts(address: str, rate_hz: float | None, joints: tuple[str, ...] = ())
     raise DrakeTeleopError("tells no motion", where=address, remedy="rtde://HOST or zenoh://HOST")
 
 
-def _parts(address: str, rate_hz: float | None, motion: str | None, arm: Arm | None) -> Parts:
+def _parts(
+    address: str, rate_hz: float | None, motion: str | None, arm: SensorPoseOfJoints | None
+) -> Parts:
     names = () if arm is None else arm.joint_names
     wrench = _of_parts(address, rate_hz, names)
     other: PartSource | None = None

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 
 VALUES = 15
 """Of a reading: wrench (6), specific force, angular velocity and acceleration (3 each)."""

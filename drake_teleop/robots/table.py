@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from drake_teleop.common.writing import make_folder, naming, part_of_log, remove_log, write_table
 from drake_teleop.logs.read.canonical import WRENCH
-from drake_teleop.result import part_of_log, remove_log
 from drake_teleop.robots.streams import Compensated
-from drake_teleop.writing import make_folder, naming, write_table
 
 #: Time between two writes [s]: what a kill loses. A file of Parquet takes milliseconds.
 PERIOD_S = {".csv": 0.1, ".parquet": 1.0}

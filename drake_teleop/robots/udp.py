@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots import streams
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import DAMAGED, Compensated, Flag, Part, Reading

@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 from drake_teleop.load.contact.noise_floor import finite_covariance
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.change import change_parameters

@@ -7,14 +7,14 @@ import json
 import pytest
 from shown import type_in
 
-from drake_teleop.analysis import analyze
-from drake_teleop.analysis import figures as of_summary
-from drake_teleop.analysis.maps import stability_map
-from drake_teleop.analysis.report import print_tables
-from drake_teleop.analysis.task_direction import task_direction
-from drake_teleop.analysis.verdict import verdict
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis import analyze
+from drake_teleop.lab.analysis import figures as of_summary
+from drake_teleop.lab.analysis.maps import stability_map
+from drake_teleop.lab.analysis.report import print_tables
+from drake_teleop.lab.analysis.task_direction import task_direction
+from drake_teleop.lab.analysis.verdict import verdict
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 PICTURES = ("bode", "nyquist", "passive", "widths", "maps")
 

@@ -5,17 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drake_teleop.analysis.frequency_response import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.frequency_response import (
     MultiSine,
     StationResponse,
     measure_frequency_response,
     predict_frequency_response,
 )
-from drake_teleop.analysis.task_direction import task_direction
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import slave_arm
-from drake_teleop.operator.operator import intent_at
-from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.lab.analysis.task_direction import task_direction
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.station.operator.operator import intent_at
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 UP = (0.0, 0.0, 1.0)
 EXCITATION = MultiSine(lowest=0.6, period=1.5, settle=1.0)

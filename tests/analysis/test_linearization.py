@@ -5,30 +5,30 @@ from dataclasses import replace as changed
 import numpy as np
 import pytest
 
-from drake_teleop.analysis.linearization import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.linearization import (
     AXES,
     Linearization,
     hybrid_along,
     linearize,
     linearize_station,
 )
-from drake_teleop.analysis.one_axis import device_impedance
-from drake_teleop.analysis.period_map import Sampling
-from drake_teleop.analysis.sampled_loop import sampled_two_port
-from drake_teleop.analysis.task_direction import task_direction
-from drake_teleop.analysis.two_port import hybrid
-from drake_teleop.channel.channel import Channel
-from drake_teleop.environment.sheet_spring import SheetSpring
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import slave_arm
-from drake_teleop.master import phantom
-from drake_teleop.operator.operator import MinimumJerk, OperatorConfig
-from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.simulation import MakeSimulator, read_log
-from drake_teleop.slave.arm import forward_kinematics, inverse_dynamics, jacobian
-from drake_teleop.slave.home import home_position
-from drake_teleop.station import GetBlock, MakeTeleopStation
+from drake_teleop.lab.analysis.one_axis import device_impedance
+from drake_teleop.lab.analysis.period_map import Sampling
+from drake_teleop.lab.analysis.sampled_loop import sampled_two_port
+from drake_teleop.lab.analysis.task_direction import task_direction
+from drake_teleop.lab.analysis.two_port import hybrid
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.master import phantom
+from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.simulation import MakeSimulator, read_log
+from drake_teleop.station.slave.arm import forward_kinematics, inverse_dynamics, jacobian
+from drake_teleop.station.slave.home import home_position
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 PERIOD = 5e-4
 UP = (0.0, 0.0, 1.0)

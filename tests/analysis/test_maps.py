@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drake_teleop.analysis.cut_loop import cut_loop
-from drake_teleop.analysis.maps import StabilityMap, distortion, stability_map
-from drake_teleop.analysis.one_axis import OneAxis
-from drake_teleop.analysis.period_map import Sampling
-from drake_teleop.analysis.sampled_loop import growth_rate, sampled_loop
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.operator.operator import GRIPS
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.cut_loop import cut_loop
+from drake_teleop.lab.analysis.maps import StabilityMap, distortion, stability_map
+from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.lab.analysis.period_map import Sampling
+from drake_teleop.lab.analysis.sampled_loop import growth_rate, sampled_loop
+from drake_teleop.station.operator.operator import GRIPS
 
 JR3 = Sampling(low_pass_hz=500.0)
 MEDIUM = OneAxis()

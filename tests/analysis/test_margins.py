@@ -9,14 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from drake_teleop.analysis.delay_limits import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.delay_limits import (
     contact_delay_margin,
     delay_independent_mass,
     delay_independent_stiffness,
     tolerated_mass_error,
     unstable_delays_of_mass,
 )
-from drake_teleop.analysis.delayed_loop import (
+from drake_teleop.lab.analysis.delayed_loop import (
     DelayedLoop,
     delay_margin,
     held_device,
@@ -24,9 +25,9 @@ from drake_teleop.analysis.delayed_loop import (
     station_loop,
     unstable_poles,
 )
-from drake_teleop.analysis.margins import margins, margins_of_response
-from drake_teleop.analysis.nyquist import encirclements, nyquist_frequencies
-from drake_teleop.analysis.one_axis import (
+from drake_teleop.lab.analysis.margins import margins, margins_of_response
+from drake_teleop.lab.analysis.nyquist import encirclements, nyquist_frequencies
+from drake_teleop.lab.analysis.one_axis import (
     OneAxis,
     device_impedance,
     environment_impedance,
@@ -34,7 +35,6 @@ from drake_teleop.analysis.one_axis import (
     servo_admittance,
     servo_response,
 )
-from drake_teleop.errors import DrakeTeleopError
 
 GRIPS = {"light": (0.1, 2.0, 50.0), "medium": (0.25, 8.0, 250.0), "firm": (0.5, 20.0, 700.0)}
 WALLS = (1000.0, 5100.0, 20000.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.analysis.polynomials import roots_of
+from drake_teleop.lab.analysis.polynomials import roots_of
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -14,7 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drake_teleop.analysis.cut_loop import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.cut_loop import (
     CutLoop,
     cut_loop,
     delay_margin,
@@ -22,17 +23,16 @@ from drake_teleop.analysis.cut_loop import (
     loop_response,
     unstable_multipliers,
 )
-from drake_teleop.analysis.one_axis import OneAxis
-from drake_teleop.analysis.period_map import Sampling, _held_response, delay_steps
-from drake_teleop.analysis.sampled_loop import (
+from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.lab.analysis.period_map import Sampling, _held_response, delay_steps
+from drake_teleop.lab.analysis.sampled_loop import (
     growth_rate,
     multipliers,
     sampled_loop,
     sampled_response,
     sampled_two_port,
 )
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIPS
 
 STATION = Sampling()
 JR3 = Sampling(low_pass_hz=500.0)

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drake_teleop.analysis.sampled_wall import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.sampled_wall import (
     _largest,
     energy_damping,
     friction_stiffness,
@@ -19,7 +20,6 @@ from drake_teleop.analysis.sampled_wall import (
     stable_stiffness,
     wall_impulse_response,
 )
-from drake_teleop.errors import DrakeTeleopError
 
 PERIOD = 1e-3
 

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from drake_teleop.analysis.analyze import wall_is
-from drake_teleop.analysis.task_direction import OneAxisFromScenario, task_direction
-from drake_teleop.channel.channel import Channel
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.environment.block import Block
-from drake_teleop.environment.sheet_spring import SheetSpring
-from drake_teleop.environment.wall import Wall
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import slave_arm
-from drake_teleop.master import phantom
-from drake_teleop.scenario import LoadScenario, Scenario, replace
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.analyze import wall_is
+from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, task_direction
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.environment.block import Block
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.master import phantom
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 
 def test_device_whose_inner_link_alone_moves():

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.analysis import transparency as tr
-from drake_teleop.analysis import two_port as tp
-from drake_teleop.analysis.one_axis import OneAxis, device_impedance, environment_impedance
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis import transparency as tr
+from drake_teleop.lab.analysis import two_port as tp
+from drake_teleop.lab.analysis.one_axis import OneAxis, device_impedance, environment_impedance
 
 OMEGA = np.geomspace(0.1, 1000.0, 200)
 S = 1j * OMEGA

@@ -6,9 +6,9 @@ import control
 import numpy as np
 import pytest
 
-from drake_teleop.analysis import two_port as tp
-from drake_teleop.analysis.one_axis import OneAxis
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis import two_port as tp
+from drake_teleop.lab.analysis.one_axis import OneAxis
 
 OMEGA = np.geomspace(0.1, 3000.0, 500)
 S = 1j * OMEGA

@@ -7,21 +7,21 @@ import pytest
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
-from drake_teleop.channel import channel
-from drake_teleop.channel.channel import MEMORY_S, Channel, channel_step
-from drake_teleop.channel.network import PRESETS, NetworkConfig
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.operator.operator import OperatorConfig, Sine
-from drake_teleop.passivity.memory import HELD, OF_LOAD
-from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.passivity.safe_state import RESUME, STOP
-from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
-from drake_teleop.scenario import Scenario, replace
-from drake_teleop.sides.channel import MakeChannel
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.channel import channel
+from drake_teleop.station.channel.channel import MEMORY_S, Channel, channel_step
+from drake_teleop.station.channel.network import PRESETS, NetworkConfig
+from drake_teleop.station.channel_side import MakeChannel
+from drake_teleop.station.operator.operator import OperatorConfig, Sine
+from drake_teleop.station.passivity.memory import HELD, OF_LOAD
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.passivity.safe_state import RESUME, STOP
+from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.station import MakeTeleopStation
 
 
 @pytest.fixture(scope="module")

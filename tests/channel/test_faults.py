@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from drake_teleop.channel import network
-from drake_teleop.channel.channel import MEMORY_S, channel_step, initial_ends
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.passivity.memory import DAMPING, HELD, STIFFNESS
-from drake_teleop.passivity.methods import METHODS, PassivityConfig, parameters, steps_of
-from drake_teleop.passivity.packet import PACKET_SIZE
-from drake_teleop.passivity.safe_state import RESUME, STOP
+from drake_teleop.station.channel import network
+from drake_teleop.station.channel.channel import MEMORY_S, channel_step, initial_ends
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.memory import DAMPING, HELD, STIFFNESS
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, parameters, steps_of
+from drake_teleop.station.passivity.packet import PACKET_SIZE
+from drake_teleop.station.passivity.safe_state import RESUME, STOP
 
 T, STEPS, DELAY = 1e-3, 4000, 0.01
 LIMIT = 5.0

@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from numba import njit
 from pydrake.common.yaml import yaml_load_typed
 
-from drake_teleop.channel import network
-from drake_teleop.channel.network import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.quaternions import exponential, multiply
+from drake_teleop.station.channel import network
+from drake_teleop.station.channel.network import (
     BACKWARD,
     FORWARD,
     LONGEST_EXTRAPOLATION,
@@ -26,8 +28,7 @@ from drake_teleop.channel.network import (
     receive,
     send,
 )
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.passivity.packet import (
+from drake_teleop.station.passivity.packet import (
     ENERGY,
     INTEGRAL,
     LOAD,
@@ -37,7 +38,6 @@ from drake_teleop.passivity.packet import (
     VELOCITY,
     WRENCH,
 )
-from drake_teleop.quaternions import exponential, multiply
 
 PERIOD = 1e-3
 STEPS = 700

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.active_elements import covering_damping, worst_frequency
-from drake_teleop.comparison.one_dof import PERIOD, OneDof, run_one_dof
-from drake_teleop.passivity.methods import PassivityConfig
+from drake_teleop.lab.comparison.active_elements import covering_damping, worst_frequency
+from drake_teleop.lab.comparison.one_dof import PERIOD, OneDof, run_one_dof
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.methods import PassivityConfig
 
 #: A hand that forces its motion on the device, which has no friction.
 FIRM = OneDof(hand_stiffness=2e5, hand_damping=500.0, device_friction=0.0)

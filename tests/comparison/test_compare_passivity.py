@@ -12,15 +12,15 @@ import polars as pl
 import pytest
 from shown import type_in
 
-from drake_teleop.channel.network import PRESETS
-from drake_teleop.comparison import compare_passivity as study
-from drake_teleop.comparison import delayed_contact
-from drake_teleop.comparison.one_dof import OneDof, Task
-from drake_teleop.comparison.report import COLUMNS, cells
-from drake_teleop.environment.wall import Wall
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identified_load import identified_load
-from drake_teleop.scenario import LoadScenario
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.comparison import compare_passivity as study
+from drake_teleop.lab.comparison import delayed_contact
+from drake_teleop.lab.comparison.one_dof import OneDof, Task
+from drake_teleop.lab.comparison.report import COLUMNS, cells
+from drake_teleop.lab.identified_load import identified_load
+from drake_teleop.station.channel.network import PRESETS
+from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.scenario import LoadScenario
 
 
 @pytest.mark.slow

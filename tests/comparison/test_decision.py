@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from drake_teleop.comparison.decision import decide
-from drake_teleop.comparison.hands import hands
-from drake_teleop.comparison.report import draw_decision, draw_energy, draw_runs
+from drake_teleop.lab.comparison.decision import decide
+from drake_teleop.lab.comparison.hands import hands
+from drake_teleop.lab.comparison.report import draw_decision, draw_energy, draw_runs
 
 
 def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, object]:

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from drake_teleop.analysis.delayed_loop import delay_margin, station_loop
-from drake_teleop.analysis.one_axis import Axis, OneAxis, servo_response
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import (
+from drake_teleop.lab.analysis.delayed_loop import delay_margin, station_loop
+from drake_teleop.lab.analysis.one_axis import Axis, OneAxis, servo_response
+from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
     HAND,
     PERIOD,
@@ -27,9 +26,10 @@ from drake_teleop.comparison.one_dof import (
     operators_intent,
     run_one_dof,
 )
-from drake_teleop.operator.operator import GRIPS
-from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.slave.joint_control import JointControlConfig
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.slave.joint_control import JointControlConfig
 
 DEVICE_MASS, DEVICE_DAMPING = 0.15, 0.5
 

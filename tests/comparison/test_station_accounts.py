@@ -5,22 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.comparison.one_dof import ACTUAL, HAND, MOTOR
-from drake_teleop.comparison.station_accounts import load_work, start_energy, station_accounts
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import slave_arm, true_load
-from drake_teleop.operator.operator import MinimumJerk
-from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.result import SimulationResult
-from drake_teleop.scaling.force_scaling import ForceScalingConfig
-from drake_teleop.scaling.kinematic_scaling import KinematicScalingConfig
-from drake_teleop.scenario import LoadScenario, Rates, Scenario, Simulation, replace
-from drake_teleop.signals import SIGNALS
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.arm import jacobian, sensor_motion
-from drake_teleop.slave.forward_kinematics import pose_into
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, MOTOR
+from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
+from drake_teleop.lab.identification import slave_arm, true_load
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.operator.operator import MinimumJerk
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
+from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
+from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, Simulation, replace
+from drake_teleop.station.signals import SIGNALS
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.arm import jacobian, sensor_motion
+from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.station import MakeTeleopStation
 
 SCENARIO = replace(
     Scenario(),

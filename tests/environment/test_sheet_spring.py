@@ -8,11 +8,11 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.environment.sheet_spring import AddSheetSpring, SheetSpring
-from drake_teleop.operator.operator import MinimumJerk
-from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station.environment.sheet_spring import AddSheetSpring, SheetSpring
+from drake_teleop.station.operator.operator import MinimumJerk
+from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.station import MakeTeleopStation
 
 
 def leaf(sheet: SheetSpring):

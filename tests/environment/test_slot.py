@@ -14,8 +14,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.environment.point_contact import ContactPairs, contact_force, indentation
-from drake_teleop.environment.slot import (
+from drake_teleop.station.environment.point_contact import ContactPairs, contact_force, indentation
+from drake_teleop.station.environment.slot import (
     PEG_RADIUS,
     TIP_BALL,
     UPPER_BALL,
@@ -23,17 +23,17 @@ from drake_teleop.environment.slot import (
     TouchAsSlot,
     _boxes,
 )
-from drake_teleop.replay import ReplayScene
-from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.arm import forward_kinematics, jacobian
-from drake_teleop.slave.home import R_WS_HOME
-from drake_teleop.slave.inverse_kinematics import IkStatus, nearest_branch
-from drake_teleop.slave.plant import AddSlavePlant, ParseSlave
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.slave.surroundings import AddEnvironment
-from drake_teleop.slave.tool_contact import environment_wrench
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station.replay import ReplayScene
+from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.arm import forward_kinematics, jacobian
+from drake_teleop.station.slave.home import R_WS_HOME
+from drake_teleop.station.slave.inverse_kinematics import IkStatus, nearest_branch
+from drake_teleop.station.slave.plant import AddSlavePlant, ParseSlave
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.surroundings import AddEnvironment
+from drake_teleop.station.slave.tool_contact import environment_wrench
+from drake_teleop.station.station import MakeTeleopStation
 
 
 def slave_at(slot: Slot):

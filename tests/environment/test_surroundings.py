@@ -13,36 +13,40 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.analysis.linearization import linearize
-from drake_teleop.environment.block import Block
-from drake_teleop.environment.box import Box
-from drake_teleop.environment.environment import Several
-from drake_teleop.environment.moving_bodies import JointTable, bodies_into, interpolate_bodies
-from drake_teleop.environment.sheet_spring import SheetSpring
-from drake_teleop.environment.wall import Wall
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import true_load
-from drake_teleop.operator.operator import MinimumJerk
-from drake_teleop.replay import ReplayScene
-from drake_teleop.resources import models_dir
-from drake_teleop.run import ScenarioRun, summarise
-from drake_teleop.scenario import LoadScenario, Scenario, ScenarioFromData, replace
-from drake_teleop.simulation import MakeSimulator, simulate
-from drake_teleop.slave.contact_twin import ContactTwin
-from drake_teleop.slave.drake_contact import contact_wrench_W
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.scene import Scene
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.slave.tool import Ball, Tool
-from drake_teleop.slave.tool import Block as ToolBox
-from drake_teleop.slave.tool_contact import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.resources import models_dir
+from drake_teleop.lab.analysis.linearization import linearize
+from drake_teleop.lab.identification import true_load
+from drake_teleop.lab.run_summary import ScenarioRun, summarise
+from drake_teleop.station.environment.block import Block
+from drake_teleop.station.environment.box import Box
+from drake_teleop.station.environment.environment import Several
+from drake_teleop.station.environment.moving_bodies import (
+    JointTable,
+    bodies_into,
+    interpolate_bodies,
+)
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.operator.operator import MinimumJerk
+from drake_teleop.station.replay import ReplayScene
+from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioFromData, replace
+from drake_teleop.station.simulation import MakeSimulator, simulate
+from drake_teleop.station.slave.contact_twin import ContactTwin
+from drake_teleop.station.slave.drake_contact import contact_wrench_W
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.scene import Scene
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.tool import Ball, Tool
+from drake_teleop.station.slave.tool import Block as ToolBox
+from drake_teleop.station.slave.tool_contact import (
     FAR,
     TOUCHING,
     WATCHED,
     environment_wrench,
     nearness,
 )
-from drake_teleop.station import GetBlock, MakeTeleopStation
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 SOFT_PAD = """
 <sdf version="1.9" xmlns:drake="drake.mit.edu"><model name="pad"><link name="pad">

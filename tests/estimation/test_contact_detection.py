@@ -6,21 +6,24 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import BasicVector, DiagramBuilder
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.estimation.contact_detection import ContactDetection, ContactDetectionConfig
-from drake_teleop.identification import identification_scenario, identify_load
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.identification import identification_scenario, identify_load, slave_arm
+from drake_teleop.lab.run_summary import in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import ContactDetector
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.run import in_contact, slave_arm
-from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.arm import accelerations
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.estimation.contact_detection import (
+    ContactDetection,
+    ContactDetectionConfig,
+)
+from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.arm import accelerations
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.station import MakeTeleopStation
 
 NOISE = np.repeat([0.1, 0.01], 3)
 OFFSETS = np.array([5.0, -3.0, 2.0, 0.1, 0.2, 0.3])

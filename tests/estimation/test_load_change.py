@@ -11,7 +11,7 @@ from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.change import STATES, LoadChangeMonitor
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.sensor.sensor_chain import WristSensorConfig, butterworth_sections
+from drake_teleop.station.sensor.sensor_chain import WristSensorConfig, butterworth_sections
 
 SENSOR, RATE, EVENT = WristSensorConfig(), 8000.0, 2.0
 TOOL = phi_from_mass_com_inertia(3.13, [0.004, -0.003, 0.085], np.diag([0.012, 0.0115, 0.0045]))

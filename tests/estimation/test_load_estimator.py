@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.signal import sosfilt
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.estimation.load_estimator import LoadEstimator, LoadEstimatorConfig
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.quantities import check_ranges
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import RecursiveEstimator, RecursiveLeastSquares
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.quantities import check_ranges
-from drake_teleop.sensor.sensor_chain import WristSensorConfig, butterworth_sections
+from drake_teleop.station.estimation.load_estimator import LoadEstimator, LoadEstimatorConfig
+from drake_teleop.station.sensor.sensor_chain import WristSensorConfig, butterworth_sections
 
 SENSOR = WristSensorConfig()
 PHI = phi_from_mass_com_inertia(3.13, [0.004, -0.003, 0.085], np.diag([0.012, 0.0115, 0.0045]))

@@ -7,7 +7,7 @@ import pytest
 from pydrake.multibody.tree import RotationalInertia, SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.change import change_parameters
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
@@ -23,11 +23,11 @@ from drake_teleop.load.online.watched import (
 )
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.operator.operator import MinimumJerk, OperatorConfig, Sine
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.simulation import MakeSimulator, advance, read_log, simulate
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
+from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.simulation import MakeSimulator, advance, read_log, simulate
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
 
 GRASP = 3.0
 MASS, COM, INERTIA = 0.8, [0.04, 0.0, 0.16], [8e-4, 8e-4, 4e-4]

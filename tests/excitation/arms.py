@@ -16,7 +16,7 @@ from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.slave.models import ParseModel
+from drake_teleop.station.slave.models import ParseModel
 
 # Of the simulation [s]; rest before the motion, without and with recording, and after it [s].
 _STEP, _SETTLING, _RESTING = 2e-4, 0.5, 0.2

@@ -9,8 +9,8 @@ import pytest
 from pydrake.geometry import Box, Cylinder
 from pydrake.geometry import Capsule as CapsuleShape
 
-from drake_teleop.excitation.capsules import Capsule, bounding_capsule
-from drake_teleop.excitation.scene import CLEARANCE, _kept_distance
+from drake_teleop.lab.excitation.capsules import Capsule, bounding_capsule
+from drake_teleop.lab.excitation.scene import CLEARANCE, _kept_distance
 
 
 @pytest.mark.parametrize("long", [0, 1, 2])

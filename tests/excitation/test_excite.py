@@ -15,30 +15,30 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from shown import type_in
 
-from drake_teleop.cli import main
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.excitation.check import check, check_motion
-from drake_teleop.excitation.excite import excite, sensor_motion
-from drake_teleop.excitation.limits import LIMITS, empty_motions, motions_of, sensor_vectors
-from drake_teleop.excitation.motion_film import write_motion_film
-from drake_teleop.excitation.prediction import predicted_deviations, sensor_noise
-from drake_teleop.excitation.robot import Robot, RobotFromModel, RobotFromScenario
-from drake_teleop.film import Film
-from drake_teleop.identification import identify_load
+from drake_teleop.cli.main import main
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.resources import models_dir
+from drake_teleop.lab.excitation.check import check, check_motion
+from drake_teleop.lab.excitation.excite import excite, sensor_motion
+from drake_teleop.lab.excitation.limits import LIMITS, empty_motions, motions_of, sensor_vectors
+from drake_teleop.lab.excitation.motion_film import write_motion_film
+from drake_teleop.lab.excitation.prediction import predicted_deviations, sensor_noise
+from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
+from drake_teleop.lab.identification import identify_load
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.resources import models_dir
-from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.sensor.motion_estimation import (
+from drake_teleop.station.film import Film
+from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_into,
     motion_estimator,
 )
-from drake_teleop.sensor.presets import PRESETS
-from drake_teleop.sensor.sensor_chain import (
+from drake_teleop.station.sensor.presets import PRESETS
+from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
     WristSensorConfig,
@@ -46,9 +46,9 @@ from drake_teleop.sensor.sensor_chain import (
     sensor_chain,
     without,
 )
-from drake_teleop.slave.arm import forward_kinematics
-from drake_teleop.slave.models import ParseModel
-from drake_teleop.slave.slave_config import Slave
+from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.models import ParseModel
+from drake_teleop.station.slave.slave_config import Slave
 
 
 @pytest.fixture(scope="module")
@@ -490,7 +490,7 @@ def test_what_drake_refuses_at_last_is_one_error(urdf, monkeypatch):
     def refused(_):
         raise RuntimeError("form one or more loops")
 
-    monkeypatch.setattr("drake_teleop.excitation.robot.finalize", refused)
+    monkeypatch.setattr("drake_teleop.lab.excitation.robot.finalize", refused)
     with pytest.raises(DrakeTeleopError, match=r"arm\.urdf: cannot be read .*one or more loops"):
         RobotFromModel(urdf, "l6", WristSensorConfig())
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.excitation.criteria import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.excitation.criteria import (
     CRITERIA,
     Criterion,
     Scales,
     characteristic_length,
 )
-from drake_teleop.excitation.design import _Search
-from drake_teleop.excitation.limits import (
+from drake_teleop.lab.excitation.design import _Search
+from drake_teleop.lab.excitation.limits import (
     CLEARANCE_SCALE,
     LIMITS,
     Limits,
@@ -26,15 +26,15 @@ from drake_teleop.excitation.limits import (
     limit_uses,
     motions_of,
 )
-from drake_teleop.excitation.prediction import SensorNoise, _correction, predicted_deviations
-from drake_teleop.excitation.problem import Problem, Task
+from drake_teleop.lab.excitation.prediction import SensorNoise, _correction, predicted_deviations
+from drake_teleop.lab.excitation.problem import Problem, Task
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import regressor
-from drake_teleop.sensor.motion_estimation import MotionEstimationConfig, motion_gains
-from drake_teleop.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.slave.arm import SLIDES
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
+from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig, motion_gains
+from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
+from drake_teleop.station.slave.arm import SLIDES
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
 
 PHI = phi_from_mass_com_inertia(3.0, [0.01, -0.02, 0.08], np.diag([0.012, 0.0115, 0.0045]))
 SCALES = Scales((0.3, 0.02), 0.07, PHI)

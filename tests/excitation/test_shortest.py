@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.excitation import shortest as module
-from drake_teleop.excitation.criteria import Criterion
-from drake_teleop.excitation.excite import sensor_motion
-from drake_teleop.excitation.prediction import predicted_covariance
-from drake_teleop.excitation.problem import Task
-from drake_teleop.excitation.robot import Robot, RobotFromScenario
-from drake_teleop.excitation.shortest import ShortestProblem, reliable_factor, shortest
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.excitation import shortest as module
+from drake_teleop.lab.excitation.criteria import Criterion
+from drake_teleop.lab.excitation.excite import sensor_motion
+from drake_teleop.lab.excitation.prediction import predicted_covariance
+from drake_teleop.lab.excitation.problem import Task
+from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
+from drake_teleop.lab.excitation.shortest import ShortestProblem, reliable_factor, shortest
 from drake_teleop.load.tolerance import deviations_of, errors_of, read_tolerance
-from drake_teleop.scenario import LoadScenario
+from drake_teleop.station.scenario import LoadScenario
 
 ASKED = read_tolerance("mass 0.1 %, com 0.1 mm, inertia 1 %")
 

@@ -7,18 +7,18 @@ import json
 import numpy as np
 import pytest
 
-from drake_teleop.experiment.apparatus import make_apparatus
-from drake_teleop.experiment.design import Condition, ContactDetection, Experiment
-from drake_teleop.experiment.guided import Guided
-from drake_teleop.experiment.messages import HAND, parse_study
-from drake_teleop.experiment.procedure import Procedure
-from drake_teleop.experiment.store import Store
-from drake_teleop.identified_load import IdentifiedLoad
+from drake_teleop.common.progress import silent
+from drake_teleop.lab.identified_load import IdentifiedLoad
+from drake_teleop.live.experiment.apparatus import make_apparatus
+from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment
+from drake_teleop.live.experiment.guided import Guided
+from drake_teleop.live.experiment.messages import HAND, parse_study
+from drake_teleop.live.experiment.procedure import Procedure
+from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.session import read_drive, repeat
 from drake_teleop.load.identification import Identification
-from drake_teleop.pages.progress import silent
-from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.slave.plant import NominalSlave
 
 EXPERIMENT = Experiment(
     tasks=[ContactDetection(trials=1, practice=0, interval=0.5)],

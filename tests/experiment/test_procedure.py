@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.experiment.design import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.live.experiment.design import (
     ApparentMass,
     Condition,
     ContactDetection,
@@ -19,9 +19,9 @@ from drake_teleop.experiment.design import (
     LoadExperiment,
     PegInSlot,
 )
-from drake_teleop.experiment.procedure import Felt, Procedure, trials_of
-from drake_teleop.experiment.psychometrics import correct_probability
-from drake_teleop.experiment.store import Store, open_results
+from drake_teleop.live.experiment.procedure import Felt, Procedure, trials_of
+from drake_teleop.live.experiment.psychometrics import correct_probability
+from drake_teleop.live.experiment.store import Store, open_results
 
 SMALL = Experiment(
     tasks=[ContactDetection(trials=6, practice=2), ApparentMass(trials=5), PegInSlot(trials=2)],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.experiment.psychometrics import Psi, correct_probability
+from drake_teleop.live.experiment.psychometrics import Psi, correct_probability
 
 
 def test_the_threshold_is_where_d_prime_is_1():

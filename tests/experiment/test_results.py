@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from test_procedure import SMALL, go_through
 
-from drake_teleop.experiment.command import whose_turn
-from drake_teleop.experiment.design import Condition, ContactDetection, Experiment
-from drake_teleop.experiment.procedure import Procedure, trials_of
-from drake_teleop.experiment.results import Result, _draw, results, write_results
-from drake_teleop.experiment.store import Store
-from drake_teleop.pages.style import Picture
+from drake_teleop.cli.experiment import whose_turn
+from drake_teleop.common.style import Picture
+from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment
+from drake_teleop.live.experiment.procedure import Procedure, trials_of
+from drake_teleop.live.experiment.results import Result, _draw, results, write_results
+from drake_teleop.live.experiment.store import Store
 
 CONTACT = "threshold of contact [N at the tool]"
 

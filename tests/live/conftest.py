@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from drake_teleop.identified_load import IdentifiedLoad
+from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live import server
 from drake_teleop.live.session import live_scenario
 from drake_teleop.load.identification import Identification
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.slave.plant import NominalSlave
 
 
 @pytest.fixture(scope="session")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.fault import MEANINGS, Fault
-from drake_teleop.identification import slave_arm
+from drake_teleop.common.fault import MEANINGS, Fault
+from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.session import Session
-from drake_teleop.slave.inverse_kinematics import IkStatus
+from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
 N = 6  # joints
 

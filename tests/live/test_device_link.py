@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from websockets.sync.server import serve
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.progress import silent
 from drake_teleop.live.device import DrivenBy
 from drake_teleop.live.device_client import Client
 from drake_teleop.live.device_guard import DeviceGuard, Limits
@@ -33,8 +34,7 @@ from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.session import Session, read_drive, repeat
 from drake_teleop.live.virtual_device import VirtualDevice, tapping
-from drake_teleop.pages.progress import silent
-from drake_teleop.result import SimulationResult
+from drake_teleop.station.result import SimulationResult
 
 MS = 1e-3
 

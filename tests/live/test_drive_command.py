@@ -16,10 +16,10 @@ from shown import hearing_ctrl_c, press_ctrl_c, type_in
 from sockets import ports
 from websockets.sync.client import connect
 
-from drake_teleop import replay
-from drake_teleop.cli import main
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.cli.main import main
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.session import Session, read_drive
+from drake_teleop.station import replay
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +31,7 @@ def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
     for room in ("live.server", "experiment.apparatus"):
         monkeypatch.setattr(f"drake_teleop.{room}.identified_load", lambda *_: load)
     for painted in ("write_replay", "write_picture", "overview"):
-        monkeypatch.setattr(f"drake_teleop.run.{painted}", lambda *_: None)
+        monkeypatch.setattr(f"drake_teleop.lab.run.{painted}", lambda *_: None)
 
     def opens(
         says: str = '{"set": {"z": -3000}}',

@@ -14,7 +14,7 @@ from drake_teleop.live.external_master import with_device
 from drake_teleop.live.following import Follower, Steering
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
-from drake_teleop.scenario import Scenario, replace
+from drake_teleop.station.scenario import Scenario, replace
 
 NAMES = ("x", "y", "z", "rx", "ry", "rz")
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.live.hand import LiveHand
-from drake_teleop.operator.operator import OperatorConfig
-from drake_teleop.quaternions import conjugate, exponential, logarithm, multiply
+from drake_teleop.station.operator.operator import OperatorConfig
 
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
 #: When, and where to: a turn [rad] and a place [m], both about and along other axes each time.

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from full_disk import small_disk
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.progress import silent
+from drake_teleop.common.writing import CannotWrite
 from drake_teleop.live.live import FRAME, Live
 from drake_teleop.live.messages import LONGEST, parse
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.session import Session, read_drive, repeat
-from drake_teleop.pages.progress import silent
-from drake_teleop.result import SimulationResult
-from drake_teleop.writing import CannotWrite
+from drake_teleop.station.result import SimulationResult
 
 
 class Clock:

@@ -12,8 +12,8 @@ from sockets import ports
 from drake_teleop.live import page_scene
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.session import Session
-from drake_teleop.slave.arm import forward_kinematics
-from drake_teleop.slave.plant import NominalSlave
+from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.plant import NominalSlave
 
 
 @pytest.fixture(scope="module")

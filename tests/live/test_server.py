@@ -17,10 +17,10 @@ from sockets import THIS_MACHINE, listening, ports
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live import server
 from drake_teleop.live.messages import LONGEST
-from drake_teleop.scenario import Scenario, replace
+from drake_teleop.station.scenario import Scenario, replace
 
 LEARNING = replace(Scenario(), load_estimator__enabled=True)  # identifies nothing beforehand
 

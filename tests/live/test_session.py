@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.cli import main
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import slave_arm
+from drake_teleop.cli.main import main
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.progress import silent
+from drake_teleop.common.resources import models_dir
+from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.hand import BEHIND
 from drake_teleop.live.handing_on import GoesOver
 from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs, row
 from drake_teleop.live.session import Drive, Session, read_drive, repeat
-from drake_teleop.pages.progress import silent
-from drake_teleop.passivity.methods import METHODS
-from drake_teleop.resources import models_dir
-from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import Scenario, replace
-from drake_teleop.slave.arm import forward_kinematics
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.passivity.methods import METHODS
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.slave.arm import forward_kinematics
 
 END = 300  # ms
 
@@ -246,7 +246,7 @@ def test_a_hand_that_has_let_go_pulls_nowhere(driven):
 def test_run_repeats_a_drive_to_the_same_bytes(driven, tmp_path, capsys, monkeypatch):
     folder, _ = driven
     for painted in ("write_replay", "write_picture", "overview"):
-        monkeypatch.setattr(f"drake_teleop.run.{painted}", lambda *_: None)
+        monkeypatch.setattr(f"drake_teleop.lab.run.{painted}", lambda *_: None)
     with pytest.raises(SystemExit) as end:
         main(["run", "--inputs", str(folder), "--out", str(tmp_path / "again"), "--quiet"])
     assert end.value.code == 0, capsys.readouterr().err

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from load_cases import OFFSETS, TOOL, rich_motion, rotations
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.consistent import Prior
 from drake_teleop.load.batch.covariance import ARM
 from drake_teleop.load.batch.methods import METHODS, _loss, identify_batch
@@ -27,7 +27,7 @@ from drake_teleop.load.inertia import (
 )
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench, regressor
-from drake_teleop.result import SimulationResult
+from drake_teleop.station.result import SimulationResult
 
 TRUTH = np.concatenate([OFFSETS, TOOL])
 WRENCH_NOISE = np.array([0.3, 0.3, 0.5, 0.01, 0.01, 0.005])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.gripper import identified_object

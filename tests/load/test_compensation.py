@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from load_cases import OFFSETS, TOOL, loads, motions, rich_motion, vectors
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import (
     contact_wrench,
     modified_phi,

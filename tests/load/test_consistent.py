@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
 from drake_teleop.load.batch.moments import Moments, Noise
 from drake_teleop.load.batch.total_least_squares import total_least_squares

@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from load_cases import OFFSETS, TOOL, motions, vectors
 from scipy.stats import chi2, norm
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import ContactDetector
 from drake_teleop.load.contact.memory import SIZE, WINDOW

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.normal_equations import NormalEquations, _pseudo_inverse, identify
 from drake_teleop.load.regressor import non_contact_wrench, regressor

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from load_cases import TOOL, loads, rotations, vectors
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import (
     inertia_about_origin,
     is_physically_consistent,

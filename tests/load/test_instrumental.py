@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.instrumental import RecursiveInstrumentalVariables
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares

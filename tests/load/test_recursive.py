@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.identification import Identification

@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces, SpatialInertia, UnitInertia
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import inertia_about_origin, transform_phi
 from drake_teleop.load.regressor import (
     non_contact_wrench,

@@ -15,7 +15,7 @@ from load_cases import OFFSETS, TOOL, rich_motion, rotations
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.uncertainty import (
     base_parameters,

@@ -15,7 +15,7 @@ import yaml
 from known_motion import GRAVITY_W, Motion, motion_at, quaternions
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.cause_lines import with_lines
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.check.conventions import check_log

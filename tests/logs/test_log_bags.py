@@ -16,7 +16,7 @@ import pytest
 import yaml
 from known_motion import Motion, motion_at, quaternions
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.inspection import inspect_command

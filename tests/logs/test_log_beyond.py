@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.lib import format as npy
 
-from drake_teleop.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.logs.inspection import inspect_command

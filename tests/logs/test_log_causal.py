@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.causal import causal_low_pass, causal_wrenches, filter_lag
 
 DT, CUTOFF = 1e-3, 30.0

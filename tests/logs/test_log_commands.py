@@ -13,11 +13,11 @@ from known_motion import motion_at
 from planted import good, written
 from scipy.special import stdtrit
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.cli.logs import eliminate_command, identify_command
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.commands import eliminate_command, identify_command
 from drake_teleop.logs.contact import robust_offsets
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import WRENCH, Log, write_log

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.description import Description, load_description
 
 PAGE = Path(__file__).parents[2] / "docs" / "logs.md"

@@ -11,11 +11,12 @@ import pytest
 from click.testing import CliRunner
 from test_log_commands import GRAVITY, describe_poses, describe_record
 
-from drake_teleop.cli import cli
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.cli.logs import detect_command
+from drake_teleop.cli.main import cli
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.detection import detect_command, detect_log
+from drake_teleop.logs.detection import detect_log
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 

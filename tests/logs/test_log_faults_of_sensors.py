@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.check import conventions
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log

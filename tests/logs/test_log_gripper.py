@@ -11,11 +11,11 @@ import pytest
 from known_motion import motion_at
 from shown import type_in
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.cli.logs import eliminate_command, identify_command
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.commands import eliminate_command, identify_command
 from drake_teleop.logs.processing import eliminate_log
 from drake_teleop.logs.read.canonical import WRENCH, Log, write_log
 

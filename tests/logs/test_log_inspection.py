@@ -18,8 +18,8 @@ from planted import NTNU_FRAME, Columns, findings, good, ntnu_log, written
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.cli import main
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.cli.main import main
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs import inspection
 from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.inspection import inspect_command

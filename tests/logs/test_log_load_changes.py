@@ -11,12 +11,12 @@ import yaml
 from known_motion import motion_at
 from test_log_commands import GRAVITY, describe_poses, describe_record
 
+from drake_teleop.cli.logs import identify_command
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.change import STATES, LoadChangeMonitor
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.explain import explain
 from drake_teleop.logs.causes.instants import instants
-from drake_teleop.logs.commands import identify_command
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 

@@ -17,7 +17,7 @@ from known_motion import GRAVITY_W, Motion, motion_at, quaternions
 from scipy.spatial.transform import Rotation
 from test_log_commands import GRAVITY, describe_poses, describe_record
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.inspection import inspect_command

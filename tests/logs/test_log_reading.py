@@ -11,7 +11,7 @@ import yaml
 from known_motion import GRAVITY_W, Motion, motion_at, quaternions
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import (
     ANGULAR_ACCELERATION,

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from known_motion import motion_at
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.cli.logs import identify_command
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import PARAMETERS
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.commands import identify_command
 from drake_teleop.logs.pictures import draw_fit, draw_knowledge, spectrum
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_log_detection import log_with_push
 
-from drake_teleop.logs.commands import eliminate_command, identify_command
+from drake_teleop.cli.logs import eliminate_command, identify_command
 
 
 def lacking(summary: dict[str, Any], path: str = "") -> list[str]:

@@ -12,13 +12,12 @@ import yaml
 from posed_record import GRAVITY_W, LATE, OFFSETS, PHI, SECONDS, Kind, motion_at, record
 from scipy.spatial.transform import Rotation
 
+from drake_teleop.cli.logs import detect_command, eliminate_command
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import causal_low_pass
-from drake_teleop.logs.commands import eliminate_command
 from drake_teleop.logs.contact import contacts_of
-from drake_teleop.logs.detection import detect_command
 from drake_teleop.logs.pose_motion.estimate import motion_of_load
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.rigid import load_coefficients

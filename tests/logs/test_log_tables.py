@@ -13,7 +13,7 @@ import pytest
 from scipy.io import savemat
 from scipy.sparse import eye_array
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.tables import decimal_step, read_table
@@ -372,7 +372,7 @@ FORKS = """
 import multiprocessing, sys
 from pathlib import Path
 from drake_teleop.logs.read.tables import read_table
-from drake_teleop.result import SimulationResult
+from drake_teleop.station.result import SimulationResult
 
 def rows(_):
     return read_table(Path(sys.argv[1])).rows

@@ -25,7 +25,7 @@ from posed_record import (
     record,
 )
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
 from drake_teleop.logs.pose_motion.levels import Levels

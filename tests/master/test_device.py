@@ -9,10 +9,10 @@ from pydrake.math import RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master import device, dynamics, phantom
-from drake_teleop.master.data_sheets import JointFriction, Master
-from drake_teleop.master.force_display import initial_display
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.master import device, dynamics, phantom
+from drake_teleop.station.master.data_sheets import JointFriction, Master
+from drake_teleop.station.master.force_display import initial_display
 
 NO_FRICTION = JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.fault import Fault
-from drake_teleop.master import phantom
-from drake_teleop.master.data_sheets import Master
-from drake_teleop.master.force_display import ForceDisplay, display_into, initial_display
-from drake_teleop.passivity.safe_state import RESUME, STOP
+from drake_teleop.common.fault import Fault
+from drake_teleop.station.master import phantom
+from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.master.force_display import ForceDisplay, display_into, initial_display
+from drake_teleop.station.passivity.safe_state import RESUME, STOP
 
 DEVICE = Master().device(0.1, 1e-4)
 PERIOD = 5e-4

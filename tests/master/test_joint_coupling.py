@@ -8,25 +8,25 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.analysis.linearization import linearize
-from drake_teleop.channel.channel import Channel
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import true_load
-from drake_teleop.master.data_sheets import Master
-from drake_teleop.master.leader_model import Leader
-from drake_teleop.operator.operator import Sine
-from drake_teleop.resources import models_dir
-from drake_teleop.scaling.joint_coupling import JointCoupling
-from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.arm import jacobian
-from drake_teleop.slave.forward_kinematics import pose_into
-from drake_teleop.slave.inverse_kinematics import IkStatus
-from drake_teleop.slave.joint_follower import JointFollower
-from drake_teleop.slave.plant import NominalSlave
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.slave.tool import Tool
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.resources import models_dir
+from drake_teleop.lab.analysis.linearization import linearize
+from drake_teleop.lab.identification import true_load
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.master.leader_model import Leader
+from drake_teleop.station.operator.operator import Sine
+from drake_teleop.station.scaling.joint_coupling import JointCoupling
+from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.arm import jacobian
+from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.slave.inverse_kinematics import IkStatus
+from drake_teleop.station.slave.joint_follower import JointFollower
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.station import MakeTeleopStation
 
 HOME = [0.2, -0.6, 1.9, 0.3, 0.5, -0.2]
 FILE = models_dir() / "leader_arm.urdf"

@@ -13,13 +13,13 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master.data_sheets import Master
-from drake_teleop.master.device import AddDevice
-from drake_teleop.master.leader_model import Leader
-from drake_teleop.resources import models_dir
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.sides.master import MakeMasterSide
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.resources import models_dir
+from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.master.device import AddDevice
+from drake_teleop.station.master.leader_model import Leader
+from drake_teleop.station.master_side import MakeMasterSide
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 PERIOD = 5e-4
 HOME = [0.2, -0.6, 1.9, 0.3, 0.5, -0.2]

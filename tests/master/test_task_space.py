@@ -9,16 +9,16 @@ import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.master import dynamics
-from drake_teleop.master.data_sheets import FIGURES, JointFriction, Master
-from drake_teleop.master.device import MasterDevice
-from drake_teleop.master.electronics import read_pose_into
-from drake_teleop.master.force_display import display_into, initial_display
-from drake_teleop.operator.operator import Sine
-from drake_teleop.scenario import LoadScenario, ScenarioFromData, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.master import dynamics
+from drake_teleop.station.master.data_sheets import FIGURES, JointFriction, Master
+from drake_teleop.station.master.device import MasterDevice
+from drake_teleop.station.master.electronics import read_pose_into
+from drake_teleop.station.master.force_display import display_into, initial_display
+from drake_teleop.station.operator.operator import Sine
+from drake_teleop.station.scenario import LoadScenario, ScenarioFromData, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.station import MakeTeleopStation
 
 HAND = (0.2, 3e-4)
 PERIOD = 5e-4

@@ -14,10 +14,10 @@ from pydrake.math import RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.master import device, phantom
-from drake_teleop.master.data_sheets import JointFriction, Master
-from drake_teleop.master.force_display import ForceDisplay
-from drake_teleop.operator.operator import (
+from drake_teleop.station.master import device, phantom
+from drake_teleop.station.master.data_sheets import JointFriction, Master
+from drake_teleop.station.master.force_display import ForceDisplay
+from drake_teleop.station.operator.operator import (
     GRIPS,
     MinimumJerk,
     Operator,

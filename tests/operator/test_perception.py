@@ -7,8 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.operator.perception import EXCESS, NOTICED, THRESHOLD, Perception, perceive
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.operator.perception import (
+    EXCESS,
+    NOTICED,
+    THRESHOLD,
+    Perception,
+    perceive,
+)
 
 RATE = 200.0
 T = np.arange(0.0, 6.0, 1 / RATE)

@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from pydrake.math import RollPitchYaw
 
-from drake_teleop.channel.channel import Channel
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import true_load
-from drake_teleop.master.data_sheets import JointFriction
-from drake_teleop.noise import random_normal
-from drake_teleop.operator import decision
-from drake_teleop.operator.decision import DONE, OVER, PHASE, SEEKING, STOPPING
-from drake_teleop.operator.minimum_jerk import add_plan_into, plan_move
-from drake_teleop.operator.perception import NOTICED, Perception, perceive
-from drake_teleop.operator.task import Insert, Movement, Press, Reach, Touch, check_task
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.station import MakeTeleopStation
-from drake_teleop.task_measures import contact_force, detection_time, task_measures
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.noise import random_normal
+from drake_teleop.lab.identification import true_load
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.master.data_sheets import JointFriction
+from drake_teleop.station.operator import decision
+from drake_teleop.station.operator.decision import DONE, OVER, PHASE, SEEKING, STOPPING
+from drake_teleop.station.operator.minimum_jerk import add_plan_into, plan_move
+from drake_teleop.station.operator.perception import NOTICED, Perception, perceive
+from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Touch, check_task
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.station import MakeTeleopStation
+from drake_teleop.station.task_measures import contact_force, detection_time, task_measures
 
 #: Rates of a study: the operator notices no difference.
 FAST = {

@@ -8,9 +8,9 @@ import hashlib
 import numpy as np
 import pytest
 
-from drake_teleop.film import Film
-from drake_teleop.pages.html import render
-from drake_teleop.pages.policy import policy
+from drake_teleop.common.html import render
+from drake_teleop.common.policy import policy
+from drake_teleop.station.film import Film
 
 CODE = "const a = 1;\nlet b = 'é';"
 
@@ -42,5 +42,5 @@ def test_films_and_reports_have_one(tmp_path):
     page = (tmp_path / "x.html").read_text(encoding="utf-8")
     head, _, rest = page.partition("<title>")
     assert policy(page) in head and "<script" not in head and rest.count("<script") >= 3
-    report = render("drake_teleop.pages", "page.html.j2")
+    report = render("drake_teleop.common", "page.html.j2")
     assert "default-src 'none'" in report.partition("<title>")[0]

@@ -12,17 +12,17 @@ import rich
 from rich.console import Console
 
 from drake_teleop import identify_load, run_scenario, simulate
-from drake_teleop.analysis.analyze import analyze, analyze_command
-from drake_teleop.comparison.compare_passivity import compare_command
-from drake_teleop.excitation.command import excite_command
-from drake_teleop.excitation.excite import excite
-from drake_teleop.identified_load import identified_load
-from drake_teleop.pages.progress import show_progress, silent
-from drake_teleop.reproduction.reproduce import reproduce_command
-from drake_teleop.run import run_command
-from drake_teleop.studies.runs import run_study
-from drake_teleop.studies.scaling_study import scaling_study_command
-from drake_teleop.studies.study import study_command
+from drake_teleop.cli.excitation import excite_command
+from drake_teleop.common.progress import show_progress, silent
+from drake_teleop.lab.analysis.analyze import analyze, analyze_command
+from drake_teleop.lab.comparison.compare_passivity import compare_command
+from drake_teleop.lab.excitation.excite import excite
+from drake_teleop.lab.identified_load import identified_load
+from drake_teleop.lab.reproduction.reproduce import reproduce_command
+from drake_teleop.lab.run import run_command
+from drake_teleop.lab.studies.runs import run_study
+from drake_teleop.lab.studies.scaling_study import scaling_study_command
+from drake_teleop.lab.studies.study import study_command
 
 SLOW = [
     *(identify_load, identified_load, run_scenario, simulate, analyze, excite, run_study),

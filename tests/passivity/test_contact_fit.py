@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.passivity.contact_fit import SUMS, fit, slipped
+from drake_teleop.station.passivity.contact_fit import SUMS, fit, slipped
 
 
 def found(stiffness, damping, way, faster, keep=0.8):

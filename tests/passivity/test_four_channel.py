@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from drake_teleop.passivity.four_channel import FourChannelConfig
-from drake_teleop.passivity.memory import DAMPING, LIMIT, STIFFNESS
-from drake_teleop.passivity.methods import (
+from drake_teleop.station.passivity.four_channel import FourChannelConfig
+from drake_teleop.station.passivity.memory import DAMPING, LIMIT, STIFFNESS
+from drake_teleop.station.passivity.methods import (
     PassivityConfig,
     initial_memory,
     master_step,
@@ -14,7 +14,7 @@ from drake_teleop.passivity.methods import (
     slave_step,
     steps_of,
 )
-from drake_teleop.passivity.packet import PACKET_SIZE, difference_into, moved_into
+from drake_teleop.station.passivity.packet import PACKET_SIZE, difference_into, moved_into
 
 T = 1e-3
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])

@@ -1,6 +1,7 @@
 """The energy ledger: its promises, each at its port, in one degree of freedom.
 
-Walls, networks and hands of `drake_teleop.comparison.one_dof`; nobody tells the method of the hand.
+Walls, networks and hands of `drake_teleop.lab.comparison.one_dof`; the method has no data of the
+hand.
 """
 
 from __future__ import annotations
@@ -10,8 +11,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import (
+from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
     MOTOR,
     PERIOD,
@@ -22,10 +22,11 @@ from drake_teleop.comparison.one_dof import (
     operators_intent,
     run_one_dof,
 )
-from drake_teleop.passivity.ledger import LedgerConfig
-from drake_teleop.passivity.ledger_slave import _ACCOUNT
-from drake_teleop.passivity.memory import LEDGER, LIMIT, LOST, RECEIVED, SENT
-from drake_teleop.passivity.methods import (
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.ledger import LedgerConfig
+from drake_teleop.station.passivity.ledger_slave import _ACCOUNT
+from drake_teleop.station.passivity.memory import LEDGER, LIMIT, LOST, RECEIVED, SENT
+from drake_teleop.station.passivity.methods import (
     PassivityConfig,
     initial_memory,
     master_step,
@@ -33,7 +34,7 @@ from drake_teleop.passivity.methods import (
     slave_step,
     steps_of,
 )
-from drake_teleop.passivity.packet import PACKET_SIZE
+from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 CHARGED_BY_DRAG = PassivityConfig(method="ledger", ledger=LedgerConfig(initial=[0.0, 0.0]))
 CHARGED_BEFORE = PassivityConfig(method="ledger")

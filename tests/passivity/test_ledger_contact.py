@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.passivity.ledger import LedgerConfig
-from drake_teleop.passivity.ledger_slave import (
+from drake_teleop.station.passivity.ledger import LedgerConfig
+from drake_teleop.station.passivity.ledger_slave import (
     CONTACT_STIFFNESS,
     NORMAL,
     TOUCHED,
@@ -17,8 +17,8 @@ from drake_teleop.passivity.ledger_slave import (
     along,
     find_direction,
 )
-from drake_teleop.passivity.memory import LEDGER, LIMIT, LOST, OF_LOAD, SENT
-from drake_teleop.passivity.methods import (
+from drake_teleop.station.passivity.memory import LEDGER, LIMIT, LOST, OF_LOAD, SENT
+from drake_teleop.station.passivity.methods import (
     PassivityConfig,
     initial_memory,
     master_step,
@@ -26,7 +26,7 @@ from drake_teleop.passivity.methods import (
     slave_step,
     steps_of,
 )
-from drake_teleop.passivity.packet import GENTLE, LOAD, PACKET_SIZE, POSE, SEQUENCE, WRENCH
+from drake_teleop.station.passivity.packet import GENTLE, LOAD, PACKET_SIZE, POSE, SEQUENCE, WRENCH
 
 T = 1e-3
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])

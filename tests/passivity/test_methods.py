@@ -5,17 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.quantities import check_ranges
+from drake_teleop.common.quaternions import multiply, normalized, rotate
+from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
     figures,
     operators_intent,
     run_one_dof,
 )
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.passivity.memory import HELD, LEDGER, LIMIT, MEMORY, SENT
-from drake_teleop.passivity.methods import (
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.memory import HELD, LEDGER, LIMIT, MEMORY, SENT
+from drake_teleop.station.passivity.methods import (
     METHODS,
     PassivityConfig,
     initial_memory,
@@ -24,7 +26,7 @@ from drake_teleop.passivity.methods import (
     slave_step,
     steps_of,
 )
-from drake_teleop.passivity.packet import (
+from drake_teleop.station.passivity.packet import (
     ENERGY,
     HEALTHY,
     PACKET_SIZE,
@@ -33,9 +35,7 @@ from drake_teleop.passivity.packet import (
     difference_into,
     moved_into,
 )
-from drake_teleop.passivity.two_layer import TwoLayerConfig, _exchange
-from drake_teleop.quantities import check_ranges
-from drake_teleop.quaternions import multiply, normalized, rotate
+from drake_teleop.station.passivity.two_layer import TwoLayerConfig, _exchange
 
 T = 1e-3
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from test_methods import T, line, poses, run, wrenches
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.passivity.energy import created, in_flight, ledger, port_work
-from drake_teleop.passivity.memory import LEDGER, LIMIT, MEMORY
-from drake_teleop.passivity.methods import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.passivity.energy import created, in_flight, ledger, port_work
+from drake_teleop.station.passivity.memory import LEDGER, LIMIT, MEMORY
+from drake_teleop.station.passivity.methods import (
     PassivityConfig,
     initial_memory,
     master_step,
     parameters,
     steps_of,
 )
-from drake_teleop.passivity.packet import OTHER_ENERGY, PACKET_SIZE, POSE
+from drake_teleop.station.passivity.packet import OTHER_ENERGY, PACKET_SIZE, POSE
 
 
 def test_work_of_a_held_wrench_is_exact_however_coarse_the_samples():

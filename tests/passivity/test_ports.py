@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from test_methods import START, line, poses, run, wrenches
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import (
+from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
     COMMAND,
     MOTOR,
@@ -26,12 +25,13 @@ from drake_teleop.comparison.one_dof import (
     operators_intent,
     run_one_dof,
 )
-from drake_teleop.passivity.energy import ledger, port_work
-from drake_teleop.passivity.force_limit import ForceLimitConfig
-from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.passivity.packet import ENERGY, difference_into
-from drake_teleop.passivity.tdpa import TdpaConfig
-from drake_teleop.passivity.wave import WaveConfig
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.energy import ledger, port_work
+from drake_teleop.station.passivity.force_limit import ForceLimitConfig
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.passivity.packet import ENERGY, difference_into
+from drake_teleop.station.passivity.tdpa import TdpaConfig
+from drake_teleop.station.passivity.wave import WaveConfig
 
 MEDIUM = dataclasses.replace(REFERENCE, hand_mass=0.25, hand_damping=8.0, hand_stiffness=250.0)
 

@@ -5,9 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.passivity import pspm
-from drake_teleop.passivity.memory import COMMAND_POSE, HELD, LEDGER, LIMIT, LOST, RECEIVED, SENT
-from drake_teleop.passivity.methods import (
+from drake_teleop.station.passivity import pspm
+from drake_teleop.station.passivity.memory import (
+    COMMAND_POSE,
+    HELD,
+    LEDGER,
+    LIMIT,
+    LOST,
+    RECEIVED,
+    SENT,
+)
+from drake_teleop.station.passivity.methods import (
     PassivityConfig,
     initial_memory,
     master_step,
@@ -15,7 +23,7 @@ from drake_teleop.passivity.methods import (
     slave_step,
     steps_of,
 )
-from drake_teleop.passivity.packet import PACKET_SIZE, WRENCH, difference_into, moved_into
+from drake_teleop.station.passivity.packet import PACKET_SIZE, WRENCH, difference_into, moved_into
 
 T, STEPS, START = 1e-3, 1500, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 K, D = np.repeat([300.0, 5.0], 3), np.repeat([2.0, 0.02], 3)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import PERIOD, REFERENCE, operators_intent, run_one_dof
-from drake_teleop.passivity.memory import HELD, MEMORY
-from drake_teleop.passivity.methods import METHODS, PassivityConfig, parameters
-from drake_teleop.passivity.retreat import retreat
+from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE, operators_intent, run_one_dof
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.memory import HELD, MEMORY
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, parameters
+from drake_teleop.station.passivity.retreat import retreat
 
 LET_GO = 9000
 

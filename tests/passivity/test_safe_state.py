@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_teleop.channel.network import NetworkConfig
-from drake_teleop.comparison.one_dof import (
+from drake_teleop.lab.comparison.one_dof import (
     AT_THE_MOTOR,
     PERIOD,
     OneDof,
@@ -17,9 +16,10 @@ from drake_teleop.comparison.one_dof import (
     operators_intent,
     run_one_dof,
 )
-from drake_teleop.master.phantom import FORCE_LIMIT
-from drake_teleop.passivity.memory import LIMIT
-from drake_teleop.passivity.methods import (
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.master.phantom import FORCE_LIMIT
+from drake_teleop.station.passivity.memory import LIMIT
+from drake_teleop.station.passivity.methods import (
     METHODS,
     PassivityConfig,
     initial_memory,
@@ -28,8 +28,8 @@ from drake_teleop.passivity.methods import (
     slave_step,
     steps_of,
 )
-from drake_teleop.passivity.packet import PACKET_SIZE
-from drake_teleop.passivity.safe_state import RESUME, STOP
+from drake_teleop.station.passivity.packet import PACKET_SIZE
+from drake_teleop.station.passivity.safe_state import RESUME, STOP
 
 TIMEOUT = 0.1
 LEDGERS = ("wave", "tdpa")  # what leaves an end is paid for by what has come, to the last joule

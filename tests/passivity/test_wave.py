@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.passivity.memory import FILLS, LEDGER, LIMIT, RECEIVED
-from drake_teleop.passivity.methods import (
+from drake_teleop.station.passivity.memory import FILLS, LEDGER, LIMIT, RECEIVED
+from drake_teleop.station.passivity.methods import (
     PassivityConfig,
     initial_memory,
     master_step,
@@ -14,8 +14,8 @@ from drake_teleop.passivity.methods import (
     slave_step,
     steps_of,
 )
-from drake_teleop.passivity.packet import ENERGY, INTEGRAL, PACKET_SIZE, POSE
-from drake_teleop.passivity.wave import WaveConfig
+from drake_teleop.station.passivity.packet import ENERGY, INTEGRAL, PACKET_SIZE, POSE
+from drake_teleop.station.passivity.wave import WaveConfig
 
 T, STEPS = 1e-3, 1200
 

@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 
-from drake_teleop.reproduction.figures import contact_figure, scaling_figure
+from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
 
 T = np.linspace(0, 0.8, 801)
 RAW = 100 * np.sin(10 * T)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from drake_teleop.reproduction.report import (
+from drake_teleop.lab.reproduction.report import (
     Comparison,
     ReportFigure,
     captions,

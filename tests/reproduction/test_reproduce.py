@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 from shown import type_in
 
-from drake_teleop.identification import slave_arm
-from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.identification import Identification
-from drake_teleop.operator.operator import Sine
-from drake_teleop.reproduction.reaction import eliminated_reaction
-from drake_teleop.reproduction.report import compare_with_paper, flat, unaccepted
-from drake_teleop.reproduction.reproduce import (
+from drake_teleop.lab.identification import slave_arm
+from drake_teleop.lab.reproduction.reaction import eliminated_reaction
+from drake_teleop.lab.reproduction.report import compare_with_paper, flat, unaccepted
+from drake_teleop.lab.reproduction.reproduce import (
     SIGMAS,
     ContactMotion,
     contact_figures,
@@ -23,9 +20,12 @@ from drake_teleop.reproduction.reproduce import (
     free_motion,
     raw_excess,
 )
-from drake_teleop.result import Signal, SimulationResult
-from drake_teleop.run import in_contact
-from drake_teleop.scenario import LoadScenario, replace
+from drake_teleop.lab.run_summary import in_contact
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.identification import Identification
+from drake_teleop.station.operator.operator import Sine
+from drake_teleop.station.result import Signal, SimulationResult
+from drake_teleop.station.scenario import LoadScenario, replace
 
 FORCE_SCALE = 1 / 17.5
 

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from test_peers import ADDRESS, peer
 from test_reading_assembly import X_FS, Told, truth
 
-from drake_teleop.cli import cli
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.cli.main import cli
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import errors_of, read_tolerance, sizes_of, values_of

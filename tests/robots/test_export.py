@@ -13,8 +13,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_teleop.cli import cli, main
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.cli.main import cli, main
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.robots.export import FORMATS, STANDARD_GRAVITY, export

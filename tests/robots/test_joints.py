@@ -17,17 +17,18 @@ from test_calibrate import NOISE, PHI
 from test_peers import free_port, peer
 from test_reading_assembly import Told
 
-from drake_teleop.cli import cli, main
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.cli.main import cli, main
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import read_tolerance, sizes_of, values_of
 from drake_teleop.robots.assembly import Assembly
-from drake_teleop.robots.joints import PosedByJoints, arm_of
+from drake_teleop.robots.joints import PosedByJoints
 from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.ros2_source import Messages
 from drake_teleop.robots.sources_and_sinks import source_of
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
-from drake_teleop.slave.arm import sensor_motion
+from drake_teleop.station.slave.arm import sensor_motion
+from drake_teleop.station.slave.joint_poses import arm_of
 
 DT = 0.002
 NAMES = ("lift", "bend", "roll", "yaw")
@@ -136,10 +137,6 @@ def test_the_motion_is_that_of_the_sensor(model: Path) -> None:
 
 
 def test_what_is_asked_for_goes_together(model: Path) -> None:
-    with pytest.raises(DrakeTeleopError, match="--sensor-frame: needs --model"):
-        arm_of(None, "tool")
-    with pytest.raises(DrakeTeleopError, match="does not say where the sensor is"):
-        arm_of(model, None)
     arm, address = arm_of(model, "tool"), "zenoh://127.0.0.1/ft?joints=/joint_states"
     with pytest.raises(DrakeTeleopError, match="joints are of an arm that is not known"):
         source_of(address, None, rate_hz=500.0)

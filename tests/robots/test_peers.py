@@ -24,7 +24,7 @@ from peer import HASH
 from test_compensator import PHI, load
 from websockets.sync.client import connect
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import NetFtSource, page_of

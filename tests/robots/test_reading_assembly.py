@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_compensator import OFFSETS, PHI, load
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.robots.assembly import Assembly

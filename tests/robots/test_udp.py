@@ -18,14 +18,14 @@ from full_disk import small_disk
 from test_compensator import DT, load, readings
 
 import drake_teleop.robots.udp as udp
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.writing import CannotWrite
 from drake_teleop.robots import table
 from drake_teleop.robots.compensate import Control, compensate_command, run
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.lines import LineSource, read_line, written_line
 from drake_teleop.robots.sources_and_sinks import sink_of, source_of
 from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Compensated, Flag, Part, Reading
-from drake_teleop.writing import CannotWrite
 
 HEADER = Path(udp.__file__).with_name("drake_teleop_udp.h").read_text()
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.scaling.force_scaling import ForceScaling, ForceScalingConfig
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
+from drake_teleop.station.scaling.force_scaling import ForceScaling, ForceScalingConfig
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
 
 GRIPPER = [2.0, 0.01, -0.02, 0.15, 0.02, 0.0, 0.0, 0.02, 0.0, 0.01]
 

@@ -11,7 +11,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from drake_teleop.scaling.kinematic_scaling import (
+from drake_teleop.station.scaling.kinematic_scaling import (
     KinematicScaling,
     KinematicScalingConfig,
     scale_pose_into,

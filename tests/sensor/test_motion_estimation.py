@@ -14,10 +14,10 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.interpolate import make_interp_spline
 from scipy.signal import sosfilt, sosfilt_zi, sosfreqz
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.sensor.motion_estimation import (
+from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     _track,
     estimate_into,
@@ -27,8 +27,8 @@ from drake_teleop.sensor.motion_estimation import (
     path_delays,
     steady_state,
 )
-from drake_teleop.sensor.presets import PRESETS
-from drake_teleop.sensor.sensor_chain import (
+from drake_teleop.station.sensor.presets import PRESETS
+from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
     WristSensorConfig,
@@ -37,11 +37,11 @@ from drake_teleop.sensor.sensor_chain import (
     sensor_chain,
     without,
 )
-from drake_teleop.slave.arm import sensor_motion
-from drake_teleop.slave.home import R_WS_HOME, home_position
-from drake_teleop.slave.inverse_kinematics import nearest_branch
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
+from drake_teleop.station.slave.arm import sensor_motion
+from drake_teleop.station.slave.home import R_WS_HOME, home_position
+from drake_teleop.station.slave.inverse_kinematics import nearest_branch
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
 
 Array = NDArray[np.float64]
 

@@ -15,10 +15,10 @@ from pydrake.common.yaml import yaml_load, yaml_load_typed
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.quantities import check_ranges
-from drake_teleop.sensor.presets import PRESETS, preset_of
-from drake_teleop.sensor.sensor_chain import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.quantities import check_ranges
+from drake_teleop.station.sensor.presets import PRESETS, preset_of
+from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
     OFFSET,
@@ -31,7 +31,7 @@ from drake_teleop.sensor.sensor_chain import (
     sensor_chain,
     without,
 )
-from drake_teleop.sensor.sensor_noise import (
+from drake_teleop.station.sensor.sensor_noise import (
     allan_deviation,
     predicted_allan_deviation,
     rest_record,

@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import BasicVector, DiagramBuilder
 
-from drake_teleop.environment.sheet_spring import SheetSpring
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.operator.operator import MinimumJerk
-from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import Scenario, replace
-from drake_teleop.sensor import wrist_sensor
-from drake_teleop.sensor.sensor_chain import (
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.operator.operator import MinimumJerk
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.sensor import wrist_sensor
+from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK,
     WristSensorConfig,
     butterworth_sections,
     without,
 )
-from drake_teleop.sensor.wrist_sensor import WristSensor
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.plant import AddSlavePlant, NominalSlave
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
+from drake_teleop.station.sensor.wrist_sensor import WristSensor
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
 
 QUIET = without(
     WristSensorConfig(), "place", "noise", "random_walk", "offset", "drift", "quantisation"

@@ -14,24 +14,24 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.analysis.linearization import linearize, linearize_station
-from drake_teleop.channel.channel import Channel
-from drake_teleop.environment.sheet_spring import SheetSpring
-from drake_teleop.environment.wall import Wall
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identification import true_load
-from drake_teleop.resources import models_dir
-from drake_teleop.scenario import LoadScenario, Scenario, replace
-from drake_teleop.signals import SIGNALS
-from drake_teleop.simulation import MakeSimulator, simulate
-from drake_teleop.slave.ik_methods import method_of
-from drake_teleop.slave.monitor import SlaveMonitor
-from drake_teleop.slave.numeric_inverse_kinematics import NumericInverseKinematics
-from drake_teleop.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
-from drake_teleop.slave.skeleton import AddSkeleton
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.slave.tool import Ball, Block, Tool
-from drake_teleop.station import GetBlock, MakeTeleopStation
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.resources import models_dir
+from drake_teleop.lab.analysis.linearization import linearize, linearize_station
+from drake_teleop.lab.identification import true_load
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.signals import SIGNALS
+from drake_teleop.station.simulation import MakeSimulator, simulate
+from drake_teleop.station.slave.ik_methods import method_of
+from drake_teleop.station.slave.monitor import SlaveMonitor
+from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
+from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
+from drake_teleop.station.slave.skeleton import AddSkeleton
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.tool import Ball, Block, Tool
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 HOME = [0.3, 0.4, -0.2, 0.1, 0.5, -0.3, 0.2]
 SCENARIO = """

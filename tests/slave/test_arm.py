@@ -9,8 +9,8 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.slave.arm import (
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.slave.arm import (
     MOTION_SIZE,
     SLIDES,
     forward_dynamics,
@@ -19,7 +19,7 @@ from drake_teleop.slave.arm import (
     jacobian,
     sensor_motion,
 )
-from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 
 
 @pytest.fixture(

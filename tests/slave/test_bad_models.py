@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.slave.home import check_strength, home_position, start_posture
-from drake_teleop.slave.inverse_kinematics import IkStatus
-from drake_teleop.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.slave.plant import NominalSlave, ParseSlave, finalize
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.slave.tool import Tool
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.slave.home import check_strength, home_position, start_posture
+from drake_teleop.station.slave.inverse_kinematics import IkStatus
+from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
+from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.tool import Tool
 
 AXES = ["0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1"]
 HOME = [0.1, 0.4, 1.2, 0.2, 1.4, 0.3]

@@ -9,11 +9,11 @@ from pydrake.math import RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_teleop.resources import models_dir
-from drake_teleop.slave import inverse_kinematics as ik
-from drake_teleop.slave.arm import forward_kinematics
-from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.slave.inverse_kinematics import (
+from drake_teleop.common.resources import models_dir
+from drake_teleop.station.slave import inverse_kinematics as ik
+from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.inverse_kinematics import (
     IkStatus,
     InverseKinematics,
     inverse_kinematics,

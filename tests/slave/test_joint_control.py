@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.slave.arm import inverse_dynamics
-from drake_teleop.slave.joint_control import JointControl, JointControlConfig, joint_control_torque
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
+from drake_teleop.station.slave.arm import inverse_dynamics
+from drake_teleop.station.slave.joint_control import (
+    JointControl,
+    JointControlConfig,
+    joint_control_torque,
+)
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
 
 
 @pytest.fixture(scope="module")

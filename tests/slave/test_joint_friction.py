@@ -5,13 +5,13 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.slave.arm import forward_dynamics, inverse_dynamics
-from drake_teleop.slave.joint_friction import FRICTION_SPEED
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.slave.arm import forward_dynamics, inverse_dynamics
+from drake_teleop.station.slave.joint_friction import FRICTION_SPEED
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.station import MakeTeleopStation
 
 FRICTION = [11.1, 16.7, 7.0, 0.84, 0.9, 0.28]  # N m, about 30 N at the tool
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.slave.joint_trajectory import JointTrajectory
+from drake_teleop.station.slave.joint_trajectory import JointTrajectory
 
 
 def test_it_rests_then_plays_once_then_rests_again():

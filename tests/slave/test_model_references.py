@@ -13,10 +13,10 @@ import pytest
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.slave import model_references
-from drake_teleop.slave.model_references import ModelFiles
-from drake_teleop.slave.models import ParsedModel, ParseModel
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.slave import model_references
+from drake_teleop.station.slave.model_references import ModelFiles
+from drake_teleop.station.slave.models import ParsedModel, ParseModel
 
 SOLID = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 LINK = """<link name="l"><inertial><mass>1</mass><inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz>

@@ -11,13 +11,17 @@ from odd_arms import other_plant, rx90_plant, sliding_plant
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.arm import ArmModel, jacobian
-from drake_teleop.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.slave.ik_methods import METHODS
-from drake_teleop.slave.inverse_kinematics import IkStatus, InverseKinematics, solve_pose_command
-from drake_teleop.slave.numeric_inverse_kinematics import (
+from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.arm import ArmModel, jacobian
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.ik_methods import METHODS
+from drake_teleop.station.slave.inverse_kinematics import (
+    IkStatus,
+    InverseKinematics,
+    solve_pose_command,
+)
+from drake_teleop.station.slave.numeric_inverse_kinematics import (
     MET,
     SINGULAR,
     STEPS,
@@ -26,7 +30,7 @@ from drake_teleop.slave.numeric_inverse_kinematics import (
     follow_pose,
     turn_length,
 )
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station.station import MakeTeleopStation
 
 # What compiles takes three seconds, once.
 pytestmark = pytest.mark.slow

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.identification import (
+from drake_teleop.lab.identification import (
     identification_scenario,
     identify_load,
     slave_arm,
 )
 from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
-from drake_teleop.operator.operator import OperatorConfig, Sine
-from drake_teleop.scenario import Scenario, replace
-from drake_teleop.simulation import MakeSimulator, advance
-from drake_teleop.slave.payload import Payload
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.station import GetBlock, MakeTeleopStation
+from drake_teleop.station.operator.operator import OperatorConfig, Sine
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.simulation import MakeSimulator, advance
+from drake_teleop.station.slave.payload import Payload
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 HELD = Payload(mass=2.0, com=[0.02, -0.03, 0.16])
 

@@ -6,19 +6,19 @@ from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_teleop.environment.wall import Wall
-from drake_teleop.scenario import LoadScenario, replace
-from drake_teleop.simulation import simulate
-from drake_teleop.slave.joint_control import (
+from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.scenario import LoadScenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.joint_control import (
     JointControl,
     JointControlConfig,
     joint_control_torque,
     servo_numbers,
 )
-from drake_teleop.slave.plant import AddSlavePlant, start_pose
-from drake_teleop.slave.sampled_servo import SampledServo, samples_within, torque_line
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.station import MakeTeleopStation
+from drake_teleop.station.slave.plant import AddSlavePlant, start_pose
+from drake_teleop.station.slave.sampled_servo import SampledServo, samples_within, torque_line
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.station import MakeTeleopStation
 
 CONFIG = JointControlConfig()
 

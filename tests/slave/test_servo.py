@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.channel import channel
-from drake_teleop.passivity.methods import PassivityConfig
-from drake_teleop.scenario import Scenario, replace
-from drake_teleop.sides.channel import MakeChannel
-from drake_teleop.slave.arm import inverse_dynamics, jacobian
-from drake_teleop.slave.home import home_position
-from drake_teleop.slave.plant import NominalSlave
-from drake_teleop.slave.servo import operational_inertia, servo_at_tool
+from drake_teleop.station.channel import channel
+from drake_teleop.station.channel_side import MakeChannel
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.slave.arm import inverse_dynamics, jacobian
+from drake_teleop.station.slave.home import home_position
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.servo import operational_inertia, servo_at_tool
 
 SCENARIO = Scenario()
 

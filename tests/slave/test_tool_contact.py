@@ -10,12 +10,12 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.environment.point_contact import ContactPairs, apart
-from drake_teleop.environment.sheet_spring import SheetSpring
-from drake_teleop.environment.slot import Slot
-from drake_teleop.slave.plant import AddSlavePlant
-from drake_teleop.slave.slave_config import Slave
-from drake_teleop.slave.tool_contact import environment_wrench
+from drake_teleop.station.environment.point_contact import ContactPairs, apart
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.environment.slot import Slot
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.tool_contact import environment_wrench
 
 
 def drakes(plant, context, tool) -> np.ndarray:

@@ -7,9 +7,9 @@ import polars as pl
 import pytest
 from scipy.stats import qmc
 
-from drake_teleop.studies.design import Factor, Study
-from drake_teleop.studies.effects import effects, main_effects, pair_means
-from drake_teleop.studies.level_model import level_model, levels_of
+from drake_teleop.lab.studies.design import Factor, Study
+from drake_teleop.lab.studies.effects import effects, main_effects, pair_means
+from drake_teleop.lab.studies.level_model import level_model, levels_of
 
 UNIT = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xyz"]
 EDGES = np.linspace(0.0, 1.0, 6)

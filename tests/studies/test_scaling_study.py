@@ -9,16 +9,16 @@ import polars as pl
 import pytest
 from shown import type_in
 
-from drake_teleop.resources import studies_dir
-from drake_teleop.scenario import ScenarioNames
-from drake_teleop.studies import scaling_study
-from drake_teleop.studies.scaling_study import (
+from drake_teleop.common.resources import studies_dir
+from drake_teleop.lab.studies import scaling_study
+from drake_teleop.lab.studies.scaling_study import (
     TASKS,
     WAYS,
     answer,
     choice_picture,
 )
-from drake_teleop.studies.study import LoadStudy
+from drake_teleop.lab.studies.study import LoadStudy
+from drake_teleop.station.scenario import ScenarioNames
 
 STUDIES = sorted(path.stem for path in studies_dir().glob("*.yaml"))
 

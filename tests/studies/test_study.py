@@ -19,18 +19,18 @@ from shown import type_in
 from sockets import THIS_MACHINE, listening
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from drake_teleop import run as runs_of_scenarios
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.identified_load import IdentifiedLoad, identified_load
-from drake_teleop.result import SimulationResult
-from drake_teleop.scenario import Scenario
-from drake_teleop.signals import SIGNALS
-from drake_teleop.studies import study as studies
-from drake_teleop.studies.design import Factor, Study
-from drake_teleop.studies.measures import default_measures, measured
-from drake_teleop.studies.runs import ONCE, Told, run_study
-from drake_teleop.studies.store import Store, open_store
-from drake_teleop.studies.study import LoadStudy, study_command
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab import run as runs_of_scenarios
+from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
+from drake_teleop.lab.studies import study as studies
+from drake_teleop.lab.studies.design import Factor, Study
+from drake_teleop.lab.studies.measures import default_measures, measured
+from drake_teleop.lab.studies.runs import ONCE, Told, run_study
+from drake_teleop.lab.studies.store import Store, open_store
+from drake_teleop.lab.studies.study import LoadStudy, study_command
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.signals import SIGNALS
 
 # Learns while it moves, so that no identification comes first.
 SCENARIO = """
@@ -53,8 +53,8 @@ FAKE = """
 import json, os, random, signal, sys, time
 from pathlib import Path
 import joblib, polars
-from drake_teleop.studies import runs
-from drake_teleop.studies.design import Factor, Study
+from drake_teleop.lab.studies import runs
+from drake_teleop.lab.studies.design import Factor, Study
 
 runs._CHUNKS = 150  # as many runs in a part as a larger study has
 
@@ -380,8 +380,8 @@ class Unreadable:
 ORPHANS = """
 import os, sys, time
 from pathlib import Path
-from drake_teleop.studies.runs import run_study
-from drake_teleop.studies.design import Factor, Study
+from drake_teleop.lab.studies.runs import run_study
+from drake_teleop.lab.studies.design import Factor, Study
 
 out = Path(sys.argv[1])
 

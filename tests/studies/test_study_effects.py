@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drake_teleop.studies.design import Factor, Study
-from drake_teleop.studies.effects import PARETO, effects, estimated, front, pareto
-from drake_teleop.studies.pictures import write_pictures
+from drake_teleop.lab.studies.design import Factor, Study
+from drake_teleop.lab.studies.effects import PARETO, effects, estimated, front, pareto
+from drake_teleop.lab.studies.pictures import write_pictures
 
 MEASURES = ["success", *PARETO]
 STUDY = Study(

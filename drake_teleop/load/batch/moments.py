@@ -22,9 +22,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop._compiled import njit
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked, checked_rows
+from drake_teleop.common.arrays import Array, checked, checked_rows
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import regressor
 
 _CHUNK = 2**15

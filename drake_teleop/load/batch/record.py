@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior
 from drake_teleop.load.batch.moments import Moments, Noise
 from drake_teleop.load.batch.total_least_squares import NormalForm

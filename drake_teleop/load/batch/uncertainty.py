@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr, solve_triangular
 from scipy.special import stdtrit
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked_rows
+from drake_teleop.common.arrays import Array, checked_rows
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import (
     PARAMETERS,
     WORTH_STATING,

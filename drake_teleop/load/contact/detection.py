@@ -13,9 +13,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop._compiled import njit
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked, positive
+from drake_teleop.common.arrays import Array, checked, positive
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.contact.memory import (
     COUNT,
     FIRST_STATISTIC,

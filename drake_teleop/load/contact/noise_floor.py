@@ -25,9 +25,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop._compiled import njit
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked, checked_rows, positive
+from drake_teleop.common.arrays import Array, checked, checked_rows, positive
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.contact.memory import HELD_A, HELD_ALPHA, LENGTHS
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.load.regressor import regressor_into

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import checked
+from drake_teleop.common.arrays import checked
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.contact.memory import LENGTHS
 from drake_teleop.load.contact.noise_floor import NoiseFloor, checked_motion, write_sigmas
 from drake_teleop.load.contact.statistics import statistics

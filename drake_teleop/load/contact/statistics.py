@@ -31,8 +31,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop._compiled import njit
-from drake_teleop.load.arrays import Array, positive
+from drake_teleop.common.arrays import Array, positive
+from drake_teleop.common.compiled import njit
 from drake_teleop.load.contact.memory import (
     COUNT,
     FIRST_STATISTIC,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked
+from drake_teleop.common.arrays import Array, checked
+from drake_teleop.common.errors import DrakeTeleopError
 
 
 def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:

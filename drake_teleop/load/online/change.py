@@ -45,9 +45,10 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop._compiled import njit
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked, checked_rows, positive
+from drake_teleop.common.arrays import Array, checked, checked_rows, positive
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.vectors import put
 from drake_teleop.load.identification import METHODS, Identification, worth_stating
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.innovation import learn, whitening
@@ -59,7 +60,6 @@ from drake_teleop.load.sample import (
     SPECIFIC_FORCE,
     WRENCH_AND_MOTION,
 )
-from drake_teleop.vectors import put
 
 STATES = ("known", "disturbed", "changed", "identified")
 """What `LoadChangeMonitor.state` may say."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from drake_teleop._compiled import njit
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.vectors import cholesky
 from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.vectors import cholesky
 
 # As in `recursive`: the least variance of a row relative to those that it is made of.
 _RESOLUTION = 1e-10

@@ -23,8 +23,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from drake_teleop._compiled import njit
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.vectors import put
 from drake_teleop.load.online.recursive_moments import (
     MomentEstimator,
     add_product,
@@ -40,7 +41,6 @@ from drake_teleop.load.online.recursive_moments import (
     weighted_right,
 )
 from drake_teleop.load.sample import INSTRUMENTS, MOTION, WRENCH
-from drake_teleop.vectors import put
 
 # Share of the instruments' own information by which M is raised, against rounding.
 _RIDGE = 1e-9

@@ -19,8 +19,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop._compiled import njit
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.compiled import njit
 from drake_teleop.load.batch.moments import coefficients
 from drake_teleop.load.online.recursive import RecursiveEstimator
 

@@ -33,9 +33,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop._compiled import njit
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked
+from drake_teleop.common.arrays import Array, checked
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.online.recursive import PRIOR_STD, SETTLED
 from drake_teleop.load.online.recursive_moments import (
     MomentEstimator,

@@ -33,8 +33,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from drake_teleop._compiled import njit
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.vectors import put
 from drake_teleop.load.online import change
 from drake_teleop.load.online.change import (
     CHANGED,
@@ -47,7 +48,6 @@ from drake_teleop.load.online.change import (
 )
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
-from drake_teleop.vectors import put
 
 LOAD_STATES = ("learning", "settled", "disturbed", "changed")
 """What the state of a load estimator means; learning is what comes before this module."""

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.logs.causes.cause import Cause, Stretch, causes_of, stretches
 from drake_teleop.logs.causes.instants import Instants
 from drake_teleop.logs.causes.intervals import (
@@ -18,7 +19,6 @@ from drake_teleop.logs.causes.intervals import (
 from drake_teleop.logs.causes.model import DELAY, LOAD
 from drake_teleop.logs.causes.search import Later, clearly_wrong, explained, search, settled
 from drake_teleop.logs.causes.state import State
-from drake_teleop.one_thread import one_blas_thread
 
 _NO_MASS, _NO_MASS_DEVIATIONS, _SURE = 0.010, 4.0, 20.0
 

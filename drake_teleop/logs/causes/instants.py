@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 
 ORDER = 4
 """Of the autoregressive noise."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.check.fitting import fit_with_offset
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import low_pass, resample
 from drake_teleop.logs.read.description import Description
-from drake_teleop.vectors import cross_matrix
 
 _CUTOFF = 3.0
 _SHIFT, _KNOWN, _SURE = 0.02, 0.01, 5.0

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.against_frame import against_frame
 from drake_teleop.logs.check.against_load import against_load, payload_finding
@@ -35,7 +36,6 @@ from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.description import NO_YAML, Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
-from drake_teleop.one_thread import one_blas_thread
 
 _STILL = 0.3, 0.1
 """Specific force [m/s^2] and angular velocity [rad/s], rms, below which nothing is said of axes."""

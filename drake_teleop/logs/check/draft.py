@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from drake_teleop.common.texts import yaml_text
 from drake_teleop.logs.read.description import UNITS
 from drake_teleop.logs.read.tables import Table
-from drake_teleop.texts import yaml_text
 
 _TIME = r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?)(_?(s|ms|us|ns))?$"
 # How the names of vectors end, before the axis.

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.check.edits import edit_field
 from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.check.load_fit import load_fit

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.saturated import Spectra, spectra_of
 from drake_teleop.logs.pose_motion.spectra import Grid, signal_spectrum

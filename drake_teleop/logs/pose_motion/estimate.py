@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.errors import DrakeTeleopError
-from drake_teleop.load.arrays import Array, checked
+from drake_teleop.common.arrays import Array, checked
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.pose_motion.aid import aid_of
 from drake_teleop.logs.pose_motion.clock_rate import at_rate, clock_rate
 from drake_teleop.logs.pose_motion.noise import noise_moments
@@ -50,8 +52,6 @@ from drake_teleop.logs.pose_motion.saturated import (
 )
 from drake_teleop.logs.pose_motion.spectra import TOP, Grid, end_taper, without
 from drake_teleop.logs.pose_motion.splines import Choice, PoseSplines
-from drake_teleop.one_thread import one_blas_thread
-from drake_teleop.vectors import cross_matrix
 
 SEARCHED = 120.0
 """Longer records are searched in a part of this length [s]."""

@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.pose_motion.spectra import Bands
 
 _LEAST_LEFT = 0.25

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.pose_motion.spectra import RATES, WIDTH, Bands, Grid
 from drake_teleop.logs.pose_motion.splines import SIGNALS, PoseSplines, passed
-from drake_teleop.vectors import cross_matrix
 
 PRODUCTS = np.array([[10, 13, 14], [13, 11, 15], [14, 15, 12]])
 """Where the products of angular velocity stand among the signals: (3, 3)."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.pose_motion.saturated import Saturated
 
 _ROUNDS = 5

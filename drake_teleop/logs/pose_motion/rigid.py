@@ -37,14 +37,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.batch.covariance import ARM, gain_effects
 from drake_teleop.load.batch.moments import coefficients
 from drake_teleop.logs.pose_motion.levels import Levels
 from drake_teleop.logs.pose_motion.saturated import Saturated, least_power
 from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH
 from drake_teleop.logs.pose_motion.splines import GRAVITY, SIGNALS
-from drake_teleop.vectors import cross_matrix
 
 PARAMETERS = 23
 """[offsets; phi] (16), tau, r (3), rho (3)."""

@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.pose_motion.levels import Levels, wander
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.pose_motion.splines import SIGNALS
 
 Complex = NDArray[np.complex128]

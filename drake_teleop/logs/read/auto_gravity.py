@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.causes.candidates import part
 from drake_teleop.logs.causes.explain import explain
 from drake_teleop.logs.read.alignment import undelayed

@@ -38,10 +38,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.texts import yaml_text
 from drake_teleop.logs.read.description import Imu, Pose, Static, Wrench
 from drake_teleop.logs.read.tables import Table, read_table
-from drake_teleop.texts import yaml_text
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

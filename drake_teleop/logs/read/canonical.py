@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.writing import write_table
 from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.read.clocks import SLOWEST
 from drake_teleop.logs.read.description import (
@@ -31,7 +32,6 @@ from drake_teleop.logs.read.description import (
 )
 from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.logs.read.tables import Table
-from drake_teleop.writing import write_table
 
 WRENCH = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 SPECIFIC_FORCE = ("s_x", "s_y", "s_z")

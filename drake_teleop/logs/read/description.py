@@ -31,7 +31,8 @@ from pydantic import (
     model_validator,
 )
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.texts import read_yaml
 from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
 from drake_teleop.logs.read.description_fields import (
     Column,
@@ -46,7 +47,6 @@ from drake_teleop.logs.read.description_fields import (
     Vector,
     Weight,
 )
-from drake_teleop.texts import read_yaml
 
 STANDARD_GRAVITY = 9.80665
 NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"

@@ -17,13 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, resample, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.jackknife import RANK, solve
-from drake_teleop.vectors import cross_matrix
 
 LEVER_KNOWN = 0.005
 """A coordinate of the accelerometer is determined if its standard deviation is below this [m]."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drake_teleop.load.arrays import Array
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.causes.instants import Instants, instants
 from drake_teleop.logs.read.canonical import Log
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.description import Description, Orientation
 from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
 from drake_teleop.logs.read.rotations import (

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.errors import DrakeTeleopError, reading, refuse_fork
+from drake_teleop.common.errors import DrakeTeleopError, reading, refuse_fork
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.mat_file import read_mat
 

@@ -1,0 +1,292 @@
+"""`drake-teleop excite`: an excitation trajectory for the station's slave, or for any other arm.
+
+Writes into the folder
+
+=================== ============================================================================
+trajectory.csv      one period at 1 kHz: t [s], then by joint q_NAME, qd_NAME, qdd_NAME [rad, s]
+excitation.yaml     the coefficients of Eqs. (9)-(10), for `FourierTrajectory.load`
+excitation.png      joint angles, wrench against the sensor's range, how the criterion fell
+excitation.html     the motion as a film in 3D, to be watched before a robot runs it
+session.json        design_s, the optimiser's CPU time [s]
+summary.json        the figures; it and all above but session.json are the same bytes every time
+=================== ============================================================================
+
+`summary.json` holds the criterion that was minimised and the value of every criterion (what each
+is: `excitation/criteria.py`), the use of every limit as checked by Drake at 1 kHz, the predicted
+standard deviation of each parameter of the heaviest load after one period, from the noise of the
+sensor (`excitation/prediction.py`), and what was assumed. With `until` also that, and how much of
+each tolerance is `reached` in the share `reliable` of the records.
+Nothing is written if no trajectory respects all limits.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import polars as pl
+from matplotlib.figure import Figure
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.progress import show_progress
+from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, house_style
+from drake_teleop.common.writing import (
+    make_folder,
+    output_folder,
+    write_json,
+    write_picture,
+    write_table,
+)
+from drake_teleop.lab.excitation.check import RATE
+from drake_teleop.lab.excitation.excite import Excitation, excite, sensor_motion
+from drake_teleop.lab.excitation.motion_film import write_motion_film
+from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
+from drake_teleop.lab.excitation.shortest import RELIABLE, shortest
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.load.tolerance import read_tolerance
+from drake_teleop.station.scenario import LoadScenario
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: What each printed criterion is.
+WORDS = {
+    "kappa_w10": "condition number, ten columns, rows whitened, columns scaled by L = {L:.3g} m",
+    "kappa10": "condition number, ten columns, plain V in SI units",
+    "kappa16": "condition number, sixteen columns with offsets, SI units",
+    "A16": "rms of predicted errors over acceptable ones",
+    "D16": "geometric mean of predicted errors over acceptable ones",
+}
+_OFFSETS = ("f_ox", "f_oy", "f_oz", "tau_ox", "tau_oy", "tau_oz")
+_PHI = ("m", "m_cx", "m_cy", "m_cz", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz")
+_UNITS = (*3 * ["N"], *3 * ["N m"], "kg", *3 * ["kg m"], *6 * ["kg m^2"])
+
+
+def excite_command(
+    scenario: str | Path,
+    out: Path,
+    *,
+    model: Path | None = None,
+    sensor_frame: str | None = None,
+    package_paths: tuple[Path, ...] = (),
+    acceleration: tuple[float, ...] = (),
+    payload: float | None = None,
+    until: str | None = None,
+    criterion: str = "kappa_w10",
+    period: float = 6.0,
+    harmonics: int | None = None,
+    seconds: float | None = None,
+    seed: int = 0,
+    quiet: bool = False,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Designs, checks and writes an excitation trajectory; see the top of this module.
+
+    Args:
+        scenario: its slave moves, and its wrist sensor measures.
+        out: the folder.
+        model: another arm that moves instead, with the scenario's sensor; and then
+        sensor_frame: the frame or link at which it measures, needed with `model`.
+        package_paths, acceleration, payload: see `RobotFromModel`.
+        until: a tolerance, see `read_tolerance`: then the shortest motion that reaches it, see
+            `shortest`, whatever criterion, period and seconds are.
+        criterion, period, harmonics, seconds, seed: see `excite`; by default 5 harmonics, 3 with
+            `until`.
+        quiet: no progress bars and no tables.
+        progress: False for no progress bars alone.
+
+    Returns:
+        The summary, and what is in session.json.
+
+    Raises:
+        DrakeTeleopError: if the input cannot be used, or nothing respects all limits.
+    """
+    tolerance = None if until is None else read_tolerance(until)
+    setup = LoadScenario(scenario)
+    make_folder(out)  # before the work: a bad path costs no time
+    with show_progress(progress and not quiet) as stage:
+        opened = stage("Read the robot")
+        if model is None:
+            _refuse(sensor_frame, package_paths, acceleration, payload)
+            robot = RobotFromScenario(setup)
+        elif sensor_frame is None:
+            raise DrakeTeleopError(
+                "the model does not say where the sensor is",
+                where="--sensor-frame",
+                remedy="name the frame or link at which it measures",
+            )
+        else:
+            robot = RobotFromModel(
+                model,
+                sensor_frame,
+                setup.wrist_sensor,
+                estimation=setup.motion_estimation,
+                sensor_hz=setup.rates.sensor_hz,
+                package_paths=package_paths,
+                acceleration=acceleration,
+                payload=payload,
+            )
+        opened(1.0)
+        reached = {}
+        if tolerance is None:
+            found = excite(
+                robot,
+                criterion=criterion,
+                period=period,
+                harmonics=5 if harmonics is None else harmonics,
+                seed=seed,
+                seconds=seconds,
+                progress=stage,
+            )
+        else:
+            told = stage("Shorten the motion")
+            result = shortest(
+                robot,
+                tolerance,
+                harmonics=3 if harmonics is None else harmonics,
+                seed=seed,
+                progress=lambda done, best: told(done, f"{best:.3g} s" if best < np.inf else ""),
+            )
+            told(1.0)
+            found = result.excitation
+            shares = dict(zip(tolerance.entries, result.reached.tolist(), strict=True))
+            reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE}
+    summary = summarise(found) | reached | {"seed": seed}
+    session = {"design_s": found.seconds}
+    with output_folder(out):
+        write_table(out / "trajectory.csv", table(found))
+        found.trajectory.save(out / "excitation.yaml", robot.arm.joint_names)
+        write_picture(out / "excitation.png", draw(found))
+        write_motion_film(out / "excitation.html", found)
+        write_json(out / "session.json", session)
+        write_json(out / "summary.json", summary)
+    if not quiet:
+        _print(summary, out)
+    return summary | session
+
+
+def _refuse(*options: object) -> None:
+    names = ("--sensor-frame", "--package-path", "--acceleration", "--payload")
+    for name, value in zip(names, options, strict=True):
+        if value not in (None, ()):
+            raise DrakeTeleopError("needs --model", where=name)
+
+
+def summarise(found: Excitation) -> dict[str, Any]:
+    """The figures of summary.json."""
+    robot, trajectory = found.robot, found.trajectory
+    names = (*_OFFSETS, *_PHI)
+    return {
+        "robot": robot.name,
+        "criterion": found.criterion,
+        **found.values,
+        "meaning": {name: _words(name, robot) for name in found.values},
+        "period_s": trajectory.period,
+        "harmonics": trajectory.rho.shape[1],
+        "limit_use": {
+            use.limit: {"share": use.share, "where": use.what, "t": use.time} for use in found.uses
+        },
+        "predicted_std": {
+            f"{name} [{unit}]": float(std)
+            for name, unit, std in zip(names, _UNITS, found.deviations, strict=True)
+        },
+        "noise": {"force [N]": robot.scales.noise[0], "torque [N m]": robot.scales.noise[1]},
+        "heaviest_load_kg": float(robot.limits.phi[0]),
+        "assumed": list(robot.assumptions),
+    }
+
+
+def _words(name: str, robot: Robot) -> str:
+    return WORDS[name].format(L=robot.scales.length)
+
+
+def table(found: Excitation) -> pl.DataFrame:
+    """One period at 1 kHz, both ends included."""
+    period = found.trajectory.period
+    t = np.linspace(0, period, round(period * RATE) + 1)
+    columns = {"t": t}
+    joints = found.trajectory.evaluate(t)
+    for symbol, values in zip(("q", "qd", "qdd"), joints, strict=True):
+        for name, of_joint in zip(found.robot.arm.joint_names, values.T, strict=True):
+            columns[f"{symbol}_{name}"] = of_joint
+    return pl.DataFrame(columns)
+
+
+def draw(found: Excitation) -> Figure:
+    """Joint angles, wrench of the heaviest load against the limit, the criterion's fall."""
+    with house_style():
+        figure = Picture(figsize=(9, 8))
+        joints, forces, torques, progress = figure.subplots(4, 1, height_ratios=(3, 2, 2, 2))
+        _draw_joints(joints, found)
+        _draw_wrench(forces, torques, found)
+        progress.step(*found.history.T, where="post", color=BLUE)
+        progress.set(
+            title=f"{found.criterion} on the way to {found.values[found.criterion]:.4g}",
+            xlabel="evaluations",
+            yscale="log",
+        )
+    return figure
+
+
+def _draw_joints(axes: Axes, found: Excitation) -> None:
+    t = np.linspace(0, found.trajectory.period, 1000)
+    q = np.degrees(found.trajectory.evaluate(t)[0])
+    for k, name in enumerate(found.robot.arm.joint_names):
+        colour, style = COLOURS[k % len(COLOURS)], ("-", "--")[k // len(COLOURS) % 2]
+        axes.plot(t, q[:, k], style, color=colour, label=name)
+    axes.set(title=f"Joints of {found.robot.name} [deg]", xlim=(0, found.trajectory.period))
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def _draw_wrench(forces: Axes, torques: Axes, found: Excitation) -> None:
+    limits = found.robot.limits
+    s, omega, alpha = sensor_motion(found.robot, found.trajectory)
+    wrench = non_contact_wrench(s, omega, alpha, limits.phi)
+    t = np.arange(len(wrench)) / RATE
+    for axes, part, limit, unit in (
+        (forces, wrench[:, :3], limits.sensor[0], "N"),
+        (torques, wrench[:, 3:], limits.sensor[1], "N m"),
+    ):
+        axes.plot(t, part, linewidth=0.9, label=list("xyz"))
+        axes.plot(t, np.linalg.norm(part, axis=1), color=GREY, label="norm")
+        axes.axhline(limit, color=BLACK, linestyle=":", label="limit")
+        axes.set(
+            title=f"{'Force' if unit == 'N' else 'Torque'} at the sensor, heaviest load [{unit}]",
+            xlim=(0, found.trajectory.period),
+        )
+    forces.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    torques.set_xlabel("t [s]")
+
+
+def _print(summary: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    values = Table("criterion", "value", "what it is")
+    for name, meaning in summary["meaning"].items():
+        marked = f"[bold]{name}[/]" if name == summary["criterion"] else name
+        values.add_row(marked, f"{summary[name]:.4g}", meaning)
+    uses = Table("limit, checked at 1 kHz", "use", "where", r"t \[s]")
+    for name, use in summary["limit_use"].items():
+        uses.add_row(name, f"{use['share']:.1%}", use["where"], f"{use['t']:.3f}")
+    deviations = Table("parameter", "predicted standard deviation")
+    for name, value in summary["predicted_std"].items():
+        deviations.add_row(name.replace("[", r"\["), f"{value:.2g}")
+    for part in (values, uses, deviations):
+        console.print(part)
+    if "until" in summary:
+        console.print(
+            f"{summary['period_s']:.3g} s reach {summary['until']}"
+            f" in {summary['reliable']:.0%} of the records, by the sensor's noise alone",
+            highlight=False,
+            markup=False,
+        )
+    for words in summary["assumed"]:
+        console.print(f"assumed: {words}", highlight=False, markup=False)
+    console.print(
+        f"written to {out}; watch {out / 'excitation.html'} before a robot runs it",
+        highlight=False,
+        markup=False,
+    )

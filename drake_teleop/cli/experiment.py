@@ -1,0 +1,87 @@
+"""`drake-teleop drive --study STUDY.yaml`: an experiment in the page, or with simulated people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.live.experiment.design import Experiment, LoadExperiment
+from drake_teleop.live.experiment.procedure import trials_of
+from drake_teleop.live.experiment.results import write_results
+from drake_teleop.live.experiment.store import MOST, Store, open_results
+from drake_teleop.station.scenario import Scenario
+
+if TYPE_CHECKING:
+    import polars as pl
+
+
+def experiment_command(
+    study: str | Path,
+    out: Path,
+    *,
+    participant: int | None = None,
+    simulated: int = 0,
+    port: int = 0,
+    browser: bool = True,
+    device: str | None = None,
+) -> pl.DataFrame:
+    """Goes on with an experiment where its folder ends.
+
+    Args:
+        study: the experiment's file, or the name of one that is shipped.
+        out: the folder of the results.
+        participant: whose turn it is; by default of the first who has not done all, or else the
+            next number.
+        simulated: how many simulated participants there are in all; 0: people, in the page.
+        port, browser, device: as of `drive`.
+
+    Returns:
+        The table of `write_results`.
+
+    Raises:
+        DrakeTeleopError: for a bad file, or a folder of something else.
+        KeyboardInterrupt: after what is done has been written.
+    """
+    experiment, scenarios = LoadExperiment(study)
+    with open_results(out, experiment) as store:
+        try:
+            if simulated:
+                _simulate(experiment, scenarios, store, simulated)
+            else:
+                from drake_teleop.live.experiment.server import serve_experiment
+
+                number = whose_turn(store, len(trials_of(experiment, 1)), participant)
+                setup = (experiment, scenarios, store, number)
+                serve_experiment(*setup, port=port, browser=browser, device=device)
+        finally:
+            table = write_results(experiment, store)
+            print(f"written {out / 'results.csv'} and .png, from {out / 'trials.csv'}", flush=True)
+    return table
+
+
+def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
+    """The participant who goes on: the one that is wanted, or has not done all, or a new one."""
+    if wanted is not None:
+        return wanted
+    known = store.participants()
+    for number in known:
+        if len(store.rows(number)) < trials:
+            return number
+    number = max(known, default=0) + 1
+    if number > MOST:
+        raise DrakeTeleopError(f"{MOST} participants are many", where=str(store.folder))
+    return number
+
+
+def _simulate(experiment: Experiment, scenarios: list[Scenario], store: Store, count: int) -> None:
+    from drake_teleop.live.experiment.simulated import all_apparatus, take_part
+
+    stations = all_apparatus(experiment, scenarios)
+
+    def progress(done: int, trials: int) -> None:
+        print(f"\rparticipant {number} of {count}: trial {done} of {trials}", end="", flush=True)
+
+    for number in range(1, count + 1):
+        take_part(experiment, scenarios, stations, store, number, progress)
+    print()

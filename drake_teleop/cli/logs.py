@@ -1,0 +1,257 @@
+"""The commands `identify`, `eliminate` and `detect`: write the results, print a table."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.cli.printing import (
+    print_detection,
+    print_elimination,
+    print_identification,
+)
+from drake_teleop.common.writing import output_folder, write_json, write_picture, write_table
+from drake_teleop.load.batch.methods import DEFAULT_METHOD
+from drake_teleop.load.contact.noise_floor import STATISTICS
+from drake_teleop.load.gripper import identified_object
+from drake_teleop.load.identification import Identification
+from drake_teleop.logs.contact import contacts_of
+from drake_teleop.logs.detection import (
+    DetectedLog,
+    detect_log,
+    draw_detection,
+    share_above_force,
+)
+from drake_teleop.logs.figures import (
+    common_figures,
+    contact_figures,
+    load_figures,
+    load_of_stretch,
+    object_figures,
+    object_notes,
+    plain,
+    rms_figures,
+)
+from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
+from drake_teleop.logs.read.canonical import WRENCH
+
+if TYPE_CHECKING:
+    import polars as pl
+
+
+def identify_command(
+    log: Path,
+    out: Path,
+    *,
+    gripper: Path | None = None,
+    method: str = DEFAULT_METHOD,
+    cutoff_hz: float | None = 30.0,
+    delay: str | float = "auto",
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """`identify_log`, writing its results into `out`.
+
+    Files: identification.json; summary.json; report.html; fit.png and knowledge.png, its
+    pictures; report.png, both on one page.
+
+    Args:
+        method: of the fit, one of `drake_teleop.load.batch.methods.METHODS`.
+        gripper: identification.json of the gripper alone; then the object's object.json, of the
+            same format, is written too (see `drake_teleop.load.gripper`).
+
+    Returns:
+        the summary; its names are explained at the top of `logs.figures`.
+    """
+    gripper_load = None if gripper is None else Identification.load(gripper)
+    found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
+    result = found.identification
+    alone = None if gripper_load is None else identified_object(result, gripper_load)
+    summary = common_figures(log, found, cutoff_hz, result.delay_s) | {
+        "samples": result.samples,
+        **load_figures(result),
+        "offsets": result.offsets,
+        "offsets_std": result.standard_deviations[:6],
+        "determined": found.base.lines(),
+        "method": result.method,
+        "rejected": found.rejected.mean(),
+        "condition_number": result.condition_number,
+        "residual_rms": result.residual_rms,
+        "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
+        "residual_rms_torque": float(np.linalg.norm(result.residual_rms[3:])),
+        "causes": [asdict(cause) for cause in found.causes],
+        "loads": [load_of_stretch(stretch) for stretch in found.loads],
+    }
+    if alone is not None:
+        summary |= {"gripper": str(gripper), "object": object_figures(alone)}
+        summary["notes"] += object_notes(alone)
+    summary = plain(summary)
+    from drake_teleop.logs.pictures import draw_fit, draw_knowledge, one_page
+    from drake_teleop.logs.report import write_report
+
+    with output_folder(out):
+        result.save(out / "identification.json")
+        if alone is not None:
+            alone.save(out / "object.json")
+        write_picture(out / "fit.png", draw_fit(found))
+        write_picture(out / "knowledge.png", draw_knowledge(found))
+        one_page(out / "fit.png", out / "knowledge.png", out / "report.png")
+        write_report(out / "report.html", found, summary, alone)
+        write_json(out / "summary.json", summary)
+    if not quiet:
+        print_identification(summary, out)
+    return summary
+
+
+def eliminate_command(
+    log: Path,
+    load: Path,
+    out: Path,
+    *,
+    gripper: Path | None = None,
+    sigma: float = 0.0,
+    sigma_object: float | None = None,
+    gamma: float = 1.0,
+    eta: float | None = None,
+    causal: str | None = None,
+    causal_tare_s: float | None = None,
+    free: Path | None = None,
+    cutoff_hz: float | None = 30.0,
+    delay: str | float = "auto",
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """`eliminate_log`, writing contact_wrench.parquet, contact_wrench.png and summary.json.
+
+    The Parquet table has `t` and, for each channel such as f_x, `contact_f_x`, `scaled_f_x`,
+    `non_contact_f_x` and `measured_f_x` (offsets removed); with `causal` (see `eliminate_log`) also
+    `causal_contact_f_x` and `causal_scaled_f_x`. The flag `in_contact` says where there is contact,
+    `edge` which samples are not judged (see `EliminatedLog`).
+
+    Returns:
+        the summary; its names are explained at the top of `logs.figures`.
+    """
+    load_file = Identification.load(load)
+    found = eliminate_log(
+        log,
+        load_file,
+        gripper=gripper,
+        sigma=sigma,
+        sigma_object=sigma_object,
+        gamma=gamma,
+        eta=eta,
+        causal=causal,
+        causal_tare_s=causal_tare_s,
+        free=free,
+        cutoff_hz=cutoff_hz,
+        delay=delay,
+    )
+    summary = common_figures(log, found, cutoff_hz, found.delay_s) | {
+        "load": str(load),
+        "gripper": None if gripper is None else str(gripper),
+        "sigma": sigma,
+        "sigma_object": sigma_object,
+        "gamma": gamma,
+        "eta": eta,
+        "free": None if free is None else str(free),
+        "tare": found.offsets - load_file.offsets,
+        "tare_fraction": found.tare_fraction,
+    }
+    if found.point_mass:
+        summary["notes"].append(
+            f"{', '.join(found.point_mass)} of the load file are not identifiable: those of a point"
+            " mass are used"
+        )
+    if found.tare_fraction < 0.5:
+        summary["notes"].append(
+            "less than half of the record agrees on the sensor's offsets: if it is in contact most"
+            " of the time, the contact wrench may be off by a constant"
+        )
+    if found.detection is not None:
+        summary["notes"] += found.detection.notes
+    elif not found.log.static:
+        summary["notes"].append(f"{len(found.log)} samples are too few to tell contact from noise")
+    summary = plain(summary | rms_figures(found) | contact_figures(found, causal_tare_s))
+    from drake_teleop.logs.pictures import draw_elimination
+
+    with output_folder(out):
+        write_table(out / "contact_wrench.parquet", _wrenches(found))
+        write_picture(out / "contact_wrench.png", draw_elimination(found))
+        write_json(out / "summary.json", summary)
+    if not quiet:
+        print_elimination(summary, out)
+    return summary
+
+
+def _wrenches(found: EliminatedLog) -> pl.DataFrame:
+    import polars as pl
+
+    columns: dict[str, NDArray[Any]] = {"t": found.log.t}
+    for name in ("contact", "scaled", "non_contact", "measured"):
+        values = getattr(found, name)
+        columns |= {f"{name}_{c}": values[:, i] for i, c in enumerate(WRENCH)}
+    if found.causal is not None:
+        for name in ("contact", "scaled"):
+            values = getattr(found.causal, name)
+            columns |= {f"causal_{name}_{c}": values[:, i] for i, c in enumerate(WRENCH)}
+    columns |= {"in_contact": found.touched, "edge": found.edge}
+    return pl.DataFrame(columns)
+
+
+def detect_command(
+    log: Path,
+    out: Path,
+    *,
+    load: Path | None = None,
+    free: Path | None = None,
+    statistic: str = "level",
+    cutoff_hz: float = 30.0,
+    delay: str | float = "auto",
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """`detect_log`, writing detection.parquet, detection.png and summary.json.
+
+    The Parquet table has `t`, the three statistics, `contact_f_x` and so on, `in_contact`, and
+    `edge` for samples that are not judged.
+
+    Returns:
+        the summary; its names are explained in `drake_teleop.logs.detection`.
+    """
+    found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
+    eliminated = found.eliminated
+    summary = common_figures(log, eliminated, cutoff_hz, eliminated.delay_s) | {
+        "load": None if load is None else str(load),
+        "free": None if free is None else str(free),
+        "free_s": found.free_s,
+        "statistic": statistic,
+        "threshold": found.threshold,
+        "noise": found.floor.noise,
+        "per_acceleration": found.floor.per_acceleration,
+        "above_threshold": found.above.mean(),
+        "in_contact": found.touched.mean(),
+        "force_threshold": found.force_threshold,
+        "above_force_threshold": share_above_force(eliminated, found.force_threshold),
+        "contacts": contacts_of(eliminated.log.t, eliminated.contact, found.touched),
+    }
+    summary["notes"] += found.notes
+    summary = plain(summary)
+    with output_folder(out):
+        write_table(out / "detection.parquet", _detection_table(found))
+        write_picture(out / "detection.png", draw_detection(found))
+        write_json(out / "summary.json", summary)
+    if not quiet:
+        print_detection(summary, out)
+    return summary
+
+
+def _detection_table(found: DetectedLog) -> pl.DataFrame:
+    import polars as pl
+
+    from drake_teleop.logs.read.canonical import WRENCH
+
+    columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
+    columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTICS)}
+    columns |= {f"contact_{c}": found.eliminated.contact[:, i] for i, c in enumerate(WRENCH)}
+    return pl.DataFrame(columns | {"in_contact": found.touched, "edge": found.eliminated.edge})

@@ -1,0 +1,143 @@
+"""What the commands for logs print on the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from drake_teleop.load.identification import PARAMETERS
+
+
+def print_identification(summary: dict[str, Any], out: Path) -> None:
+    """The table of the load, and what the fit leaves."""
+    from rich.table import Table
+
+    table = Table(title=f"Load identified from {Path(summary['log']).name}", title_justify="left")
+    for heading in ("", "value", "std", "unit"):
+        table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
+    _add_rows(table, _load_rows(summary), summary["identifiable"])
+    rows = [
+        (name, value, std, 1.0, "N" if i < 3 else "N m", name)
+        for i, (name, value, std) in enumerate(
+            zip(PARAMETERS[:6], summary["offsets"], summary["offsets_std"], strict=True)
+        )
+    ]
+    _add_rows(table, rows, summary["identifiable"])
+    if "object" in summary:
+        table.add_section()
+        rows = [(f"object: {row[0]}", *row[1:]) for row in _load_rows(summary["object"])]
+        _add_rows(table, rows, summary["object"]["identifiable"])
+    figures = (
+        f"residual {summary['residual_rms_force']:.4g} N rms of |F|,"
+        f" {summary['residual_rms_torque']:.4g} N m rms of |tau|,"
+        f" condition number {summary['condition_number']:.3g}, {summary['samples']} samples"
+    )
+    if summary["rejected"] > 0:
+        figures += f"; {summary['rejected']:.1%} of them rejected as disturbed"
+    print_results(table, figures, summary, out)
+
+
+_Row: TypeAlias = tuple[str, float, float, float, str, str]
+"""Label, value, standard deviation, how many of the unit make one of SI, unit, parameter."""
+
+
+def _load_rows(load: dict[str, Any]) -> list[_Row]:
+    rows: list[_Row] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
+    rows += [
+        (f"com {axis}", load["com"][i], load["com_std"][i], 1e3, "mm", f"m c_{axis}")
+        for i, axis in enumerate("xyz")
+    ]
+    return rows + [
+        (name, load["phi"][4 + i], load["phi_std"][4 + i], 1e3, "g m^2", name)
+        for i, name in enumerate(PARAMETERS[10:])
+    ]
+
+
+def _add_rows(table: Any, rows: list[_Row], identifiable: list[str]) -> None:
+    for label, value, std, scale, unit, name in rows:
+        if name in identifiable:
+            table.add_row(label, f"{value * scale:.4f}", f"{std * scale:.4f}", unit)
+        else:
+            table.add_row(f"[dim]{label}", "[dim]not identifiable", "", "")
+
+
+def print_elimination(summary: dict[str, Any], out: Path) -> None:
+    """The table of what is left of the wrench, and the contacts."""
+    from rich.table import Table
+
+    table = Table(title=f"Contact wrench in {Path(summary['log']).name}", title_justify="left")
+    for heading in ("rms of", "|F| [N]", "|tau| [N m]"):
+        table.add_column(heading, justify="left" if heading == "rms of" else "right")
+    for label, name in (
+        ("measured, without offsets", "raw"),
+        ("less static weight only", "gravity_only"),
+        ("less the non-contact wrench", "residual"),
+    ):
+        force, torque = summary[f"{name}_rms"], summary[f"{name}_torque_rms"]
+        if force is not None:
+            table.add_row(label, f"{force:.4g}", f"{torque:.4g}")
+    figures = (
+        f"largest contact force {summary['residual_peak']:.4g} N,"
+        f" torque {summary['residual_torque_peak']:.4g} N m"
+    )
+    contacts = summary["contacts"]
+    if contacts:
+        first = ", ".join(f"{c['start_s']:.3f}" for c in contacts[:5])
+        more = " ..." if len(contacts) > 5 else ""
+        figures += f"; {len(contacts)} contacts, from {first}{more} s"
+    elif contacts is not None:
+        figures += "; no contact found"
+    causal = summary["causal"]
+    if causal is not None:
+        late = "late" if causal["mode"] == "delayed" else "made up for by prediction"
+        figures += (
+            f"\ncausal: {1e3 * causal['lag_s']:.1f} ms {late},"
+            f" rms of |F| {causal['residual_rms']:.4g} N,"
+            f" of |tau| {causal['residual_torque_rms']:.4g} N m"
+        )
+    print_results(table, figures, summary, out)
+
+
+def print_detection(summary: dict[str, Any], out: Path) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=f"Contact in {Path(summary['log']).name}", title_justify="left")
+    for heading in ("from [s]", "to [s]", "|F| [N]", "|tau| [N m]", "pushed along"):
+        table.add_column(escape(heading), justify="right")
+    for c in summary["contacts"]:
+        push = "" if c["push"] is None else " ".join(f"{x:+.2f}" for x in c["push"])
+        table.add_row(
+            f"{c['start_s']:.3f}", f"{c['stop_s']:.3f}", f"{c['peak_N']:.3g}",
+            f"{c['peak_Nm']:.3g}", push,
+        )  # fmt: skip
+    if not summary["contacts"]:
+        table.add_row("none", *[""] * 4)
+    said = {"raw": "measured", "gravity_only": "without the weight", "eliminated": "contact"}
+    shares = ", ".join(
+        f"{said[name]} {100 * share:.2g} %"
+        for name, share in summary["above_force_threshold"].items()
+        if share is not None
+    )
+    figures = (
+        f"above the threshold ({summary['statistic']} {summary['threshold']:.3g})"
+        f" {100 * summary['above_threshold']:.2g} % of the time, in contact"
+        f" {100 * summary['in_contact']:.2g} %\n"
+        f"|F| above {summary['force_threshold']:.3g} N, of the time: {shares}"
+    )
+    print_results(table, figures, summary, out)
+
+
+def print_results(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:
+    """A table, figures in words, the notes, and where the files are."""
+    from rich.console import Console
+
+    lines = [figures]
+    if summary["delay_source"] != "static":
+        delay = f"{summary['delay_s'] * 1e3:.2f} ms behind the wrench ({summary['delay_source']})"
+        lines.append(f"motion {delay}")
+    lines += [f"note: {note}" for note in summary["notes"]]
+    console = Console()
+    console.print(table)
+    for line in [*lines, f"written to {out}"]:
+        console.print(line, highlight=False, markup=False)

@@ -1,0 +1,1 @@
+"""Shared by all packages: errors, settings, compiled mathematics, files and pages."""

@@ -1,0 +1,287 @@
+"""The sampled axis cut where the hand feels the force: stability for every delay at once.
+
+If servo and sensor are as fast as the hand or a whole number of times faster, one loop through the
+channel remains, L(z) z^(-D) with D = 2 d periods of the hand. It is cut where the hand feels the
+force, and L = 1 - prod (z - m_i) / prod (z - p_i): p_i are the multipliers of the cut loop, m_i
+those of the loop closed without delay. Its crossings of |L| = 1 say how many multipliers of the
+closed loop lie outside the unit circle for every D at once (argument principle), without the
+thousands of eigenvalues of a long delay.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
+from drake_teleop.lab.analysis.period_map import RECEIVED, SAMPLE, Array, Sampling, cut_map
+
+# Frequencies at which L is looked at, as angles of z: five decades up to half the hand's rate.
+_ANGLES = np.pi * np.logspace(-5, 0, 401)
+_AROUND = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
+_GOLDEN, _GOLDEN_STEPS = 0.6180339887498949, 25
+_MOST_CROSSINGS = 32
+_DOUBLINGS, _HALVINGS, _NEWTON_STEPS = 12, 30, 12  # for the rate of growth, from 1/s
+_ON_THE_CIRCLE = 1e-9  # a multiplier as close to 1 is taken for 1
+
+
+@dataclass(frozen=True)
+class CutLoop:
+    """L(z) from the felt force around to the felt force, without the channel's delay.
+
+    Args:
+        open: (..., n) multipliers of the cut loop.
+        closed: (..., n) multipliers of the loop that is closed without delay.
+        period: of the hand [s], (...).
+        angles, phases, signs: (..., 32) where |L(e^(j angle))| passes 1, between 0 and pi: the
+            unwrapped phase there, 1 where |L| falls below 1, -1 where it rises above. An end of
+            the range that lies within |L| > 1 counts as a crossing. Unused places have sign 0.
+
+    Crossings are looked for between 80 frequencies in a decade, more around the cut loop's own, and
+    the peaks that those leave near 1.
+    """
+
+    open: Complex
+    closed: Complex
+    period: Array
+    angles: Array
+    phases: Array
+    signs: Array
+
+    @classmethod
+    def of(
+        cls, opened: Complex, closed: Complex, period: ArrayLike, level: ArrayLike = 1.0
+    ) -> CutLoop:
+        """From the multipliers and the period; finds the crossings, of |L| = level."""
+        shape, n = opened.shape[:-1], opened.shape[-1]
+        found = np.zeros((3, *shape, _MOST_CROSSINGS))
+        _find_crossings(
+            opened.reshape(-1, n),
+            closed.reshape(-1, n),
+            np.full(shape, level).ravel(),
+            _ANGLES,
+            found.reshape(3, -1, _MOST_CROSSINGS),
+        )
+        return cls(opened, closed, np.broadcast_to(period, shape), *found)
+
+
+def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
+    """The loop cut where the hand feels the force; `axis.delay` plays no part.
+
+    Raises:
+        DrakeTeleopError: for an ideal servo, or if servo or sensor do not run at the hand's rate or
+            a whole number of times faster.
+    """
+    M = cut_map(axis, sampling)
+    n = M.shape[-1] - 3
+    closed = M[..., :n, :n].copy()
+    closed[..., :, SAMPLE] += M[..., :n, n + 3 + RECEIVED]
+    opened = np.linalg.eigvals(M[..., :n, :n]).astype(np.complex128)
+    zeros = np.linalg.eigvals(closed).astype(np.complex128)
+    return CutLoop.of(opened, zeros, 1 / np.asarray(sampling.hand_hz))
+
+
+def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -> Complex:
+    """L(z) z^(-D) at z = e^(j w T); the closed loop is at its limit where it is 1.
+
+    Args:
+        loop: the cut loop (...).
+        frequency: (N,) w [rad/s].
+        delay: one way [s], (...).
+
+    Returns:
+        (N, ...).
+    """
+    dimensions = max(loop.period.ndim, np.ndim(delay))
+    w = np.atleast_1d(np.asarray(frequency, dtype=float)).reshape(-1, *[1] * dimensions)
+    z = np.exp(1j * w * loop.period)[..., None]
+    # Factor by factor, so that poles close to z = 1 cost no digits.
+    L = 1 - np.prod((z - loop.closed) / (z - loop.open), axis=-1)
+    return L * np.exp(-2j * w * np.asarray(delay))
+
+
+def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
+    """How many multipliers of the closed loop lie outside the unit circle, (...).
+
+    Of the argument principle: those of the cut loop, less the times that L z^(-D) goes around 1.
+    It does so only while |L| > 1, so that the phases where it passes 1 are enough.
+
+    Args:
+        loop: the cut loop (...).
+        delay: one way [s], (...). Exact at whole hand periods; in between the delay is taken as it
+            is instead of rounded.
+    """
+    D = (2 * np.asarray(delay) / loop.period)[..., None]
+    turns = (loop.phases - D * loop.angles) / (2 * np.pi)
+    # Twice the whole turns passed, once for each sign of the frequency; the ends count half.
+    around = np.where(loop.angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns))
+    outside = (np.abs(loop.open) > 1 + _ON_THE_CIRCLE).sum(axis=-1)
+    return outside - (loop.signs * around).sum(axis=-1).astype(np.int64)
+
+
+def delay_margin(loop: CutLoop) -> Array:
+    """The round-trip delay at which the loop first becomes unstable [s], (...).
+
+    0 if it is unstable without any, infinite if no delay makes it so. Above it there may be windows
+    in which the loop is stable again.
+    """
+    inside = (loop.angles > 0) & (loop.angles < np.pi) & (loop.signs != 0)
+    steps = np.mod(loop.phases, 2 * np.pi) / np.where(inside, loop.angles, 1.0)
+    first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period
+    return np.where(unstable_multipliers(loop, 0.0) > 0, 0.0, first)
+
+
+def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
+    """The largest multiplier of the closed loop, of a pair the one above the real axis, (...).
+
+    By the same count as `unstable_multipliers` on circles of other radii, bisected, and Newton's
+    method from there: no matrix grows with the delay.
+
+    Args:
+        loop: the cut loop (...).
+        delay: one way [s], (...); exact at whole hand periods.
+    """
+    shape = np.broadcast_shapes(loop.period.shape, np.shape(delay))
+    n = loop.open.shape[-1]
+    opened, closed = (np.broadcast_to(m, (*shape, n)) for m in (loop.open, loop.closed))
+    period = np.broadcast_to(loop.period, shape)
+    delay = np.broadcast_to(np.asarray(delay, dtype=float), shape)
+    D = 2 * delay / period
+
+    def on_circle(growth: Array) -> CutLoop:
+        radius = np.exp(growth * period)[..., None]
+        return CutLoop.of(opened / radius, closed / radius, period, radius[..., 0] ** D)
+
+    # Growth rates: one with no multiplier outside, one with some.
+    high, low = np.ones(shape), -np.ones(shape)
+    for _ in range(_DOUBLINGS):
+        some = unstable_multipliers(on_circle(high), delay) > 0
+        none = unstable_multipliers(on_circle(low), delay) == 0
+        if not (some | none).any():
+            break
+        high, low = np.where(some, 2 * high, high), np.where(none, 2 * low, low)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        some = unstable_multipliers(on_circle(middle), delay) > 0
+        low, high = np.where(some, middle, low), np.where(some, high, middle)
+    # Which one it is: roots of P (1 - z^-D) + M z^-D with P and M the products over `open` and
+    # `closed`, from where |L| crosses on the circle and from the multipliers without delay.
+    radius = np.exp(high * period)[..., None]
+    crossings = np.where(radius > 0, radius * np.exp(1j * on_circle(high).angles), 0)
+    z = np.concatenate([crossings, closed * (1 + 1e-7)], axis=-1)
+    opened, closed, D = opened[..., None, :], closed[..., None, :], D[..., None]
+    found = np.zeros(z.shape, dtype=bool)
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            to_open, to_closed = z[..., None] - opened, z[..., None] - closed
+            P, M, late = to_open.prod(axis=-1), to_closed.prod(axis=-1), z**-D
+            slope = P * (1 / to_open).sum(axis=-1) * (1 - late)
+            slope += (M * (1 / to_closed).sum(axis=-1) + (P - M) * D / z) * late
+            value = P * (1 - late) + M * late
+            step = np.where(value == 0, 0.0, value / slope)
+            # Once there it stays: on a root that is in P or M itself the slope means nothing.
+            z = np.where(found | ~np.isfinite(step), z, z - step)
+            found |= np.abs(step) < 1e-10
+    off = np.where(found, np.abs(np.abs(z) / radius - 1), np.inf)
+    z = np.take_along_axis(z, off.argmin(axis=-1)[..., None], axis=-1)[..., 0]
+    return np.where(z.imag < 0, z.conj(), z)
+
+
+@njit(cache=True)
+def _loop(closed, opened, angle, radius):
+    """L at z = radius e^(j angle)."""
+    z = complex(radius * math.cos(angle), radius * math.sin(angle))
+    ratio = 1.0 + 0.0j
+    for i in range(opened.shape[0]):
+        ratio *= (z - closed[i]) / (z - opened[i])
+    return 1.0 - ratio
+
+
+@njit(cache=True)
+def _find_crossings(opened, closed, levels, angles, found):
+    """Writes where |L| passes the level: angles, phases, signs, `found` (3, loops, places)."""
+    for n in range(opened.shape[0]):
+        poles, zeros, level, count = opened[n], closed[n], levels[n], 0
+        # Around z = 1, where the cut loop has a multiplier if the hand has no stiffness.
+        value = _loop(zeros, poles, 0.0, 1.0 + _ON_THE_CIRCLE)
+        before, size = 0.0, abs(value)
+        phase = 0.0 if value.real >= 0.0 else math.pi
+        if size > level:
+            found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
+            count = 1
+        at, values = _with_extremes(_with_peaks(angles, poles), poles, zeros, level)
+        for i in range(at.shape[0]):
+            angle, value = at[i], values[i]
+            last_size, last_phase = size, phase
+            size, phase = abs(value), _unwrapped(value, last_phase)
+            if (size > level) != (last_size > level) and count < found.shape[2]:
+                low, high = before, angle
+                while high - low > 1e-12 * high:
+                    middle = 0.5 * (low + high)
+                    if (abs(_loop(zeros, poles, middle, 1.0)) > level) == (last_size > level):
+                        low = middle
+                    else:
+                        high = middle
+                found[0, n, count] = low
+                found[1, n, count] = _unwrapped(_loop(zeros, poles, low, 1.0), last_phase)
+                found[2, n, count] = 1.0 if size < last_size else -1.0
+                count += 1
+            before = angle
+        if size > level and count < found.shape[2]:
+            found[0, n, count], found[2, n, count] = math.pi, 1.0
+            found[1, n, count] = math.pi * np.rint(phase / math.pi)
+
+
+@njit(cache=True)
+def _with_peaks(angles, poles):
+    """The angles, and more at every pole, where |L| may have a peak as narrow as 1 - |pole|."""
+    more = np.empty(_AROUND.shape[0] * poles.shape[0])
+    count = 0
+    for pole in poles:
+        for share in _AROUND:
+            angle = abs(math.atan2(pole.imag, pole.real)) + share * abs(1.0 - abs(pole))
+            if angles[0] < angle < math.pi:
+                more[count] = angle
+                count += 1
+    return np.sort(np.concatenate((angles, more[:count])))
+
+
+@njit(cache=True)
+def _with_extremes(angles, poles, zeros, level):
+    """More angles, where |L| comes nearest to the level between two of them; and L at each."""
+    values = np.empty(angles.shape[0], np.complex128)
+    for i in range(angles.shape[0]):
+        values[i] = _loop(zeros, poles, angles[i], 1.0)
+    size = np.abs(values)
+    more = np.empty(angles.shape[0])
+    count = 0
+    for i in range(1, angles.shape[0] - 1):
+        sign = 1.0 if size[i] <= level else -1.0
+        is_extreme = sign * size[i] >= max(sign * size[i - 1], sign * size[i + 1])
+        if is_extreme and 0.5 * level < size[i] < 2.0 * level:
+            low, high = angles[i - 1], angles[i + 1]
+            for _ in range(_GOLDEN_STEPS):
+                a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+                at_a, at_b = _loop(zeros, poles, a, 1.0), _loop(zeros, poles, b, 1.0)
+                if sign * abs(at_a) > sign * abs(at_b):
+                    high = b
+                else:
+                    low = a
+            more[count] = 0.5 * (low + high)
+            values = np.append(values, _loop(zeros, poles, more[count], 1.0))
+            count += 1
+    if count == 0:
+        return angles, values
+    angles = np.concatenate((angles, more[:count]))
+    order = np.argsort(angles)
+    return angles[order], values[order]
+
+
+@njit(cache=True)
+def _unwrapped(value, near):
+    phase = math.atan2(value.imag, value.real)
+    return phase + 2.0 * math.pi * np.rint((near - phase) / (2.0 * math.pi))

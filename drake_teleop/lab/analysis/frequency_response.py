@@ -1,0 +1,264 @@
+"""Frequency responses measured on the whole nonlinear station: the operator draws a multi-sine.
+
+The intent oscillates at several frequencies at once, odd multiples of one that are about evenly
+spread over the logarithm. Even distortion then falls between the lines, and a number of whole
+periods has no leakage. Random phases, the best of many, keep the peaks low.
+
+A response is the ratio of two spectra, averaged over the periods before they are divided: what
+noise adds cancels, in a closed loop too, because the intent repeats and the noise does not. The
+coherence says how much of it was left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.linearization import delays, linearize_station
+from drake_teleop.lab.analysis.one_axis import Complex
+from drake_teleop.lab.analysis.task_direction import TaskDirection
+from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import Scenario, check_scenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.slave.arm import ArmModel, jacobian
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.station import MakeTeleopStation
+
+Array = NDArray[np.float64]
+
+_DRAWS = 300  # of random phases, of which the flattest is taken
+_APPARENT_MASS_BAND = 2 * np.pi * 10.0  # rad/s, up to which the apparent mass is fitted
+
+
+@dataclass(frozen=True)
+class MultiSine:
+    """What the operator draws.
+
+    Args:
+        lowest, highest: frequencies [Hz].
+        lines: their number, at most; on a coarse grid there are fewer.
+        velocity: amplitude of the intended velocity at each [m/s]; for a direction that turns,
+            [rad/s].
+        period: [s], of which all frequencies are odd multiples of the inverse.
+        periods: how many are recorded.
+        settle: for fading in and for transients, before [s].
+        seed: of the phases.
+    """
+
+    lowest: float = 0.5
+    highest: float = 31.0
+    lines: int = 16
+    velocity: float = 0.04
+    period: float = 2.0
+    periods: int = 3
+    settle: float = 1.5
+    seed: int = 0
+
+    def multiples(self) -> NDArray[np.int64]:
+        """(n,) odd multiples of 1 / period."""
+        wanted = np.geomspace(self.lowest * self.period, self.highest * self.period, self.lines)
+        odd: NDArray[np.int64] = np.unique(2 * np.floor((wanted - 1) / 2 + 1e-9).astype(int) + 1)
+        return odd[odd > 0]
+
+    def segments(self, direction: Array, start: float) -> list[Sine]:
+        """The intent along `direction` (6,) in B, from `start` [s] until all is recorded."""
+        frequencies = self.multiples() / self.period
+        amplitudes = self.velocity / (2 * np.pi * frequencies)
+        duration = self.settle + self.period * self.periods + self.settle
+        return [
+            Sine(
+                t_start=start,
+                duration=duration,
+                ramp=0.5 * self.settle,
+                frequency=float(frequency),
+                phase=float(phase),
+                translation=list(amplitude * direction[:3]),
+                rotation=list(amplitude * direction[3:]),
+            )
+            for frequency, amplitude, phase in zip(
+                frequencies, amplitudes, self._phases(), strict=True
+            )
+        ]
+
+    def _phases(self) -> Array:
+        k = self.multiples()
+        draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_DRAWS, len(k)))
+        u = np.arange(8 * k[-1]) / (8 * k[-1])
+        angle = 2 * np.pi * np.outer(u, k)
+        peaks = [np.abs(np.cos(angle + draw).sum(axis=1)).max() for draw in draws]
+        return draws[int(np.argmin(peaks))]
+
+
+@dataclass(frozen=True, eq=False)
+class StationResponse:
+    """Spectra of the station's signals along a direction, measured or predicted.
+
+    Args:
+        omega: (n,) [rad/s].
+        spectra: signal -> (periods, n) amplitudes; predicted: (1, n), for a unit push. The signals:
+            `hand_force` on the stylus [N], `hand_velocity` [m/s], `felt_force` that the device
+            displays [N], `tool_velocity` at the tip [m/s].
+        force_scale: of the station.
+    """
+
+    omega: Array
+    spectra: dict[str, Complex]
+    force_scale: float
+
+    def response(self, output: str, input_: str) -> Complex:
+        """(n,) output over input."""
+        ratio: Complex = self.spectra[output].mean(axis=0) / self.spectra[input_].mean(axis=0)
+        return ratio
+
+    def coherence(self, output: str, input_: str) -> Array:
+        """(n,) share of the output's power that is linear in the input, over the periods."""
+        y, x = self.spectra[output], self.spectra[input_]
+        cross = np.abs((y * x.conj()).sum(axis=0)) ** 2
+        power = (np.abs(y) ** 2).sum(axis=0) * (np.abs(x) ** 2).sum(axis=0)
+        return cross / power
+
+    def apparent_mass(self) -> float:
+        """What the hand feels of the tool's mass, in the slave's units [kg]: sigma m_t on paper.
+
+        The felt force, undone of its scale, over the tool's acceleration, towards zero frequency;
+        a delay of far less than 1/10 Hz leaves its real part even in frequency. It is what the hand
+        feels of its own acceleration as well, times both scales, as long as the servo follows.
+
+        Raises:
+            DrakeTeleopError: if fewer than three lines are below 10 Hz.
+        """
+        low = self.omega <= _APPARENT_MASS_BAND
+        if np.count_nonzero(low) < 3:
+            raise DrakeTeleopError(
+                "fewer than three lines below 10 Hz",
+                where="MultiSine",
+                remedy="lower `lowest` or lengthen `period`",
+            )
+        omega = self.omega[low]
+        felt = -self.response("felt_force", "tool_velocity")[low] / self.force_scale
+        # Noise of the force is about the same at all lines: the mass times their acceleration.
+        acceleration = omega * np.abs(self.spectra["tool_velocity"].mean(axis=0))[low]
+        powers = (omega[:, None] / omega[-1]) ** [0, 2]
+        mass = (felt / (1j * omega)).real
+        weighted = acceleration[:, None] * powers
+        return float(np.linalg.lstsq(weighted, acceleration * mass, rcond=None)[0][0])
+
+    def to_control(self, output: str, input_: str) -> Any:
+        """`response` as a `control.FRD`."""
+        import control
+
+        return control.FRD(self.response(output, input_)[None, None], self.omega)
+
+
+def measure_frequency_response(
+    scenario: Scenario,
+    task: TaskDirection,
+    excitation: MultiSine,
+    *,
+    load_estimate: Array | None = None,
+    approach: Sequence[MinimumJerk] = (),
+) -> StationResponse:
+    """Simulates the station while the operator draws a multi-sine, and takes the spectra.
+
+    Args:
+        scenario: its intent does not matter.
+        task: the direction.
+        excitation: the multi-sine.
+        load_estimate: (16,) as for `MakeTeleopStation`.
+        approach: moves to the operating point; the multi-sine fades in after the last.
+
+    Raises:
+        DrakeTeleopError: if a period is not a whole number of steps of the hand, or as for
+            `MakeTeleopStation`.
+    """
+    check_scenario(scenario)
+    rate = scenario.rates.hand_hz
+    steps = round(excitation.period * rate)
+    if abs(steps - excitation.period * rate) > 1e-6:
+        raise DrakeTeleopError(
+            f"{excitation.period:g} s are not a whole number of steps at {rate:g} Hz",
+            where="MultiSine.period",
+        )
+    start = max((move.t_start + move.duration for move in approach), default=0.0)
+    intent: list[MinimumJerk | Sine] = [*approach, *excitation.segments(task.hand, start)]
+    drawing = replace(
+        scenario,
+        operator=OperatorConfig(grip=scenario.operator.grip, intent=intent),
+        simulation__settle=start + excitation.settle,
+        simulation__duration=excitation.period * excitation.periods,
+        rates__log_hz=rate,
+    )
+    diagram = MakeTeleopStation(drawing, load_estimate=load_estimate)
+    result = simulate(diagram, drawing.simulation, progress=False)
+    multiples = excitation.multiples()
+    spectra: dict[str, Complex] = {
+        name: np.fft.rfft(signal[: steps * excitation.periods].reshape(-1, steps))[:, multiples]
+        * (2 / steps)
+        for name, signal in _signals(result, scenario, task).items()
+    }
+    return StationResponse(
+        np.asarray(2 * np.pi / excitation.period * multiples, dtype=float),
+        spectra,
+        scenario.force_scaling.force_scale,
+    )
+
+
+def predict_frequency_response(
+    scenario: Scenario,
+    task: TaskDirection,
+    omega: Array,
+    *,
+    load_estimate: Array | None = None,
+    displacement: Sequence[float] = (0.0, 0.0, 0.0),
+) -> StationResponse:
+    """The same of the linearised Diagram.
+
+    Args:
+        scenario, load_estimate, displacement: as for `linearize_station`.
+        task: the direction.
+        omega: (n,) [rad/s].
+    """
+    system = linearize_station(scenario, load_estimate=load_estimate, displacement=displacement)
+    first = system.inputs.index("hand_wrench.x")
+    pushed = system.frequency_response(omega)[:, :, first : first + 6] @ task.hand
+
+    def along(port: str, direction: Array) -> Complex:
+        row = system.outputs.index(f"{port}.x")
+        return (pushed[:, row : row + 6] @ direction)[None]
+
+    _, backward = delays(scenario)
+    late = np.exp(-1j * np.asarray(omega) * system.dt * backward)
+    spectra = {
+        # The operator's own force answers the push, which takes its intent's place.
+        "hand_force": 1 + along("operator_wrench", task.hand),
+        "hand_velocity": along("twist_master", task.hand),
+        "felt_force": late * along("wrench_B", task.hand),
+        "tool_velocity": along("twist_slave", task.tool),
+    }
+    return StationResponse(omega, spectra, scenario.force_scaling.force_scale)
+
+
+def _signals(result: SimulationResult, scenario: Scenario, task: TaskDirection) -> dict[str, Array]:
+    arm = NominalSlave(scenario.slave).arm
+    return {
+        "hand_force": result["hand_wrench_E"] @ task.hand,
+        "hand_velocity": result["twist_master"] @ task.hand,
+        "felt_force": result["force_to_master"] @ task.hand,
+        "tool_velocity": _twists(arm, result["slave_state"]) @ task.tool,
+    }
+
+
+def _twists(arm: ArmModel, states: Array) -> Array:
+    """(N, 6) of So in W."""
+    n = arm.num_joints
+    J, twists = np.empty((6, n)), np.empty((len(states), 6))
+    for state, twist in zip(states, twists, strict=True):
+        jacobian(arm.table, np.ascontiguousarray(state[:n]), J)
+        twist[:] = J @ state[n:]
+    return twists

@@ -1,0 +1,685 @@
+"""The actual Diagram, linearised at rest over a period (long: a model, and how it comes about).
+
+Every state of the Diagram that acts on anything is displaced by a little, up and down; the Diagram
+is simulated for one period of the hand; what has become of the displacement after that is a column
+of the state transition. Nothing of the blocks is written a second time. Differences, because the
+blocks are compiled for numbers and take no automatic derivatives.
+
+The loops are cut where an analysis wants to put something else in:
+
+    cut                                 output              input
+    the hand lets go of the stylus      operator_wrench     hand_wrench      F_E_B at E, in B
+    the network, master to slave        pose_command        pose_received    of S, in W
+    the network, slave to master        wrench_B            wrench_received  F_E_B, in B
+
+and `Linearization.close` closes them again, with a delay of any number of periods, exactly. The
+input `tool_wrench` is a wrench of the environment on the tool, about So, in W; the environment of
+the scenario is part of the model besides. All inputs are held for a period; outputs are those of
+its start.
+
+What is left out, because it has no linear part at rest: noise, offset, quantisation and range of
+the sensors; Coulomb friction of the master, whose tanh(v / 0.01) would be a huge damping at rest
+and which only takes energy; friction of a contact, likewise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Role, RoleAssign
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialForce
+from pydrake.systems.analysis import InitializeParams
+from pydrake.systems.framework import Diagram
+
+from drake_teleop.common.arrays import checked
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
+from drake_teleop.lab.analysis.one_axis import Complex
+from drake_teleop.lab.analysis.two_port import two_port
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.environment.point_contact import FRICTION
+from drake_teleop.station.master.force_display import initial_display
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.scenario import Scenario, check_scenario, replace
+from drake_teleop.station.sensor.sensor_chain import without
+from drake_teleop.station.simulation import MakeSimulator
+from drake_teleop.station.slave.arm import jacobian
+from drake_teleop.station.slave.ik_methods import AUTOMATIC, method_of
+from drake_teleop.station.slave.plant import ARM, NominalSlave
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
+
+Array = NDArray[np.float64]
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+_INPUTS = ("hand_wrench", "pose_received", "wrench_received", "tool_wrench")
+_OUTPUTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twist_slave")
+
+# Displacements up and down. The error of a difference is their square, or rounding over them.
+_ANGLE, _RATE, _OTHER = 1e-4, 1e-4, 1.0
+_AT_THE_HAND = np.repeat([1.0, 0.02], 3)  # N, N m: within what the device can display
+_ACCELERATION = 20.0  # rad/s^2, that the servo may ask of a joint: within the motors' torque
+_IN_CONTACT = 1e-6  # rad, m: much less than what a newton indents
+_AT_REST = 1e-6  # of these displacements, that a state of rest may move in a period
+_MOST_STEPS = 8  # of Newton's method on the way to rest
+_RAMP, _SETTLE = 0.3, 0.1  # s, of the slave on its way to the operating point, and there
+_LARGEST_DENSE = 800  # states, beyond which eigenvalues are sought piece by piece
+MOST_STATES = 8000  #: with those of the delay, of which multipliers are still found
+_HIGHEST = 100.0  # Hz, up to which
+_AT_ONCE = 40  # of them
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """x' = A x + B u, y = C x + D u from one period to the next, and loops closed with delay.
+
+    Args:
+        A, B, C, D: of small deviations from rest.
+        dt: the period [s].
+        states, inputs, outputs: their names; a port's parts are "port.x", ..., "port.rz": poses as
+            translation [m] and rotation vector [rad], wrenches [N, N m], twists [m/s, rad/s].
+        loops: (outputs, inputs, periods) that are closed with a delay: u += z^-periods y.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    dt: float
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    loops: tuple[tuple[tuple[int, ...], tuple[int, ...], int], ...] = ()
+
+    def close(
+        self, outputs: str | Sequence[str], inputs: str | Sequence[str], periods: int = 0
+    ) -> Linearization:
+        """Feeds outputs back to inputs: u += z^-periods y. The inputs remain, and add to that.
+
+        Args:
+            outputs, inputs: a port's name, or names of its parts.
+            periods: whole periods of delay.
+
+        Raises:
+            DrakeTeleopError: if there is no such output or input.
+        """
+        rows, columns = self._indices(outputs, self.outputs), self._indices(inputs, self.inputs)
+        if periods > 0:
+            return dataclasses.replace(self, loops=(*self.loops, (rows, columns, periods)))
+        A = self.A + self.B[:, columns] @ self.C[list(rows)]
+        return dataclasses.replace(self, A=A)
+
+    def frequency_response(self, omega: Array) -> Complex:
+        """G(e^(j omega dt)), (n, outputs, inputs), at omega (n,) [rad/s], with exact delays."""
+        z = np.exp(1j * np.asarray(omega, dtype=float) * self.dt)
+        identity = np.eye(len(self.A))
+        # A solution for each frequency: eigenvectors of a chain of delays would be defective.
+        states = [np.linalg.solve(w * identity - self.A, self.B.astype(complex)) for w in z]
+        G: Complex = self.C @ np.stack(states) + self.D
+        for rows, columns, periods in self.loops:
+            delay = z[:, None, None] ** -periods
+            L = delay * G[:, list(rows)][:, :, list(columns)]
+            back = np.linalg.solve(np.eye(len(rows)) - L, delay * G[:, list(rows)])
+            G = G + G[:, :, list(columns)] @ back
+        return G
+
+    @property
+    def multipliers(self) -> Complex:
+        """The eigenvalues of the transition over a period, the largest first; stable below 1.
+
+        With so long a delay that it makes more than 800 states, those near the unit circle up to
+        100 Hz.
+
+        Raises:
+            DrakeTeleopError: for more than 8000 states, whose multipliers lie too close together.
+        """
+        size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
+        if size <= _LARGEST_DENSE:
+            values = np.linalg.eigvals(self.expanded().A)
+        elif size > MOST_STATES:
+            raise DrakeTeleopError(
+                f"{size} states, most of them of the delay, are too many",
+                where="channel.delay",
+                remedy="count unstable multipliers of one axis instead (cut_loop)",
+            )
+        else:
+            values = _near_the_circle(self._with_lines(size), 2 * np.pi * _HIGHEST * self.dt)
+        return values[np.argsort(-np.abs(values))].astype(complex)
+
+    def _with_lines(self, size: int) -> Any:
+        """`expanded().A`, sparse."""
+        from scipy.sparse import lil_array
+
+        n = end = len(self.A)
+        A = lil_array((size, size), dtype=complex)
+        A[:n, :n] = self.A
+        for rows, columns, periods in self.loops:
+            start, width = end, len(rows)
+            end = start + width * periods
+            A[start : start + width, :n] = self.C[list(rows)]
+            A[:n, end - width : end] = self.B[:, columns]
+            for k in range(start + width, end):
+                A[k, k - width] = 1.0
+        return A.tocsc()
+
+    def expanded(self) -> Linearization:
+        """The same without `loops`: each delay as a shift register among the states."""
+        result = dataclasses.replace(self, loops=())
+        for rows, columns, periods in self.loops:
+            result = _with_register(result, rows, columns, periods)
+        return result
+
+    def to_control(self) -> Any:
+        """As a discrete `control.StateSpace` with the same names, but "port[x]" for "port.x"."""
+        import control
+
+        system = self.expanded()
+        return control.StateSpace(
+            *(system.A, system.B, system.C, system.D, system.dt),
+            # python-control takes no dots in the names of inputs and outputs.
+            inputs=[_in_brackets(name) for name in system.inputs],
+            outputs=[_in_brackets(name) for name in system.outputs],
+            states=list(system.states),
+        )
+
+    @staticmethod
+    def _indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
+        parts = _parts(names) if isinstance(names, str) else names
+        if missing := [name for name in parts if name not in known]:
+            ports = sorted({name.rpartition(".")[0] or name for name in known})
+            raise DrakeTeleopError(
+                f"there is no {missing[0]}",
+                where="close",
+                remedy=f"name one of {', '.join(ports)}, or a list of parts, as ['{known[0]}']",
+            )
+        return tuple(known.index(name) for name in parts)
+
+
+def _in_brackets(name: str) -> str:
+    port, dot, part = name.rpartition(".")
+    return f"{port}[{part}]" if dot else name
+
+
+def _near_the_circle(A: Any, highest: float) -> Complex:
+    """Eigenvalues of a large sparse A near the unit circle, from angle 0 to `highest`.
+
+    A delay's multipliers lie all around the circle, hardly apart in size: what is found at a time
+    are the nearest to a point on it (shift and invert), and the next point is where they end.
+    """
+    from scipy.sparse.linalg import eigs
+
+    start = np.random.default_rng(0).standard_normal(A.shape[0]).astype(complex)
+    found, angle = np.zeros(0, dtype=complex), 0.0
+    while angle < highest:
+        # A little beside the circle, so that none of them is met exactly.
+        shift = 1.0005 * np.exp(1j * angle)
+        values = eigs(A, _AT_ONCE, sigma=shift, v0=start, return_eigenvectors=False)
+        known = np.abs(values[:, None] - found).min(axis=1, initial=np.inf) < 1e-9
+        found = np.concatenate([found, values[~known]])
+        angle = max(float(np.angle(values).max()), angle + 1e-4)
+    return found
+
+
+def _with_register(
+    system: Linearization, rows: tuple[int, ...], columns: tuple[int, ...], periods: int
+) -> Linearization:
+    n, width = len(system.A), len(rows)
+    size = n + width * periods
+    A, B = np.zeros((size, size)), np.zeros((size, len(system.inputs)))
+    C = np.zeros((len(system.outputs), size))
+    A[:n, :n], B[:n], C[:, :n] = system.A, system.B, system.C
+    A[n : n + width, :n] = system.C[list(rows)]
+    A[n + width :, n : size - width] = np.eye(size - n - width)
+    A[:n, size - width :] = system.B[:, columns]
+    names = [f"delayed {system.outputs[row]} {k + 1}" for k in range(periods) for row in rows]
+    return dataclasses.replace(system, A=A, B=B, C=C, states=(*system.states, *names))
+
+
+def linearize(
+    scenario: Scenario,
+    *,
+    load_estimate: Array | None = None,
+    displacement: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Linearization:
+    """The Diagram of a scenario, linearised at rest with its loops cut; see the module.
+
+    Args:
+        scenario: its intent, its network and its method do not matter: their loops are cut.
+        load_estimate: (16,) as for `MakeTeleopStation`.
+        displacement: of the master from its start [m], in B, where all is at rest; the slave
+            follows, and leans on what is in its way.
+
+    Raises:
+        DrakeTeleopError: if the rates have no common period that a cut can be made at, or if the
+            slave does not come to rest.
+    """
+    check_scenario(scenario)
+    if load_estimate is not None:
+        load_estimate = checked("load_estimate", load_estimate, 16)
+        # The sensor has no offset here, so there is none to subtract.
+        load_estimate = np.concatenate([np.zeros(6), load_estimate[6:]])
+    period = _Period(scenario, load_estimate)
+    x, A, C = period.rest(np.asarray(displacement, dtype=float))
+    B = period.input_derivative(x)
+    acts = _acting(A, C)
+    names = tuple(name for name, kept in zip(period.states, acts, strict=True) if kept)
+    D = np.zeros((len(C), B.shape[1]))
+    A, B, C = A[np.ix_(acts, acts)], B[acts], C[:, acts]
+    return Linearization(A, B, C, D, period.dt, names, _parts(*_INPUTS), _parts(*_OUTPUTS))
+
+
+def _parts(*ports: str) -> tuple[str, ...]:
+    return tuple(f"{port}.{axis}" for port in ports for axis in AXES)
+
+
+def linearize_station(
+    scenario: Scenario,
+    *,
+    load_estimate: Array | None = None,
+    displacement: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Linearization:
+    """As `linearize`, with all loops closed: the operator holds the stylus over the network.
+
+    Args:
+        scenario: of its network, the constant part of the delay matters.
+        load_estimate, displacement: as for `linearize`.
+
+    Raises:
+        DrakeTeleopError: as `linearize`, or if a method of passivity is in the channel, which is
+            not linear.
+    """
+    check_scenario(scenario)
+    if scenario.passivity.method != "none":
+        raise DrakeTeleopError(
+            f"'{scenario.passivity.method}' is not linear",
+            where="passivity.method",
+            remedy="linearise with method: none, or identify the frequency response",
+        )
+    cut = linearize(scenario, load_estimate=load_estimate, displacement=displacement)
+    forward, backward = delays(scenario)
+    system = cut.close("operator_wrench", "hand_wrench")
+    system = system.close("pose_command", "pose_received", forward)
+    return system.close("wrench_B", "wrench_received", backward)
+
+
+def delays(scenario: Scenario) -> tuple[int, int]:
+    """Periods of the hand that a pose and a wrench take over the scenario's network.
+
+    None if the network is ideal, which is nothing but wires; otherwise at least one.
+    """
+    lines = scenario.channel.lines()
+    if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
+        return 0, 0
+    ahead, back = (
+        max(1, round(max(line.delay, line.playout) * scenario.rates.hand_hz)) for line in lines
+    )
+    return ahead, back
+
+
+def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
+    """[F_h; -V_s] = H [V_m; F_e] along one direction of the hand and one of the tool.
+
+    All other directions are as the system has them: closed by the operator, or free. As in
+    `sampled_loop`, forces are the share of a held one that is of the frequency itself.
+
+    Args:
+        system: a linearisation, with the loop of the hand cut in the direction `hand`. The hand's
+            mass is part of its device.
+        omega: (n,) [rad/s], not zero.
+        hand: (6,) direction in B at E, of the hand's force and V_m.
+        tool: (6,) direction in W as a wrench about So, see `TaskDirection`: F_e tool is what the
+            tool exerts on the environment, V_s = tool . [v; omega].
+
+    Returns:
+        (n, 2, 2).
+    """
+    G = system.frequency_response(omega)
+    i, o = list(system.inputs), list(system.outputs)
+
+    def response(output: str, left: Array, input_: str, right: Array) -> Complex:
+        row, column = o.index(f"{output}.x"), i.index(f"{input_}.x")
+        return left @ G[:, row : row + 6, column : column + 6] @ right
+
+    step = 1j * np.asarray(omega) * system.dt
+    hold = -np.expm1(-step) / step
+    mm = response("twist_master", hand, "hand_wrench", hand) / hold
+    ms = response("twist_master", hand, "tool_wrench", tool) / hold
+    sm = response("twist_slave", tool, "hand_wrench", hand) / hold
+    ss = response("twist_slave", tool, "tool_wrench", tool) / hold
+    # The tool feels -F_e.
+    return two_port(1 / mm, ms / mm, -sm / mm, ss - sm * ms / mm)
+
+
+def _acting(A: Array, C: Array) -> NDArray[np.bool_]:
+    """Which states act on an output, by any way."""
+    acts = (C != 0.0).any(axis=0)
+    while True:
+        more = acts | (A[acts] != 0.0).any(axis=0)
+        if (more == acts).all():
+            return acts
+        acts = more
+
+
+@dataclass(frozen=True)
+class _States:
+    """Some states of one block: `part` of its discrete `group`, or of the continuous state."""
+
+    system: str
+    group: int | None
+    part: slice | NDArray[np.intp]
+    steps: Array  # displacements for the differences
+
+
+class _Period:
+    """One period of the station's Diagram as a function of its states and of the cut inputs."""
+
+    def __init__(self, scenario: Scenario, load_estimate: Array | None) -> None:
+        _check_rates(scenario)
+        own_period = scenario.master.own_period(scenario.rates.hand_hz)
+        if own_period is not None:
+            raise DrakeTeleopError(
+                f"the device has a rate of its own, {1 / own_period:g} Hz, below that of the hand",
+                where="rates.hand_hz",
+                remedy=f"set it to {1 / own_period:g}, or master.figures.rate_hz to 0",
+            )
+        self.dt = 1 / scenario.rates.hand_hz
+        smooth = _smooth(scenario)
+        self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
+        if smooth.surroundings is not None:
+            _check_contact(self._diagram)
+            _remove_friction(self._diagram)
+        self._simulator = MakeSimulator(self._diagram, smooth.simulation)
+        # Steps that followed the error would follow the displacements too.
+        self._simulator.get_mutable_integrator().set_fixed_step_mode(True)
+        slave = NominalSlave(smooth.slave)
+        self._arm, self._joints = slave.arm.table, slave.arm.num_joints
+        self._remembers = method_of(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
+        self._push = ExternallyAppliedSpatialForce()
+        self._push.body_index = slave.tool
+        self._sensor = self._system("wrist_sensor")
+        servo = smooth.joint_control
+        servo.check_is_torque("the linearisation")
+        scenario.master.check_leads_the_pose("the linearisation")
+        if self._remembers:  # a slow joint would not follow the displacements
+            GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf
+        gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
+        # In a period the arm goes a small part of what it is commanded.
+        self._command_step = min(_ANGLE, _ACCELERATION / gain)
+        touches = smooth.surroundings is not None
+        self._joint_step = min(self._command_step, _IN_CONTACT) if touches else self._command_step
+        hand = smooth.operator.hand
+        self._device = smooth.master.device(hand.mass, hand.inertia)
+        self._groups = self._state_groups()
+        self._steps = np.concatenate([group.steps for group in self._groups])
+        # What the sensor remembers follows from the rest; it is of order 1.
+        sensed = [group.system == "wrist_sensor" for group in self._groups]
+        counts = [len(group.steps) for group in self._groups]
+        self._sizes = np.where(np.repeat(sensed, counts), _OTHER, self._steps)
+        self.states = tuple(
+            f"{g.system} {'' if g.group is None else g.group}[{k}]"
+            for g in self._groups
+            for k in range(len(g.steps))
+        )
+        self._start_B = np.array([1.0, 0.0, 0.0, 0.0, *smooth.master.position])
+        self._pose = self._eval("kinematic_scaling", "pose_command")
+        self._hand, self._wrench = np.zeros(6), np.zeros(6)
+        self._apply(np.zeros(24))
+        self._simulator.Initialize()
+
+    def _system(self, name: str) -> Any:
+        return GetBlock(self._diagram, name)
+
+    def _context(self, name: str) -> Any:
+        root = self._simulator.get_mutable_context()
+        return self._system(name).GetMyMutableContextFromRoot(root)
+
+    def _eval(self, system: str, port: str) -> Array:
+        return np.array(self._system(system).GetOutputPort(port).Eval(self._context(system)))
+
+    def _fix(self, system: str, port: str, value: object) -> None:
+        self._system(system).GetInputPort(port).FixValue(self._context(system), value)
+
+    def _state_groups(self) -> list[_States]:
+        """All that acts. Not the clutch's references, which stay; not monitor, log and noise."""
+
+        def whole(system: str, group: int, *steps: Array) -> _States:
+            return _States(system, group, slice(None), np.concatenate(steps))
+
+        joints = self._context("slave_plant").num_continuous_states() // 2
+        axes = self._device.num_joints
+        # Angles, as the sensor remembers some of them, must stay small.
+        remembered = np.full(len(self._sensor.remembered), _ANGLE)
+        return [
+            whole("master_device", 0, np.full(axes, _ANGLE), np.full(axes, _RATE)),
+            whole("master_device", 1, np.full(7, _ANGLE)),
+            whole("master_device", 2, np.full(6, _RATE)),
+            # The angles again, for the display; what else it remembers acts after faults alone.
+            _States("master_device", 3, slice(0, 6), np.full(6, _ANGLE)),
+            whole("joint_control", 0, np.full(self._joints, _OTHER)),
+            _States("slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE], joints)),
+            _States("wrist_sensor", 0, self._sensor.remembered, remembered),
+            *self._last_command(),
+        ]
+
+    def _last_command(self) -> list[_States]:
+        """From which the numeric inverse kinematics goes on; the closed form remembers nothing."""
+        steps = np.full(self._joints, self._command_step)
+        command = _States("inverse_kinematics", 0, slice(0, self._joints), steps)
+        return [command] if self._remembers else []
+
+    def get(self) -> Array:
+        """The states now."""
+        parts = []
+        for group in self._groups:
+            context = self._context(group.system)
+            if group.group is None:
+                parts.append(context.get_continuous_state_vector().CopyToVector())
+            else:
+                parts.append(context.get_discrete_state(group.group).value()[group.part])
+        return np.concatenate(parts)
+
+    def _set(self, x: Array) -> None:
+        ends = np.cumsum([len(group.steps) for group in self._groups])
+        for group, values in zip(self._groups, np.split(x, ends[:-1]), strict=True):
+            context = self._context(group.system)
+            if group.group is None:
+                context.SetContinuousState(values)
+            else:
+                state = context.get_mutable_discrete_state(group.group)
+                state.get_mutable_value()[group.part] = values
+        self._sensor.bring_up_to_date(self._context("wrist_sensor"))
+
+    def _apply(self, u: Array) -> None:
+        """Sets the cut inputs: `u` (24,) is what they are more than at the operating point."""
+        self._fix("master_device", "hand_wrench_E", self._hand + u[:6])
+        self._fix("inverse_kinematics", "pose_command", _moved(self._pose, u[6:12]))
+        self._fix("force_display", "wrench_command", self._wrench + u[12:18])
+        push = u[18:24]
+        self._push.F_Bq_W = SpatialForce(push[3:], push[:3])
+        self._fix("slave_plant", "applied_spatial_force", [self._push])
+        self._fix("wrist_sensor", "applied_wrench_W", push)
+
+    def _slave_state(self) -> Array:
+        return self._eval("slave_plant", f"{ARM}_state")
+
+    def _run(self) -> Array:
+        """The states after a period, from those now."""
+        # The sample of noise, which is 0, and the log have other instants.
+        context = self._simulator.get_mutable_context()
+        context.SetTime(self.dt)
+        if self._remembers:  # when its last command was
+            command = self._context("inverse_kinematics").get_mutable_discrete_state(0)
+            command.get_mutable_value()[-1] = 0.0
+        self._sensor.bring_up_to_date(self._context("wrist_sensor"))
+        self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+        self._simulator.AdvanceTo(2 * self.dt)
+        self._sensor.take_samples(self._context("wrist_sensor"))
+        return self.get()
+
+    def _outputs(self) -> Array:
+        pose, state = self._eval("kinematic_scaling", "pose_command"), self._slave_state()
+        J = np.empty((6, self._joints))
+        jacobian(self._arm, state[: self._joints], J)
+        return np.concatenate(
+            [
+                self._eval("operator", "hand_wrench_E"),
+                _difference(pose, self._pose),
+                self._eval("force_scaling", "wrench_B"),
+                self._eval("master_device", "twist_master"),
+                J @ state[self._joints :],
+            ]
+        )
+
+    def rest(self, displacement: Array) -> tuple[Array, Array, Array]:
+        """The states at the operating point, A and C.
+
+        The cut inputs become what keeps it at rest.
+        """
+        start = self._pose
+        pose_B = self._start_B.copy()
+        pose_B[4:] += displacement
+        q = self._device.inverse_kinematics(pose_B)
+        context = self._context("master_device")
+        rest = (
+            np.append(q, np.zeros(len(q))),
+            pose_B,
+            np.zeros(6),
+            initial_display(self._device.display_axes(q), self._device.numbers),
+        )
+        for group, value in enumerate(rest):
+            context.SetDiscreteState(group, value)
+        target = self._eval("kinematic_scaling", "pose_command")
+        ramp = round(_RAMP / self.dt) if displacement.any() else 0
+        for k in range(ramp + round(_SETTLE / self.dt)):
+            u = min((k + 1) / ramp, 1.0) if ramp else 1.0
+            share = u**3 * (10 + u * (6 * u - 15))
+            self._pose = start + share * (target - start)
+            self._apply(np.zeros(24))
+            self._run()
+        return self._newton(self._balanced())
+
+    def _balanced(self) -> Array:
+        """The states, where the hand holds the master against what it displays."""
+        self._wrench = self._eval("force_scaling", "wrench_B")
+        self._apply(np.zeros(24))
+        self._hand = -self._eval("force_display", "force_to_master")
+        self._apply(np.zeros(24))
+        return self.get()
+
+    def _newton(self, x: Array) -> tuple[Array, Array, Array]:
+        """To where nothing moves that acts. The master rests already; unheld, it could anywhere."""
+        slave = np.array([not name.startswith("master") for name in self.states])
+        for _ in range(_MOST_STEPS):
+            A, C = self.derivative(x)
+            free = slave & _acting(A, C)
+            self._set(x)
+            moved = self._run() - x
+            if (np.abs(moved) < _AT_REST * self._sizes)[free].all():
+                return x, A, C
+            moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
+            x[slave] += moved[slave]
+            self._set(x)
+            x = self._balanced()
+        raise DrakeTeleopError(
+            f"the slave does not come to rest, {self.states[np.argmax(np.abs(moved))]} moves",
+            where="displacement",
+            remedy="choose another operating point",
+        )
+
+    def derivative(self, x: Array) -> tuple[Array, Array]:
+        """A and C at the states x, by central differences."""
+        A, C = np.empty((len(x), len(x))), np.empty((30, len(x)))
+        self._apply(np.zeros(24))
+        for k, step in enumerate(self._steps):
+            ends, outputs = [], []
+            for sign in (1.0, -1.0):
+                displaced = x.copy()
+                displaced[k] += sign * step
+                self._set(displaced)
+                outputs.append(self._outputs())
+                ends.append(self._run())
+            A[:, k] = (ends[0] - ends[1]) / (2 * step)
+            C[:, k] = (outputs[0] - outputs[1]) / (2 * step)
+        return A, C
+
+    def input_derivative(self, x: Array) -> Array:
+        """B at the states x."""
+        B = np.empty((len(x), 24))
+        pose, tool = np.full(6, self._command_step), np.full(6, _OTHER)
+        for k, step in enumerate(np.concatenate([_AT_THE_HAND, pose, _AT_THE_HAND, tool])):
+            ends = []
+            for sign in (1.0, -1.0):
+                self._set(x)
+                self._apply(sign * step * np.eye(24)[k])
+                ends.append(self._run())
+            B[:, k] = (ends[0] - ends[1]) / (2 * step)
+        return B
+
+
+def _moved(pose: Array, change: Array) -> Array:
+    """The pose after a translation [m] and a rotation vector [rad]."""
+    return np.concatenate(
+        [multiply(exponential(tuple(change[3:])), pose[:4]), pose[4:] + change[:3]]
+    )
+
+
+def _difference(pose: Array, other: Array) -> Array:
+    """What moves `other` to `pose`, see `_moved`."""
+    turn = logarithm(multiply(tuple(pose[:4]), conjugate(tuple(other[:4]))))
+    return np.concatenate([pose[4:] - other[4:], turn])
+
+
+def _smooth(scenario: Scenario) -> Scenario:
+    """The scenario's linear part at rest, without what the cuts replace."""
+    parts = ("noise", "random_walk", "offset", "drift", "quantisation", "saturation")
+    return replace(
+        scenario,
+        simulation__integrator="runge_kutta3",
+        simulation__max_step=0.5 / scenario.rates.sensor_hz,
+        rates__log_hz=1.0,
+        operator__intent=[],
+        channel=Channel(),
+        passivity=PassivityConfig(),
+        wrist_sensor=without(scenario.wrist_sensor, *parts),
+        master=scenario.master.without_coulomb_friction(),
+        slave__friction=[],
+        load_estimator__enabled=False,
+        # For an arm that has a closed form, which leads to the same angles and remembers nothing.
+        slave__inverse_kinematics=AUTOMATIC,
+    )
+
+
+def _check_contact(diagram: Diagram) -> None:
+    sensor = GetBlock(diagram, "wrist_sensor")
+    if beyond := sensor.beyond or sensor.moves:
+        raise DrakeTeleopError(
+            f"these surroundings cannot be linearised: {beyond}",
+            where="environment",
+            remedy="leave them out, or leave a leaf, a slot, walls and boxes",
+        )
+
+
+def _remove_friction(diagram: Diagram) -> None:
+    plant = GetBlock(diagram, "slave_plant")
+    scene_graph = GetBlock(diagram, "scene_graph")
+    inspector, source = scene_graph.model_inspector(), plant.get_source_id()
+    for geometry in inspector.GetAllGeometryIds(Role.kProximity):
+        properties = inspector.GetProximityProperties(geometry)
+        properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(0.0, 0.0))
+        scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
+    GetBlock(diagram, "wrist_sensor").contact_pairs[:, FRICTION] = 0.0
+
+
+def _check_rates(scenario: Scenario) -> None:
+    rates = scenario.rates
+    if rates.joint_control_hz != rates.hand_hz or rates.sensor_hz % rates.hand_hz != 0.0:
+        raise DrakeTeleopError(
+            "the loops can only be cut at instants that hand and joint control share",
+            where="rates",
+            remedy="set joint_control_hz to hand_hz, and sensor_hz to a multiple of it",
+        )

@@ -1,0 +1,184 @@
+"""Maps: where over two parameters the sampled loop is stable, and how true the hand feels.
+
+Stability is counted by the argument principle, see `cut_loop`; where it changes between two
+neighbours of the grid, bisection finds the place. The delay is taken as it is instead of rounded to
+whole hand periods, so that its boundaries are curves instead of steps.
+
+Over-compensation. Where the slave is free and sigma = 0, an error dm of the estimated mass is felt
+as the mass -k_f l_p gamma dm. If the slave follows at once, that must not exceed the mass m that
+hand and device move anyway: dm < m / (k_f l_p gamma), and with sigma > 0
+(gamma - sigma) dm - sigma m_t < m / (k_f l_p). The lag of the station's servo lowers the bound, by
+2 % with the firm grip, 10 % with the medium and 18 % with the light one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.cut_loop import (
+    CutLoop,
+    cut_loop,
+    loop_response,
+    unstable_multipliers,
+)
+from drake_teleop.lab.analysis.one_axis import (
+    Complex,
+    OneAxis,
+    device_impedance,
+    environment_impedance,
+    hand_impedance,
+)
+from drake_teleop.lab.analysis.period_map import Sampling
+from drake_teleop.lab.analysis.transparency import ideal_impedance
+
+Array = NDArray[np.float64]
+
+#: All rates together, in their ratios, as the hand's [Hz].
+RATE = "rate"
+_PARAMETERS = {entry.name for entry in fields(OneAxis)} - {"ideal_servo"} | {RATE, "low_pass_hz"}
+_HALVINGS = 10
+_BAND = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # rad/s, deliberate movements
+
+
+@dataclass(frozen=True)
+class StabilityMap:
+    """Over the grid of two parameters.
+
+    Args:
+        x_name, y_name: fields of `OneAxis`, "low_pass_hz" or "rate".
+        x, y: (nx,), (ny,) their values.
+        unstable: (ny, nx) multipliers outside the unit circle.
+        distortion: (ny, nx) see `distortion`; it means something where the loop is stable.
+        boundary: (n, 2) places x, y where stability changes, within a thousandth of the grid's
+            distances.
+    """
+
+    x_name: str
+    y_name: str
+    x: Array
+    y: Array
+    unstable: NDArray[np.int64]
+    distortion: Array
+    boundary: Array
+
+    @property
+    def stable(self) -> NDArray[np.bool_]:
+        """(ny, nx)."""
+        return self.unstable == 0
+
+
+def stability_map(
+    axis: OneAxis,
+    sampling: Sampling,
+    x_name: str,
+    x: ArrayLike,
+    y_name: str,
+    y: ArrayLike,
+) -> StabilityMap:
+    """Stability and distortion over two parameters, the others as they are.
+
+    Args:
+        axis, sampling: the station.
+        x_name, y_name: fields of `OneAxis`, "low_pass_hz" or "rate", all rates together as the
+            hand's [Hz].
+        x, y: (nx,), (ny,) increasing values.
+
+    Raises:
+        DrakeTeleopError: for another name, values that do not increase, or a station that
+            `cut_loop` does not know.
+    """
+    xs, ys = _increasing(x_name, x), _increasing(y_name, y)
+
+    def loops(at_x: Array, at_y: Array) -> tuple[OneAxis, CutLoop]:
+        return _loops(axis, sampling, {x_name: at_x, y_name: at_y})
+
+    def is_stable(at_x: Array, at_y: Array) -> NDArray[np.bool_]:
+        moved, loop = loops(at_x, at_y)
+        return unstable_multipliers(loop, moved.delay) == 0
+
+    moved, loop = loops(xs, ys[:, None])
+    shape = len(ys), len(xs)
+    unstable = np.broadcast_to(unstable_multipliers(loop, moved.delay), shape)
+    stable = unstable == 0
+    # Between neighbours in a row, and between neighbours in a column.
+    row, column = np.nonzero(stable[:, 1:] != stable[:, :-1])
+    along_x = _bisect(
+        lambda at: is_stable(at, ys[row]), xs[column], xs[column + 1], stable[row, column]
+    )
+    row_2, column_2 = np.nonzero(stable[1:] != stable[:-1])
+    along_y = _bisect(
+        lambda at: is_stable(xs[column_2], at), ys[row_2], ys[row_2 + 1], stable[row_2, column_2]
+    )
+    boundary = np.concatenate(
+        [np.column_stack([along_x, ys[row]]), np.column_stack([xs[column_2], along_y])]
+    )
+    felt = np.broadcast_to(distortion(moved, loop), shape)
+    return StabilityMap(x_name, y_name, xs, ys, unstable, felt, boundary)
+
+
+def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _BAND) -> Array:
+    """How far off what the hand has to exert is, the worst of a band, (...).
+
+    All of it: for itself, the device and what the loop displays, as a share of the same with the
+    `ideal_impedance`. So it is small where the hand would not notice, in free motion too.
+
+    Args:
+        axis: the axis (...), its delay one way.
+        loop: its `cut_loop` (...).
+        frequency: (N,) the band [rad/s].
+    """
+    shape = np.broadcast_shapes(
+        loop.period.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))
+    )
+    w = np.atleast_1d(np.asarray(frequency, dtype=float))
+    s: Complex = 1j * w.reshape(-1, *[1] * len(shape))
+    hand = hand_impedance(axis, s)
+    ideal = hand + ideal_impedance(axis, s, environment_impedance(axis, s))
+    exerted = (hand + device_impedance(axis, s)) * (1 - loop_response(loop, w, axis.delay))
+    return np.abs(exerted / ideal - 1).max(axis=0)
+
+
+def _increasing(name: str, values: ArrayLike) -> Array:
+    if name not in _PARAMETERS:
+        raise DrakeTeleopError(
+            f"there is no parameter '{name}' to draw a map of",
+            where="stability_map",
+            remedy=f"choose one of {', '.join(sorted(_PARAMETERS))}",
+        )
+    array = np.asarray(values, dtype=float)
+    if array.ndim != 1 or array.size == 0 or not (np.diff(array) > 0).all():
+        raise DrakeTeleopError("the values do not increase", where=f"stability_map:{name}")
+    return array
+
+
+def _loops(axis: OneAxis, sampling: Sampling, values: dict[str, Any]) -> tuple[OneAxis, CutLoop]:
+    """The axis with these values, and its loops; their shape is that of the values together."""
+    for name, value in values.items():
+        if name == RATE:
+            factor = value / sampling.hand_hz
+            sampling = replace(
+                sampling,
+                hand_hz=value,
+                joint_control_hz=factor * sampling.joint_control_hz,
+                sensor_hz=factor * sampling.sensor_hz,
+            )
+        elif name == "low_pass_hz":
+            sampling = replace(sampling, low_pass_hz=value)
+        else:
+            axis = replace(axis, **{name: value})
+    return axis, cut_loop(axis, sampling)
+
+
+def _bisect(is_stable, low: Array, high: Array, stable_at_low: NDArray[np.bool_]) -> Array:
+    """Where stability changes between `low` and `high` (n,), all at once."""
+    low, high = low.copy(), high.copy()
+    for _ in range(_HALVINGS if low.size else 0):
+        middle = 0.5 * (low + high)
+        as_low = is_stable(middle) == stable_at_low
+        low, high = np.where(as_low, middle, low), np.where(as_low, high, middle)
+    return 0.5 * (low + high)

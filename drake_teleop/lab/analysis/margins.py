@@ -1,0 +1,167 @@
+"""How far a loop with a delay is from its limit: gain, phase and delay margins.
+
+`margins` of loops of known coefficients, exactly but for the gain margin's search;
+`margins_of_response` of loops that are known by their frequency response only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.delayed_loop import (
+    DelayedLoop,
+    angle_of,
+    angle_past_minus_one,
+    gain_crossings,
+    least_along,
+    margin_of_delay,
+    unstable_poles,
+)
+from drake_teleop.lab.analysis.nyquist import break_frequencies, encirclements, frequency_grid
+from drake_teleop.lab.analysis.polynomials import Array
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Margins of a loop or of each loop of a grid (...); those of an unstable loop are 1, 0 and 0.
+
+    Args:
+        unstable_poles: of the closed loop.
+        gain, gain_frequency: factor by which L may grow, and where it then meets -1 [rad/s].
+        phase, phase_frequency: by which L may turn either way [rad], and where [rad/s].
+        delay, delay_frequency: that may be added [s], and where [rad/s].
+
+    Where there is no limit the margin is inf and its frequency NaN.
+    """
+
+    unstable_poles: Array
+    gain: Array
+    gain_frequency: Array
+    phase: Array
+    phase_frequency: Array
+    delay: Array
+    delay_frequency: Array
+
+
+def margins(loop: DelayedLoop) -> Margins:
+    """Gain, phase and delay margins with the delay exact.
+
+    Phase and delay margins follow from the exact gain crossings. The phase crossings of the gain
+    margin are bracketed on a grid of frequencies and bisected, for one loop at a time: for large
+    grids of parameters take `delay_margin` and `unstable_poles`.
+    """
+    unstable = unstable_poles(loop)
+    stable = unstable == 0
+    frequency, _ = gain_crossings(loop)
+    phase, phase_frequency = least_along(np.abs(angle_past_minus_one(loop, frequency)), frequency)
+    delay, delay_frequency = margin_of_delay(loop, stable)
+    limits = [_gain_margin(loop[cell]) for cell in np.ndindex(loop.delay.shape)]
+    gain, gain_frequency = np.moveaxis(np.reshape(limits, (*loop.delay.shape, 2)), -1, 0)
+    return Margins(
+        unstable,
+        np.where(stable, gain, 1.0),
+        gain_frequency,
+        np.where(stable, phase, 0.0),
+        phase_frequency,
+        delay,
+        delay_frequency,
+    )
+
+
+def margins_of_response(
+    omega: ArrayLike,
+    response: ArrayLike,
+    *,
+    delay: ArrayLike = 0.0,
+    open_loop_poles: int = 0,
+    poles_at_origin: int = 0,
+    sampled: bool = False,
+) -> Margins:
+    """The margins of loops that are known by their frequency response, measured or sampled.
+
+    Between frequencies, log |L| and the phase are taken as linear in log w: an error of the second
+    order in the spacing. The response of a control.FrequencyResponseData is its `frdata[0, 0]`.
+
+    Args:
+        omega: (n,) [rad/s], rising, positive.
+        response: L(jw) or L(e^(jw Ts)), (n, ...).
+        delay: (...) [s], to be added to the response, exactly.
+        open_loop_poles, poles_at_origin, sampled: as in `encirclements`.
+
+    Raises:
+        DrakeTeleopError: frequencies that do not rise from above zero; else as in `encirclements`.
+    """
+    omega = np.asarray(omega, dtype=float)
+    if omega.ndim != 1 or not np.all(np.diff(omega, prepend=0.0) > 0):
+        raise DrakeTeleopError("the frequencies of a response must rise, from above zero")
+    measured, added = np.asarray(response, dtype=complex), np.asarray(delay, dtype=float)
+    dimensions = max(measured.ndim - 1, added.ndim)
+    w = omega.reshape(-1, *(1,) * dimensions)
+    L = measured.reshape(*measured.shape, *(1,) * (dimensions + 1 - measured.ndim))
+    L = L * np.exp(-1j * w * added)
+    unstable = encirclements(
+        L, open_loop_poles=open_loop_poles, poles_at_origin=poles_at_origin, sampled=sampled
+    )
+    stable = unstable == 0
+    log_w, log_gain, angle = np.log(w), np.log(np.abs(L)), angle_of(-L)
+    turn = np.unwrap(angle, axis=0)
+
+    at_one = _zero_between(log_gain)
+    w_c = np.exp(_between(log_w, at_one))
+    past = np.mod(_between(turn, at_one), 2 * np.pi)
+    phase, phase_frequency = least_along(np.minimum(past, 2 * np.pi - past), w_c, axis=0)
+    more, more_frequency = least_along(past / w_c, w_c, axis=0)
+
+    at_minus = np.where(np.abs(np.diff(angle, axis=0)) < np.pi, _zero_between(angle), np.nan)
+    factor = np.exp(-_between(log_gain, at_minus))
+    w_p = np.exp(_between(log_w, at_minus))
+    factor, factor_frequency = least_along(np.where(factor > 1, factor, np.nan), w_p, axis=0)
+    return Margins(
+        unstable,
+        np.where(stable, factor, 1.0),
+        factor_frequency,
+        np.where(stable, phase, 0.0),
+        phase_frequency,
+        np.where(stable, more, 0.0),
+        more_frequency,
+    )
+
+
+def _gain_margin(loop: DelayedLoop) -> tuple[float, float]:
+    """The least factor above 1 that puts a single L on -1 and its frequency, inf for the tail."""
+    slow, fast = break_frequencies(loop)
+    # Past the last pole |L| falls, and with a delay its phase passes -pi within one turn of that.
+    delay = float(loop.delay)
+    turn = 2 * np.pi / (delay if delay > 1e-9 / fast else 1e-3 / fast)
+    omega = frequency_grid(loop, slow, 3 * fast + 2 * turn)
+    angle = angle_of(-loop(1j * omega))
+    crossed = ((angle[1:] < 0) != (angle[:-1] < 0)) & (np.abs(np.diff(angle)) < np.pi)
+    low, high, below = omega[:-1][crossed], omega[1:][crossed], angle[:-1][crossed] < 0
+    for _ in range(52):
+        middle = (low + high) / 2
+        same = (angle_of(-loop(1j * middle)) < 0) == below
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    size = np.abs(loop(1j * high))
+    found = list(zip(1 / size[size > 0], high[size > 0], strict=True))
+
+    N, D = loop.numerator, loop.denominator
+    if N[-1] * D[-1] < 0:
+        found.append((-D[-1] / N[-1], 0.0))
+    if loop.high_frequency_gain > 0 and (loop.delay > 0 or N[0] * D[0] < 0):
+        found.append((1 / loop.high_frequency_gain, np.inf))
+    return min((limit for limit in found if limit[0] > 1), default=(np.inf, np.nan))
+
+
+def _zero_between(value: Array) -> Array:
+    """Fraction of each step (n - 1, ...) at which the value passes zero, NaN where it does not."""
+    before, after = value[:-1], value[1:]
+    step = np.where(before == after, 1.0, before - after)
+    return np.where((before < 0) != (after < 0), before / step, np.nan)
+
+
+def _between(value: Array, fraction: Array) -> Array:
+    return value[:-1] + fraction * (value[1:] - value[:-1])

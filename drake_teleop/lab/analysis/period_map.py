@@ -1,0 +1,280 @@
+"""The station's one axis over the period of all its rates: sampled, held, delayed by samples.
+
+The station's timing is kept event by event. All updates at one instant read what stood before it:
+
+* The device goes on by one hand period with the hand's pull and the felt force of its beginning
+  held; its own damping acts all the time. In between, the others read where it will be.
+* The servo takes the command that stands there and the slave as it is; its pull is held.
+* The sensor sees the acceleration and the environment's force just before the servo's update.
+  What reads it at the same instant gets the sample before. Its low-pass, if any, is digital.
+* A channel with a delay of d whole hand periods hands on what was there d periods ago. Without
+  delay there is none: d = 0.
+* The slave moves continuously, against the environment's spring and damper.
+
+Between two events everything is linear with constant inputs, so the map over the period that all
+rates have in common is exact (matrix exponentials), whatever the rates.
+
+Fields of `OneAxis` and `Sampling` may be arrays that broadcast; results have their shape in front.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.station.sensor.sensor_chain import butterworth_sections
+
+Array = NDArray[np.float64]
+X_M, V_M, SERVO, X_S, V_S, SAMPLE, FILTER = range(7)
+# Behind the states: the inputs, held, and the force that is felt where the loop is cut.
+_HAND, _ENVIRONMENT, RECEIVED = -3, -2, -1
+_MOST_EVENTS = 1000
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """The rates of the station; the defaults are its own, with the ideal sensor.
+
+    Args:
+        hand_hz: of haptic device and channel [Hz].
+        joint_control_hz, sensor_hz: [Hz].
+        low_pass_hz: of the sensor's 4th-order Butterworth low-pass [Hz]; None: ideal sensor.
+    """
+
+    hand_hz: float = 2000.0
+    joint_control_hz: float = 2000.0
+    sensor_hz: float = 8000.0
+    low_pass_hz: float | None = None
+
+
+def delay_steps(axis: OneAxis, sampling: Sampling) -> int:
+    """Hand periods that a packet travels: rounded, at least one if there is any delay at all."""
+    steps = math.floor(axis.delay * sampling.hand_hz + 0.5)
+    return max(steps, 1) if axis.delay > 0 else 0
+
+
+def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
+    """(..., n + 3, n + 3) over the hand's period, without delay."""
+    M, periods = period_map(axis, sampling, 0, cut=True)
+    if periods != 1:
+        raise DrakeTeleopError(
+            "the hand's period is not the period of all rates",
+            where="sampling",
+            remedy="let servo and sensor run a whole number of times faster, or use `sampled_loop`",
+        )
+    return M
+
+
+def period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> tuple[Array, int]:
+    """The map of [states; held inputs; force received] over the common period, and its length.
+
+    Returns:
+        (..., n + 3, n + 3), in hand periods.
+    """
+    if axis.ideal_servo:
+        raise DrakeTeleopError(
+            "an ideal servo has no sampled form",
+            where="axis.ideal_servo",
+            remedy="give it high gains, or use the continuous model",
+        )
+    periods, events = _events(sampling)
+    hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
+    sections = _sections(sampling)
+    first_line = FILTER + 2 * sections.shape[-2]
+    n = first_line + 2 * steps
+    rows = _Rows(axis, n + 3)
+    command = first_line + steps - 1 if steps else X_M
+    received = RECEIVED if cut else (n - 1 if steps else SAMPLE)
+    hand, servo, sensor = (
+        rows.hand(hand_period, received),
+        rows.servo(command),
+        rows.sensor(sections),
+    )
+    gaps = {gap for gap, *_ in events}
+    flows = {gap: rows.slave(float(gap) * hand_period) for gap in gaps}
+    shape = np.broadcast_shapes(
+        *(part.shape[:-2] for part in (hand, servo, sensor, *flows.values()))
+    )
+    M = np.broadcast_to(np.eye(n + 3), (*shape, n + 3, n + 3)).copy()
+    for gap, at_hand, at_servo, at_sensor in events:
+        new = M.copy()
+        if at_hand:
+            new[..., [X_M, V_M], :] = hand @ M
+            for line, source in ((first_line, X_M), (first_line + steps, SAMPLE)):
+                if steps:
+                    new[..., line, :] = M[..., source, :]
+                    new[..., line + 1 : line + steps, :] = M[..., line : line + steps - 1, :]
+        if at_servo:
+            new[..., [SERVO], :] = servo @ M
+        if at_sensor:
+            new[..., SAMPLE:first_line, :] = sensor @ M
+        M = new
+        M[..., [X_S, V_S], :] = flows[gap] @ M
+    return M, periods
+
+
+def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
+    """Hand periods in the common period; each event's time to the next, and who updates at it."""
+    hand = np.asarray(sampling.hand_hz, dtype=float)
+    ratios = []
+    for name in ("joint_control_hz", "sensor_hz"):
+        ratio = np.unique(np.asarray(getattr(sampling, name) / hand, dtype=float))
+        exact = Fraction(float(ratio[0])).limit_denominator(100)
+        if exact <= 0 or np.ptp(ratio) > 1e-9 * ratio[0] or abs(exact - ratio[0]) > 1e-9 * ratio[0]:
+            raise DrakeTeleopError(
+                f"{name} is not in a simple ratio to hand_hz",
+                where=f"sampling.{name}",
+                remedy="choose rates whose ratios are ratios of small whole numbers",
+            )
+        ratios.append(exact)
+    return _schedule(*ratios)
+
+
+@cache
+def _schedule(
+    servo: Fraction, sensor: Fraction
+) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
+    """`_events` of a servo and a sensor so many times as fast as the hand."""
+    lengths = [Fraction(1), 1 / servo, 1 / sensor]
+    common = Fraction(
+        math.lcm(*(length.numerator for length in lengths)),
+        math.gcd(*(length.denominator for length in lengths)),
+    )
+    times = sorted({i * length for length in lengths for i in range(int(common / length))})
+    if len(times) > _MOST_EVENTS:
+        raise DrakeTeleopError(
+            f"the rates take {float(common):g} hand periods to meet again",
+            where="sampling",
+            remedy="choose rates whose ratios are ratios of small whole numbers",
+        )
+    ends = [*times[1:], common]
+    return int(common), [
+        (end - time, *(time % length == 0 for length in lengths))  # type: ignore[misc]
+        for time, end in zip(times, ends, strict=True)
+    ]
+
+
+def _sections(sampling: Sampling) -> Array:
+    """(..., 2, 5) of the low-pass at the sensor's rate, (0, 5) for the ideal sensor."""
+    if sampling.low_pass_hz is None:
+        return np.zeros((0, 5))
+    cutoffs, rates = np.broadcast_arrays(sampling.low_pass_hz, sampling.sensor_hz)
+    if not (cutoffs < rates / 2).all():
+        raise DrakeTeleopError(
+            "the low-pass lets half the sensor's rate pass",
+            where="sampling.low_pass_hz",
+            remedy="choose less than half of sensor_hz",
+        )
+    pairs = zip(cutoffs.flat, rates.flat, strict=True)
+    sections = np.array([butterworth_sections(cutoff, rate) for cutoff, rate in pairs])
+    return sections.reshape(*rates.shape, 2, 5)
+
+
+class _Rows:
+    """What each event writes, as rows over [states; inputs; force received]."""
+
+    def __init__(self, axis: OneAxis, size: int) -> None:
+        self._axis, self._size = axis, size
+
+    def _row(self, entries: dict[int, Any]) -> Array:
+        """(..., size) from entries that broadcast."""
+        values = np.broadcast_arrays(
+            *(np.asarray(value, dtype=float) for value in entries.values())
+        )
+        row = np.zeros((*values[0].shape, self._size))
+        for index, value in zip(entries, values, strict=True):
+            row[..., index] += value
+        return row
+
+    def _environment(self) -> dict[int, Any]:
+        return {X_S: self._axis.wall_stiffness, V_S: self._axis.wall_damping, _ENVIRONMENT: 1.0}
+
+    def hand(self, period: Array, received: int) -> Array:
+        """x_m and v_m a hand period later, with the force on the device held."""
+        axis = self._axis
+        mass = axis.hand_mass + axis.device_mass
+        x, v, push = _held_response(0.0, axis.device_damping / mass, period)
+        pull = {
+            X_M: -axis.hand_stiffness / mass,
+            V_M: -axis.hand_damping / mass,
+            _HAND: 1 / mass,
+        }
+        force = self._row(pull) + self._row({received: -1 / mass})
+        ahead = [force * push[..., i, None] for i in range(2)]
+        for i in range(2):
+            ahead[i] = ahead[i] + self._row({X_M: x[..., i], V_M: v[..., i]})
+        return np.stack(np.broadcast_arrays(*ahead), axis=-2)
+
+    def servo(self, command: int) -> Array:
+        """The acceleration k_v (k_p (l_p x_command - x_s) - v_s)."""
+        kv, kp = self._axis.velocity_gain, self._axis.position_gain
+        row = self._row({command: kv * kp * self._axis.position_scale})
+        return (row + self._row({X_S: -kv * kp, V_S: -kv}))[..., None, :]
+
+    def sensor(self, sections: Array) -> Array:
+        """The sample, scaled for the hand after the elimination, and the memory of its low-pass."""
+        axis = self._axis
+        felt_mass = axis.felt_tool_mass
+        environment = axis.gamma - felt_mass / axis.slave_mass
+        value = self._row(
+            {
+                index: axis.force_scale * environment * share
+                for index, share in self._environment().items()
+            }
+        ) + self._row({SERVO: axis.force_scale * felt_mass})
+        memory = []
+        for k in range(sections.shape[-2]):
+            b0, b1, b2, a1, a2 = np.moveaxis(sections[..., k, :, None], -2, 0)
+            first, second = FILTER + 2 * k, FILTER + 2 * k + 1
+            filtered = b0 * value + self._row({first: 1.0})
+            memory.append(b1 * value - a1 * filtered + self._row({second: 1.0}))
+            memory.append(b2 * value - a2 * filtered)
+            value = filtered
+        return np.stack(np.broadcast_arrays(value, *memory), axis=-2)
+
+    def slave(self, time: Array) -> Array:
+        """x_s and v_s after `time` [s], with the servo's pull held, in touch with the wall."""
+        axis = self._axis
+        mass = axis.slave_mass
+        x, v, push = _held_response(axis.wall_stiffness / mass, axis.wall_damping / mass, time)
+        rows = []
+        for i in range(2):
+            p = push[..., i]
+            rows.append(
+                self._row({X_S: x[..., i], V_S: v[..., i], SERVO: p, _ENVIRONMENT: -p / mass})
+            )
+        return np.stack(rows, axis=-2)
+
+
+def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
+    """Of x'' = u - damping x' - stiffness x with u held: what (x, v) owe to x, to v and to u.
+
+    Returns:
+        Three arrays (..., 2).
+    """
+    k, b, t = np.broadcast_arrays(stiffness, damping, time)
+    M = np.zeros((*k.shape, 3, 3))
+    M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t
+    E = _exponential(M)
+    return E[..., :2, 0], E[..., :2, 1], E[..., :2, 2]
+
+
+def _exponential(M: Array) -> Array:
+    """e^M of (..., n, n), vectorised: the Taylor series of M / 2^s, squared s times."""
+    largest = float(np.abs(M).sum(axis=-1).max(initial=0.0))
+    halvings = math.ceil(math.log2(largest / 0.25)) if largest > 0.25 else 0
+    term = E = np.broadcast_to(np.eye(M.shape[-1]), M.shape)
+    for i in range(1, 15):  # 0.25^15 / 15! is below rounding
+        term = term @ M / (i * 2.0**halvings)
+        E = E + term
+    for _ in range(halvings):
+        E = E @ E
+    return E

@@ -1,0 +1,325 @@
+"""The report of `drake-teleop analyze`: one page with a verdict, tables and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from drake_teleop.common.html import embedded, render
+from drake_teleop.common.style import (
+    BLACK,
+    COLOURS,
+    GREY,
+    PAGE_DPI,
+    VERMILION,
+    Picture,
+    house_style,
+)
+from drake_teleop.common.writing import write_picture, write_text
+from drake_teleop.lab.analysis import absolute_stability, transparency
+from drake_teleop.lab.analysis.maps import StabilityMap
+from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
+from drake_teleop.lab.analysis.two_port import (
+    power_ratio,
+    power_scaled,
+    reference_impedances,
+    scattering,
+    transmitted_impedance,
+)
+
+_GRIP_COLOURS = {"light": COLOURS[3], "medium": COLOURS[4], "firm": COLOURS[1]}
+#: Parameter of a map -> its name on an axis, and the factor to its unit there.
+_AXES = {
+    "delay": ("round trip [ms]", 2e3),
+    "wall_stiffness": ("stiffness of the wall [kN/m]", 1e-3),
+    "sigma": ("σ", 1.0),
+    "mass_error": ("estimated minus true mass [kg]", 1.0),
+    "rate": ("rate of the hand [kHz]", 1e-3),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """What the pictures show beyond the figures.
+
+    Args:
+        omega: (n,) [rad/s].
+        H: (n, 2, 2) of the Diagram, without the hand's mass; closed_form: likewise.
+        wall: stiffness and damping of the environment [N/m], [N s/m].
+        nyquist: grip -> (n,) loop, which is at its limit where it is -1.
+        maps: title -> grip -> map.
+    """
+
+    axis: OneAxis
+    omega: NDArray[np.float64]
+    H: Complex
+    closed_form: Complex
+    wall: tuple[float, float]
+    nyquist: dict[str, Complex]
+    maps: dict[str, dict[str, StabilityMap]]
+
+
+def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
+    """Writes report.html and its pictures into `out`."""
+    pictures = {
+        "bode": draw_bode(curves, summary["measured"]),
+        "nyquist": draw_nyquist(curves),
+        "passive": draw_passive_loads(curves),
+        "widths": draw_widths(curves, summary["z_width"]),
+        "maps": draw_maps(curves, summary["grip"]),
+    }
+    for name, figure in pictures.items():
+        write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
+    page = render(
+        "drake_teleop.lab.analysis",
+        "report.html.j2",
+        s=summary,
+        wall=curves.wall[0],
+        pictures={name: embedded(out / f"{name}.png") for name in pictures},
+        axis_rows=axis_rows(summary["axis"]),
+        margin_rows=[margin_cells(row, summary["delay_s"]) for row in summary["margins"]],
+    )
+    write_text(out / "report.html", page)
+
+
+def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The one-axis numbers with their units, as printed."""
+    scale = f"1/{1 / axis['force_scale']:.4g}" if axis["force_scale"] > 0 else "0"
+    return [
+        (
+            "Hand",
+            f"{axis['hand_mass']:g} kg, {axis['hand_damping']:g} N s/m, "
+            f"{axis['hand_stiffness']:g} N/m",
+        ),
+        ("Device", f"{axis['device_mass']:.4g} kg, {axis['device_damping']:.3g} N s/m"),
+        ("Slave, with its tool", f"{axis['slave_mass']:.4g} kg at the tip"),
+        (
+            "Servo",
+            f"position loop {axis['position_gain']:.4g} 1/s, "
+            f"velocity loop {axis['velocity_gain']:.4g} 1/s",
+        ),
+        ("Tool beyond the sensor", f"{axis['tool_mass']:g} kg"),
+        ("Scales", f"force {scale}, motion {axis['position_scale']:g}"),
+        ("Elimination", f"σ = {axis['sigma']:g}, γ = {axis['gamma']:g}"),
+    ]
+
+
+def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
+    """A row of the table of margins, as printed."""
+    wall = "free motion" if row["wall_N_per_m"] == 0 else f"{row['wall_N_per_m'] / 1e3:.3g} kN/m"
+    if not row["stable"]:
+        return (row["grip"], wall, "no", "", "", "")
+    return (
+        row["grip"],
+        wall,
+        "yes",
+        "any" if row["gain"] is None else f"{row['gain']:.3g}",
+        "any" if row["phase_deg"] is None else f"{row['phase_deg']:.0f}°",
+        "any" if row["round_trip_s"] is None else f"{1e3 * (row['round_trip_s'] - 2 * delay):.1f}",
+    )
+
+
+def draw_bode(curves: Curves, measured: Mapping[str, Any] | None) -> Figure:
+    """What the hand feels over frequency, in free motion and of the wall."""
+    hertz, s = curves.omega / (2 * np.pi), 1j * curves.omega.astype(complex)
+    stiffness, damping = curves.wall
+    environments = {
+        "free motion": np.zeros_like(s),
+        f"wall of {stiffness / 1e3:.3g} kN/m": damping + stiffness / s,
+    }
+    with house_style():
+        figure = Picture(figsize=(9.0, 5.4))
+        grid = figure.subplots(2, 2, sharex=True, sharey="row")
+        for column, (name, environment) in enumerate(environments.items()):
+            shown = {
+                "ideal": transparency.ideal_impedance(curves.axis, s, environment),
+                "closed form": transmitted_impedance(curves.closed_form, environment),
+                "Diagram, linearised": transmitted_impedance(curves.H, environment),
+            }
+            styles = ((GREY, "--", 1.0), (COLOURS[3], "-", 2.4), (COLOURS[0], "-", 1.1))
+            for (label, felt), (colour, line, width) in zip(shown.items(), styles, strict=True):
+                kind: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}
+                grid[0, column].loglog(hertz, np.abs(felt), label=label, **kind)
+                grid[1, column].semilogx(hertz, _degrees(felt), **kind)
+            grid[0, column].set_title(name)
+            grid[1, column].set_xlabel("frequency [Hz]")
+        if measured is not None:
+            felt = np.array(measured["felt_re"]) + 1j * np.array(measured["felt_im"])
+            dots: dict[str, Any] = {"color": VERMILION, "linestyle": "", "marker": "o", "ms": 3.5}
+            label = "Diagram, simulated"
+            grid[0, 0].loglog(measured["frequency_Hz"], np.abs(felt), label=label, **dots)
+            grid[1, 0].semilogx(measured["frequency_Hz"], _degrees(felt), **dots)
+        grid[0, 0].set_ylabel("|Z| felt [N s/m]")
+        grid[1, 0].set_ylabel("phase [deg]")
+        grid[0, 0].legend()
+    return figure
+
+
+def _degrees(felt: Complex) -> Any:
+    return np.degrees(np.unwrap(np.angle(felt)))
+
+
+def draw_nyquist(curves: Curves) -> Figure:
+    """The loop before the wall, held by each grip; -1 must not be gone around."""
+    with house_style():
+        figure = Picture(figsize=(9.0, 4.2))
+        whole, near = figure.subplots(1, 2)
+        near.set_xlim(-2.0, 1.0)
+        near.set_ylim(-1.3, 1.3)
+        for axes, adjusted in ((whole, "datalim"), (near, "box")):
+            for grip, loop in curves.nyquist.items():
+                axes.plot(loop.real, loop.imag, color=_GRIP_COLOURS[grip], label=grip)
+            axes.plot(-1, 0, color=BLACK, marker="+", ms=11, mew=2)
+            axes.set_xlabel("real part")
+            axes.set_aspect("equal", adjustable=adjusted)
+        whole.set_ylabel("imaginary part")
+        whole.set_title(f"Loop at the felt force, wall of {curves.wall[0] / 1e3:.3g} kN/m")
+        near.set_title("around -1")
+        whole.legend(title="grip")
+    return figure
+
+
+def draw_passive_loads(curves: Curves) -> Figure:
+    """Llewellyn's parameter, the norm of S, and mu: for anything passive, and for real grips."""
+    hertz, axis = curves.omega / (2 * np.pi), curves.axis
+    ratio = power_ratio(axis)
+    scaled = power_scaled(curves.H, ratio) if ratio > 0 else curves.H
+    S = scattering(scaled, reference_impedances(axis))
+    wall = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, curves.wall[0]))
+    hands = absolute_stability.range_of_grips()
+    bounded = absolute_stability.bounded_singular_value(curves.H, curves.omega, hands, wall)
+    with house_style():
+        figure = Picture(figsize=(9.0, 3.6))
+        left, right = figure.subplots(1, 2)
+        left.semilogx(hertz, absolute_stability.llewellyn_parameter(curves.H), color=COLOURS[0])
+        left.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
+        left.set_ylim(-1.2, 5.0)
+        left.set_title("Llewellyn's parameter: absolutely stable from 1 on")
+        right.semilogx(
+            hertz,
+            absolute_stability.scattering_norm(S),
+            color=COLOURS[2],
+            label="passive: norm of S",
+        )
+        right.semilogx(
+            hertz,
+            absolute_stability.structured_singular_value(S),
+            color=COLOURS[0],
+            label="any passive hand and environment: μ",
+        )
+        right.semilogx(
+            hertz,
+            bounded,
+            color=COLOURS[3],
+            label=f"hands from light to firm, walls up to {curves.wall[0] / 1e3:.3g} kN/m: μ",
+        )
+        right.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
+        right.set_ylim(0.0, 3.0)
+        right.set_title("stable for sure below 1")
+        right.legend(fontsize=7.5)
+        for axes in (left, right):
+            axes.set_xlabel("frequency [Hz]")
+    return figure
+
+
+def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
+    """What can be felt between nothing and a rigid wall; virtual walls of the device itself."""
+    hertz, width = curves.omega / (2 * np.pi), transparency.transmitted_width(curves.H)
+    walls = z_width["walls"]
+    damping = [row["wall_damping_Ns_per_m"] for row in walls]
+    with house_style():
+        figure = Picture(figsize=(9.0, 3.6))
+        left, right = figure.subplots(1, 2)
+        left.fill_between(
+            hertz, np.abs(width.free), np.abs(width.rigid), color=COLOURS[5], alpha=0.35
+        )
+        left.loglog(hertz, np.abs(width.rigid), color=COLOURS[0], label="rigid environment")
+        left.loglog(hertz, np.abs(width.free), color=COLOURS[2], label="free motion")
+        left.set_xlabel("frequency [Hz]")
+        left.set_ylabel("|Z| felt [N s/m]")
+        left.set_title("Transmitted through the station")
+        left.legend()
+        shown = {
+            "stable in this hand": ("stable_in_the_hand_N_per_m", COLOURS[0]),
+            "passive with this hand's damping": ("passive_in_the_hand_N_per_m", COLOURS[2]),
+            "passive by the device's damping": ("passive_N_per_m", GREY),
+        }
+        for label, (key, colour) in shown.items():
+            right.plot(damping, [1e-3 * row[key] for row in walls], color=colour, label=label)
+        right.set_xlabel("damping of the virtual wall [N s/m]")
+        right.set_ylabel("stiffness [kN/m]")
+        right.set_title(f"Virtual walls of the device at {z_width['rate_Hz'] / 1e3:g} kHz")
+        right.legend()
+    return figure
+
+
+def draw_maps(curves: Curves, grip: str) -> Figure:
+    """Stability over two parameters: for the scenario's grip as area, for each as boundary."""
+    with house_style():
+        rows = -(-len(curves.maps) // 2)
+        figure = Picture(figsize=(9.0, 3.3 * rows))
+        cells = figure.subplots(rows, 2, squeeze=False).ravel()
+        for axes, (title, shown) in zip(cells, curves.maps.items(), strict=False):
+            mesh = _draw_map(axes, shown, grip)
+            axes.set_title(title)
+        for axes in cells[len(curves.maps) :]:
+            axes.set_axis_off()
+        legend = cells[len(curves.maps)] if len(cells) > len(curves.maps) else cells[0]
+        for name, colour in _GRIP_COLOURS.items():
+            legend.plot([], [], color=colour, label=f"limit of stability, {name} grip")
+        legend.fill_between([], [], color=GREY, alpha=0.25, label=f"unstable with the {grip} grip")
+        legend.legend(loc="upper left", fontsize=9)
+        figure.colorbar(mesh, ax=legend, location="bottom", label="error of the felt force")
+    return figure
+
+
+def _draw_map(axes: Axes, shown: Mapping[str, StabilityMap], grip: str) -> Any:
+    one = shown[grip]
+    (x_label, x_factor), (y_label, y_factor) = _AXES[one.x_name], _AXES[one.y_name]
+    x, y = x_factor * one.x, y_factor * one.y
+    distortion = np.ma.masked_where(~one.stable, np.clip(one.distortion, 0.01, 1.0))
+    axes.set_facecolor("#D5D8DD")
+    mesh = axes.pcolormesh(
+        x, y, distortion, norm=LogNorm(0.01, 1.0), cmap="YlGnBu", shading="nearest", rasterized=True
+    )
+    for name, other in shown.items():
+        edge = other.boundary * (x_factor, y_factor)
+        axes.plot(*edge.T, color=_GRIP_COLOURS[name], linestyle="", marker=".", ms=2.2)
+    for scale, name in ((axes.set_xscale, one.x_name), (axes.set_yscale, one.y_name)):
+        if name in ("wall_stiffness", "rate"):
+            scale("log")
+    axes.set_xlim(x[0], x[-1])
+    axes.set_ylim(y[0], y[-1])
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    axes.grid(False)
+    return mesh
+
+
+def print_tables(summary: Mapping[str, Any], out: Path) -> None:
+    """Margins and verdict on the terminal."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console()
+    table = Table(title="How far from the limit", title_justify="left", box=SIMPLE_HEAD)
+    for heading in ("Grip", "Wall", "Stable"):
+        table.add_column(heading)
+    for heading in ("Gain", "Phase", "More round trip [ms]"):
+        table.add_column(escape(heading), justify="right")  # [ms] is no markup
+    for row in summary["margins"]:
+        table.add_row(*margin_cells(row, summary["delay_s"]))
+    console.print(table)
+    for sentence in summary["verdict"]:
+        console.print(f"- {sentence}", highlight=False, markup=False)
+    console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

@@ -1,0 +1,353 @@
+"""`drake-teleop compare-passivity`: every method that keeps a station passive, over every network.
+
+Three studies, with the same channel:
+
+* The whole 6-DoF station presses on a leaf (`delayed_contact`), for each method, network and leaf.
+* In one degree of freedom the hand lets go while it presses, and taps (`hands`).
+* There too: each method's longest round trip (`one_dof`), for walls of three stiffnesses.
+
+`summary.json` holds
+
+========= ======================================================================================
+decision  list: method, network, verdict (`decision`); felt_N, and pressed_N that should be,
+          before each leaf; leaked_J: all of it null or empty if unstable
+station   list of runs: method, network, leaf, and the figures of `one_dof.Figures`, the energy
+          between hand and actual motion; pressed_force: what should be felt [N]; felt_share of it;
+          left_behind [m]; leaked [J], these three never negative. A run that is not at rest in its
+          hold ends there (left_behind and drift are null); `error` says why one ended earlier (its
+          other figures are then null)
+hands     list: method, network, and the figures of `hands.Hands`
+one_dof   list: method, wall_N_per_m, jitter, loss, longest_s: the longest round trip of the grid up
+          to which every one was stable (0: none was), and grid_s, the round trips tried
+covering  list: sigma, round_trip_s, wall_N_per_m, injected_J: energy that a loop without a method
+          has created in one run; damping_Ns_per_m: what the device needs so that it creates none
+networks, methods, scenario, seed  as asked for
+========= ======================================================================================
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import Diagram
+
+from drake_teleop.common.errors import DrakeTeleopError, meant
+from drake_teleop.common.progress import Stage, show_progress
+from drake_teleop.common.writing import make_folder, output_folder, write_json, write_table
+from drake_teleop.lab.comparison.active_elements import covering_damping
+from drake_teleop.lab.comparison.decision import decide
+from drake_teleop.lab.comparison.delayed_contact import (
+    LEAVES,
+    delayed_contact,
+    station_figures,
+    vertical_traces,
+)
+from drake_teleop.lab.comparison.hands import hands
+from drake_teleop.lab.comparison.one_dof import ACTUAL, Figures, OneDof, Task, figures, run_one_dof
+from drake_teleop.lab.identified_load import identified_load
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import PRESETS, NetworkConfig
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, steps_of
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, Simulation, replace
+from drake_teleop.station.simulation import MakeSimulator, advance, read_log
+from drake_teleop.station.station import MakeTeleopStation
+
+NETWORKS = ("lan", "wan", "internet", "geostationary", "lunar")
+#: Round trips that are tried in one degree of freedom [s].
+ROUND_TRIPS = (
+    *(0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0),
+)
+WALLS = (500.0, 5100.0, 20000.0)  #: N/m
+IMPAIRMENTS = ((0.0, 0.0), (0.5, 0.3))
+"""(jitter, loss) of the networks that are tried in one degree of freedom."""
+SIGMAS = (0.0, 1.0)
+_COVERED = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
+#: Of the station: a quarter of the shipped scenarios' for the sensor, half for the rest.
+_RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
+#: s; events cut it. One of their period would often end a rounding before them: a step of its own.
+_LONGEST_STEP = 2e-3
+#: m/s, at which the leaf's friction is complete: Drake's own, as of all other surroundings. At the
+#: leaf's tenth of it a tip that rests takes 9,000 to 16,000 steps a second instead of 1,500.
+_SLIP = 1e-3
+
+
+def compare_command(
+    out: Path,
+    *,
+    networks: Sequence[str] = NETWORKS,
+    methods: Sequence[str] = METHODS,
+    scenario: str | Path = "contact_transition",
+    seed: int = 0,
+    jobs: int = -1,
+    quiet: bool = False,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Compares the methods; writes summary.json, runs.parquet, report.html and its pictures.
+
+    Args:
+        out: the folder.
+        networks: names of presets.
+        methods: names of methods.
+        scenario: whose station it is, a shipped one or a YAML file: slave, master, sensor, scales,
+            grip; not its rates, its integrator, nor what it touches.
+        seed: of sensor and networks.
+        jobs: processes at once; -1: one for each core.
+        quiet: no progress bars and no tables.
+        progress: False for no progress bars alone.
+
+    Returns:
+        The summary, see the top of this module.
+
+    Raises:
+        DrakeTeleopError: for an unknown method or network.
+    """
+    _check("network", networks, tuple(PRESETS))
+    _check("method", methods, METHODS)
+    make_folder(out)  # before the work: a bad path costs no time
+    with show_progress(progress and not quiet) as stage:
+        limits = _one_dof_study(methods, seed, jobs, stage)
+        let_go = _hands_study(networks, methods, seed, jobs, stage)
+        runs, traces = _station_study(scenario, networks, methods, seed, jobs, stage)
+        covering = _covering_study(stage)
+    summary = {
+        "networks": list(networks),
+        "methods": list(methods),
+        "scenario": str(scenario),
+        "seed": seed,
+        "station": runs,
+        "hands": let_go,
+        "one_dof": limits,
+        "covering": covering,
+    }
+    summary["decision"] = [
+        {
+            "method": method,
+            "network": network,
+            "verdict": cell.verdict,
+            "felt_N": [felt for felt, _ in cell.forces],
+            "pressed_N": [pressed for _, pressed in cell.forces],
+            "leaked_J": cell.leaked,
+        }
+        for (method, network), cell in decide(summary).items()
+    ]
+    import polars as pl
+
+    from drake_teleop.lab.comparison.report import print_tables, write_report
+
+    with output_folder(out):
+        write_table(out / "runs.parquet", pl.DataFrame(runs, infer_schema_length=None))
+        write_report(summary, traces, out)
+        write_json(out / "summary.json", summary)
+    if not quiet:
+        print_tables(summary, out)
+    return summary
+
+
+def longest_round_trip(
+    method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
+) -> float:
+    """The longest of `ROUND_TRIPS` [s] up to which every run is stable; 0 if none is."""
+    longest = 0.0
+    for round_trip in ROUND_TRIPS:
+        network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
+        for seed in seeds if jitter or loss else seeds[:1]:
+            run = run_one_dof(model, PassivityConfig(method=method), network, seed=seed)
+            if not figures(run, model).stable:
+                return longest
+        longest = round_trip
+    return longest
+
+
+def station_base(scenario: str | Path, seed: int) -> Scenario:
+    """The station of a scenario as the comparison has it: with rates and steps of its own, and
+    nothing to touch yet."""
+    return replace(
+        LoadScenario(scenario).without_environment(),
+        simulation=Simulation(seed=seed, max_step=_LONGEST_STEP),
+        rates=_RATES,
+        contact_detection=None,
+    )
+
+
+def station_run(
+    scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
+) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
+    """One run of the whole station: its row of the table, and what a picture shows of it.
+
+    Args:
+        scenario: rates, sensor, scales and grip.
+        method, network, leaf: by name.
+        estimate: (16,) of the load.
+    """
+    row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
+    names = [entry.name for entry in dataclasses.fields(Figures)]
+    names += ["pressed_force", "felt_share", "left_behind", "leaked"]
+    setup, task = delayed_contact(
+        scenario, Channel(network=network), PassivityConfig(method=method), leaf
+    )
+    setup = replace(setup, sheet_spring__slip=_SLIP)
+    try:
+        station = MakeTeleopStation(setup, load_estimate=estimate)
+        result, found = _as_far_as_it_holds(station, setup, task)
+    except DrakeTeleopError as error:
+        return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
+    shown = vertical_traces(result, setup)
+    held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
+    own = {
+        "pressed_force": abs(float(shown["pressed"][held].mean())),
+        "felt_share": max(1 + found.force_error, 0.0),
+        "left_behind": abs(found.drift),
+        "leaked": max(-found.least_energy, 0.0),
+    }
+    return row | _plain(dataclasses.asdict(found) | own) | {"error": None}, shown
+
+
+def _as_far_as_it_holds(
+    station: Diagram, scenario: Scenario, task: Task
+) -> tuple[SimulationResult, Figures]:
+    """The run and its figures; to the end of the hold alone if it is not at rest there."""
+    settle = scenario.simulation.settle
+    simulator = MakeSimulator(station, scenario.simulation)
+    simulator.Initialize()
+    hold = dataclasses.replace(task, end=task.release)
+    for part in (hold, task):
+        advance(simulator, 1e-3 * round(1e3 * (settle + part.end)))  # to the event's own instant
+        result = read_log(simulator, settle)
+        found = station_figures(result, scenario, part)
+        if not found.stable:
+            break
+    # After a hold that is not at rest nobody looks what is left behind.
+    return result, found if part is task else dataclasses.replace(found, drift=float("nan"))
+
+
+def _one_dof_study(
+    methods: Sequence[str], seed: int, jobs: int, stage: Stage
+) -> list[dict[str, Any]]:
+    cases = list(itertools.product(methods, WALLS, IMPAIRMENTS))
+    # What is compiled here, processes side by side need not compile each for itself.
+    longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
+    for method in methods:
+        steps_of(method)
+    seeds = range(seed, seed + 2)
+    found = _each(
+        longest_round_trip,
+        [(m, OneDof(wall_stiffness=wall), *how, seeds) for m, wall, how in cases],
+        jobs,
+        stage("One degree of freedom"),
+    )
+    return [
+        {
+            "method": method,
+            "wall_N_per_m": wall,
+            "jitter": jitter,
+            "loss": loss,
+            "longest_s": longest,
+            "grid_s": list(ROUND_TRIPS),
+        }
+        for (method, wall, (jitter, loss)), longest in zip(cases, found, strict=True)
+    ]
+
+
+def _hands_study(
+    networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: Stage
+) -> list[dict[str, Any]]:
+    cases = list(itertools.product(networks, methods))
+    found = _each(
+        hands,
+        [(method, network, seed) for network, method in cases],
+        jobs,
+        stage("Let go, and taps"),
+    )
+    return [
+        {"method": method, "network": network}
+        | dataclasses.asdict(one)
+        | {"tap_shares": list(one.tap_shares)}
+        for (network, method), one in zip(cases, found, strict=True)
+    ]
+
+
+def _station_study(
+    scenario: str | Path,
+    networks: Sequence[str],
+    methods: Sequence[str],
+    seed: int,
+    jobs: int,
+    stage: Stage,
+) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, NDArray[np.float64]]]]:
+    base = station_base(scenario, seed)
+    estimate = identified_load(base, stage).estimate
+    # The longest runs first, so that no process is left with one at the end.
+    slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
+    cases = list(itertools.product(slowest, LEAVES, methods))
+    results = _each(
+        station_run,
+        [(base, method, network, leaf, estimate) for network, leaf, method in cases],
+        jobs,
+        stage("The whole station"),
+    )
+    order = {name: list(names).index for name, names in (("network", networks), ("leaf", LEAVES))}
+    rows = sorted(
+        (row for row, _ in results),
+        key=lambda row: (order["network"](row["network"]), order["leaf"](row["leaf"])),
+    )
+    first = next(iter(LEAVES))
+    traces = {
+        (row["network"], row["method"]): shown
+        for row, shown in results
+        if row["leaf"] == first and shown
+    }
+    return rows, traces
+
+
+def _covering_study(stage: Stage) -> list[dict[str, Any]]:
+    progress, rows = stage("What the elimination puts in"), []
+    for done, (sigma, round_trip, wall) in enumerate(_COVERED):
+        model = OneDof(sigma=sigma, wall_stiffness=wall)
+        run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
+        rows.append(
+            {
+                "sigma": sigma,
+                "round_trip_s": round_trip,
+                "wall_N_per_m": wall,
+                "injected_J": max(0.0, -run.least(ACTUAL)),
+                "damping_Ns_per_m": covering_damping(model, round_trip),
+            }
+        )
+        progress((done + 1) / len(_COVERED))
+    return rows
+
+
+def _each(function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any) -> list[Any]:
+    """The function's result for each case, in order, in several processes."""
+    from joblib import Parallel, delayed
+
+    results = []
+    parallel = Parallel(n_jobs=min(jobs, len(cases)) if jobs > 0 else jobs, return_as="generator")
+    for result in parallel(delayed(function)(*case) for case in cases):
+        results.append(result)
+        progress(len(results) / len(cases))
+    return results
+
+
+def _check(what: str, wanted: Sequence[str], known: Sequence[str]) -> None:
+    for name in wanted:
+        if name not in known:
+            raise DrakeTeleopError(
+                f"there is no {what} '{name}'",
+                where=f"{what}s",
+                remedy=meant(name, known, f"choose among {', '.join(known)}"),
+            )
+
+
+def _plain(figures: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: None if isinstance(value, float) and not np.isfinite(value) else value
+        for name, value in figures.items()
+    }

@@ -1,0 +1,116 @@
+"""What a press does not show of a method: a hand that lets go while it presses, and one that taps.
+
+In one degree of freedom (`one_dof`), with the station's medium grip and servo, before a wall of 5.1
+kN/m, over the network as it is.
+
+* Let go: the hand presses for some round trips and is gone. What is left of the device, 0.15 kg on
+  its own, shows the force that nobody holds against any more.
+* Taps: eight of 30 mm in a row, at each of `RATES`. What is felt of them comes late, or comes from
+  what the method remembers of the wall.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.lab.comparison.one_dof import (
+    ACTUAL,
+    PERIOD,
+    OneDof,
+    OneDofRun,
+    Task,
+    operators_intent,
+    run_one_dof,
+)
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import PRESETS
+from drake_teleop.station.passivity.methods import PassivityConfig
+
+RATES = (1.0, 1.5)  #: of the taps [Hz]
+_TAPS, _DEEP = 8, 0.03  # how many; m, how far to either side of the wall's surface
+_WATCHED = 2.0  # s, for how long one looks at a device that was let go
+
+
+@dataclass(frozen=True)
+class Hands:
+    """One method over one network; nothing here can be negative.
+
+    Args:
+        release_force: felt on average in the last 0.1 s before the hand lets go [N].
+        release_speed: the largest of the device in 2 s after that [m/s].
+        release_way: how far it goes in them [m].
+        tap_shares: impulse felt over the wall's, from the second contact on, at each of `RATES`
+            [1]; 0 where what is felt pulls into the wall.
+        leaked: the most that came out between hand and actual motion beyond what the stores held at
+            the start, in any of these runs [J].
+    """
+
+    release_force: float
+    release_speed: float
+    release_way: float
+    tap_shares: tuple[float, ...]
+    leaked: float
+
+
+def hands(method: str, network: str, seed: int = 0) -> Hands:
+    """Lets go and taps with a method over a preset."""
+    round_trip, model = 2 * PRESETS[network].delay, OneDof()
+
+    def run(intent: NDArray[np.float64], grip: NDArray[np.float64] | None = None) -> OneDofRun:
+        return run_one_dof(
+            model,
+            PassivityConfig(method=method),
+            PRESETS[network],
+            seed=seed,
+            timeout=Channel(network=network).silent_after(PERIOD),
+            intent=intent,
+            grip=grip,
+        )
+
+    gone = 3.0 + 3 * round_trip
+    task = Task(0.1, 0.6, 0.7, 1.5, gone + 10.0, gone + 11.0, gone + _WATCHED, 0.1)
+    pressing = operators_intent(task)
+    last = round(gone / PERIOD)
+    grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(pressing), 1))
+    grip[last:] = 0.0
+    let_go = run(pressing, grip)
+    after = let_go.master[last:]
+    tapping = [run(_taps(rate, round_trip)) for rate in RATES]
+    scale = model.force_scale * model.gamma
+    return Hands(
+        release_force=float(np.abs(let_go.felt[last - 100 : last]).mean()),
+        release_speed=float(np.abs(np.diff(after)).max() / PERIOD),
+        release_way=float(np.abs(after - after[0]).max()),
+        tap_shares=tuple(
+            _share(found, scale, rate, 0.5 * round_trip)
+            for found, rate in zip(tapping, RATES, strict=True)
+        ),
+        leaked=max(max(0.0, -found.least(ACTUAL)) for found in (let_go, *tapping)),
+    )
+
+
+def _taps(rate: float, round_trip: float) -> NDArray[np.float64]:
+    """(N, 2) position and velocity; at rest on the wall's surface before and after."""
+    t = np.arange(round((1.0 + _TAPS / rate + round_trip + 1.0) / PERIOD)) * PERIOD - 0.5
+    moving = (t > 0.0) & (t < _TAPS / rate)
+    x = np.where(moving, -_DEEP * np.sin(2 * np.pi * rate * t), 0.0)
+    return np.stack([x, np.gradient(x, PERIOD)], axis=1)
+
+
+def _share(run: OneDofRun, scale: float, rate: float, way: float) -> float:
+    """Of the wall's impulse, without that of the first contact, which nobody can know of before.
+
+    Args:
+        run: of taps.
+        scale: of the wall's force to the hand.
+        rate: of the taps [Hz].
+        way: how long a packet travels [s].
+    """
+    first = int(np.argmax(run.wall < 0.0))
+    second = first + round(0.75 / rate / PERIOD)  # half a period before it, and as long after
+    pressed = scale * run.wall[second:].sum()
+    felt = run.felt[second + round(way / PERIOD) :].sum()
+    return float(max(felt / pressed, 0.0)) if pressed < 0.0 else 0.0

@@ -1,0 +1,235 @@
+"""The report of `drake-teleop compare-passivity`: one page with tables and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+from drake_teleop.common.html import embedded, render
+from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, house_style
+from drake_teleop.common.writing import write_picture, write_text
+from drake_teleop.lab.comparison.decision import BEHIND, HOLDS, LEAKS, UNSTABLE, decide
+from drake_teleop.lab.comparison.hands import RATES
+from drake_teleop.station.channel.network import PRESETS
+
+#: Columns of the station's table: key of the row, heading, factor, decimals.
+COLUMNS = (
+    ("hunting", "Hunting [mm]", 1e3, 2),
+    ("turning", "Turning [deg]", 180 / np.pi, 2),
+    ("felt_force", "Felt [N]", 1.0, 2),
+    ("felt_share", "Felt share [%]", 1e2, 1),
+    ("chatter", "Chatter [N]", 1.0, 2),
+    ("left_behind", "Left behind [mm]", 1e3, 2),
+    ("free_force", "Free force [N]", 1.0, 2),
+    ("rise_delay", "Rise delay [ms]", 1e3, 0),
+    ("leaked", "Leaked [mJ]", 1e3, 1),
+)
+
+#: Of the verdicts: mark, colour of the cell, colour of what stands in it. They differ in lightness
+#: too, and the words say the same.
+VERDICTS = {
+    HOLDS: ("✓", "#CBE4F4", BLACK),
+    LEAKS: ("⚠", "#FBEBB8", BLACK),
+    BEHIND: ("↷", "#F0B878", BLACK),
+    UNSTABLE: ("✗", "#565C66", "white"),
+}
+_MARKERS = "os^Dv"  # of the networks
+_MIDDLE: dict[str, Any] = {"ha": "center", "va": "center"}
+
+Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
+
+
+def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
+    """Writes report.html and decision, hands, runs, energy and limits as PNG into `out`."""
+    pictures = {
+        "decision": draw_decision(summary),
+        "hands": draw_hands(summary),
+        "runs": draw_runs(summary, traces),
+        "energy": draw_energy(summary, traces),
+        "limits": draw_limits(summary["one_dof"]),
+    }
+    for name, figure in pictures.items():
+        write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
+    page = render(
+        "drake_teleop.lab.comparison",
+        "report.html.j2",
+        networks=[(name, 2e3 * PRESETS[name].delay) for name in summary["networks"]],
+        columns=[heading for _, heading, _, _ in COLUMNS],
+        station=[(row, cells(row)) for row in summary["station"]],
+        covering=summary["covering"],
+        pictures={name: embedded(out / f"{name}.png") for name in pictures},
+    )
+    write_text(out / "report.html", page)
+
+
+def cells(row: Mapping[str, Any]) -> list[str]:
+    """The figures of one run of the station, as printed; a run that ended early has none."""
+    return [
+        # Adding 0 to what is rounded takes the sign from -0.
+        "–" if row[key] is None else f"{round(factor * row[key], decimals) + 0.0:.{decimals}f}"
+        for key, _, factor, decimals in COLUMNS
+    ]
+
+
+def draw_decision(summary: Mapping[str, Any]) -> Figure:
+    """What becomes of each method (a row) over each network (a column), in words."""
+    methods, networks, table = summary["methods"], summary["networks"], decide(summary)
+    with house_style():
+        figure = Picture(figsize=(1.75 * len(networks) + 1.5, 0.72 * len(methods) + 1.1))
+        axes = figure.subplots()
+        for (method, network), cell in table.items():
+            x, y = networks.index(network), methods.index(method)
+            mark, colour, ink = VERDICTS[cell.verdict]
+            axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
+            lines = [f"feels {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.forces]
+            lines += cell.unrest
+            up = 0.12 * len(lines)
+            axes.text(
+                x, y - up, f"{mark} {cell.words}", color=ink, size=9.5, weight="bold", **_MIDDLE
+            )
+            for place, line in enumerate(lines):
+                down = y - up + 0.27 * (place + 1)
+                axes.text(x, down, line, color=ink, size=8.5, **_MIDDLE)
+        axes.set_xlim(-0.5, len(networks) - 0.5)
+        axes.set_ylim(len(methods) - 0.5, -0.5)
+        names = [f"{name}\n{2e3 * PRESETS[name].delay:g} ms" for name in networks]
+        axes.set_xticks(range(len(networks)), names)
+        axes.set_yticks(range(len(methods)), methods)
+        axes.xaxis.tick_top()
+        axes.tick_params(length=0)
+        axes.grid(False)
+        for side in axes.spines.values():
+            side.set_visible(False)
+        figure.suptitle("What becomes of each method over each network", x=0.01, ha="left")
+    return figure
+
+
+def draw_hands(summary: Mapping[str, Any]) -> Figure:
+    """A hand that lets go and one that taps: a row for each method, a mark for each network."""
+    methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
+    panels = (
+        ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
+        (f"felt of taps at {RATES[0]:g} Hz [%]", "linear", lambda row: 100 * row["tap_shares"][0]),
+        (f"felt of taps at {RATES[1]:g} Hz [%]", "linear", lambda row: 100 * row["tap_shares"][1]),
+    )
+    with house_style():
+        figure = Picture(figsize=(10.0, 0.36 * len(methods) + 1.5))
+        columns = figure.subplots(1, len(panels), sharey=True)
+        for axes, (title, scale, value) in zip(columns, panels, strict=True):
+            for place, network in enumerate(networks):
+                shown = [row for row in rows if row["network"] == network]
+                # Side by side, so that none hides another.
+                y = [methods.index(row["method"]) + 0.12 * (place - 2) for row in shown]
+                marker, colour = _MARKERS[place % 5], COLOURS[place % len(COLOURS)]
+                x = [max(value(row), 0.0) for row in shown]
+                axes.plot(x, y, marker, markersize=5, color=colour, label=network)
+            axes.set_xscale(scale)
+            if scale == "log":
+                axes.xaxis.set_major_formatter("{x:g}")
+            else:
+                axes.set_xlim(left=0.0)
+            axes.set_yticks(range(len(methods)), methods)
+            axes.set_ylim(len(methods) - 0.5, -0.5)
+            axes.set_xlabel(title)
+        figure.legend(*columns[0].get_legend_handles_labels(), loc="outside upper center", ncols=6)
+    return figure
+
+
+def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
+    """What the hand feels over time: a row for each method, a column for each network."""
+
+    def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
+        axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
+        axes.plot(shown["t"], shown["felt"], color=COLOURS[0], linewidth=0.9)
+
+    figure = _grid(summary, traces, draw, "force [N]")
+    figure.suptitle("Felt force (blue) and scaled contact force (grey)", x=0.01, ha="left")
+    return figure
+
+
+def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
+    """What hand and environment have put in, with what was stored at the start, over time."""
+
+    def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
+        axes.axhline(0.0, color=GREY, linewidth=0.6)
+        axes.plot(shown["t"], shown["energy"], color=COLOURS[2], linewidth=1.0)
+
+    figure = _grid(summary, traces, draw, "energy [J]")
+    figure.suptitle(
+        "Energy between hand and actual motion:\nbelow 0 more came out than went in or was stored",
+        x=0.01,
+        ha="left",
+    )
+    return figure
+
+
+def _grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> Figure:
+    methods, networks = summary["methods"], summary["networks"]
+    with house_style():
+        figure = Picture(figsize=(max(3.0 * len(networks), 7.5), 1.5 * len(methods) + 0.8))
+        grid = figure.subplots(len(methods), len(networks), squeeze=False, sharex="col")
+        for i, method in enumerate(methods):
+            for j, network in enumerate(networks):
+                axes, shown = grid[i, j], traces.get((network, method))
+                if i == 0:
+                    axes.set_title(f"{network}, RTT {2e3 * PRESETS[network].delay:g} ms")
+                if j == 0:
+                    axes.set_ylabel(f"{method}\n{unit}", fontsize=8)
+                if shown is None:
+                    axes.text(0.5, 0.5, "ended early", transform=axes.transAxes, ha="center")
+                else:
+                    draw(axes, shown)
+        for axes in grid[-1]:
+            axes.set_xlabel("time [s]")
+    return figure
+
+
+def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """The longest stable round trip of each method: a panel for each wall."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    walls = sorted({row["wall_N_per_m"] for row in rows})
+    with house_style():
+        figure = Picture(figsize=(3.6 * len(walls), 0.36 * len(methods) + 1.3))
+        for axes, wall in zip(
+            figure.subplots(1, len(walls), squeeze=False, sharey=True)[0], walls, strict=True
+        ):
+            for place, method in enumerate(methods):
+                found = [
+                    1e3 * row["longest_s"]
+                    for row in rows
+                    if row["method"] == method and row["wall_N_per_m"] == wall
+                ]
+                shortest, longest = max(min(found), 1.0), max(max(found), 1.0)
+                axes.plot([1.0, shortest], [place, place], color=COLOURS[0], linewidth=5)
+                axes.plot([shortest, longest], [place, place], color=COLOURS[5], linewidth=2)
+            axes.set_xscale("log")
+            axes.set_xlim(1.0, 1e3 * max(rows[0]["grid_s"]))
+            axes.set_yticks(range(len(methods)), methods)
+            axes.invert_yaxis()
+            axes.set_title(f"wall of {wall / 1e3:g} kN/m")
+            axes.set_xlabel("longest stable round trip [ms]")
+    return figure
+
+
+def print_tables(summary: Mapping[str, Any], out: Path) -> None:
+    """The decision table on the terminal."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    console, table = Console(), decide(summary)
+    grid = Table(title="Felt share of the contact's force", title_justify="left", box=SIMPLE_HEAD)
+    grid.add_column("Method", no_wrap=True)
+    for network in summary["networks"]:
+        grid.add_column(f"{network}\n{2e3 * PRESETS[network].delay:g} ms", overflow="fold")
+    for method in summary["methods"]:
+        cells = [table[method, network] for network in summary["networks"]]
+        grid.add_row(method, *(f"{cell.words} {cell.share}".strip() for cell in cells))
+    console.print(grid)
+    console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

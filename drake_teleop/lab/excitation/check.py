@@ -1,0 +1,196 @@
+"""The verdict on a trajectory: every limit again at 1 kHz, by Drake's rigid bodies and shapes.
+
+Nothing is shared with the optimiser but the trajectory's positions and the limits: speeds and
+accelerations are differences of positions, torques and accelerations of bodies are the plant's,
+distances are those of the shapes themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import QueryObject
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, Frame, MultibodyForces, SpatialInertia
+
+from drake_teleop.lab.excitation.limits import LIMITS
+from drake_teleop.lab.excitation.robot import Robot
+from drake_teleop.load.trajectory import FourierTrajectory
+
+Array = NDArray[np.float64]
+
+#: Samples a second.
+RATE = 1000.0
+# Of the differences [s]: errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
+_STEP = 1e-4
+# Distances are looked up this far beyond the clearance [m].
+_NEAR = 0.01
+
+
+@dataclass(frozen=True)
+class Use:
+    """How much of a limit a trajectory uses.
+
+    Attributes:
+        limit: its name.
+        share: largest |value| over the limit; above 1 violates it.
+        time: when [s].
+        what: which joint, axis or pair of shapes.
+    """
+
+    limit: str
+    share: float
+    time: float
+    what: str
+
+    def __str__(self) -> str:
+        share = f"{self.share:.1%}" if np.isfinite(self.share) else "more than all"
+        return f"{share} of its {self.limit} ({self.what}, at {self.time:.3f} s)"
+
+
+def check(
+    robot: Robot,
+    trajectory: FourierTrajectory,
+    progress: Callable[[float], None] = lambda done: None,
+) -> list[Use]:
+    """Use of every limit, the largest first.
+
+    Args:
+        robot: the arm in its surroundings.
+        trajectory: one period of it is looked at, both ends included.
+        progress: called with the share done.
+    """
+    t = np.linspace(0, trajectory.period, round(trajectory.period * RATE) + 1)
+    before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP, 0.0, _STEP))
+    qd, qdd = (after - before) / (2 * _STEP), (after - 2 * q + before) / _STEP**2
+    return check_motion(robot, t, q, qd, qdd, progress)
+
+
+def check_motion(
+    robot: Robot,
+    t: Array,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+    progress: Callable[[float], None] = lambda done: None,
+) -> list[Use]:
+    """Use of every limit by a motion that was sampled, or executed, the largest first.
+
+    Args:
+        robot: the arm in its surroundings.
+        t: (T,) [s].
+        q, qd, qdd: (T, n) [rad, s].
+        progress: called with the share done.
+    """
+    names, limits = robot.arm.joint_names, robot.limits
+    motion = _bodies(robot, q, qd, qdd, progress)
+    uses = [
+        _use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
+        _use("velocity", np.abs(qd) / limits.velocity, t, names),
+        _use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
+        _use("torque", np.abs(motion.torque) / limits.effort, t, names),
+        _use("sensor", motion.sensor / limits.sensor, t, _SENSOR),
+        _use("workspace", motion.workspace, t, ("x", "y", "z") * len(limits.points_S)),
+        _use("clearance", motion.clearance[:, np.newaxis], t, ("",)),
+    ]
+    nearest = motion.nearest[int(np.argmax(motion.clearance))]
+    uses[-1] = Use("clearance", uses[-1].share, uses[-1].time, nearest)
+    if np.isinf(limits.box_half).all():
+        del uses[LIMITS.index("workspace")]
+    return sorted(uses, key=lambda use: -use.share)
+
+
+_SENSOR = ("force", "torque", "specific force", "angular acceleration")
+
+
+def _use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> Use:
+    when, which = np.unravel_index(np.argmax(shares), shares.shape)
+    return Use(limit, float(shares[when, which]), float(t[when]), names[which])
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """Of (T,) samples: joint torques (T, n), norms at the sensor (T, 4), use of the box (T, 3 P),
+    clearance over distance (T,), and the shapes that it is between."""
+
+    torque: Array
+    sensor: Array
+    workspace: Array
+    clearance: Array
+    nearest: list[str]
+
+
+def _bodies(
+    robot: Robot, q: Array, qd: Array, qdd: Array, progress: Callable[[float], None]
+) -> _Motion:
+    plant, limits, frame_S, arm = robot.plant, robot.limits, robot.sensor_frame, robot.arm
+    root = robot.diagram.CreateDefaultContext()
+    context = plant.GetMyMutableContextFromRoot(root)
+    of_scene = robot.scene_graph.GetMyContextFromRoot(root)
+    gravity = plant.gravity_field().gravity_vector()
+    position, velocity = plant.GetPositions(context), np.zeros(plant.num_velocities())
+    acceleration = velocity.copy()
+    M_S = plant.CalcSpatialInertia(context, frame_S, _outboard(plant, frame_S))
+    body, X_BS = frame_S.body(), frame_S.GetFixedPoseInBodyFrame()
+    torque, kinematics = np.empty(q.shape), np.empty((len(q), 3, 3))
+    workspace = np.empty((len(q), limits.points_S.size))
+    clearance, nearest = np.empty(len(q)), []
+    for k in range(len(q)):
+        position[arm.position_index] = q[k]
+        velocity[arm.velocity_index], acceleration[arm.velocity_index] = qd[k], qdd[k]
+        plant.SetPositionsAndVelocities(context, np.concatenate([position, velocity]))
+        forces = MultibodyForces(plant)
+        plant.CalcForceElementsContribution(context, forces)
+        tau = plant.CalcInverseDynamics(context, acceleration, forces)
+        torque[k] = tau[arm.velocity_index]
+        A_WB = plant.CalcSpatialAccelerationsFromVdot(context, acceleration)[body.index()]
+        X_WB = plant.EvalBodyPoseInWorld(context, body)
+        X_WS = X_WB @ X_BS
+        w_WS = plant.EvalBodySpatialVelocityInWorld(context, body).rotational()
+        A_WS = A_WB.Shift(X_WB.rotation().multiply(X_BS.translation()), w_WS)
+        kinematics[k] = A_WS.translational() - gravity, w_WS, A_WS.rotational()
+        kinematics[k] = kinematics[k] @ X_WS.rotation().matrix()
+        p = X_WS.multiply(limits.points_S.T).T
+        workspace[k] = (np.abs(p - limits.box_middle) / limits.box_half).ravel()
+        query = robot.scene_graph.get_query_output_port().Eval(of_scene)
+        distance, words = _nearest(robot, query, limits.clearance + _NEAR)
+        clearance[k] = limits.clearance / distance if distance > 0 else np.inf
+        nearest.append(words)
+        if k % 200 == 0:
+            progress(k / len(q))
+    progress(1.0)
+    sensor = _sensor_norms(M_S, *kinematics.swapaxes(0, 1))
+    return _Motion(torque, sensor, workspace, clearance, nearest)
+
+
+def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
+    """(T, 4) norms of force, torque, s and alpha, from (T, 3) in S: Newton and Euler."""
+    mass, com = M_S.get_mass(), M_S.get_com()
+    inertia = M_S.CalcRotationalInertia().CopyToFullMatrix3()
+    force = mass * (s + np.cross(alpha, com) + np.cross(omega, np.cross(omega, com)))
+    torque = alpha @ inertia + np.cross(omega, omega @ inertia) + mass * np.cross(com, s)
+    return np.linalg.norm([force, torque, s, alpha], axis=2).T
+
+
+def _outboard(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
+    """The load: all bodies that hang on the one that carries S."""
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    found = [frame_S.body().index()]
+    for body in found:
+        found += [j.child_body().index() for j in joints if j.parent_body().index() == body]
+    return found[1:]
+
+
+def _nearest(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str]:
+    """Smallest distance [m] up to `reach` of any two shapes, and their bodies' names."""
+    found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
+    if not found:
+        return reach, "all farther"
+    pair = min(found, key=lambda pair: pair.distance)
+    inspector = robot.scene_graph.model_inspector()
+    frames = (inspector.GetFrameId(shape) for shape in (pair.id_A, pair.id_B))
+    names = (robot.plant.GetBodyFromFrameId(frame).name() for frame in frames)
+    return float(pair.distance), " and ".join(names)

@@ -1,0 +1,217 @@
+"""The optimiser of excitation trajectories.
+
+From random candidates, the best first: L-BFGS with the limits as penalties brings each near, then
+SLSQP with one smooth-maximum constraint for each kind of limit; both with the analytic gradients
+of `problem.py`. The best iterates that respect all limits on the optimiser's grid are kept, since
+SLSQP often ends on one that does not. A problem may bound a descent, where SLSQP would go too far
+and not come back; it is repeated from its end then. Nothing here is a verdict: `check.py` is.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.lab.excitation.problem import Evaluation, Problem
+from drake_teleop.load.trajectory import FourierTrajectory
+
+Array = NDArray[np.float64]
+
+#: Held back from each limit; the optimiser's grid misses up to 0.9 % of a fifth harmonic's peak.
+MARGIN = 0.985
+# An iterate on the grid counts as feasible up to here.
+_FEASIBLE = 0.9885
+
+# Candidates drawn at once, and how many of them are followed.
+_CANDIDATES, _FOLLOWED = 128, 8
+# (sharpness of the criterion, of the maxima, weight of the penalty, iterations) of L-BFGS.
+_APPROACH = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
+# (sharpness of the criterion, of the maxima, iterations) of SLSQP.
+_DESCENT = ((12.0, 200.0, 80), (40.0, 400.0, 120))
+_TOLERANCE = 1e-5
+# A start is given up without a feasible iterate after so many evaluations, and after the first
+# stage of SLSQP if it is not within this factor of the best.
+_PATIENCE, _PROMISING = 250, 1.08
+# Where the problem bounds how far a descent goes, it is repeated while it is worth so much.
+_WORTH = 0.995
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """A trajectory that respects all limits on the optimiser's grid, the best of its start so far.
+
+    Attributes:
+        seconds: thread CPU time since the design began, without compilation.
+        evaluations: of the criterion, since the design began.
+        start: the candidate that it came from, counted from 0.
+        value: the criterion on the grid.
+        trajectory: itself.
+    """
+
+    seconds: float
+    evaluations: int
+    start: int
+    value: float
+    trajectory: FourierTrajectory
+
+
+def design(
+    problem: Problem,
+    *,
+    seed: int,
+    starts: int = 4,
+    seconds: float | None = None,
+    progress: Callable[[float, float], None] = lambda done, best: None,
+) -> list[Iterate]:
+    """Minimises the criterion within the limits.
+
+    Args:
+        problem: what to design.
+        seed: of the candidates. With `seconds` left out, the result is a function of the arguments.
+        starts: how many candidates are followed.
+        seconds: thread CPU time; instead of `starts`, as many as fit.
+        progress: called with the share done and the criterion's best value (inf: none yet).
+
+    Returns:
+        The feasible iterates as they were found; none if there were none.
+    """
+    search = _Search(problem, starts, seconds, progress)
+    with one_blas_thread(), suppress(_TimeIsUpError):
+        for candidate in search.candidates(np.random.default_rng(seed)):
+            if seconds is None and search.start == starts:
+                break
+            with suppress(_HopelessError):
+                search.follow(candidate)
+            search.start += 1
+    return search.found
+
+
+class _TimeIsUpError(Exception):
+    """Raised inside the optimisers, to leave them."""
+
+
+class _HopelessError(Exception):
+    """Likewise: this start does not become feasible."""
+
+
+class _Search:
+    """What was found, and when to stop."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        starts: int,
+        seconds: float | None,
+        progress: Callable[[float, float], None],
+    ) -> None:
+        self._problem, self._starts = problem, starts
+        self._seconds, self._progress = seconds, progress
+        self.start = 0
+        self.found: list[Iterate] = []
+        self._best = self._best_of_start = float("inf")
+        self._evaluations = self._of_all_starts = 0
+        self._key = b""
+        from scipy.optimize import minimize
+
+        self._minimize = minimize
+        # Compiles, if that has not been done, before the clock starts.
+        self._last = problem.evaluate(
+            self._problem.candidate(np.random.default_rng(0), near_home=True), 1.0, 1.0
+        )
+        self._began = time.thread_time()
+
+    def candidates(self, rng: np.random.Generator) -> Iterator[Array]:
+        """Random motions without end, the most promising of a batch first."""
+        while True:
+            batch = [self._problem.candidate(rng, near_home=k % 2 == 0) for k in range(_CANDIDATES)]
+            merit = []
+            for x in batch:
+                self._tick()
+                point = self._problem.evaluate(x, *_APPROACH[0][:2])
+                merit.append(point.log_criterion + 10 * max(point.uses.max() - 1, 0))
+            for k in np.argsort(merit)[:_FOLLOWED]:
+                yield batch[k]
+
+    def follow(self, x: Array) -> None:
+        """Descends from x; what is feasible on the way is remembered."""
+        self._evaluations, self._best_of_start = 0, float("inf")
+        for of_criterion, of_maxima, weight, iterations in _APPROACH:
+            options = {"maxiter": iterations}
+            stage = (of_criterion, of_maxima, weight)
+            x = self._minimize(self._penalised, x, stage, "L-BFGS-B", jac=True, options=options).x
+        step_by_step = self._problem.bounds(x) is not None
+        for k, stage_of in enumerate(_DESCENT):
+            hopeless = self._best_of_start > _PROMISING * self._best
+            if k > 0 and hopeless and not step_by_step:
+                return
+            x = self._descended(x, *stage_of)
+        before = float("inf")
+        while step_by_step and self._best_of_start < _WORTH * before:
+            before = self._best_of_start
+            x = self._descended(x, *_DESCENT[-1])
+
+    def _descended(self, x: Array, of_criterion: float, of_maxima: float, iterations: int) -> Array:
+        """Where SLSQP ends."""
+        found: Array = self._minimize(
+            lambda x, *sharpness: self._at(x, *sharpness).log_criterion,
+            x,
+            (of_criterion, of_maxima),
+            "SLSQP",
+            jac=lambda x, *sharpness: self._at(x, *sharpness).gradients[0],
+            bounds=self._problem.bounds(x),
+            constraints={
+                "type": "ineq",
+                "fun": lambda x, *sharpness: MARGIN - self._at(x, *sharpness).uses,
+                "jac": lambda x, *sharpness: -self._at(x, *sharpness).gradients[1:],
+                "args": (of_criterion, of_maxima),
+            },
+            options={"maxiter": iterations, "ftol": _TOLERANCE},
+        ).x
+        return found
+
+    def _penalised(
+        self, x: Array, of_criterion: float, of_maxima: float, weight: float
+    ) -> tuple[float, Array]:
+        point = self._at(x, of_criterion, of_maxima)
+        excess = np.maximum(point.uses - MARGIN, 0)
+        value = point.log_criterion + weight * float(excess @ excess)
+        return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
+
+    def _at(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
+        """SLSQP asks for value, limits and gradients of a point one after the other."""
+        key = np.array([*x, of_criterion, of_maxima]).tobytes()
+        if key != self._key:
+            self._tick()
+            self._last = self._problem.evaluate(x, of_criterion, of_maxima)
+            self._key = key
+            if self._last.largest_use <= _FEASIBLE:
+                self._remember(x)
+            elif self._evaluations > _PATIENCE and self._best_of_start == float("inf"):
+                raise _HopelessError
+        return self._last
+
+    def _remember(self, x: Array) -> None:
+        value = self._problem.value()
+        if value < self._best_of_start:
+            self._best_of_start = value
+            self._best = min(value, self._best)
+            seconds = time.thread_time() - self._began
+            trajectory = self._problem.trajectory(x)
+            self.found.append(Iterate(seconds, self._of_all_starts, self.start, value, trajectory))
+
+    def _tick(self) -> None:
+        self._evaluations += 1
+        self._of_all_starts += 1
+        done = self.start / self._starts
+        if self._seconds is not None:
+            done = (time.thread_time() - self._began) / self._seconds
+            if done >= 1:
+                raise _TimeIsUpError
+        if self._evaluations % 20 == 0:
+            self._progress(done, self._best)

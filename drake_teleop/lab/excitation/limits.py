@@ -1,0 +1,384 @@
+"""The limits of arm, sensor and room, and how much of each a motion uses, with gradients."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.lab.excitation.criteria import regressor_gradient
+from drake_teleop.lab.excitation.recursion import (
+    SEED_SIZE,
+    pull_back,
+    seed_joint_torque,
+    seed_point,
+    seed_vector,
+    seed_wrench,
+    to_link,
+    to_world,
+)
+from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.station.slave.arm import MOTION_SIZE, inverse_dynamics, link_motions
+
+Array = NDArray[np.float64]
+
+LIMITS = ("position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance")
+
+#: The use of the clearance is 1 at the clearance, 0 this much farther away [m].
+CLEARANCE_SCALE = 0.1
+# Of a smooth maximum: what counts less than this in it is left out of its gradient.
+_NEGLIGIBLE = 1e-7
+# Stands for every distance that is larger than the clearance by its scale [m].
+_FAR = 1.0
+
+
+class Limits(NamedTuple):
+    """What an excitation must respect. A use of 1 is all of a limit; more violates it.
+
+    Attributes:
+        q_middle, q_half: (n,) middle and half width of the joints' ranges [rad].
+        velocity, acceleration, effort: (n,) of the joints [rad/s], [rad/s^2], [N m]; may be inf.
+        phi: (10,) the heaviest load to expect, about the origin of S.
+        sensor: (4,) largest norms at S under that load: force [N], torque [N m], specific force
+            [m/s^2], angular acceleration [rad/s^2].
+        points_S: (P, 3) points fixed to S that stay in the box [m].
+        box_middle, box_half: (3,) of the box, in W [m]; half may be inf.
+        capsule_row: (C,) link of each capsule, as a row of `link_motions`; -1 is the world.
+        capsule_ends: (C, 2, 3) ends of its axis in the link's frame [m].
+        capsule_radius: (C,) [m].
+        pairs: (K, 2) capsules that keep a distance from each other.
+        distances: (K,) which [m]; below the clearance, even below zero, where capsules are much
+            larger than their shapes.
+        clearance: of the shapes, for the check [m].
+    """
+
+    q_middle: Array
+    q_half: Array
+    velocity: Array
+    acceleration: Array
+    effort: Array
+    phi: Array
+    sensor: Array
+    points_S: Array
+    box_middle: Array
+    box_half: Array
+    capsule_row: NDArray[np.int64]
+    capsule_ends: Array
+    capsule_radius: Array
+    pairs: NDArray[np.int64]
+    distances: Array
+    clearance: float
+
+
+@njit(cache=True)
+def motions_of(table, q, qd, qdd, motions):
+    """`link_motions` of (T, n) samples into (T, n+1, 21)."""
+    for t in range(len(q)):
+        link_motions(table, q[t], qd[t], qdd[t], motions[t])
+
+
+@njit(cache=True)
+def sensor_vectors(motions, out):
+    """s, omega, alpha of S in S, (3, T, 3), from (T, n+1, 21)."""
+    for t in range(len(motions)):
+        motion = motions[t, -1]
+        for k in range(3):
+            x = to_link(motion, (motion[3 * k], motion[3 * k + 1], motion[3 * k + 2]))
+            out[k, t, 0], out[k, t, 1], out[k, t, 2] = x
+
+
+@njit(cache=True)
+def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
+    """From dJ/dV (T, 6, 10) to dJ/d(q, qd, qdd), (3, T, n), which is added to."""
+    rows = motions.shape[1]
+    seeds = np.zeros((rows, SEED_SIZE))
+    c, virtual = np.zeros(rows - 1), np.zeros((rows, 6))
+    g = np.empty((3, 3))
+    for t in range(len(motions)):
+        motion = motions[t, -1]
+        omega = to_link(motion, (motion[3], motion[4], motion[5]))
+        regressor_gradient(omega, g_V[t], g[0], g[1], g[2])
+        seeds[-1] = 0.0
+        for k in range(3):
+            seed_vector(motion, 3 * k, (g[k, 0], g[k, 1], g[k, 2]), seeds[-1])
+        pull_back(
+            table, motions[t], qd[t], qdd[t], c, virtual, seeds,
+            gradient[0, t], gradient[1, t], gradient[2, t],
+        )  # fmt: skip
+
+
+@njit(cache=True)
+def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient):
+    """Largest use of each of `LIMITS` over all samples: smooth (7,), exact (7,), and gradients.
+
+    The smooth maximum (Kreisselmeier and Steinhauser 1979) is never below the exact one.
+
+    Args:
+        table: `ArmModel.table`, with the heaviest load.
+        q, qd, qdd: (T, n).
+        motions: (T, n+1, 21), `motions_of` them.
+        limits: `Limits`.
+        sharpness: of the smooth maximum.
+        smooth, largest: (7,), filled.
+        gradient: (7, 3, T, n), of the smooth uses with respect to q, qd, qdd; filled.
+    """
+    gradient[:] = 0.0
+    T, n = q.shape
+    use, sign = np.empty((T, n)), np.empty((T, n))
+    for k in range(3):
+        values = (q, qd, qdd)[k]
+        scale = (limits.q_half, limits.velocity, limits.acceleration)[k]
+        for t in range(T):
+            for j in range(n):
+                x = values[t, j] - limits.q_middle[j] if k == 0 else values[t, j]
+                use[t, j], sign[t, j] = abs(x) / scale[j], np.sign(x) / scale[j]
+        largest[k], smooth[k] = _soften(use, sharpness)
+        for t in range(T):
+            for j in range(n):
+                gradient[k, k, t, j] = use[t, j] * sign[t, j]
+    work = np.zeros((n + 1, SEED_SIZE)), np.zeros(n), np.zeros((n + 1, 6))
+    _torque(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[3], work)
+    work[1][:] = 0.0
+    work[2][:] = 0.0
+    _sensor(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[4], work)
+    _workspace(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[5], work)
+    _clearance(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[6], work)
+
+
+@njit(cache=True)
+def _soften(use, sharpness):
+    """The maximum of `use` (T, m) and a smooth one; `use` becomes its gradient."""
+    top = use.max()
+    total = 0.0
+    for t in range(use.shape[0]):
+        for k in range(use.shape[1]):
+            below = sharpness * (use[t, k] - top)
+            use[t, k] = np.exp(below) if below > -40.0 else 0.0
+            total += use[t, k]
+    for t in range(use.shape[0]):
+        for k in range(use.shape[1]):
+            use[t, k] /= total
+    return top, top + np.log(total) / sharpness
+
+
+@njit(cache=True)
+def _torque(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
+    seeds, c, virtual = work
+    T, n = q.shape
+    tau = np.empty((T, n))
+    use = np.empty((T, n))
+    for t in range(T):
+        inverse_dynamics(table, q[t], qd[t], qdd[t], tau[t])
+        for j in range(n):
+            use[t, j] = abs(tau[t, j]) / limits.effort[j]
+    largest[3], smooth[3] = _soften(use, sharpness)
+    for t in range(T):
+        if use[t].max() < _NEGLIGIBLE:
+            continue
+        seeds[:] = 0.0
+        for j in range(n):
+            c[j] = use[t, j] * np.sign(tau[t, j]) / limits.effort[j]
+            # The rotor's inertia and the joint's damping, table columns 22 and 23.
+            gradient[2, t, j] += c[j] * table[j, 22]
+            gradient[1, t, j] += c[j] * table[j, 23]
+        seed_joint_torque(table, motions[t], c, virtual, seeds)
+        _pull(table, motions, qd, qdd, t, gradient, work)
+
+
+@njit(cache=True)
+def _pull(table, motions, qd, qdd, t, gradient, work):
+    seeds, c, virtual = work
+    pull_back(
+        table, motions[t], qd[t], qdd[t], c, virtual, seeds,
+        gradient[0, t], gradient[1, t], gradient[2, t],
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _sensor(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
+    seeds = work[0]
+    T = len(motions)
+    use, size = np.empty((T, 4)), np.empty((T, 4))
+    x = np.empty((T, 12))  # force, torque, s, alpha in S
+    omega = np.empty(3)
+    for t in range(T):
+        motion = motions[t, -1]
+        x[t, 6], x[t, 7], x[t, 8] = to_link(motion, (motion[0], motion[1], motion[2]))
+        x[t, 9], x[t, 10], x[t, 11] = to_link(motion, (motion[6], motion[7], motion[8]))
+        omega[0], omega[1], omega[2] = to_link(motion, (motion[3], motion[4], motion[5]))
+        non_contact_wrench_into(x[t, 6:9], omega, x[t, 9:12], limits.phi, x[t, :6])
+        for k in range(4):
+            a, b, c = x[t, 3 * k], x[t, 3 * k + 1], x[t, 3 * k + 2]
+            size[t, k] = np.sqrt(a * a + b * b + c * c)
+            use[t, k] = size[t, k] / limits.sensor[k]
+    largest[4], smooth[4] = _soften(use, sharpness)
+    g = np.empty((4, 3))
+    for t in range(T):
+        if use[t].max() < _NEGLIGIBLE:
+            continue
+        seeds[:] = 0.0
+        for k in range(4):
+            factor = use[t, k] / (limits.sensor[k] * max(size[t, k], 1e-12))
+            for i in range(3):
+                g[k, i] = factor * x[t, 3 * k + i]
+        motion = motions[t, -1]
+        force, torque = (g[0, 0], g[0, 1], g[0, 2]), (g[1, 0], g[1, 1], g[1, 2])
+        seed_wrench(motion, limits.phi, force, torque, seeds[-1])
+        seed_vector(motion, 0, (g[2, 0], g[2, 1], g[2, 2]), seeds[-1])
+        seed_vector(motion, 6, (g[3, 0], g[3, 1], g[3, 2]), seeds[-1])
+        _pull(table, motions, qd, qdd, t, gradient, work)
+
+
+@njit(cache=True)
+def _workspace(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
+    seeds = work[0]
+    T, P = len(motions), len(limits.points_S)
+    use, sign = np.empty((T, 3 * P)), np.empty((T, 3 * P))
+    for t in range(T):
+        motion = motions[t, -1]
+        for k in range(P):
+            p = to_world(motion, limits.points_S[k])
+            for i in range(3):
+                x = motion[9 + i] + p[i] - limits.box_middle[i]
+                use[t, 3 * k + i] = abs(x) / limits.box_half[i]
+                sign[t, 3 * k + i] = np.sign(x) / limits.box_half[i]
+    largest[5], smooth[5] = _soften(use, sharpness)
+    for t in range(T):
+        if use[t].max() < _NEGLIGIBLE:
+            continue
+        seeds[:] = 0.0
+        for k in range(P):
+            i = 3 * k
+            g = (
+                use[t, i] * sign[t, i],
+                use[t, i + 1] * sign[t, i + 1],
+                use[t, i + 2] * sign[t, i + 2],
+            )
+            seed_point(motions[t, -1], limits.points_S[k], g, seeds[-1])
+        _pull(table, motions, qd, qdd, t, gradient, work)
+
+
+@njit(cache=True)
+def _clearance(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
+    seeds = work[0]
+    T, K = len(motions), len(limits.pairs)
+    if K == 0:
+        largest[6] = smooth[6] = 0.0
+        return
+    use, nearest = np.empty((T, K)), np.empty(5)
+    ends = np.empty((T, *limits.capsule_ends.shape))
+    for t in range(T):
+        _place(motions[t], limits.capsule_row, limits.capsule_ends, ends[t])
+        for k in range(K):
+            a, b = limits.pairs[k]
+            reach = limits.capsule_radius[a] + limits.capsule_radius[b]
+            distance = _FAR
+            if not _is_far(ends[t, a], ends[t, b], reach + CLEARANCE_SCALE):
+                distance = _between(ends[t, a], ends[t, b], nearest) - reach
+            use[t, k] = 1.0 - (distance - limits.distances[k]) / CLEARANCE_SCALE
+    largest[6], smooth[6] = _soften(use, sharpness)
+    for t in range(T):
+        if use[t].max() < _NEGLIGIBLE:
+            continue
+        seeds[:] = 0.0
+        for k in range(K):
+            if use[t, k] < _NEGLIGIBLE:
+                continue
+            a, b = limits.pairs[k]
+            _between(ends[t, a], ends[t, b], nearest)
+            for side in range(2):
+                capsule = limits.pairs[k, side]
+                row = limits.capsule_row[capsule]
+                if row < 0:
+                    continue
+                along, towards = nearest[side], (1.0 if side == 0 else -1.0)
+                factor = -use[t, k] / CLEARANCE_SCALE * towards
+                point = limits.capsule_ends[capsule, 0] + along * (
+                    limits.capsule_ends[capsule, 1] - limits.capsule_ends[capsule, 0]
+                )
+                g = (factor * nearest[2], factor * nearest[3], factor * nearest[4])
+                seed_point(motions[t, row], point, g, seeds[row])
+        _pull(table, motions, qd, qdd, t, gradient, work)
+
+
+@njit(cache=True)
+def capsule_distances(motions, rows, ends, radii, pairs):
+    """(T, K) distances of pairs of capsules [m], see `Limits`; at (T, n+1, 21) motions."""
+    distances = np.empty((len(motions), len(pairs)))
+    placed, nearest = np.empty(ends.shape), np.empty(5)
+    for t in range(len(motions)):
+        _place(motions[t], rows, ends, placed)
+        for k in range(len(pairs)):
+            a, b = pairs[k]
+            distances[t, k] = _between(placed[a], placed[b], nearest) - radii[a] - radii[b]
+    return distances
+
+
+@njit(cache=True)
+def _place(motions, rows, ends, placed):
+    """Ends of all capsules in W."""
+    for k in range(len(rows)):
+        row = rows[k]
+        for e in range(2):
+            if row < 0:
+                placed[k, e] = ends[k, e]
+                continue
+            p = to_world(motions[row], ends[k, e])
+            for i in range(3):
+                placed[k, e, i] = motions[row, 9 + i] + p[i]
+
+
+@njit(cache=True)
+def _is_far(first, second, enough):
+    """Whether two segments (2, 3) are certainly farther apart than `enough` [m]."""
+    between = length_a = length_b = 0.0
+    for i in range(3):
+        d = 0.5 * (first[0, i] + first[1, i] - second[0, i] - second[1, i])
+        a, b = 0.5 * (first[1, i] - first[0, i]), 0.5 * (second[1, i] - second[0, i])
+        between, length_a, length_b = between + d * d, length_a + a * a, length_b + b * b
+    # (a + b + c)^2 <= 3 (a^2 + b^2 + c^2)
+    return between > 3 * (length_a + length_b + enough * enough)
+
+
+@njit(cache=True)
+def _between(first, second, nearest):
+    """Distance of two segments (2, 3) [m].
+
+    `nearest` (5,) is filled: where along each segment, 0 to 1, and the direction from the second
+    to the first. After Ericson, Real-Time Collision Detection, 2005, 5.1.9.
+    """
+    dd = ee = de = dr = er = 0.0
+    for i in range(3):
+        d, e = first[1, i] - first[0, i], second[1, i] - second[0, i]
+        r = first[0, i] - second[0, i]
+        dd, ee, de = dd + d * d, ee + e * e, de + d * e
+        dr, er = dr + d * r, er + e * r
+    tiny = 1e-14
+    denominator = dd * ee - de * de
+    s = t = 0.0
+    if denominator > tiny * max(dd * ee, tiny):
+        s = min(max((de * er - dr * ee) / denominator, 0.0), 1.0)
+    if ee > tiny:
+        t = (de * s + er) / ee
+    if t < 0.0 or t > 1.0 or ee <= tiny:
+        t = min(max(t, 0.0), 1.0)
+        s = min(max((de * t - dr) / dd, 0.0), 1.0) if dd > tiny else 0.0
+    total = 0.0
+    for i in range(3):
+        x = first[0, i] + s * (first[1, i] - first[0, i])
+        x -= second[0, i] + t * (second[1, i] - second[0, i])
+        nearest[2 + i] = x
+        total += x * x
+    distance = np.sqrt(total)
+    nearest[0], nearest[1] = s, t
+    if distance > 0.0:
+        for i in range(3):
+            nearest[2 + i] /= distance
+    return distance
+
+
+def empty_motions(samples: int, joints: int) -> Array:
+    """Room for `motions_of`."""
+    return np.empty((samples, joints + 1, MOTION_SIZE))

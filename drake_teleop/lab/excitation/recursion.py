@@ -1,0 +1,184 @@
+"""Gradients of whatever depends on the motion of a serial arm's links, in one sweep.
+
+It goes from the hand to the base, as the adjoint of the forward recursion of `slave/arm.py`.
+
+A scalar J depends on each link's motion ``[s, omega, alpha, p, R]`` (world coordinates). Its
+derivatives with respect to them are the seeds; the one with respect to R is the vector g of
+``dJ = g . dtheta`` for a rotation dtheta of the link. `pull_back` turns seeds into dJ/dq, dJ/dqd
+and dJ/dqdd.
+
+Joint torques need no second recursion: the weighted sum of torques ``c . tau`` is the power of the
+links' wrenches (f, n) under the joint velocities c (virtual power), so the same sweep carries it,
+with the velocities (v, w) of the links under c as two more variables.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.vectors import (
+    add_into,
+    apply,
+    cross,
+    dot,
+    minus,
+    nine,
+    plus,
+    symmetric,
+    three,
+    times,
+    transposed,
+)
+from drake_teleop.station.slave.arm import MOTION_SIZE, SLIDES
+
+#: Of a link's seeds: s, omega, alpha, p, theta, and v, w of virtual power.
+SEED_SIZE = 21
+_S, _OMEGA, _ALPHA, _P, _THETA, _V, _W = 0, 3, 6, 9, 12, 15, 18
+
+
+@njit(cache=True)
+def to_world(motion, a):
+    """R a, with the R of a link's motion (21,); a and the result are triples."""
+    return apply(nine(motion, 12), a)
+
+
+@njit(cache=True)
+def to_link(motion, a):
+    """R^T a."""
+    return apply(transposed(nine(motion, 12)), a)
+
+
+@njit(cache=True)
+def seed_vector(motion, place, gradient, seed):
+    """J depends on s, omega or alpha (`place` 0, 3, 6) as expressed in the link's own frame."""
+    g = to_world(motion, gradient)
+    add_into(seed, place, g)
+    add_into(seed, _THETA, cross(g, three(motion, place)))
+
+
+@njit(cache=True)
+def seed_point(motion, point, gradient, seed):
+    """J depends on the position in W of a point (3,) fixed to the link; `gradient` is in W."""
+    add_into(seed, _P, gradient)
+    add_into(seed, _THETA, cross(to_world(motion, point), gradient))
+
+
+@njit(cache=True)
+def seed_wrench(motion, phi, g_force, g_torque, seed):
+    """J depends on the wrench, Eqs. (1)-(2), that moves phi about the link's origin, in the link.
+
+    Args:
+        motion: (21,) of the link.
+        phi: (10,) of the body.
+        g_force, g_torque: dJ/df and dJ/dtau, triples in the link's frame.
+        seed: (21,), added to.
+    """
+    s = to_link(motion, three(motion, _S))
+    w = to_link(motion, three(motion, _OMEGA))
+    h, inertia = three(phi, 1), symmetric(phi, 4)
+    lever = cross(g_torque, h)
+    gs = plus(times(phi[0], g_force), lever)
+    ga = plus(cross(h, g_force), apply(inertia, g_torque))
+    # f holds w x (w x h), tau holds w x (I w).
+    gw = plus(cross(cross(w, h), g_force), cross(h, cross(g_force, w)))
+    gw = plus(gw, cross(apply(inertia, w), g_torque))
+    gw = plus(gw, apply(inertia, cross(g_torque, w)))
+    seed_vector(motion, _S, gs, seed)
+    seed_vector(motion, _OMEGA, gw, seed)
+    seed_vector(motion, _ALPHA, ga, seed)
+    return s, w
+
+
+@njit(cache=True)
+def seed_joint_torque(table, motions, c, virtual, seeds):
+    """J is c . tau, the joint torques without those of rotors and damping.
+
+    Args:
+        table: `ArmModel.table`.
+        motions: (n+1, 21), `link_motions`.
+        c: (n,) weights.
+        virtual: (n+1, 6) filled with the links' velocities under c, `pull_back` wants them.
+        seeds: (n+1, 21), added to.
+    """
+    n = motions.shape[0] - 1
+    v = w = p = (0.0, 0.0, 0.0)
+    for row in range(n + 1):
+        motion, phi = motions[row], table[row, 12:22]
+        here = three(motion, _P)
+        v = plus(v, cross(w, minus(here, p)))
+        p = here
+        if row < n:
+            along = times(c[row], (motion[14], motion[17], motion[20]))
+            if table[row, SLIDES] != 0.0:
+                v = plus(v, along)
+            else:
+                w = plus(w, along)
+        virtual[row, 0], virtual[row, 1], virtual[row, 2] = v
+        virtual[row, 3], virtual[row, 4], virtual[row, 5] = w
+        v_L, w_L = to_link(motion, v), to_link(motion, w)
+        s, omega = seed_wrench(motion, phi, v_L, w_L, seeds[row])
+        alpha = to_link(motion, three(motion, _ALPHA))
+        h, inertia = three(phi, 1), symmetric(phi, 4)
+        force = plus(times(phi[0], s), cross(alpha, h))
+        force = plus(force, cross(omega, cross(omega, h)))
+        torque = plus(apply(inertia, alpha), cross(omega, apply(inertia, omega)))
+        torque = plus(torque, cross(h, s))
+        F, N = to_world(motion, force), to_world(motion, torque)
+        add_into(seeds[row], _V, F)
+        add_into(seeds[row], _W, N)
+        add_into(seeds[row], _THETA, plus(cross(F, v), cross(N, w)))
+
+
+@njit(cache=True)
+def pull_back(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
+    """Adds dJ/dq, dJ/dqd and dJ/dqdd of the seeds to `g_q`, `g_qd`, `g_qdd`, (n,) each.
+
+    Args:
+        table: `ArmModel.table`.
+        motions: (n+1, 21), `link_motions` at (q, qd, qdd).
+        qd, qdd: (n,) [rad/s], [rad/s^2].
+        c: (n,) as in `seed_joint_torque`, or zeros.
+        virtual: (n+1, 6) from there, or zeros.
+        seeds: (n+1, 21).
+    """
+    n = motions.shape[0] - 1
+    gs = gw = ga = gp = gt = gv = go = (0.0, 0.0, 0.0)
+    still = np.zeros(MOTION_SIZE)
+    for row in range(n, -1, -1):
+        motion, seed = motions[row], seeds[row]
+        inboard = motions[row - 1] if row > 0 else still
+        w, a = three(inboard, _OMEGA), three(inboard, _ALPHA)
+        gs, gw = plus(gs, three(seed, _S)), plus(gw, three(seed, _OMEGA))
+        ga, gp = plus(ga, three(seed, _ALPHA)), plus(gp, three(seed, _P))
+        gt, gv = plus(gt, three(seed, _THETA)), plus(gv, three(seed, _V))
+        go = plus(go, three(seed, _W))
+        z, slides = (motion[14], motion[17], motion[20]), table[row, SLIDES] != 0.0
+        if row < n and slides:
+            gz = plus(times(qdd[row], gs), times(2.0 * qd[row], cross(gs, w)))
+            gz = plus(gz, times(c[row], gv))
+            g_qd[row] += 2.0 * dot(cross(w, z), gs)
+            g_qdd[row] += dot(z, gs)
+            gt = plus(gt, cross(z, gz))
+        elif row < n:
+            gz = plus(times(qd[row], plus(gw, cross(ga, w))), times(qdd[row], ga))
+            gz = plus(gz, times(c[row], go))
+            g_qd[row] += dot(z, gw) + dot(cross(w, z), ga)
+            g_qdd[row] += dot(z, ga)
+            gt = plus(gt, cross(z, gz))
+            g_q[row] += dot(z, gt)
+            gw = plus(gw, times(qd[row], cross(z, ga)))
+        turned, gr = cross(gs, w), gp
+        if row > 0:
+            gr = plus(gp, plus(cross(gs, a), cross(turned, w)))
+            gr = plus(gr, cross(gv, three(virtual[row - 1], 3)))
+        if row < n and slides:
+            g_q[row] += dot(z, gr)
+        if row > 0:
+            r = minus(three(motion, _P), three(inboard, _P))
+            gw = plus(gw, plus(cross(cross(w, r), gs), cross(r, turned)))
+            ga = plus(ga, cross(r, gs))
+            go = plus(go, cross(r, gv))
+            gt = plus(gt, cross(r, gr))
+            if row < n and slides:
+                gw = plus(gw, times(2.0 * qd[row], cross(z, gs)))

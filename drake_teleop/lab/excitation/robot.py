@@ -1,0 +1,289 @@
+"""The arm that is to be excited, its surroundings, and its limits.
+
+Of the station's slave, or of any model that Drake can read (URDF, SDF, MJCF, model directives).
+What a model lacks is assumed, and every assumption is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame, ModelInstanceIndex
+from pydrake.systems.framework import Diagram
+
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.excitation.criteria import Scales, characteristic_length
+from drake_teleop.lab.excitation.limits import Limits
+from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
+from drake_teleop.lab.excitation.scene import CLEARANCE, Parse, Scene
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.station.scenario import Scenario, check_scenario
+from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
+from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
+from drake_teleop.station.slave.arm import ArmModel
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.assumed_limits import with_all_limits
+from drake_teleop.station.slave.model_check import check_size
+from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
+from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
+from drake_teleop.station.slave.surroundings import AddEnvironment
+
+_POSTURES = 1000  # random ones, in which distances of shapes are looked at
+# Of the joints' ranges, speeds and torques; the rest is for tracking errors and feedback.
+_JOINT_SHARE = 0.8
+# Of the weakest axis of the sensor; a grasped object lies farther out than the tool.
+_FORCE_SHARE, _TORQUE_SHARE = 0.9, 10.0 / 12.0
+# The heaviest load to expect is this much heavier than the known one (a grasped object of 0.8 kg).
+_LOAD_FACTOR = 1.3
+# What a payload of unknown shape looks like: centre of mass along z_S, radius of gyration [m].
+_PAYLOAD_COM, _PAYLOAD_GYRATION = 0.08, 0.05
+_PAYLOAD = 2.0
+_LEAST_PAYLOAD, _MOST_PAYLOAD = 1e-3, 1e4
+
+# The station's wrist centre and ball tip, and where both may be: in front of the arm, above the
+# table.
+_POINTS_S = ((0.0, 0.0, -0.085), (0.0, 0.0, 0.2))
+_BOX_W = ((0.25, -0.7, 0.1), (1.05, 0.7, 1.3))
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """An arm with its surroundings, ready for a design and for a check.
+
+    Attributes:
+        name: of the scenario or the model.
+        diagram: of plant and scene graph.
+        plant: with the heaviest load on the arm.
+        scene_graph: with everything that may collide.
+        sensor_frame: S.
+        arm: the same as arrays.
+        limits: what an excitation must respect.
+        scales: what criteria divide by; with the heaviest load.
+        noise: of the sensor, for predictions.
+        home: (n,) a posture to begin from [rad].
+        assumptions: what was not in the model.
+        folders: with converted meshes, which live as long as this.
+    """
+
+    name: str
+    diagram: Diagram
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+    sensor_frame: Frame
+    arm: ArmModel
+    limits: Limits
+    scales: Scales
+    noise: SensorNoise
+    home: Array
+    assumptions: tuple[str, ...]
+    folders: tuple[TemporaryDirectory[str], ...] = ()
+
+
+def RobotFromScenario(scenario: Scenario) -> Robot:
+    """The station's slave with its tool, what it has to touch, and a table at z = 0.
+
+    Raises:
+        DrakeTeleopError: if the arm cannot reach the scenario's start.
+    """
+    check_scenario(scenario)
+
+    def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
+        parsed = ParseSlave(plant, scenario.slave)
+        if scenario.surroundings is not None:
+            AddEnvironment(plant, scenario.surroundings)
+        folders.extend(parsed.folders)
+        return parsed.instance, parsed.sensor_frame
+
+    slave, folders = NominalSlave(scenario.slave), list[TemporaryDirectory[str]]()
+    own = scenario.slave.model != ""
+    scene = Scene(parse, (_LOAD_FACTOR - 1) * slave.arm.phi_load, visuals_count=not own)
+    scene.arm, _ = with_all_limits(scene.arm, str(scenario.slave.path))
+    lower, upper = np.array(_BOX_W)
+    box = (upper + lower) / 2, (upper - lower) / 2
+    endless = np.zeros(3), np.full(3, np.inf)
+    return _robot(
+        scene,
+        "the station's slave",
+        scenario.wrist_sensor,
+        scenario.motion_estimation,
+        scenario.rates.sensor_hz,
+        home=slave.start,
+        stands_there=True,
+        points_S=np.array([np.zeros(3), slave.tip] if own else _POINTS_S),
+        box=endless if own else box,
+        assumptions=["a table at z = 0", *slave.assumptions],
+        folders=folders,
+    )
+
+
+def RobotFromModel(
+    path: Path,
+    sensor_frame: str,
+    sensor: WristSensorConfig,
+    *,
+    estimation: MotionEstimationConfig | None = None,
+    sensor_hz: float = 8000.0,
+    package_paths: tuple[Path, ...] = (),
+    acceleration: tuple[float, ...] = (),
+    payload: float | None = None,
+) -> Robot:
+    """Any serial arm of revolute and prismatic joints.
+
+    A base that hangs on nothing is welded to the world, joints beyond the sensor are held.
+
+    Args:
+        path: of the model.
+        sensor_frame: name of the frame or link at which the sensor measures.
+        sensor: what it can measure.
+        estimation: from what the motion will be known; by default as in the station.
+        sensor_hz: rate of the sensor [Hz].
+        package_paths: folders in which `package://` addresses are looked up.
+        acceleration: limits [rad/s^2], one for all joints or one for each, if the model has none.
+        payload: mass of the heaviest load [kg], if it is not in the model.
+
+    Raises:
+        DrakeTeleopError: if the model cannot be read or is no such arm.
+    """
+    lacking: list[str] = []
+    folders: list[TemporaryDirectory[str]] = []
+
+    def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
+        model = ParseModel(plant, path, sensor_frame, package_paths)
+        lacking[:] = model.assumptions
+        folders.append(model.folder)
+        return model.instance, model.sensor_frame
+
+    assumptions = ["a table at z = 0"]
+    with drakes_errors_said(path):
+        arm = _arm_of(parse)
+    check_size(arm, str(path))
+    load = arm.phi_load
+    if payload is None and load[0] > 0:
+        reserve = (_LOAD_FACTOR - 1) * load
+    else:
+        mass = _PAYLOAD if payload is None else payload
+        if not _LEAST_PAYLOAD <= mass <= _MOST_PAYLOAD:
+            raise DrakeTeleopError(
+                f"{mass:g} kg is outside {_LEAST_PAYLOAD:g} to {_MOST_PAYLOAD:g} kg",
+                where="--payload",
+            )
+        if payload is None:
+            assumptions.append(f"a load of {mass:g} kg (--payload)")
+        if mass <= load[0]:
+            raise DrakeTeleopError(
+                f"the model holds {load[0]:.3g} kg beyond the sensor already",
+                where="--payload",
+                remedy="give the mass of all that may hang there",
+            )
+        reserve = _payload(mass - load[0])
+    with drakes_errors_said(path):
+        scene = Scene(parse, reserve, visuals_count=False, where=str(path))
+    assumptions += lacking
+    scene.arm, completed = with_all_limits(
+        scene.arm, str(path), acceleration, hint=" (--acceleration)"
+    )
+    return _robot(
+        scene,
+        path.name,
+        sensor,
+        estimation or MotionEstimationConfig(),
+        sensor_hz,
+        home=(scene.arm.lower + scene.arm.upper) / 2,
+        stands_there=False,
+        points_S=np.zeros((1, 3)),
+        box=(np.zeros(3), np.full(3, np.inf)),
+        assumptions=assumptions + completed,
+        folders=folders,
+    )
+
+
+def _robot(
+    scene: Scene,
+    name: str,
+    sensor: WristSensorConfig,
+    estimation: MotionEstimationConfig,
+    sensor_hz: float,
+    *,
+    home: Array,
+    stands_there: bool,
+    points_S: Array,
+    box: tuple[Array, Array],
+    assumptions: list[str],
+    folders: Sequence[TemporaryDirectory[str]] = (),
+) -> Robot:
+    """Limits and all else, see `Robot`; `box` is its middle and half size in W [m].
+
+    Where the arm is known to stand at home, what touches there may touch.
+    """
+    arm = scene.arm
+    middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
+    postures = middle + half * np.random.default_rng(0).uniform(-1, 1, (_POSTURES, len(half)))
+    bodies = scene.rows()
+    start = home if stands_there else None
+    candidates, touching = scene.without_neighbours(bodies, postures, start)
+    if touching:
+        assumptions.append(
+            f"as they touch where the arm starts, not kept apart: {', '.join(touching)}"
+        )
+    rows, capsules, pairs, distances = scene.capsules(bodies, candidates, postures)
+    phi = arm.phi_load
+    limits = Limits(
+        q_middle=middle,
+        q_half=_JOINT_SHARE * half,
+        velocity=_JOINT_SHARE * arm.velocity_limit,
+        acceleration=arm.acceleration_limit,
+        effort=_JOINT_SHARE * arm.effort_limit,
+        phi=phi,
+        sensor=np.array(
+            [
+                _FORCE_SHARE * min(sensor.force_range),
+                _TORQUE_SHARE * min(sensor.torque_range),
+                sensor.acceleration_range,
+                sensor.angular_acceleration_range,
+            ]
+        ),
+        points_S=points_S,
+        box_middle=box[0],
+        box_half=box[1],
+        capsule_row=rows,
+        capsule_ends=np.array([capsule.ends for capsule in capsules]).reshape(-1, 2, 3),
+        capsule_radius=np.array([capsule.radius for capsule in capsules]),
+        pairs=pairs,
+        distances=distances,
+        clearance=CLEARANCE,
+    )
+    std = sensor.wrench_std()
+    return Robot(
+        name=name,
+        diagram=scene.diagram,
+        plant=scene.plant,
+        scene_graph=scene.scene_graph,
+        sensor_frame=scene.sensor_frame,
+        arm=arm,
+        limits=limits,
+        scales=Scales((float(std[0]), float(std[3])), characteristic_length(phi), phi),
+        noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
+        home=home,
+        assumptions=tuple(assumptions),
+        folders=tuple(folders),
+    )
+
+
+def _arm_of(parse: Parse) -> ArmModel:
+    plant = MultibodyPlant(0.0)
+    instance, frame = parse(plant)
+    finalize(plant)
+    return ArmModelFromPlant(plant, instance, frame.name())
+
+
+def _payload(mass: float) -> Array:
+    """(10,) phi of a compact load."""
+    com = np.array([0.0, 0.0, _PAYLOAD_COM])
+    return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION**2 * np.eye(3) * 2 / 3)

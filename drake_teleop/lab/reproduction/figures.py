@@ -1,0 +1,171 @@
+"""The paper's figures, from plain arrays: the same layout, the same scale in all subplots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike, NDArray
+
+from drake_teleop.common.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    VERMILION,
+    Picture,
+    house_style,
+    shade_contact,
+)
+
+
+def scaling_figure(
+    t: ArrayLike,
+    values: Sequence[ArrayLike],
+    sigmas: Sequence[float],
+    *,
+    symbol: str,
+    unit: str,
+    downscaling: float,
+) -> Figure:
+    """Figs. 6 and 7: one component at the slave for each sigma, one below the other.
+
+    The right-hand axes show what the master gets. Every subplot's note states its peak.
+
+    Args:
+        t: (N,) [s].
+        values: per sigma, (N,) the scaled component at the slave, in `unit`.
+        sigmas: the scale of the non-contact wrench in each subplot.
+        symbol: of the component, as matplotlib text ("$f_z$").
+        unit: "N" or "N m".
+        downscaling: slave over master, 17.5 in the paper.
+    """
+    time, time_unit = _time(t)
+    traces = [np.asarray(trace, float) for trace in values]
+    with house_style():
+        figure = Picture(figsize=(7.6, 1.2 + 1.75 * len(traces)))
+        rows = figure.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+        for axes, trace, sigma in zip(rows, traces, sigmas, strict=True):
+            axes.plot(time, trace, color=BLUE if sigma else GREEN)
+            axes.set_title(_sigma_title(sigma))
+            peak = float(np.abs(trace).max())
+            _note(
+                axes,
+                f"peak {_number(peak)} {unit}   ·   {_number(peak / downscaling)} {unit}"
+                " at the master",
+            )
+            axes.set_ylabel(f"{symbol} [{unit}]")
+            _master_axis(axes, downscaling, f"at the master [{unit}]")
+        rows[0].set_ylim(*_common_range(traces))
+        rows[0].set_xlim(time[0], time[-1])
+        rows[-1].set_xlabel(f"t [{time_unit}]")
+    return figure
+
+
+def contact_figure(
+    t: ArrayLike,
+    measured: ArrayLike,
+    contact_force: ArrayLike,
+    *,
+    symbol: str,
+    contact: ArrayLike,
+    detected_s: float,
+    threshold: float,
+    turning_s: float | None = None,
+) -> Figure:
+    """Fig. 8: the measured force above, the calculated contact force below.
+
+    Both subplots have the same scale and are shaded where there is contact; the lower one shows
+    the threshold and the instant of detection.
+
+    Args:
+        t: (N,) [s].
+        measured, contact_force: (N,) [N], at the slave.
+        symbol: of the component, as matplotlib text ("$f_z$").
+        contact: (N,) booleans, from the simulation's truth.
+        detected_s: when the contact force crosses the threshold [s].
+        threshold: of the detection [N].
+        turning_s: a reversal of the motion without contact, to be marked [s].
+    """
+    time, time_unit = _time(t)
+    per_second = 1e3 if time_unit == "ms" else 1.0
+    traces = [np.asarray(trace, float) for trace in (measured, contact_force)]
+    touched = np.asarray(contact, bool)
+    with house_style():
+        figure = Picture(figsize=(7.6, 5.0))
+        rows = figure.subplots(2, 1, sharex=True, sharey=True)
+        titles = ("Measured force", "Calculated contact force, σ = 0")
+        for axes, trace, title, colour in zip(rows, traces, titles, (BLUE, GREEN), strict=True):
+            shade_contact(axes, time, touched)
+            axes.plot(time, trace, color=colour)
+            axes.set_title(title)
+            axes.set_ylabel(f"{symbol} [N]")
+            if turning_s is not None:
+                _mark(axes, turning_s * per_second, "no contact", GREY)
+        if touched.any():
+            _mark(rows[0], time[np.argmax(touched)], "contact", VERMILION)
+        _mark(rows[1], detected_s * per_second, "detected", VERMILION)
+        for level in (-threshold, threshold):
+            rows[1].axhline(level, color=VERMILION, linewidth=0.8, linestyle=":")
+        _note(rows[0], f"peak {_number(np.abs(traces[0]).max())} N")
+        _note(
+            rows[1],
+            f"peak {_number(np.abs(traces[1]).max())} N   ·   threshold {_number(threshold)} N",
+        )
+        rows[0].set_ylim(*_common_range(traces))
+        rows[0].set_xlim(time[0], time[-1])
+        rows[1].set_xlabel(f"t [{time_unit}]")
+    return figure
+
+
+def _time(t: ArrayLike) -> tuple[NDArray[np.float64], str]:
+    """Times in milliseconds, as the paper has them, up to two seconds; then in seconds."""
+    seconds = np.asarray(t, float)
+    return (seconds * 1e3, "ms") if seconds[-1] - seconds[0] <= 2 else (seconds, "s")
+
+
+def _common_range(traces: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
+    low = min(0.0, *(float(trace.min()) for trace in traces))
+    high = max(0.0, *(float(trace.max()) for trace in traces))
+    margin = 0.1 * (high - low) or 1.0
+    return low - margin, high + margin
+
+
+def _sigma_title(sigma: float) -> str:
+    meaning = {1.0: "as measured", 0.0: "non-contact part eliminated"}
+    return f"σ = {sigma:g}:  {meaning.get(sigma, f'{sigma:.0%} of the non-contact part')}"
+
+
+def _number(value: float) -> str:
+    """Three significant digits, never as a power of ten."""
+    rounded = float(f"{value:.3g}")
+    decimals = max(0, 2 - int(np.floor(np.log10(abs(rounded))))) if rounded else 0
+    return f"{rounded:.{decimals}f}"
+
+
+def _note(axes: Axes, text: str) -> None:
+    axes.set_title(text, loc="right", color=GREY, fontsize=8.5)
+
+
+def _master_axis(axes: Axes, downscaling: float, label: str) -> None:
+    right = axes.secondary_yaxis(
+        "right",
+        functions=(lambda v: np.asarray(v) / downscaling, lambda v: np.asarray(v) * downscaling),
+    )
+    right.set_ylabel(label, color=GREY)
+    right.spines["right"].set_visible(True)
+
+
+def _mark(axes: Axes, time: float, text: str, colour: str) -> None:
+    """A vertical line with its name at the foot of the axes."""
+    axes.axvline(time, color=colour, linewidth=0.9, linestyle="--")
+    axes.annotate(
+        text,
+        (time, 0.03),
+        xycoords=("data", "axes fraction"),
+        xytext=(4, 0),
+        textcoords="offset points",
+        color=colour,
+        fontsize=8.5,
+    )

@@ -1,0 +1,58 @@
+"""What elimination leaves of the wrench that the plant itself says the wrist transmits.
+
+The ideal sensor samples V phi, so what V phi leaves of its samples is zero whatever V is. Here the
+wrench is the reaction force of the weld that the tool hangs on, as Drake's plant has it, which
+knows nothing of V; the motion is the ideal sensor's sample of the same instant, which knows nothing
+of the plant's accelerations.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.progress import Progress
+from drake_teleop.lab.identification import sensor_samples, slave_arm
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.simulation import MakeSimulator, advance, read_log
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
+
+Array = NDArray[np.float64]
+
+
+def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:
+    """Runs a free movement with an ideal sensor and eliminates the true load from the reaction.
+
+    Args:
+        scenario: without anything to touch; the sensor samples at the rate of its log.
+        progress: called with the fraction done.
+
+    Returns:
+        (N, 6) F - V phi at each sample after the settling time [N, N m]: rounding, if V and the
+        sensor's kinematics are those of rigid bodies.
+    """
+    rate, simulation = scenario.rates.log_hz, scenario.simulation
+    phi = slave_arm(scenario).phi_load
+    ideal = replace(scenario, wrist_sensor__ideal=True, rates__sensor_hz=rate)
+    station = MakeTeleopStation(ideal, load_estimate=np.concatenate([np.zeros(6), phi]))
+    plant, simulator = GetBlock(station, "slave_plant"), MakeSimulator(station, simulation)
+    context = plant.GetMyContextFromRoot(simulator.get_context())
+    reactions = plant.get_reaction_forces_output_port()
+    weld = plant.GetJointByName("sensor_weld")
+    place = list(plant.GetJointIndices()).index(weld.index())
+    wrenches = np.empty((round((simulation.settle + simulation.duration) * rate) + 1, 6))
+    for k in range(len(wrenches)):
+        advance(simulator, k * (1 / rate))  # a product, as Drake's event times are
+        reaction = reactions.Eval(context)[place]
+        wrenches[k] = *reaction.translational(), *reaction.rotational()
+        if k % 256 == 0:
+            progress(k / len(wrenches))
+    progress(1.0)
+    result = read_log(simulator, simulation.settle)
+    taken = np.rint((result["sample_time"][:, 0] + simulation.settle) * rate).astype(int)
+    _, s, omega, alpha = sensor_samples(result)
+    started = taken >= 0
+    return contact_wrench(
+        wrenches[taken[started]], np.zeros(6), s[started], omega[started], alpha[started], phi
+    )

@@ -1,0 +1,72 @@
+"""What a station costs over its bare plant, and how fast it runs.
+
+Bare plant: arm and tool under a constant torque, nothing around it, in steps of the sensor's period
+by the second-order Runge-Kutta method. All run interleaved in one process, and the times are thread
+CPU time: a busy machine matters little.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.common.progress import Progress
+from drake_teleop.lab.identification import true_load
+from drake_teleop.station.scenario import Scenario, Simulation
+from drake_teleop.station.simulation import MakeSimulator, advance
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.station import MakeTeleopStation
+
+_SPAN = 0.1  # simulated seconds a turn
+
+
+def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
+    """Arm and tool under the torque that holds them, see the module.
+
+    Args:
+        scenario: of the station.
+        touching: whether its surroundings are there too.
+    """
+    builder = DiagramBuilder()
+    surroundings = scenario.surroundings if touching else None
+    slave = AddSlavePlant(builder, scenario.slave, surroundings)
+    diagram = builder.Build()
+    step = 1 / scenario.rates.sensor_hz
+    simulation = Simulation(integrator="runge_kutta2", max_step=step)
+    simulator = MakeSimulator(diagram, simulation)
+    context = slave.plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    gravity = slave.plant.CalcGravityGeneralizedForces(context)
+    torque = -slave.plant.GetVelocitiesFromArray(slave.instance, gravity)
+    slave.plant.get_actuation_input_port(slave.instance).FixValue(context, list(torque))
+    simulator.Initialize()
+    return simulator
+
+
+def MakeMovingStation(scenario: Scenario) -> Simulator:
+    """The station of a scenario, past its settling time."""
+    # What the estimate says costs nothing, so it is the truth.
+    station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
+    simulator = MakeSimulator(station, scenario.simulation)
+    simulator.Initialize()
+    advance(simulator, scenario.simulation.settle)
+    return simulator
+
+
+def cpu_seconds(
+    simulators: Mapping[str, Simulator], *, turns: int = 11, progress: Progress = lambda done: None
+) -> dict[str, float]:
+    """CPU seconds a simulated second of each, the least over interleaved turns of 0.1 s.
+
+    What else the machine does can only add to a turn (the advice of Python's timeit).
+    """
+    spent: dict[str, list[float]] = {name: [] for name in simulators}
+    for turn in range(turns):
+        for name, simulator in simulators.items():
+            start = time.thread_time()
+            advance(simulator, simulator.get_context().get_time() + _SPAN)
+            spent[name].append((time.thread_time() - start) / _SPAN)
+        progress((turn + 1) / turns)
+    return {name: min(times) for name, times in spent.items()}

@@ -1,0 +1,263 @@
+"""`drake-teleop run SCENARIO`: one scenario, its log, its picture and its figures.
+
+What the station knows about its load, by one rule:
+
+- A scenario whose load estimator is enabled starts from nothing and learns while it runs. If its
+  operator wants nothing either (the shipped "identification"), the slave alone runs an excitation
+  trajectory as long as the scenario.
+- Every other scenario does what an honest user would: it first identifies the load with that
+  trajectory and its own sensor, from the sensor's samples alone; or it takes what was found when
+  that was done before, see `drake_teleop.lab.identified_load`.
+
+The same scenario gives the same bytes in every file but `session.json`, which holds
+
+=========================== =====================================================================
+load_source                 which load was used: "learnt while it ran", "identified before the run",
+                            "cache", identified before an earlier run, or "of the drive"
+real_time_factor            simulated over elapsed time, this machine, compilation included
+=========================== =====================================================================
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.progress import Progress, Stage, show_progress
+from drake_teleop.common.writing import (
+    CannotWrite,
+    naming,
+    output_folder,
+    remove_log,
+    write_json,
+    write_picture,
+    write_table,
+)
+from drake_teleop.lab.identification import (
+    identify_load,
+    timed,
+)
+from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
+from drake_teleop.lab.run_summary import ScenarioRun, overview, summarise
+from drake_teleop.station.replay import write_replay
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario, replace
+from drake_teleop.station.scenario_reference import write_scenario
+from drake_teleop.station.station import MakeTeleopStation
+
+Array = NDArray[np.float64]
+
+_LEARNT = "learnt while it ran"
+_WRITTEN_AT_THE_END = (
+    "sensor_log.parquet",
+    "identification.json",
+    "overview.png",
+    "replay.html",
+    "session.json",
+)
+
+
+class RecordedDrive(Protocol):
+    """A drive that can be repeated; `drake_teleop.live.session.read_drive` returns one."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the recording."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """Scenario that was driven, with the duration of the drive."""
+
+    @property
+    def load(self) -> IdentifiedLoad | None:
+        """Load with which the station was made."""
+
+    def repeat(self, progress: Progress, log: Path | None = None) -> SimulationResult:
+        """Simulate the drive again."""
+
+
+def run_command(
+    scenario: str | Path | None,
+    out: Path,
+    *,
+    drive: RecordedDrive | None = None,
+    seed: int | None = None,
+    fresh: bool = False,
+    quiet: bool = False,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Runs one scenario.
+
+    Writes log.parquet, sensor_log.parquet (canonical, for `drake-teleop identify`), overview.png,
+    replay.html (the film in 3D), scenario.yaml (all fields, as they were run), identification.json
+    (unless the scenario learnt while it ran), session.json and summary.json into `out`. The log is
+    a folder, written while the station runs; all but the scenario follow at the end, the summary
+    last. What an earlier run left there is removed first; a run that fails before it begins leaves
+    nothing.
+
+    Args:
+        scenario: the name of a shipped one, or a YAML file.
+        out: the folder.
+        drive: a recorded drive, which is repeated instead of the scenario.
+        seed: instead of the scenario's.
+        fresh: whether to identify the load anew although it was kept.
+        quiet: no progress bars and no table.
+        progress: False for no progress bars alone.
+
+    Returns:
+        The summary, and what is in session.json.
+
+    Raises:
+        DrakeTeleopError: if the scenario cannot be used, a joint leaves its range, or a file cannot
+            be written; then saying what was.
+        KeyboardInterrupt: saying what was recorded until then.
+    """
+    if drive is not None and (seed is not None or fresh):
+        raise DrakeTeleopError("a drive has its own seed and load", where="run --inputs")
+    if drive is not None and out.resolve() == drive.folder.resolve():
+        raise DrakeTeleopError("is the drive itself", where=str(out), remedy="give another --out")
+    setup = LoadScenario(scenario or "") if drive is None else drive.scenario
+    if seed is not None:
+        setup = replace(setup, simulation__seed=seed)
+    with output_folder(out):
+        with show_progress(progress and not quiet) as stage:
+            run = _logged(setup, out, stage, fresh, drive)
+            written = stage("Write pictures and film")
+            write_picture(out / "overview.png", overview(run.result))
+            written(0.3)
+            write_replay(out / "replay.html", run.result, run.scenario)
+            written(1.0)
+        summary = {"scenario": str(scenario if drive is None else drive.folder)} | summarise(run)
+        session = {"load_source": run.load_source, "real_time_factor": run.real_time_factor}
+        write_table(out / "sensor_log.parquet", run.result.sensor_log())
+        if run.identification is not None:
+            run.identification.save(out / "identification.json")
+        write_json(out / "session.json", session)
+        write_json(out / "summary.json", summary)
+    if not quiet:
+        _print(summary | session, out)
+    return summary | session
+
+
+def _logged(
+    setup: Scenario, out: Path, stage: Stage, fresh: bool, drive: RecordedDrive | None
+) -> ScenarioRun:
+    """Runs it with its log and its scenario in a folder, without what an earlier run left there."""
+    log, its_scenario = out / "log.parquet", out / "scenario.yaml"
+    # It must not be taken for what belongs to this run, should this one be interrupted.
+    remove_log(log)
+    for name in _WRITTEN_AT_THE_END:
+        with naming(out / name):
+            (out / name).unlink(missing_ok=True)
+    earlier = its_scenario.exists()
+    write_scenario(its_scenario, setup)
+    try:
+        if drive is not None:
+            return _repeated(drive, stage, log)
+        return run_scenario(setup, stage, log, fresh=fresh)
+    except BaseException as error:
+        if log.is_dir() and not any(log.iterdir()):
+            log.rmdir()
+        if not log.exists() and not earlier:
+            its_scenario.unlink(missing_ok=True)
+        if isinstance(error, KeyboardInterrupt):
+            raise KeyboardInterrupt(_kept(log)) from error
+        if isinstance(error, CannotWrite):
+            raise DrakeTeleopError(str(error), remedy=_kept(log)) from error
+        raise
+
+
+def run_scenario(
+    scenario: Scenario,
+    progress: bool | Stage = True,
+    log: Path | None = None,
+    *,
+    fresh: bool = False,
+) -> ScenarioRun:
+    """Runs a scenario by the rule at the top of this module.
+
+    Args:
+        scenario: what to run.
+        progress: whether bars are shown, or where: see `pages/progress.py`.
+        log: as `simulate` has it.
+        fresh: as for `identified_load`.
+
+    Raises:
+        DrakeTeleopError: if the scenario cannot be used or a joint leaves its range.
+    """
+    check_scenario(scenario)
+    learns = scenario.load_estimator.enabled
+    if learns and not scenario.operator.intent and scenario.operator.task is None:
+        found = identify_load(scenario, progress, log=log)
+        return ScenarioRun(
+            scenario, found.result, found.identification, _LEARNT, found.real_time_factor
+        )
+    identification, estimate, floor, source = None, None, None, _LEARNT
+    with show_progress(progress) as stage:
+        if not learns:
+            load = identified_load(scenario, stage, fresh=fresh)
+            identification, estimate, floor = load.identification, load.estimate, load.noise_floor
+            source = "cache" if load.from_cache else "identified before the run"
+        station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
+        result, factor = timed(station, scenario.simulation, stage("Run the scenario"), log)
+    return ScenarioRun(scenario, result, identification, source, factor)
+
+
+def _repeated(drive: RecordedDrive, progress: Stage, log: Path) -> ScenarioRun:
+    begin = time.perf_counter()
+    result = drive.repeat(progress("Repeat the drive"), log)
+    factor = drive.scenario.simulation.duration / (time.perf_counter() - begin)
+    identification = None if drive.load is None else drive.load.identification
+    return ScenarioRun(drive.scenario, result, identification, "of the drive", factor)
+
+
+def _kept(log: Path) -> str:
+    if not log.exists():
+        return ""
+    return f"{log} has the {len(SimulationResult.scan_parquet(log).t)} samples until then"
+
+
+def _print(summary: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(show_header=False)
+    table.add_column()
+    table.add_column(justify="right")
+    for name, value in summary.items():
+        if isinstance(value, (int, float)):
+            table.add_row(name, f"{value:.4g}")
+    console = Console()
+    console.print(summary["description"] or summary["scenario"], style="bold", markup=False)
+    console.print(table)
+    hint = "; --fresh identifies it anew" if summary["load_source"] == "cache" else ""
+    console.print(f"load: {summary['load_source']}{hint}", highlight=False)
+    for k, (start, stop) in enumerate(summary["true_contact_s"]):
+        noticed = ""
+        if "contact_noticed_ms" in summary:
+            slave, hand = (summary[f"contact_{at}_ms"][k] for at in ("noticed", "at_hand"))
+            noticed = f", noticed after {_ms(slave)}, at the hand after {_ms(hand)}"
+        console.print(f"contact from {start:.4f} to {stop:.4f} s{noticed}", highlight=False)
+    if "contact_by" in summary:
+        console.print(f"contact by {summary['contact_by']}", highlight=False)
+    for name, way in summary.get("moved_mm", {}).items():
+        turn = f"{way:.1f} mm and turned by {summary['turned_deg'][name]:.1f} degrees"
+        console.print(f"{name} was moved by {turn}", highlight=False)
+    if summary.get("failure"):
+        console.print(f"[bold red]the task failed:[/] {summary['failure']}", highlight=False)
+    for words in summary.get("assumed", ()):
+        console.print(f"assumed: {words}", highlight=False, markup=False)
+    for warning in summary["warnings"]:
+        console.print(f"[bold yellow]warning:[/] {warning}", highlight=False)
+    console.print(
+        f"written to {out}; its film: {out / 'replay.html'}", highlight=False, markup=False
+    )
+
+
+def _ms(delay: float | None) -> str:
+    return "never" if delay is None else f"{delay:.1f} ms"

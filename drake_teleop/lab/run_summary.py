@@ -1,0 +1,219 @@
+"""Figures and picture of a run.
+
+`summary.json` contains, beside the scenario:
+
+=========================== =====================================================================
+peak_measured_force_N       largest measured |f|, offsets removed; likewise peak_measured_torque_Nm;
+                            this and the next two with the load estimate of the end
+peak_contact_force_N        largest calculated contact force; likewise peak_contact_torque_Nm
+residual_force_max_N        largest contact force calculated while there was no contact; null if
+                            there was contact throughout; likewise residual_torque_max_Nm
+true_contact_s              [start, end] of each contact
+contact_noticed_ms          with contact_detection: how long after the beginning of each contact the
+                            detector noticed it, null if it did not; likewise contact_at_hand_ms
+false_contacts              how often the detector began to notice a contact that there was not
+success, task_time_s, ...   with a task, see `drake_teleop.station.task_measures`; null for
+                            what did not happen
+failure                     with a task: why it failed, in words; null if it did not
+peak_force_to_master_N      largest force that the device displayed
+joint_speed_use             largest share of a joint's speed limit; likewise joint_torque_use
+mass_error_percent          of the estimate at the end; likewise com_error_mm
+assumed                     what the models of arm and tool do not say, if anything
+contact_by                  if Drake's contact results are used, which takes longer: why
+moved_mm                    with bodies that move: how far each is at the end from where it was;
+                            likewise turned_deg
+warnings                    faults and their times, see `drake_teleop.station.run_warnings`
+=========================== =====================================================================
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.common.arrays import learnt
+from drake_teleop.common.quaternions import conjugate, logarithm, multiply
+from drake_teleop.common.style import contact_spans
+from drake_teleop.lab.identification import sensor_samples, slave_arm
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.identification import Identification
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.run_warnings import run_warnings
+from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.signals import POSE_OF
+from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
+from drake_teleop.station.task_measures import task_failure, task_measures
+
+Array = NDArray[np.float64]
+
+# After a contact has ended the sensor's filter still shows it for this long [s].
+FILTER_TAIL = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioRun:
+    """A scenario that was run.
+
+    Attributes:
+        scenario: with the seed that was used.
+        result: the recorded signals.
+        identification: what was found beforehand; None if the scenario learnt while it ran.
+        load_source: as in session.json.
+        real_time_factor: simulated over elapsed time.
+    """
+
+    scenario: Scenario
+    result: SimulationResult
+    identification: Identification | None
+    load_source: str
+    real_time_factor: float
+
+
+def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
+    """(N,) whether the tool touches something, from the simulation's truth.
+
+    A touch with its bounces is one contact: gaps shorter than FILTER_TAIL are closed.
+    """
+    if "true_contact_wrench_W" not in result:
+        return np.zeros(len(result.t), dtype=bool)
+    touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
+    return _time_since(touching, result.t) + _time_until(touching, result.t) < FILTER_TAIL
+
+
+def calculated_contact_wrench(result: SimulationResult) -> Array:
+    """(N, 6) Eq. (13) from the recorded samples and the load estimate of the end.
+
+    Raises:
+        DrakeTeleopError: if that load was never learnt.
+    """
+    estimate = result["load_estimate"][-1]
+    learnt("load_estimate", estimate[6:])
+    wrench, s, omega, alpha = sensor_samples(result)
+    return contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
+
+
+def summarise(run: ScenarioRun) -> dict[str, Any]:
+    """The figures of summary.json (see the top of this module)."""
+    result, arm = run.result, slave_arm(run.scenario)
+    estimate = result["load_estimate"][-1]
+    measured = result["measured_wrench_S"] - estimate[:6]
+    calculated = calculated_contact_wrench(result)
+    contact = in_contact(result)
+    # Of the bounces that a touch begins with, the first may have been between two samples.
+    free = _time_since(contact, result.t) > FILTER_TAIL
+    free &= _time_until(contact, result.t) > FILTER_TAIL
+    mass, com = _mass_and_com(estimate[6:])
+    true_mass, true_com = _mass_and_com(arm.phi_load)
+    n = arm.num_joints
+    summary: dict[str, Any] = {
+        "description": run.scenario.description,
+        "seed": run.scenario.simulation.seed,
+        "duration_s": round(float(result.t[-1]), 6),
+        "samples": len(result.t),
+        **_peaks("peak_measured", "", measured),
+        **_peaks("peak_contact", "", calculated),
+        **_peaks("residual", "_max", calculated[free]),
+        "true_contact_s": [list(span) for span in contact_spans(result.t, contact)],
+        "joint_speed_use": _use(result["slave_state"][:, n:], arm.velocity_limit),
+        "joint_torque_use": _use(result["joint_torque"], arm.effort_limit),
+        "mass_error_percent": 100 * abs(mass / true_mass - 1),
+        "com_error_mm": 1e3 * float(np.linalg.norm(com - true_com)),
+    }
+    if "force_to_master" in result:
+        summary |= _peaks("peak", "_to_master", result["force_to_master"])
+    if "contact" in result:
+        summary |= _detection_figures(result, contact_spans(result.t, contact))
+    if beyond := _beyond(run.scenario):
+        summary["contact_by"] = f"Drake's contact results (slower): {beyond}"
+    summary |= _moved(result)
+    if run.scenario.operator.task is not None:
+        figures = task_measures(result, run.scenario)
+        summary |= {name: None if np.isnan(x) else x for name, x in figures.items()}
+        summary["failure"] = task_failure(result, run.scenario) or None
+    assumed = NominalSlave(run.scenario.slave).assumptions
+    if assumed:
+        summary["assumed"] = list(assumed)
+    return summary | {"warnings": run_warnings(result, run.scenario, arm)}
+
+
+def overview(result: SimulationResult) -> Figure:
+    """The picture of a run: the wrenches, the motion, what the hand feels; contact shaded."""
+    wanted = ("measured_wrench_S", "contact_wrench_S", "pose_command", "force_to_master")
+    if "contact_wrench_S" not in result:
+        wanted = ("measured_wrench_S", "specific_force_S", "angular_velocity_S", "load_estimate")
+    figure = result.plot(*wanted, contact=in_contact(result))
+    figure.align_ylabels()
+    return figure
+
+
+def _detection_figures(
+    result: SimulationResult, spans: list[tuple[float, float]]
+) -> dict[str, Any]:
+    """When each contact was noticed, at the slave and by the hand, and what was none."""
+    t, summary = result.t, {}
+    for name, key in (("contact", "contact_noticed_ms"), ("contact_at_hand", "contact_at_hand_ms")):
+        flagged = t[result[name][:, 0] > 0]
+        ends = [*(start for start, _ in spans[1:]), np.inf][: len(spans)]
+        found = [
+            flagged[(flagged >= start) & (flagged < end)]
+            for (start, _), end in zip(spans, ends, strict=True)
+        ]
+        summary[key] = [
+            1e3 * float(times[0] - start) if len(times) else None
+            for times, (start, _) in zip(found, spans, strict=True)
+        ]
+    onsets = t[1:][np.diff(result["contact"][:, 0]) > 0]
+    false = [x for x in onsets if not any(a <= x <= b + FILTER_TAIL for a, b in spans)]
+    return summary | {"false_contacts": len(false)}
+
+
+def _beyond(scenario: Scenario) -> str:
+    """What of the surroundings the compiled contact law does not know, see `Contact`."""
+    surroundings = scenario.surroundings
+    if surroundings is None:
+        return ""
+    builder = DiagramBuilder()
+    return AddSlavePlant(builder, scenario.slave, surroundings).contact.beyond
+
+
+def _moved(result: SimulationResult) -> dict[str, dict[str, float]]:
+    """How far each body of the surroundings has moved and turned since t = 0."""
+    moved, turned = {}, {}
+    for signal in (name for name in result.signals if name.startswith(POSE_OF)):
+        name, first, last = signal.removeprefix(POSE_OF), *result[signal][[0, -1]]
+        moved[name] = 1e3 * float(np.linalg.norm(last[4:] - first[4:]))
+        turn = logarithm(multiply(tuple(last[:4]), conjugate(tuple(first[:4]))))
+        turned[name] = float(np.degrees(np.linalg.norm(turn)))
+    return {"moved_mm": moved, "turned_deg": turned} if moved else {}
+
+
+def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
+    names = (f"{prefix}_force{suffix}_N", f"{prefix}_torque{suffix}_Nm")
+    if not len(wrench):
+        return dict.fromkeys(names)
+    norms = (np.linalg.norm(part, axis=1).max() for part in (wrench[:, :3], wrench[:, 3:]))
+    return {name: float(norm) for name, norm in zip(names, norms, strict=True)}
+
+
+def _time_since(contact: NDArray[np.bool_], t: Array) -> Array:
+    """(N,) time since the last sample in contact; 0 in contact, inf before the first."""
+    last = np.maximum.accumulate(np.where(contact, np.arange(len(t)), -1))
+    return np.where(last < 0, np.inf, t - t[last])
+
+
+def _time_until(contact: NDArray[np.bool_], t: Array) -> Array:
+    """(N,) time until the next sample in contact; 0 in contact, inf after the last."""
+    return _time_since(contact[::-1], -t[::-1])[::-1]
+
+
+def _mass_and_com(phi: Array) -> tuple[float, Array]:
+    return float(phi[0]), phi[1:4] / phi[0]
+
+
+def _use(values: Array, limit: Array) -> float:
+    return float(np.max(np.abs(values) / limit))

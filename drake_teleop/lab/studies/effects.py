@@ -1,0 +1,314 @@
+"""What a study's rows say about its factors: means with confidence intervals; the Pareto front.
+
+All points of a design have the same seeds, and the seeds are what the runs are a sample of. In a
+factorial design every level of a factor meets the same combinations of the others. So each mean
+is one over runs, calculated for each seed alone, and its interval is Student's for the mean over
+seeds. Differences between levels are taken within each seed: what a seed does to all points
+cancels. One repeat says nothing about other seeds, and has no intervals (nan).
+
+The points of any other design are a sample, too, and its levels differ by chance in what else is
+varied. There the effects are those of a regression, and the intervals hold for the design and the
+seeds together; see `level_model.py`. With one repeat the intervals of effects are those of the
+design alone.
+
+If points fail with every seed, levels are compared over those combinations of the other factors at
+which all of them have a successful run, in any design; see `cells.py`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.lab.studies.cells import TOO_FEW, Flags, reasons
+from drake_teleop.lab.studies.design import Factor, Study
+from drake_teleop.lab.studies.factorial import Factorial, filled, interval
+from drake_teleop.lab.studies.level_model import LevelModel, level_model, levels_of
+
+if TYPE_CHECKING:
+    import polars as pl
+
+Array = NDArray[np.float64]
+
+#: What a designer of the loop gives and takes: the hand's effort against what it gets for it.
+PARETO = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Means with their intervals.
+
+    Attributes:
+        mean: (n,) over the seeds.
+        half: (n,) half the width of the interval of the mean.
+        effect_half: (n,) half the width of the interval of the mean's difference from the mean of
+            all n, which is the narrower one if seeds differ in the same way at every level.
+    """
+
+    mean: Array
+    half: Array
+    effect_half: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MainEffect:
+    """What one factor does to a measure; nan at a level that cannot be compared.
+
+    Attributes:
+        names: of its n levels, or of parts of its range.
+        runs: (n,) at each that have the measure.
+        mean: (n,) over the other factors and the seeds.
+        half: (n,) half the width of the interval of the mean.
+        effect: (n,) the difference of the mean from that over all levels.
+        effect_half: (n,) half the width of its interval.
+        why: (n,) why a level has no value; empty if it has.
+        compared: over so many combinations of the other factors' levels.
+        left_out: so many more there are.
+        fitted: whether a regression found it, see `level_model.py`.
+    """
+
+    names: list[str]
+    runs: NDArray[np.int64]
+    mean: Array
+    half: Array
+    effect: Array
+    effect_half: Array
+    why: list[str]
+    compared: int
+    left_out: int
+    fitted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PairMeans:
+    """The means of a measure over two factors; nan in a cell that cannot be compared.
+
+    Attributes:
+        fields: of the two, n and m levels.
+        names: of the levels.
+        mean: (n, m) over the other factors and the seeds.
+        why: (n, m) why a cell has no value; empty if it has.
+        compared: over so many combinations of the other factors' levels.
+        left_out: so many more there are.
+        fitted: whether a regression found it, see `level_model.py`.
+    """
+
+    fields: tuple[str, str]
+    names: tuple[list[str], list[str]]
+    mean: Array
+    why: NDArray[Any]
+    compared: int
+    left_out: int
+    fitted: bool
+
+
+def estimated(
+    values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
+) -> Estimate:
+    """The mean of each of `count` levels, over seeds.
+
+    Args:
+        values: (N,) of the rows; nan does not count.
+        levels: (N,) indices of the level.
+        seeds: (N,).
+    """
+    present, seed = np.unique(seeds, return_inverse=True)
+    sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
+    known = np.isfinite(values)
+    np.add.at(sums, (levels[known], seed[known]), values[known])
+    np.add.at(runs, (levels[known], seed[known]), 1.0)
+    with np.errstate(invalid="ignore"):
+        table = sums / runs
+    mean, half = interval(table)
+    # Differences only between what is there: a seed that lacks a level would shift all others.
+    _, effect_half = interval(table - table.mean(axis=0))
+    return Estimate(mean, half, effect_half)
+
+
+def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
+    """The main effects: a row for each measure, factor and level."""
+    import polars as pl
+
+    table = [
+        {
+            "measure": measure,
+            "factor": field,
+            "level": name,
+            "runs": int(found.runs[index]),
+            "mean": found.mean[index],
+            "mean_half": found.half[index],
+            "effect": found.effect[index],
+            "effect_half": found.effect_half[index],
+            "combinations": found.compared,
+            "left_out": found.left_out,
+            "why": found.why[index] or None,
+        }
+        for measure in study.measures
+        for field, found in main_effects(study, rows, measure).items()
+        for index, name in enumerate(found.names)
+    ]
+    return pl.DataFrame(table)
+
+
+def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
+    """What each factor does to a measure, by field; nothing if no run has it."""
+    data = _Data(study, rows, measure)
+    return (
+        {} if data.nothing else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
+    )
+
+
+def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
+    """The means of a measure over each pair of factors; none if there are too few points."""
+    data = _Data(study, rows, measure)
+    pairs = itertools.combinations(range(len(data.factors)), 2)
+    return [] if data.nothing else [found for pair in pairs if (found := data.pair(*pair))]
+
+
+class _Data:
+    """One measure at the points of a design, and how its effects are found: see above."""
+
+    def __init__(self, study: Study, rows: pl.DataFrame, measure: str) -> None:
+        self.factors = varied(study)
+        points, values = _points_and_seeds(rows, measure)
+        seen = np.isfinite(values)
+        self.runs = seen.sum(axis=1)
+        known = self.runs > 0
+        self.nothing = not known.any()
+        if self.nothing:
+            return
+        kept = np.ix_(known, seen.any(axis=0))
+        self.table = filled(values[kept])
+        columns = [points[factor.field].to_list() for factor in self.factors]
+        self.levels = [levels_of(f, c) for f, c in zip(self.factors, columns, strict=True)]
+        self.model: Factorial | LevelModel | None
+        if study.design == "factorial":
+            index = [levels.index[known] for levels in self.levels]
+            counts = [len(levels.names) for levels in self.levels]
+            self.model = Factorial(index, counts, seen[kept])
+        else:
+            by_chance = study.design == "sobol"
+            self.model = level_model(self.factors, columns, known, by_chance=by_chance)
+            self.levels = self.levels if self.model is None else self.model.factors
+
+    def main_effect(self, factor: int) -> MainEffect:
+        levels = self.levels[factor]
+        count = len(levels.names)
+        mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
+        why, compared = [TOO_FEW] * count, 0
+        if self.model is not None:
+            kept, over, weights = self.model.compared(factor)
+            if kept.sum() > 1:
+                effects, halves = self.model.effects(self.table)
+                found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
+                figures[:, kept] = found
+                compared = self._combinations(over, factor)
+            why = self._reasons(kept & (kept.sum() > 1), levels.index)
+        runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
+        left_out = self._combinations(np.ones(1), factor) - compared
+        return MainEffect(
+            levels.names, runs, mean, half, effect, effect_half, why, compared, left_out,
+            self.fitted,
+        )  # fmt: skip
+
+    def pair(self, first: int, second: int) -> PairMeans | None:
+        if self.model is None or (isinstance(self.model, LevelModel) and not self.model.products):
+            return None
+        a, b = self.levels[first], self.levels[second]
+        shape = len(a.names), len(b.names)
+        kept, over, weights = self.model.compared(first, second)
+        mean = np.full(len(kept), np.nan)
+        mean[kept] = self.model.means(self.table, weights)[0]
+        # A cell in which no point happens to lie is fitted, too, but nobody has been there.
+        cell = a.index * shape[1] + b.index
+        kept &= np.bincount(cell, self.runs, len(kept)) > 0
+        mean[~kept] = np.nan
+        why = np.array(self._reasons(kept, cell)).reshape(shape)
+        compared = self._combinations(over, first, second)
+        left_out = self._combinations(np.ones(1), first, second) - compared
+        fields = self.factors[first].field, self.factors[second].field
+        names = a.names, b.names
+        return PairMeans(fields, names, mean.reshape(shape), why, compared, left_out, self.fitted)
+
+    @property
+    def fitted(self) -> bool:
+        return not isinstance(self.model, Factorial)
+
+    def _combinations(self, over: NDArray[Any], *shown: int) -> int:
+        """How many of the levels of the other factors there are at this share of them."""
+        others = (len(f.names) for k, f in enumerate(self.levels) if k not in shown)
+        return round(np.mean(over) * math.prod(others))
+
+    def _reasons(self, compared: Flags, cell: NDArray[np.int64]) -> list[str]:
+        """Why cells have no value; (n,) `cell` is that of each point."""
+        runs = np.bincount(cell, minlength=len(compared))
+        return reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
+
+
+def _points_and_seeds(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
+    """The points, and (n, seeds) the values of a measure; nan where there is none."""
+    points = rows.unique("point", keep="first").sort("point")
+    _, point = np.unique(rows["point"].to_numpy(), return_inverse=True)
+    seeds, seed = np.unique(rows["seed"].to_numpy(), return_inverse=True)
+    table = np.full((points.height, len(seeds)), np.nan)
+    table[point, seed] = numbers(rows, measure)
+    return points, table
+
+
+def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
+    """Every point with the means of `PARETO`, their intervals, and whether it is on the front.
+
+    On the front is a point to which no other is better or equal in everything. A point at which not
+    every run has all three is not compared: a mean over the runs that went well would flatter it.
+
+    Returns:
+        A row for each point, or None if the study does not measure all three.
+    """
+    import polars as pl
+
+    if not set(PARETO) <= set(study.measures) or rows.is_empty():
+        return None
+    fields = [factor.field for factor in study.factors]
+    points = rows.unique("point", keep="first").sort("point").select("point", *fields)
+    order, index = np.unique(rows["point"].to_numpy(), return_inverse=True)
+    seeds, complete = rows["seed"].to_numpy(), np.ones(len(order), dtype=bool)
+    means = []
+    for name in PARETO:
+        values = numbers(rows, name)
+        complete &= np.bincount(index, ~np.isfinite(values), len(order)) == 0
+        found = estimated(values, index, seeds, len(order))
+        points = points.with_columns(
+            pl.Series(name, found.mean), pl.Series(f"{name}_half", found.half)
+        )
+        means.append(found.mean)
+    return points.with_columns(
+        pl.Series("complete", complete), pl.Series("front", front(np.column_stack(means), complete))
+    )
+
+
+def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(n,) which of the complete points no other complete one dominates; (n, k), small is good."""
+    found = complete.copy()
+    for index in np.flatnonzero(complete):
+        other = values[complete]
+        dominated = np.all(other <= values[index], axis=1) & np.any(other < values[index], axis=1)
+        found[index] = not dominated.any()
+    return found
+
+
+def varied(study: Study) -> list[Factor]:
+    """The factors that have more than one value."""
+    return [factor for factor in study.factors if len(factor.listed()) > 1]
+
+
+def numbers(rows: pl.DataFrame, measure: str) -> Array:
+    """(N,) a measure, nan where a run has none."""
+    import polars as pl
+
+    column: Array = rows[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    return column

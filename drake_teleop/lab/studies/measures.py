@@ -1,0 +1,84 @@
+"""What a study measures in a run of the station."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.station.measure_names import TASK_MEASURES
+from drake_teleop.station.result import SimulationResult
+
+if TYPE_CHECKING:
+    from drake_teleop.station.scenario import Scenario
+
+Array = NDArray[np.float64]
+
+
+def _peak(forces: Array) -> float:
+    return float(np.linalg.norm(forces, axis=1).max(initial=0.0))
+
+
+def _force_to_master(result: SimulationResult) -> Array:
+    return result["force_to_master"][:, :3]
+
+
+def _peak_contact_force(result: SimulationResult, threshold: float) -> float:
+    if "true_contact_wrench_W" not in result:
+        return 0.0
+    return _peak(result["true_contact_wrench_W"][:, :3])
+
+
+def _hand_work(result: SimulationResult, threshold: float) -> float:
+    power = np.sum(result["hand_wrench_E"] * result["twist_master"], axis=1)
+    return float(np.trapezoid(power, result.t))
+
+
+def _time_above(result: SimulationResult, threshold: float) -> float:
+    above = np.linalg.norm(_force_to_master(result), axis=1) > threshold
+    return float(np.trapezoid(above.astype(float), result.t))
+
+
+#: Those of every run by name: of its signals and the study's `force_threshold` [N].
+_OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = {
+    # Largest force that the device displays.
+    "peak_force_to_master_N": lambda result, _: _peak(_force_to_master(result)),
+    # Root of the mean of its square.
+    "rms_force_to_master_N": lambda result, _: float(
+        np.sqrt(np.mean(np.sum(_force_to_master(result) ** 2, axis=1)))
+    ),
+    # Largest force between tool and environment, the simulation's truth.
+    "peak_contact_force_N": _peak_contact_force,
+    # Integral of F.v and tau.omega: what the hand puts into the stylus.
+    "hand_work_J": _hand_work,
+    # How long the displayed force is above the threshold.
+    "time_above_force_s": _time_above,
+}
+
+
+#: All names; those of tasks are explained in `task_measures.py`.
+MEASURES = (*_OF_EVERY_RUN, *TASK_MEASURES)
+
+
+def default_measures() -> list[str]:
+    """What a study measures that does not say: what every run has."""
+    return list(_OF_EVERY_RUN)
+
+
+def measured(
+    result: SimulationResult, scenario: Scenario, names: Sequence[str], force_threshold: float
+) -> dict[str, float]:
+    """The measures of one run, by name.
+
+    Raises:
+        DrakeTeleopError: if they are those of a task and there is none.
+    """
+    own = [name for name in names if name in _OF_EVERY_RUN]
+    found = {name: _OF_EVERY_RUN[name](result, force_threshold) for name in own}
+    if len(own) < len(names):
+        from drake_teleop.station.task_measures import task_measures
+
+        found |= task_measures(result, scenario)
+    return {name: found[name] for name in names}

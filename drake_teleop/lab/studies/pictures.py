@@ -1,0 +1,211 @@
+"""The pictures of a study: main effects, interactions, and the Pareto front."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from drake_teleop.common.style import BLUE, GREY, VERMILION, Picture, house_style
+from drake_teleop.common.writing import write_picture
+from drake_teleop.lab.studies import effects
+from drake_teleop.lab.studies.cells import NO_RUN, NO_SUCCESS, NOT_COMPARABLE, TOO_FEW
+from drake_teleop.lab.studies.design import Study
+from drake_teleop.lab.studies.effects import PARETO, numbers, pair_means, pareto, varied
+from drake_teleop.lab.studies.level_model import CONFIDENCE
+
+if TYPE_CHECKING:
+    import polars as pl
+
+_LABELLED = 24  # points of the front that have room for their names
+_WIDTH = 24  # letters that have room below a picture
+# What has no value is hatched, by the reason.
+_HATCHES = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW: ""}
+
+
+def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
+    """Writes those pictures that mean something for this study into the folder.
+
+    Returns:
+        Their files; of an earlier study of this folder none remain.
+    """
+    for old in out.glob("*.png"):
+        old.unlink()
+    measures = [name for name in study.measures if np.isfinite(numbers(rows, name)).any()]
+    pictures: dict[str, Figure | None] = {}
+    if measures and varied(study):
+        pictures["main_effects"] = main_effects(study, rows, measures)
+        if len(varied(study)) > 1:
+            pictures |= {f"interactions_{m}": interactions(study, rows, m) for m in measures}
+    pictures["pareto"] = pareto_front(study, rows)
+    written = []
+    for name, picture in pictures.items():
+        if picture is not None:
+            written.append(out / f"{name}.png")
+            write_picture(written[-1], picture, bbox_inches="tight")
+    return written
+
+
+def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
+    """The mean of each measure at each level of each factor; dotted, that of all levels.
+
+    Bars are intervals of the level's difference from the mean of all, which is what a factor does.
+    A level that cannot be compared is hatched.
+    """
+    factors, fitted, reasons = varied(study), False, set[str]()
+    with house_style():
+        size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
+        figure = Picture(figsize=size)
+        grid = figure.subplots(len(measures), len(factors), squeeze=False, sharey="row")
+        for line, measure in zip(grid, measures, strict=True):
+            found = effects.main_effects(study, rows, measure)
+            for axes, factor in zip(line, factors, strict=True):
+                _levels(axes, found[factor.field])
+                fitted |= found[factor.field].fitted
+                reasons |= set(found[factor.field].why)
+            words = textwrap.wrap(measure.replace("_", "_ "), 18)
+            line[0].set_ylabel("\n".join(words).replace(" ", ""), fontsize=7)
+        for axes, factor in zip(grid[-1], factors, strict=True):
+            axes.set_xlabel(factor.field)
+        figure.suptitle(f"Main effects{_effects_caption(study, fitted)}", x=0.01, ha="left")
+        _legend(figure, reasons)
+    return figure
+
+
+def _levels(axes: Axes, found: effects.MainEffect) -> None:
+    place = np.arange(len(found.names))
+    bars = np.nan_to_num(found.effect_half)
+    axes.errorbar(place, found.mean, bars, color=BLUE, marker="o", ms=3.5, capsize=3)
+    _name(axes, found.names)
+    axes.set_xlim(-0.5, len(place) - 0.5)
+    for level in place[np.isnan(found.mean)]:
+        bar = _hatched(found.why[level], (level - 0.5, 0.0))
+        bar.set_transform(axes.get_xaxis_transform())
+        axes.add_patch(bar)
+    if np.isnan(found.mean).all():
+        words = TOO_FEW if TOO_FEW in found.why else ""
+        axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", fontsize=8)
+        return
+    axes.axhline(np.nanmax(found.mean - found.effect), color=GREY, lw=0.8, ls=":")
+    axes.set_title(_combinations(found), fontsize=7, color=GREY, loc="right")
+
+
+def _name(axes: Axes, levels: list[str]) -> None:
+    axes.set_xticks(range(len(levels)), levels)
+    if len("".join(levels)) > _WIDTH:
+        for label in axes.get_xticklabels():
+            label.set(rotation=20, ha="right", rotation_mode="anchor")
+
+
+def _combinations(found: effects.MainEffect | effects.PairMeans) -> str:
+    """What is left of the other factors, if something is left out."""
+    if not found.left_out:
+        return ""
+    return f"over {found.compared} of {found.compared + found.left_out} combinations of the rest"
+
+
+def _hatched(why: str, corner: tuple[float, float]) -> Rectangle:
+    """A hatched cell of width and height 1."""
+    return Rectangle(corner, 1.0, 1.0, hatch=_HATCHES[why], fc="white", ec=GREY, lw=0)
+
+
+def _legend(figure: Figure, reasons: Iterable[str]) -> None:
+    """Of the reasons for hatched cells, if there are any."""
+    names = [why for why in _HATCHES if why in reasons and why != TOO_FEW]
+    if names:
+        patches = [_hatched(why, (0.0, 0.0)) for why in names]
+        figure.legend(patches, names, loc="outside lower left", ncols=len(names))
+
+
+def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
+    """The mean of a measure over each pair of factors; None if there are too few points for it.
+
+    A cell without a value is hatched.
+    """
+    maps = [found for found in pair_means(study, rows, measure) if np.isfinite(found.mean).any()]
+    if not maps:
+        return None
+    columns = min(len(maps), 3)
+    lines = -(-len(maps) // columns)
+    with house_style():
+        figure = Picture(figsize=(1.0 + 3.1 * columns, 0.6 + 2.6 * lines))
+        grid = figure.subplots(lines, columns, squeeze=False)
+        low, high = (end([end(found.mean) for found in maps]) for end in (np.nanmin, np.nanmax))
+        for axes, found in zip(grid.ravel(), maps, strict=False):
+            drawn = axes.imshow(found.mean, origin="lower", aspect="auto", vmin=low, vmax=high)
+            for row, column in np.argwhere(np.isnan(found.mean)):
+                axes.add_patch(_hatched(found.why[row, column], (column - 0.5, row - 0.5)))
+            axes.grid(False)
+            _name(axes, found.names[1])
+            axes.set_yticks(range(len(found.names[0])), found.names[0])
+            axes.set_xlabel(found.fields[1])
+            axes.set_ylabel(found.fields[0])
+            axes.set_title(_combinations(found), fontsize=7, color=GREY, loc="right")
+        for axes in grid.ravel()[len(maps) :]:
+            axes.set_visible(False)
+        figure.colorbar(drawn, ax=grid, label=measure)
+        words = ", fitted: levels of each, and products" if maps[0].fitted else ""
+        figure.suptitle(f"Interactions: mean of {measure}{words}", x=0.01, ha="left")
+        _legend(figure, set().union(*(found.why.ravel() for found in maps)))
+    return figure
+
+
+def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
+    """Effort against task time and overshoot of the contact force; None if not measured."""
+    points = pareto(study, rows)
+    if points is None or not points["complete"].any():
+        return None
+    points = points.filter("complete")
+    on_front = points.filter("front")
+    factors = [factor.field for factor in varied(study)]
+    with house_style():
+        figure = Picture(figsize=(10.0, 4.2))
+        for axes, name in zip(figure.subplots(1, 2), PARETO[1:], strict=True):
+            axes.plot(points[name], points[PARETO[0]], "o", ms=3, color=GREY, alpha=0.5)
+            _bars(axes, on_front, name)
+            axes.set_xlabel(name)
+            axes.set_ylabel(PARETO[0])
+        if on_front.height <= _LABELLED:
+            for place, point in enumerate(on_front.iter_rows(named=True), 1):
+                for axes, name in zip(figure.axes, PARETO[1:], strict=True):
+                    axes.annotate(str(place), (point[name], point[PARETO[0]]), (4, 4),
+                                  textcoords="offset points", fontsize=8)  # fmt: skip
+            lines = [
+                f"{place}: "
+                + ", ".join(f"{field.split('.')[-1]} {point[field]}" for field in factors)
+                for place, point in enumerate(on_front.iter_rows(named=True), 1)
+            ]
+            figure.text(1.0, 0.5, "\n".join(lines), fontsize=7.5, va="center")
+        left = rows["point"].n_unique() - points.height
+        words = f"; points left out for failures: {left}" if left else ""
+        title = f"Pareto front of all three (red){_caption(study, 'of the mean')}{words}"
+        figure.suptitle(title, x=0.01, ha="left")
+    return figure
+
+
+def _bars(axes: Axes, points: pl.DataFrame, name: str) -> None:
+    half = [np.nan_to_num(points[f"{which}_half"].to_numpy()) for which in (name, PARETO[0])]
+    axes.errorbar(
+        points[name], points[PARETO[0]], half[1], half[0],
+        color=VERMILION, marker="o", ms=4, lw=0, elinewidth=0.9, capsize=2,
+    )  # fmt: skip
+
+
+def _effects_caption(study: Study, fitted: bool) -> str:
+    if not fitted:
+        return _caption(study, "of a level against the mean (dotted)")
+    words = f"; bars: {CONFIDENCE:.0%} intervals of all levels against the mean (dotted)"
+    over = "one seed" if study.repeats == 1 else f"{study.repeats} seeds"
+    return f"{words}, over the design and {over}"
+
+
+def _caption(study: Study, what: str) -> str:
+    if study.repeats == 1:
+        return "; one repeat has no intervals"
+    return f"; bars: {CONFIDENCE:.0%} intervals {what}, over {study.repeats} seeds"

@@ -1,0 +1,203 @@
+"""Where the runs of a study are worked off: processes of this machine, or Dask's workers.
+
+A run that ends its process (a crash in compiled code, memory that is short) is known by the mark of
+its chunk, which nobody has taken away. It is then run alone, and if that process ends too, it is a
+row with an error like any other failure. In the study's own process (one job) such a crash ends the
+study, and the same command goes on behind it.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.lab.studies.store import Store
+
+Chunk: TypeAlias = list[dict[str, Any]]
+"""Rows that go to a process together and come back with their measures."""
+Run: TypeAlias = Callable[[Chunk], Chunk]
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Where chunks are run.
+
+    Attributes:
+        count: of the processes.
+        rows_of: gives the rows of chunks, in the order in which they are done.
+    """
+
+    count: int
+    rows_of: Callable[[Run, Sequence[Chunk]], Iterator[Chunk]]
+
+
+DIED = "the run has ended its process"
+_LOOK = 0.5  # how often a process looks whether the study's is still there [s]
+
+
+@contextmanager
+def processes(store: Store, jobs: int, cluster: str | None) -> Iterator[Processes]:
+    """Processes, for as long as the context lasts.
+
+    Args:
+        store: of the study, for the marks.
+        jobs: processes on this machine, as joblib has it; 1 is this process.
+        cluster: address of a Dask scheduler, or "local" for one here with `jobs` workers.
+
+    Raises:
+        DrakeTeleopError: if Dask is not installed or no scheduler answers; from the function, if
+            processes end before they begin.
+    """
+    if cluster is None:
+        from joblib import effective_n_jobs
+
+        yield Processes(
+            effective_n_jobs(jobs),
+            lambda run, chunks: _on_this_machine(run, chunks, store, jobs),
+        )
+        return
+    with _client(cluster, jobs) as client:
+        workers = sum(client.nthreads().values())
+        yield Processes(workers, lambda run, chunks: _on_a_cluster(run, chunks, client))
+
+
+def _on_this_machine(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
+    left = list(chunks)
+    # A mark of an earlier session may be that of a kill; two at one chunk are suspicious.
+    suspicious = 2
+    while left:
+        marked = store.marked(suspicious)
+        for chunk in left:
+            if chunk[0]["run"] in marked:
+                yield _alone(run, chunk, store)
+        left = [chunk for chunk in left if chunk[0]["run"] not in marked]
+        done: set[int] = set()
+        try:
+            for found in _parallel(jobs)(_task(run, chunk, store) for chunk in left):
+                done.add(found[0]["run"])
+                yield found
+        except BrokenExecutor as error:
+            suspicious = 1
+            if not store.marked(suspicious):
+                raise DrakeTeleopError(f"processes end before they begin ({error})") from error
+        left = [chunk for chunk in left if chunk[0]["run"] not in done]
+
+
+def _parallel(jobs: int) -> Any:
+    from joblib import Parallel
+
+    # joblib replaces processes that have grown; a crash is an error, not this warning.
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
+    return Parallel(
+        n_jobs=jobs,
+        backend="loky",
+        return_as="generator_unordered",
+        # No batches of chunks: at the end one process would have work and the others none.
+        batch_size=1,
+        initializer=_watch,
+        initargs=(os.getpid(),),
+    )
+
+
+def _task(run: Run, chunk: Chunk, store: Store) -> Any:
+    from joblib import delayed
+
+    return delayed(_marked)(run, chunk, store)
+
+
+def _alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
+    """The rows one by one, each the only thing that other processes do."""
+    found = []
+    for row in chunk:
+        try:
+            # Two processes, because one would be this one.
+            found += next(_parallel(2)([_task(run, [row], store)]))
+        except BrokenExecutor:
+            found.append(row | {"error": DIED})
+    store.unmark(chunk[0]["run"])
+    return found
+
+
+def _marked(run: Run, chunk: Chunk, store: Store) -> Chunk:
+    """The chunk's rows; what ends the process leaves its mark."""
+    store.mark(chunk[0]["run"])
+    try:
+        return run(chunk)
+    finally:
+        store.unmark(chunk[0]["run"])
+
+
+def _watch(parent: int) -> None:
+    """Ends this process when the study's own is gone, of which nobody tells after a SIGKILL."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_LOOK)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def _client(address: str, jobs: int) -> Iterator[Any]:
+    """Dask's client. Not by joblib, whose backend for it waits for ever when a worker dies."""
+    try:
+        import dask
+        from distributed import Client
+    except ImportError:
+        raise DrakeTeleopError(
+            "Dask is not installed",
+            where="--cluster",
+            remedy=install_extra("cluster"),
+        ) from None
+    local = {
+        "n_workers": jobs if jobs > 0 else None,
+        "threads_per_worker": 1,
+        "host": "127.0.0.1",
+        "dashboard_address": "127.0.0.1:0",
+    }
+    settings = {
+        # A worker that dies takes no chunk along that was only waiting there.
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.scheduler.allowed-failures": 1,
+    }
+    with dask.config.set(settings):
+        try:
+            client = Client(**local) if address == "local" else Client(address)
+        except (OSError, ValueError) as error:
+            raise DrakeTeleopError(
+                f"no Dask scheduler answers at {address} ({error})", where="--cluster"
+            ) from None
+        with client:
+            yield client
+
+
+def _on_a_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:
+    from distributed import as_completed
+
+    futures = client.map(run, chunks, pure=False)
+    chunk_of = dict(zip(futures, chunks, strict=True))
+    for future in as_completed(futures):
+        yield _rows_of(future, chunk_of.pop(future), run, client)
+
+
+def _rows_of(future: Any, chunk: Chunk, run: Run, client: Any) -> Chunk:
+    """The rows of a future; those of a chunk that ends its workers one by one."""
+    from distributed import KilledWorker
+
+    try:
+        found: Chunk = future.result()
+    except KilledWorker:
+        if len(chunk) == 1:
+            return [chunk[0] | {"error": DIED}]
+        alone = [(client.submit(run, [row], pure=False), [row]) for row in chunk]
+        found = [row for part, rows in alone for row in _rows_of(part, rows, run, client)]
+    return found

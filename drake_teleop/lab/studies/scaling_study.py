@@ -1,0 +1,344 @@
+"""`drake-teleop scaling-study`: how to scale forces, for the simulated operator.
+
+The paper ends with that question. Four tasks are studied over sigma and gamma (free reaching, to
+which gamma does nothing; a contact transition; pressing with a set force; a peg into a slot), and
+eta for a contact transition with an object in the gripper: the files `scaling_*.yaml`.
+
+What is best depends on what counts. Each criterion is the mean over the runs of a point, as a part
+of its value at the reference sigma = gamma = 1, where the hand feels everything as it is. The merit
+of a point is their mean over criteria and tasks: below 1 it is better than the reference. Seeds are
+drawn with replacement, the same for all points, to see how sure the choice is: the interval of the
+merit, and how often a point is the best one. A point at which more than one run in twenty fails is
+no choice.
+
+The folder holds the studies' folders, and
+
+=========== =====================================================================================
+answer.json for each way of counting: the best sigma and gamma, its merit with the 95 % interval,
+            how often it is the best, and all points that are the best in one draw of twenty; and
+            what eta does
+answer.csv  each point's merit by each way of counting, with intervals
+answer.png  the criteria over sigma and gamma
+choice.png  the merit, and how often each point is the best
+=========== =====================================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from drake_teleop.common.style import COLOURS, Picture, house_style
+from drake_teleop.common.writing import (
+    make_folder,
+    output_folder,
+    write_json,
+    write_picture,
+    write_table,
+)
+from drake_teleop.lab.studies.effects import estimated, numbers
+from drake_teleop.lab.studies.store import Store
+from drake_teleop.lab.studies.study import LoadStudy, study_command
+
+if TYPE_CHECKING:
+    import polars as pl
+
+Array = NDArray[np.float64]
+
+CRITERIA = {
+    "effort": "effort_Ns",
+    "time": "task_time_s",
+    "force": "contact_force_overshoot_N",
+}
+#: Ways of counting: the criteria that count, each as much as the others.
+WAYS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
+TASKS = {"reach": ("effort", "time")} | dict.fromkeys(("touch", "press", "insert"), tuple(CRITERIA))
+"""The criteria of each task: nothing is touched in free reaching."""
+_OBJECT = "scaling_object"
+_SIGMA, _GAMMA, _ETA = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
+_DRAWS, _SEED = 2000, 0
+_FAILURES, _SELDOM = 0.05, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What the rows say for one way of counting.
+
+    Attributes:
+        merit: (s, g) of each sigma and gamma, 1 at the reference; nan where too many runs fail.
+        low, high: (s, g) its 95 % interval.
+        best: (s, g) in what part of the draws a point is the best.
+        failures: (s, g) what part of the runs fails, in the task in which most do.
+    """
+
+    merit: Array
+    low: Array
+    high: Array
+    best: Array
+    failures: Array
+
+
+def scaling_study_command(
+    out: Path,
+    *,
+    jobs: int = -1,
+    cluster: str | None = None,
+    repeats: int | None = None,
+    yes: bool | Callable[[str], bool] = False,
+    quiet: bool = False,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Runs the studies, or what is left of them, and answers.
+
+    Args:
+        out: the folder.
+        jobs, cluster, yes, quiet, progress: as for `study_command`.
+        repeats: of each point, instead of the studies' own.
+
+    Returns:
+        What answer.json holds.
+    """
+    make_folder(out)
+    rows = {}
+    for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT):
+        study_command(
+            name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
+            progress=progress, yes=yes,
+        )  # fmt: skip
+        rows[name] = Store(out / name / "runs.parquet").read()
+    tables = {task: _tables(rows[f"scaling_{task}"], task) for task in TASKS}
+    sigmas, gammas = _axes()
+    answers = {way: answer(tables, criteria) for way, criteria in WAYS.items()}
+    summary = {
+        "runs": sum(table.height for table in rows.values()),
+        "choice": {way: _chosen(found, sigmas, gammas) for way, found in answers.items()},
+        "eta": _eta(rows[_OBJECT]),
+    }
+    with output_folder(out, "answer.json"):
+        write_table(out / "answer.csv", _merits(answers, sigmas, gammas))
+        write_picture(out / "answer.png", criteria_picture(rows, sigmas, gammas))
+        write_picture(out / "choice.png", choice_picture(answers, sigmas, gammas))
+        write_json(out / "answer.json", summary)
+    if not quiet:
+        _print(summary, out)
+    return summary
+
+
+def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> Answer:
+    """The merit of each point.
+
+    Args:
+        tables: of each task, each criterion and "success": (s, g, seeds), nan where a run failed;
+            the last sigma and the gamma named by `_reference` are the reference.
+        criteria: those that count.
+    """
+    # Of a task nothing may count.
+    counted = {task: [name for name in TASKS[task] if name in criteria] for task in tables}
+    count = next(iter(tables.values()))["success"].shape[-1]
+    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), _DRAWS)
+    weights = np.vstack([np.ones(count), draws]).astype(float)
+    parts = [
+        np.mean([_relative(tables[task][name], weights) for name in names], axis=0)
+        for task, names in counted.items()
+        if names
+    ]
+    merits = np.mean(parts, axis=0)
+    failures = np.max([1 - t["success"].mean(axis=-1) for t in tables.values()], axis=0)
+    usable = failures <= _FAILURES
+    # Seeds at which the reference failed say nothing alone.
+    known = np.isfinite(merits[:, usable]).all(axis=1)
+    merits[:, ~usable] = np.nan
+    drawn, best = merits[1:][known[1:]], np.zeros(usable.size)
+    if not (usable.any() and known[0] and len(drawn)):
+        nothing = np.full(usable.shape, np.nan)
+        return Answer(nothing, nothing, nothing, best.reshape(usable.shape), failures)
+    flat = np.where(usable, drawn, np.inf).reshape(len(drawn), -1)
+    best = np.bincount(flat.argmin(axis=1), minlength=usable.size) / len(drawn)
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    return Answer(merits[0], low, high, best.reshape(usable.shape), failures)
+
+
+def _relative(table: Array, weights: Array) -> Array:
+    """(draws, s, g) weighted means over the seeds (s, g, seeds), as parts of the reference's."""
+    known = np.isfinite(table)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sums = np.einsum("sgk,dk->dsg", np.where(known, table, 0.0), weights)
+        means = sums / np.einsum("sgk,dk->dsg", known.astype(float), weights)
+    return means / means[:, -1, _reference(), None, None]
+
+
+def _axes() -> tuple[list[float], list[float]]:
+    factors = {factor.field: factor.values for factor in LoadStudy("scaling_touch").factors}
+    return factors[_SIGMA], factors[_GAMMA]
+
+
+def _reference() -> int:
+    return _axes()[1].index(1.0)
+
+
+def _tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
+    """(s, g, seeds) of each criterion and of success; without gamma the same for each."""
+    sigmas, gammas = _axes()
+    seeds = rows["seed"].n_unique()
+    count = len(gammas) if _GAMMA in rows.columns else 1
+    measures = {"success": "success"} | {name: CRITERIA[name] for name in TASKS[task]}
+    tables = {}
+    for name, measure in measures.items():
+        values = numbers(rows, measure)
+        if name == "success":
+            values = np.nan_to_num(values)
+        shaped = values.reshape(len(sigmas), count, seeds)
+        tables[name] = np.broadcast_to(shaped, (len(sigmas), len(gammas), seeds))
+    return tables
+
+
+def _chosen(found: Answer, sigmas: list[float], gammas: list[float]) -> dict[str, Any] | None:
+    if not np.isfinite(found.merit).any():
+        return None
+    s, g = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
+    near = np.argwhere(found.best >= _SELDOM)
+    return {
+        "sigma": sigmas[s],
+        "gamma": gammas[g],
+        "merit": found.merit[s, g],
+        "interval": [found.low[s, g], found.high[s, g]],
+        "best_in": found.best[s, g],
+        "others": [
+            {"sigma": sigmas[i], "gamma": gammas[j], "best_in": found.best[i, j]}
+            for i, j in near
+            if (i, j) != (s, g)
+        ],
+    }
+
+
+def _merits(answers: dict[str, Answer], sigmas: list[float], gammas: list[float]) -> pl.DataFrame:
+    import polars as pl
+
+    return pl.DataFrame(
+        [
+            {
+                "way": way,
+                "sigma": sigma,
+                "gamma": gamma,
+                "merit": found.merit[i, j],
+                "low": found.low[i, j],
+                "high": found.high[i, j],
+                "best_in": found.best[i, j],
+            }
+            for way, found in answers.items()
+            for i, sigma in enumerate(sigmas)
+            for j, gamma in enumerate(gammas)
+        ]
+    )
+
+
+def _eta(rows: pl.DataFrame) -> list[dict[str, Any]]:
+    """Each criterion's mean at each eta, with its interval and that of the effect of eta."""
+    etas = sorted(rows[_ETA].unique().to_list())
+    levels = np.array([etas.index(value) for value in rows[_ETA]])
+    seeds = rows["seed"].to_numpy()
+    table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
+    for measure in ("success", *CRITERIA.values(), "detection_time_s"):
+        found = estimated(numbers(rows, measure), levels, seeds, len(etas))
+        for index, row in enumerate(table):
+            figures = (found.mean[index], found.half[index], found.effect_half[index])
+            names = (measure, f"{measure}_half", f"{measure}_effect_half")
+            row |= {n: v if np.isfinite(v) else None for n, v in zip(names, figures, strict=True)}
+    return table
+
+
+def criteria_picture(
+    rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
+) -> Figure:
+    """Each criterion over sigma, a line for each gamma; bars: intervals against the mean of all."""
+    tasks = [task for task in TASKS if "force" in TASKS[task]]
+    with house_style():
+        figure = Picture(figsize=(10.0, 7.6))
+        grid = figure.subplots(len(tasks), 3, sharex=True)
+        for line, task in zip(grid, tasks, strict=True):
+            table = rows[f"scaling_{task}"]
+            levels, seeds = table["point"].to_numpy(), table["seed"].to_numpy()
+            for axes, measure in zip(line, CRITERIA.values(), strict=True):
+                found = estimated(numbers(table, measure), levels, seeds, levels.max() + 1)
+                means, bars = (a.reshape(-1, len(gammas)) for a in (found.mean, found.effect_half))
+                for j, gamma in enumerate(gammas):
+                    axes.errorbar(
+                        sigmas, means[:, j], np.nan_to_num(bars[:, j]), color=COLOURS[j],
+                        marker="o", ms=3, capsize=2, label=f"$\\gamma$ = {gamma:g}",
+                    )  # fmt: skip
+                axes.set_title(f"{task}: {measure}")
+                axes.set_ylim(bottom=0)
+        for axes in grid[-1]:
+            axes.set_xlabel("$\\sigma$")
+        grid[0, -1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list[float]) -> Figure:
+    """The merit over sigma and gamma for each way of counting, all in the same colours.
+
+    In the cells stand the merit and how often a point is the best, or how many runs fail.
+    """
+    known = np.concatenate([found.merit[np.isfinite(found.merit)] for found in answers.values()])
+    farthest = np.abs(np.log2(known)).max(initial=0.01)
+    # As far from 1 below as above, in ratios; the cell of a point that is no choice is grey.
+    ends = 2.0**-farthest, 2.0**farthest
+    scale = LogNorm(*ends)
+    colours = colormaps["RdBu_r"].with_extremes(bad="#dddddd")
+    with house_style():
+        figure = Picture(figsize=(10.0, 7.6))
+        grid = figure.subplots(2, 2)
+        for axes, (way, found) in zip(grid.ravel(), answers.items(), strict=True):
+            drawn = axes.imshow(
+                found.merit, origin="lower", aspect="auto", cmap=colours, norm=scale
+            )
+            axes.grid(False)
+            axes.set_xticks(range(len(gammas)), [f"{gamma:g}" for gamma in gammas])
+            axes.set_yticks(range(len(sigmas)), [f"{sigma:g}" for sigma in sigmas])
+            axes.set_xlabel("$\\gamma$")
+            axes.set_ylabel("$\\sigma$")
+            axes.set_title(f"counts: {way}")
+            for i, j in np.ndindex(found.merit.shape):
+                # White on what is dark.
+                dark = abs(scale(found.merit[i, j]) - 0.5) > 0.3
+                axes.text(j, i, _cell(found, i, j), color="white" if dark else "black",
+                          ha="center", va="center", fontsize=7.5)  # fmt: skip
+        bar = figure.colorbar(drawn, ax=grid, label="merit; below 1 is better than feeling all")
+        ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
+        bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks], minor=False)
+        bar.minorticks_off()
+        words = "Merit, and how often a point is the best; grey: in some task too many runs fail"
+        figure.suptitle(words, x=0.01, ha="left")
+    return figure
+
+
+def _cell(found: Answer, i: int, j: int) -> str:
+    if not np.isfinite(found.merit[i, j]):
+        return f"{found.failures[i, j]:.0%} fail"
+    best = f"\nbest: {found.best[i, j]:.0%}" if found.best[i, j] >= 0.005 else ""
+    return f"{found.merit[i, j]:.2f}{best}"
+
+
+def _print(summary: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("what counts", "sigma", "gamma", "merit", "95 %", "best in")
+    for way, found in summary["choice"].items():
+        if found is not None:
+            low, high = found["interval"]
+            table.add_row(
+                way, f"{found['sigma']:g}", f"{found['gamma']:g}", f"{found['merit']:.3f}",
+                f"{low:.3f} to {high:.3f}", f"{found['best_in']:.0%}",
+            )  # fmt: skip
+    console = Console()
+    console.print(table)
+    console.print(f"{summary['runs']} runs; written to {out}", highlight=False, markup=False)

@@ -1,0 +1,208 @@
+"""The station of a task under a condition, and what an interval in it was.
+
+The level of a stimulus goes into the inputs of a drive, in their whole numbers. A contact of F
+newton at the tool, for somebody who presses with P, is the share gamma F / P of what is touched;
+in the other interval it is none, so that eyes see the same in both. A mass of m at the hand is a
+share sigma of the load, more than the condition has (of a held object, if the condition has eta).
+What counts as the level is what it then was: with the force that was pressed with.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
+from drake_teleop.live.choice_names import OWN
+from drake_teleop.live.choices import chosen, known_estimate
+from drake_teleop.live.experiment.design import (
+    ApparentMass,
+    Condition,
+    ContactDetection,
+    PegInSlot,
+    Task,
+)
+from drake_teleop.live.experiment.procedure import Felt
+from drake_teleop.live.inputs import RANGES, Inputs
+from drake_teleop.live.session import live_scenario
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.operator.task import Insert
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.plant import NominalSlave
+
+Array = NDArray[np.float64]
+
+_MOST = RANGES["gamma"][1]  # %
+# A contact force counts when it lasts [s], and as a touch from here on [N].
+_LASTS, _TOUCHED = 0.02, 0.5
+# Of the slot: the tip stands so near the floor [m], for so long [s].
+_NEAR, _STANDS = 2e-3, 0.2
+
+
+def load_of(scenario: Scenario) -> IdentifiedLoad | None:
+    """What a station is told of its load, if it does not learn it."""
+    return None if scenario.load_estimator.enabled else identified_load(scenario)
+
+
+@dataclass(frozen=True, eq=False)
+class Apparatus:
+    """A task under a condition.
+
+    Attributes:
+        task, condition: which.
+        scenario: with the condition's network and method, and its object if there is one.
+        load: what the station knows of it.
+        mass: at the hand, of the load or object whose share is felt [kg].
+    """
+
+    task: Task
+    condition: Condition
+    scenario: Scenario
+    load: IdentifiedLoad | None
+    mass: float
+
+    def inputs(self, level: float, pressed: float) -> dict[str, int]:
+        """Those of an interval, in the units of `Inputs`.
+
+        Args:
+            level: of its stimulus; 0 for none.
+            pressed: the contact force at the tool that is expected [N].
+        """
+        condition = self.condition
+        sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
+        share = sigma if condition.eta is None else 100.0 * condition.eta
+        if isinstance(self.task, ContactDetection):
+            gamma = max(1.0, gamma * level / pressed) if level else 0.0
+        elif isinstance(self.task, ApparentMass) and level:
+            share += max(1.0, 100.0 * level / self.mass)
+        if condition.eta is None:
+            sigma = share
+        values = {"sigma": sigma, "sigma_object": share, "gamma": gamma}
+        return {name: min(round(value), _MOST) for name, value in values.items()}
+
+    def felt(self, shown: float, inputs: dict[str, int], rows: Rows) -> Felt:
+        """What an interval was.
+
+        Args:
+            shown: the level that it should have; 0 for none.
+            inputs: as above.
+            rows: of its log.
+        """
+        force = rows.force()
+        if isinstance(self.task, PegInSlot):
+            return Felt(force_N=force, done=rows.done_at > 0.0, time_s=rows.done_at or rows.time)
+        if isinstance(self.task, ContactDetection):
+            level = force * inputs["gamma"] / (100.0 * self.condition.gamma)
+            return Felt(level if shown else 0.0, force, valid=force > _TOUCHED)
+        before = self.condition.sigma if self.condition.eta is None else self.condition.eta
+        level = self.mass * (inputs["sigma_object"] / 100.0 - before)
+        return Felt(level if shown else 0.0, force)
+
+
+def make_apparatus(
+    task: Task, condition: Condition, scenario: Scenario, load: IdentifiedLoad | None
+) -> Apparatus:
+    """The station of a task under a condition, to be driven.
+
+    Args:
+        task, condition: which.
+        scenario: of the task.
+        load: that was identified in it.
+
+    Raises:
+        DrakeTeleopError: if there is no such station.
+    """
+    setup = live_scenario(scenario)
+    changes: dict[str, object] = {}
+    if condition.delay is not None:
+        changes["channel"] = Channel(delay=condition.delay)
+    elif condition.network != OWN:
+        changes["channel"] = Channel(network=condition.network)
+    if condition.method != OWN:
+        changes["passivity__method"] = condition.method
+    setup = replace(setup, contact_detection=None, **changes)
+    empty = NominalSlave(setup.slave).arm.phi_load[0]
+    if condition.eta is not None and setup.slave.payload.mass == 0.0:
+        held = chosen(setup, load, Inputs.of(setup).changed({"object": 1}))
+        estimate = known_estimate(setup, load, held)
+        if load is not None and estimate is not None:
+            known = dataclasses.replace(load.identification, offsets=estimate[:6], phi=estimate[6:])
+            load = dataclasses.replace(load, identification=known)
+        setup = held
+    setup.check()
+    mass = empty
+    if condition.eta is not None:
+        mass = setup.slave.payload.mass
+    at_hand = setup.force_scaling.force_scale * setup.kinematic_scaling.translation_scale
+    return Apparatus(task, condition, setup, load, float(mass) * at_hand)
+
+
+class Rows:
+    """The log of an interval, as it comes in.
+
+    Attributes:
+        time: of the last row [s].
+        done_at: when the tool had come to the floor of the slot [s]; 0 before.
+
+    Args:
+        task: that is done.
+        scenario: that is driven; with the task's slot, if it has one.
+    """
+
+    def __init__(self, task: Task, scenario: Scenario, insert: Insert | None) -> None:
+        self.time, self.done_at = 0.0, 0.0
+        self._forces: list[Array] = []
+        self._felt: list[Array] = []
+        self._dt = 1.0 / scenario.rates.log_hz
+        self._slave, self._insert = NominalSlave(scenario.slave), insert
+        self._on_floor: float | None = None
+
+    def add(self, rows: dict[str, Array]) -> None:
+        """The newest rows, as `Session.news` gives them."""
+        if not len(rows["t"]):
+            return
+        self.time = float(rows["t"][-1])
+        contact = rows.get("true_contact_wrench_W", np.zeros((len(rows["t"]), 6)))
+        self._forces.append(np.linalg.norm(contact[:, :3], axis=1))
+        self._felt.append(rows["force_to_master"][:, :3])
+        if self._insert is not None and not self.done_at:
+            self._look(self._insert, rows)
+
+    def _look(self, insert: Insert, rows: dict[str, Array]) -> None:
+        """Whether the tip stands on the slot's floor."""
+        arm, R_WS, p_WS = self._slave.arm, np.empty((3, 3)), np.empty(3)
+        forward_kinematics(arm.table, rows["slave_state"][-1, : arm.num_joints], R_WS, p_WS)
+        tip = p_WS + R_WS @ self._slave.tip - self._slave.start_tip
+        if tip[2] - insert.translation[2] + insert.depth > _NEAR:
+            self._on_floor = None
+        elif self._on_floor is None:
+            self._on_floor = self.time
+        elif self.time - self._on_floor >= _STANDS:
+            self.done_at = self._on_floor
+
+    def force(self) -> float:
+        """The largest contact force at the tool that lasted for 20 ms [N]."""
+        return _largest(np.concatenate([np.zeros(1), *self._forces]), self._dt)
+
+    def change(self, after: float) -> float:
+        """The largest change of the felt force that lasted for 20 ms [N].
+
+        Args:
+            after: what was felt in the tenth of a second before is what it changes from [s].
+        """
+        felt = np.concatenate(self._felt)
+        begin = round(after / self._dt)
+        rest = felt[round((after - 0.1) / self._dt) : begin].mean(axis=0)
+        return _largest(np.linalg.norm(felt[begin:] - rest, axis=1), self._dt)
+
+
+def _largest(values: Array, dt: float) -> float:
+    """Of the means over 20 ms."""
+    n = max(1, round(_LASTS / dt))
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    means = (sums[n:] - sums[:-n]) / n
+    return float(means.max()) if len(means) else float(values.max())

@@ -1,0 +1,266 @@
+"""A drive in which a participant is led through an experiment; without any page.
+
+It takes the place of `Live`: each interval is a `Live` of its own, from the scenario's start, and a
+recorded drive, which `run --inputs` repeats. The page is told what the hand feels, for it has to
+come to the hand, and nothing else of the forces, of the condition, or of the stimulus.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.common.writing import CannotWrite
+from drake_teleop.live.device_link import DeviceLink
+from drake_teleop.live.experiment.apparatus import Apparatus, Rows
+from drake_teleop.live.experiment.design import PegInSlot
+from drake_teleop.live.experiment.messages import HAND, parse_study
+from drake_teleop.live.experiment.procedure import GAP, INTERVAL, Procedure
+from drake_teleop.live.experiment.simulated import seeded
+from drake_teleop.live.experiment.store import Store
+from drake_teleop.live.inputs import RANGES, Inputs
+from drake_teleop.live.live import FRAME, Live, Show
+from drake_teleop.station.operator.task import Insert
+from drake_teleop.station.scenario import Scenario
+
+#: Between the intervals of a trial [s].
+_GAP = 0.8
+_KNOWN = (
+    *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
+    *("speed", "slow", "view", "no_view", "moves"),
+)
+_HIDDEN = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": "", "scene": "own"}
+
+
+def unseen(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The rows without what would draw forces."""
+    none = dict.fromkeys(("measured_wrench_S", "load_estimate"))
+    return rows | {name: np.zeros_like(rows[name]) for name in none}
+
+
+class Guided:
+    """What happens when messages and the clock's ticks come in; as `Live` has it.
+
+    Attributes:
+        refused: how many messages were none.
+        asked: always "": there is no scene to ask for.
+
+    Args:
+        procedure: of the participant.
+        stations: of each task and condition.
+        scenarios: of the tasks.
+        store: beside whose trials the drives are recorded.
+        shows: what shows the scene of each task.
+        now: the clock [s].
+        link: to a haptic device that is the hand.
+    """
+
+    def __init__(
+        self,
+        procedure: Procedure,
+        stations: dict[tuple[int, int], Apparatus],
+        scenarios: list[Scenario],
+        store: Store,
+        shows: Sequence[Show],
+        now: float,
+        link: DeviceLink | None = None,
+    ) -> None:
+        self.refused, self.asked = 0, ""
+        self._procedure, self._stations, self._scenarios = procedure, stations, scenarios
+        self._drives, self._shows, self._link = store.folder / "drives", shows, link
+        self._clients: list[int] = []
+        self._driver: int | None = None
+        self._unwritten = ""
+        self._intervals, self._since, self._frame_due = 0, now, now
+        self._prepare(now)
+
+    def _prepare(self, now: float) -> None:
+        """The station of the next interval, at its start."""
+        procedure = self._procedure
+        trial, self._prepared = procedure.trial, procedure.prepared
+        self._apparatus = self._stations[trial.task, trial.condition]
+        self._show = self._shows[trial.task]
+        insert = self._scenarios[trial.task].operator.task
+        insert = insert if isinstance(insert, Insert) else None
+        self._rows = Rows(procedure.task, self._apparatus.scenario, insert)
+        self._stimulus = self._apparatus.inputs(procedure.shown, procedure.pressed)
+        name = f"{procedure.number:04}-{procedure.interval}"
+        self._live = Live(
+            seeded(self._apparatus.scenario, procedure),
+            self._apparatus.load,
+            self._drives / f"{procedure.participant:02}" / name,
+            self._watch,
+            now,
+            self._link,
+            log=False,
+            begin=self._stimulus,
+        )
+        self._intervals += 1
+        if self._driver is not None:
+            self._live.join(self._driver, now)
+
+    def _watch(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
+        self._rows.add(rows)
+        return self._show(unseen(rows))
+
+    def hello(self) -> dict[str, Any]:
+        """What a page has to know."""
+        procedure = self._procedure
+        known = {"scenario": f"Participant {procedure.participant}", "scenes": []}
+        hidden = {"object": False, "known": False, "noise": False, "touch": 0.01}
+        study = {"feedback": procedure.experiment.feedback, "device": self._link is not None}
+        return self._live.hello() | known | hidden | {"study": study}
+
+    def join(self, client: int, now: float) -> None:
+        """A page has connected; the first one drives."""
+        self._clients.append(client)
+        if self._driver is None:
+            self._hand_over(client, now)
+
+    def _hand_over(self, client: int, now: float) -> None:
+        self._leave_alone(now)
+        self._driver = client
+        self._live.join(client, now)
+
+    def leave(self, client: int, now: float) -> None:
+        """A page has gone. If it was the driver, the trial will begin again."""
+        self._clients.remove(client)
+        if client == self._driver:
+            self._leave_alone(now)
+
+    def _leave_alone(self, now: float) -> None:
+        if self._driver is None:
+            return
+        self._live.leave(self._driver, now)
+        self._driver = None
+        self._procedure.interrupted()
+        self._keep_up(now)
+
+    def _keep_up(self, now: float) -> None:
+        """Another interval has its own station."""
+        with self._noting():
+            if self._procedure.prepared != self._prepared:
+                self._live.end()
+                self._prepare(now)
+
+    @contextmanager
+    def _noting(self) -> Iterator[None]:
+        """Keep what cannot be written for `tick`, which ends the experiment with it."""
+        try:
+            yield
+        except CannotWrite as error:
+            self._unwritten = str(error)
+
+    def hear(self, client: int, text: Any, now: float) -> None:
+        """A message of a page; what is not one changes nothing but a counter."""
+        said = parse_study(text)
+        if said is None:
+            self.refused += 1
+            return
+        if "drive" in said and client != self._driver:
+            self._hand_over(client, now)
+        if client != self._driver:
+            return
+        procedure = self._procedure
+        if procedure.phase == INTERVAL:
+            moves = {kind: said[kind] for kind in said.keys() & {"set", "rates"}}
+            self._live.hear(client, json.dumps(moves), now)
+        before = procedure.phase, procedure.number
+        if "answer" in said:
+            with self._noting():
+                procedure.answer(said["answer"], now - self._since)
+        elif "go" in said:
+            procedure.go()
+        if (procedure.phase, procedure.number) == before:
+            return
+        self._keep_up(now)
+        self._since = now
+        if procedure.phase == INTERVAL:
+            self._live.pace.start(now)
+
+    def wait(self, now: float) -> float:
+        """How long there is nothing to do [s]."""
+        return self._live.wait(now) if self._runs else max(0.0, self._frame_due - now)
+
+    @property
+    def stopped(self) -> str:
+        """Why simulated time stands still; "" if nothing has failed."""
+        return self._live.stopped
+
+    @property
+    def ms(self) -> int:
+        """Simulated time of the present interval [ms]."""
+        return self._live.ms
+
+    @property
+    def _runs(self) -> bool:
+        return self._procedure.phase == INTERVAL and self._driver is not None
+
+    def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
+        """Simulates what is due; gives a frame when one is due.
+
+        Raises:
+            CannotWrite: if a trial or a drive cannot be written.
+        """
+        if self._unwritten:
+            raise CannotWrite(self._unwritten)
+        now = clock()
+        if self._procedure.phase == GAP and now - self._since >= _GAP:
+            self._procedure.second()
+            self._live.pace.start(now)
+        if self._runs:
+            told = self._live.tick(clock) is not None
+            self._look(clock())
+            return self.frame() if told else None
+        if now < self._frame_due:
+            return None
+        self._frame_due = now + FRAME
+        return self.frame()
+
+    def _look(self, now: float) -> None:
+        """Whether the interval is over."""
+        task, live = self._procedure.task, self._live
+        slot = isinstance(task, PegInSlot)
+        length = task.timeout if isinstance(task, PegInSlot) else task.interval
+        if live.ms < 1e3 * length and not (slot and self._rows.done_at):
+            return
+        live.frame()
+        felt = self._apparatus.felt(self._procedure.shown, self._stimulus, self._rows)
+        felt = dataclasses.replace(felt, lost_s=live.pace.given_up)
+        self._procedure.finished(felt)
+        self._since = self._frame_due = now
+        self._keep_up(now)
+
+    def frame(self) -> dict[str, Any]:
+        """What a page is shown now."""
+        inner = self._live.frame()
+        felt = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._runs else [0.0, 0.0]
+        task = self._procedure.task
+        length = task.timeout if isinstance(task, PegInSlot) else task.interval
+        left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._runs else 0.0
+        plain = Inputs()
+        inputs = {name: getattr(plain, name) for name in RANGES}
+        inputs |= {name: inner["inputs"][name] for name in HAND}
+        scaling = self._apparatus.scenario.kinematic_scaling
+        return {
+            **{name: inner[name] for name in _KNOWN if name in inner},
+            **_HIDDEN,
+            "f": [felt] * 3,
+            "state": "stopped" if inner["stopped"] else "running",
+            "driver": self._driver,
+            "drive": self._intervals,
+            "inputs": inputs,
+            "scale": scaling.translation_scale,
+            "study": self._procedure.view() | {"left": round(left, 3)},
+        }
+
+    def close(self) -> None:
+        """Ends the drive; its trials are on the disk."""
+        self._live.close()
+        if self._link is not None:
+            self._link.close()

@@ -1,0 +1,184 @@
+"""What came out of an experiment: thresholds, d', times and forces with 95 % intervals.
+
+`results.csv` has a row for each quantity of each participant, task and condition, and one over all
+participants from two on. Of one participant a threshold and d' are medians of what is probable
+after its answers (`Psi`), times and forces geometric means over the trials with t intervals of the
+logarithm, a share Wilson's. Over participants it is the geometric mean with the t interval of the
+logarithm, of a share the mean with the t interval. d' is that at the middle of the levels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.special import stdtrit
+
+from drake_teleop.common.writing import write_picture, write_table
+from drake_teleop.live.experiment.design import ApparentMass, Experiment, PegInSlot, Task
+from drake_teleop.live.experiment.psychometrics import Estimate, Psi
+from drake_teleop.live.experiment.store import Row, Store
+
+if TYPE_CHECKING:
+    import polars as pl
+    from matplotlib.axes import Axes
+
+_Z = 1.959964
+_SHOWN = (
+    "threshold of contact [N at the tool]",
+    "threshold of mass [kg at the hand]",
+    "time to the floor [s]",
+    "largest contact force [N]",
+)
+_SHARE = "share of trials done"
+
+
+class Result(NamedTuple):
+    """A row of the table; participant 0 stands for all of them."""
+
+    task: str
+    condition: str
+    participant: int
+    trials: int
+    quantity: str
+    value: float
+    low: float
+    high: float
+
+
+def results(experiment: Experiment, store: Store) -> list[Result]:
+    """All rows of the table; what nothing is known of is left out."""
+    found = []
+    known = {n: [row for row in store.rows(n) if not row.practice] for n in store.participants()}
+    for task in experiment.tasks:
+        kind = type(task).__name__
+        for condition in experiment.conditions:
+            each: dict[str, list[Result]] = {}
+            for n, rows in known.items():
+                done = [r for r in rows if (r.task, r.condition) == (kind, condition.name)]
+                for quantity, estimate in _of_one(task, done).items():
+                    values = (estimate.value, estimate.low, estimate.high)
+                    result = Result(kind, condition.name, n, len(done), quantity, *values)
+                    each.setdefault(quantity, []).append(result)
+            for quantity, one in each.items():
+                found += one
+                if len(one) > 1:
+                    over = _over_all([r.value for r in one], share=quantity == _SHARE)
+                    trials = sum(r.trials for r in one)
+                    found.append(Result(kind, condition.name, 0, trials, quantity, *_triple(over)))
+    return found
+
+
+def _triple(estimate: Estimate) -> tuple[float, float, float]:
+    return estimate.value, estimate.low, estimate.high
+
+
+def _of_one(task: Task, rows: Sequence[Row]) -> dict[str, Estimate]:
+    if not rows:
+        return {}
+    if isinstance(task, PegInSlot):
+        done = [row for row in rows if row.correct]
+        found = {_SHARE: _wilson(len(done), len(rows))}
+        if done:
+            found["time to the floor [s]"] = _over_all([row.time_s for row in done])
+            found["largest contact force [N]"] = _over_all([row.force_N for row in done])
+        return found
+    psi = Psi(task.low, task.high)
+    for row in rows:
+        psi.answered(row.level, bool(row.correct))
+    middle = math.sqrt(task.low * task.high)
+    mass = isinstance(task, ApparentMass)
+    unit = "kg" if mass else "N"
+    name = "threshold of mass [kg at the hand]" if mass else "threshold of contact [N at the tool]"
+    return {name: psi.threshold(), f"d' at {middle:.3g} {unit}": psi.d_prime(middle)}
+
+
+def _over_all(values: Sequence[float], *, share: bool = False) -> Estimate:
+    """The (geometric) mean with its t interval; of one value the interval is not known."""
+    x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
+    mean, half = float(x.mean()), math.nan
+    if len(x) > 1:
+        half = float(stdtrit(len(x) - 1, 0.975) * x.std(ddof=1) / math.sqrt(len(x)))
+    found = (mean, mean - half, mean + half)
+    if share:
+        return Estimate(*(min(max(v, 0.0), 1.0) if v == v else v for v in found))
+    return Estimate(*(math.exp(v) for v in found))
+
+
+def _wilson(successes: int, n: int) -> Estimate:
+    """A share with Wilson's interval (J. Am. Stat. Assoc. 22, 1927)."""
+    p, z2 = successes / n, _Z**2
+    middle = (p + z2 / (2 * n)) / (1 + z2 / n)
+    half = _Z / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
+    return Estimate(p, max(middle - half, 0.0), min(middle + half, 1.0))
+
+
+def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
+    """Writes trials.csv, results.csv and results.png into the folder; returns the table."""
+    import polars as pl
+
+    found = results(experiment, store)
+    schema: dict[str, type[pl.DataType]] = {
+        name: pl.String for name in ("task", "condition", "quantity")
+    }
+    schema |= {name: pl.Int64 for name in ("participant", "trials")}
+    schema |= {name: pl.Float64 for name in ("value", "low", "high")}
+    schema = {name: schema[name] for name in Result._fields}
+    table = pl.DataFrame(found, schema=schema, orient="row").with_columns(
+        pl.col("value", "low", "high").fill_nan(None)
+    )
+    write_table(store.folder / "trials.csv", store.table())
+    write_table(store.folder / "results.csv", table)
+    _write_picture(store.folder / "results.png", experiment, found)
+    return table
+
+
+def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> None:
+    """A panel for each quantity: small points for participants, a large one for all of them."""
+    from drake_teleop.common.style import Picture, house_style
+
+    shown = [quantity for quantity in _SHOWN if any(r.quantity == quantity for r in found)]
+    if not shown:
+        return
+    names = [condition.name for condition in experiment.conditions]
+    with house_style():
+        figure = Picture(figsize=(2.9 * len(shown), 0.9 + 0.62 * len(names)))
+        grid = figure.subplots(1, len(shown), squeeze=False, sharey=True)
+        for axes, quantity in zip(grid[0], shown, strict=True):
+            _draw(axes, names, [r for r in found if r.quantity == quantity])
+            axes.set_xlabel(quantity)
+        grid[0][0].set_yticks(range(len(names)), names)
+        grid[0][0].set_ylim(len(names) - 0.5, -0.5)
+        people = len({r.participant for r in found} - {0})
+        who = f"{people} participants and their mean" if people > 1 else "1 participant"
+        figure.suptitle(f"{who}, 95 % intervals", x=0.01, ha="left", fontsize=10)
+    write_picture(path, figure, bbox_inches="tight")
+
+
+def _draw(axes: Axes, names: list[str], found: list[Result]) -> None:
+    from matplotlib.ticker import LogLocator
+
+    from drake_teleop.common.style import BLUE, VERMILION
+
+    people = sorted({r.participant for r in found} - {0})
+    for r in found:
+        place = float(names.index(r.condition))
+        if r.participant and len(people) > 1:
+            place += 0.1 + 0.25 * people.index(r.participant) / (len(people) - 1)
+        large = not r.participant or len(people) == 1
+        colour, thick = (VERMILION, 2.0) if large else (BLUE, 0.8)
+        if not r.participant:
+            place -= 0.15
+        axes.plot(r.value, place, "o", color=colour, markersize=6 if large else 2.5)
+        if math.isfinite(r.low):
+            axes.plot([r.low, r.high], [place, place], color=colour, linewidth=thick)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    # There may be no power of ten among what is shown.
+    least, most = axes.get_xlim()
+    axes.xaxis.set_minor_locator(LogLocator(subs=(2, 3, 4, 6) if most < 30 * least else (3,)))
+    axes.xaxis.set_minor_formatter("{x:g}")
+    axes.grid(axis="y", visible=False)

@@ -1,0 +1,104 @@
+"""The page of an experiment: that of `drive`, whose cockpit gives way to what is asked."""
+
+from __future__ import annotations
+
+import time
+import webbrowser
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.live.experiment.design import Experiment
+from drake_teleop.live.experiment.guided import Guided
+from drake_teleop.live.experiment.procedure import Procedure
+from drake_teleop.live.experiment.simulated import all_apparatus
+from drake_teleop.live.experiment.store import Store
+from drake_teleop.live.external_master import with_device
+from drake_teleop.live.page_scene import PageScene
+from drake_teleop.live.server import LiveDrive, waits, warm_up
+from drake_teleop.station.scenario import Scenario
+
+
+class ExperimentDrive(LiveDrive):
+    """An experiment whose page is open to one participant.
+
+    Args:
+        experiment, scenarios: as `LoadExperiment` gives them.
+        store: of the trials.
+        participant: whose turn it is.
+        port, device: as of `drive`.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        scenarios: list[Scenario],
+        store: Store,
+        participant: int,
+        port: int = 0,
+        device: str | None = None,
+    ) -> None:
+        if device is not None:
+            scenarios = [with_device(scenario) for scenario in scenarios]
+        self._stations = all_apparatus(experiment, scenarios)
+        self._procedure = Procedure(experiment, participant, store)
+        self._scenarios, self._store = scenarios, store
+        super().__init__(scenarios[0], None, port, device)
+
+    def _prepare(self, scenario: Scenario, device: bool) -> None:
+        """Make a 3D scene for each task. Arrows would show which force is rendered."""
+        for task in map(str, range(len(self._scenarios))):
+            seen = self._stations[int(task), 0].scenario
+            self._views[task] = PageScene(task, seen, forces=False)
+        first = self._stations[0, 0]
+        warm_up(first.scenario, first.load, device)
+
+    def _make(self, scenario: Scenario, record: Path | None) -> Any:
+        link = None if self._device is None else self._device.link
+        shows = [view.show for view in self._views.values()]
+        setup = (self._procedure, self._stations, self._scenarios, self._store, shows)
+        return Guided(*setup, time.perf_counter(), link)
+
+    def done(self) -> tuple[int, int]:
+        """Trials that the participant has done, and all."""
+        return self._procedure.number, len(self._procedure.trials)
+
+    def _page(self) -> str:
+        panel = (
+            resources.files("drake_teleop.live.experiment").joinpath("page.html").read_text("utf-8")
+        )
+        return super()._page().replace("</body>", panel + "</body>")
+
+
+def serve_experiment(
+    experiment: Experiment,
+    scenarios: list[Scenario],
+    store: Store,
+    participant: int,
+    *,
+    port: int,
+    browser: bool,
+    device: str | None,
+) -> None:
+    """Serve the page until Ctrl-C or SIGTERM.
+
+    Args:
+        experiment, scenarios, store, participant, port, device: as of `ExperimentDrive`.
+        browser: whether to open the page.
+
+    Raises:
+        DrakeTeleopError: with what had stopped the drive.
+        KeyboardInterrupt: if the participant has not done all trials.
+    """
+    live = ExperimentDrive(experiment, scenarios, store, participant, port, device)
+    if browser:
+        webbrowser.open(live.url)
+    print(f"participant {participant} at {live.url}\n{waits(device)}; Ctrl-C ends it", flush=True)
+    reason, (done, trials) = live.until_signal(), live.done()
+    what = f"participant {participant} has done {done} of {trials} trials"
+    if live.ended:
+        raise DrakeTeleopError(f"had stopped: {live.ended}; {what}", where="drive")
+    if done < trials:
+        raise KeyboardInterrupt(f"{reason}: {what}; the same command continues")
+    print(f"\nended by {reason}: {what}")

@@ -1,0 +1,160 @@
+"""Participants that are simulated: the station runs, and an observer with noise compares.
+
+In each interval the hand is led by a script: down to what there is to touch and up again, or to and
+fro. The response to an interval is the largest change of the force that the station displayed, plus
+normal noise whose standard deviation grows with it; the interval of the larger one is the answer.
+The peg goes into the slot by the simulated operator of `docs/operator.md`. A participant of its own
+has its own noise, and nothing else: none learns or tires.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from drake_teleop.live.experiment.apparatus import Apparatus, Rows, load_of, make_apparatus
+from drake_teleop.live.experiment.design import (
+    ApparentMass,
+    Experiment,
+    PegInSlot,
+    SimulatedParticipant,
+)
+from drake_teleop.live.experiment.procedure import ANSWER, END, GAP, INTERVAL, Felt, Procedure
+from drake_teleop.live.experiment.store import Store
+from drake_teleop.live.inputs import SLICE_MS
+from drake_teleop.live.session import Session
+from drake_teleop.station.operator.task import Insert
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.station import MakeTeleopStation
+from drake_teleop.station.task_measures import contact_force, task_measures
+
+# The hand moves from here on [s]; what it feels in the tenth of a second before is rest.
+_BEGINS = 0.4
+_UNIT = 1e-5  # m, of the inputs
+_NEWS_MS = 200
+
+
+def all_apparatus(
+    experiment: Experiment, scenarios: list[Scenario]
+) -> dict[tuple[int, int], Apparatus]:
+    """The station of each task under each condition; loads are identified if they are not known."""
+    found = {}
+    for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
+        load = load_of(scenario)
+        for c, condition in enumerate(experiment.conditions):
+            found[t, c] = make_apparatus(task, condition, scenario, load)
+    return found
+
+
+def seeded(scenario: Scenario, procedure: Procedure) -> Scenario:
+    """The scenario with noise of its own for each interval of each trial of each participant."""
+    number = 2 * procedure.number + procedure.interval
+    rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
+    return replace(scenario, simulation__seed=int(rng.integers(2**32)))
+
+
+def take_part(
+    experiment: Experiment,
+    scenarios: list[Scenario],
+    stations: dict[tuple[int, int], Apparatus],
+    store: Store,
+    participant: int,
+    progress: Callable[[int, int], None],
+) -> None:
+    """A simulated participant does what it has not done.
+
+    Args:
+        experiment: with its `simulated`.
+        scenarios, stations: as of `all_apparatus`.
+        store: where trials go to.
+        participant: its number.
+        progress: is told the trials that are done, and all.
+    """
+    procedure = Procedure(experiment, participant, store)
+    observer, responses = experiment.simulated, [0.0, 0.0]
+    while procedure.phase != END:
+        if procedure.phase == INTERVAL:
+            apparatus = stations[procedure.trial.task, procedure.trial.condition]
+            if isinstance(procedure.task, PegInSlot):
+                felt = _insert(apparatus, scenarios[procedure.trial.task], procedure)
+            else:
+                felt, response = _interval(apparatus, procedure)
+                responses[procedure.interval - 1] = response
+            procedure.finished(felt)
+        elif procedure.phase == GAP:
+            procedure.second()
+        elif procedure.phase == ANSWER:
+            rng = np.random.default_rng([experiment.seed, participant, procedure.number, 3])
+            procedure.answer(compared(observer, responses, rng), 0.5)
+            progress(procedure.number, len(procedure.trials))
+        else:
+            procedure.go()
+
+
+def compared(
+    observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
+) -> int:
+    """The interval, 1 or 2, that the observer thinks was stronger.
+
+    Of responses r1 and r2 with deviations s1 and s2, P(r1 + s1 n1 > r2 + s2 n2) is that of
+    d' = (r1 - r2) / s where both deviations are s: a difference of `noise` at rest is d' = 1.
+    """
+    if rng.random() < observer.lapse:
+        return int(rng.integers(1, 3))
+    noisy = [
+        r + math.hypot(observer.noise, observer.weber * r) * rng.standard_normal()
+        for r in responses
+    ]
+    return 1 if noisy[0] > noisy[1] else 2
+
+
+def _interval(apparatus: Apparatus, procedure: Procedure) -> tuple[Felt, float]:
+    """What it was, and the response of an observer without noise [N]."""
+    task, observer = apparatus.task, procedure.experiment.simulated
+    assert not isinstance(task, PegInSlot)
+    session = Session(seeded(apparatus.scenario, procedure), apparatus.load)
+    stimulus = apparatus.inputs(procedure.shown, procedure.pressed)
+    rows = Rows(task, apparatus.scenario, None)
+    sways, length = isinstance(task, ApparentMass), task.interval - _BEGINS
+    while session.ms < 1e3 * task.interval:
+        t = max(1e-3 * session.ms - _BEGINS, 0.0)
+        if sways:
+            ramp = min(t, 1.0)
+            place = {"x": observer.sway * ramp * math.sin(2.0 * math.pi * t)}
+        else:
+            place = {"z": -observer.reach * 0.5 * (1.0 - math.cos(2.0 * math.pi * t / length))}
+        hand = {name: value / _UNIT for name, value in place.items()}
+        session.apply(session.inputs.changed(stimulus | hand))
+        session.advance(SLICE_MS)
+        if session.ms % _NEWS_MS == 0:
+            rows.add(session.news())
+    rows.add(session.news())
+    session.close()
+    return apparatus.felt(procedure.shown, stimulus, rows), rows.change(_BEGINS)
+
+
+def _insert(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> Felt:
+    """The simulated operator brings the peg into the slot."""
+    task, condition = apparatus.task, apparatus.condition
+    assert isinstance(task, PegInSlot) and isinstance(own.operator.task, Insert)
+    scenario = replace(
+        seeded(apparatus.scenario, procedure),
+        operator__task=own.operator.task,
+        simulation__duration=task.timeout,
+        simulation__settle=own.simulation.settle,
+        simulation__end_with_task=True,
+        force_scaling__sigma=condition.sigma,
+        force_scaling__gamma=condition.gamma,
+        force_scaling__eta=condition.eta,
+    )
+    scenario.check()
+    estimate = None if apparatus.load is None else apparatus.load.estimate
+    station = MakeTeleopStation(scenario, load_estimate=estimate)
+    result = simulate(station, scenario.simulation, progress=False)
+    found = task_measures(result, scenario)
+    done = found["success"] > 0.0
+    taken = found["task_time_s"] if done else task.timeout
+    return Felt(force_N=float(contact_force(result).max()), done=done, time_s=taken)

@@ -1,1 +1,0 @@
-"""Look of pages, pictures and terminal."""

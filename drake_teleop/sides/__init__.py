@@ -1,1 +1,0 @@
-"""The three parts of a station: master side, channel, slave side (docs/station.md)."""

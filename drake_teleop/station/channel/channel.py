@@ -1,0 +1,499 @@
+"""What lies between master and slave (long: a network, both ends of it, and their block).
+
+At every period both ends take one step of the method that keeps the station passive
+(`drake_teleop.station.passivity`), and their packets pass one line of the network each
+(`drake_teleop.station.channel.network`). The block works in world axes and in the master's power
+units, see `drake_teleop.station.passivity.methods`.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    LeafSystem,
+    ValueProducer,
+)
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fault import sound
+from drake_teleop.common.fields import settings
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.quantities import choice, plain, quantity
+from drake_teleop.common.vectors import put
+from drake_teleop.station.channel import network
+from drake_teleop.station.channel.network import PRESETS, NetworkConfig
+from drake_teleop.station.passivity import methods
+from drake_teleop.station.passivity.memory import FILLS, LIMIT, MEMORY, OF_LOAD, Slots
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.passivity.packet import (
+    CONTACT,
+    HEALTHY,
+    LOAD,
+    PACKET_SIZE,
+    difference_into,
+    dot,
+)
+from drake_teleop.station.passivity.safe_state import (
+    MASTER_WATCH,
+    SILENT,
+    SLAVE_WATCH,
+    STOP,
+    initial_master_watch,
+    initial_slave_watch,
+    master_limits_into,
+    slave_command_into,
+)
+
+_NETWORKS = ("custom", *PRESETS)
+_DIRECTIONS = (network.FORWARD, network.BACKWARD)
+#: Of a time-out that follows from the network [s], and of any.
+SHORTEST_TIMEOUT, LONGEST_TIMEOUT = 0.1, 1.0
+_AFTER = 1.5  # times the longest silence that a minute has
+
+
+@settings
+@dataclass
+class Channel(NetworkConfig):
+    """The network between master and slave; its own fields are those of `custom`."""
+
+    network: str = choice("custom", _NETWORKS, "a preset, or the network that these fields say")
+    backward: NetworkConfig | None = plain(
+        None, "from slave to master; null: as from master to slave"
+    )
+    timeout: float | None = quantity(
+        None,
+        "s",
+        1e-3,
+        LONGEST_TIMEOUT,
+        "without a packet for so long, an end goes into its safe state; null: half as much again "
+        "as the longest silence in a minute of this network, but 0.1 s at least",
+    )
+
+    def lines(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
+        """The two directions, forward (master to slave) and backward.
+
+        Raises:
+            DrakeTeleopError: if a preset is asked for and changed at the same time.
+        """
+        names = [entry.name for entry in dataclasses.fields(NetworkConfig)]
+        own = NetworkConfig(**{name: getattr(self, name) for name in names})
+        if self.network == "custom":
+            return own, own if self.backward is None else self.backward
+        if own != NetworkConfig() or self.backward is not None:
+            raise DrakeTeleopError(
+                f"'{self.network}' says all about the network",
+                where=f"{where}.network",
+                remedy="leave the other fields out, or set network: custom",
+            )
+        return PRESETS[self.network], PRESETS[self.network]
+
+    def silent_after(self, period: float) -> float:
+        """After how long an end goes into its safe state [s], with packets each `period` [s]."""
+        if self.timeout is not None:
+            return self.timeout
+        longest = [
+            network.longest_silence(line, direction, period)
+            for line, direction in zip(self.lines(), _DIRECTIONS, strict=True)
+        ]
+        return min(max(_AFTER * max(longest), SHORTEST_TIMEOUT), LONGEST_TIMEOUT)
+
+
+# The state of both ends, one array.
+_SIZE = 2 + 2 * (8 + 6 + MEMORY) + MASTER_WATCH + SLAVE_WATCH
+_places = Slots(_SIZE)
+_STEP = _places.number()  # the step's number
+_POSE_M = _places.vector(8)  # command at the master, a step ago; 1 if unknown, then the one before
+_POSE_S = _places.vector(8)  # slave, likewise
+_WRENCH_M = _places.vector(6)  # what the hand feels since then
+_WRENCH_S = _places.vector(6)  # the slave's wrench then
+_TRUSTED = _places.number()  # for how long the wrench was good without a break [s]
+_WATCH_M, _WATCH_S = _places.vector(MASTER_WATCH), _places.vector(SLAVE_WATCH)
+MEMORY_M, MEMORY_S = _places.vector(MEMORY), _places.vector(MEMORY)
+# What turns a wrench at the hand into one in the world, one array.
+_places = Slots(11)
+_ROTATION = _places.vector(9)  # R_WB by rows
+_SCALES = _places.vector(2)  # of translation and rotation
+# What the station records of the channel, one array: see `channel_step`.
+PORTS = 8
+_places = Slots(PORTS)
+_WORK_M, _WORK_S, _SILENCE = _places.vector(2), _places.vector(2), _places.vector(2)
+_WORK_C = _places.vector(2)
+# What the hand's end makes of the newest packet.
+_places = Slots(7)
+_FELT, _TOLD = _places.vector(6), _places.number()
+
+# Steps that a packet is on its way at least. Forward: the slave sees the command a step later.
+# Backward: the master has taken its step when the slave takes its own.
+_LEAST_DELAY = 1
+_NO_LOAD = np.zeros(6)
+
+
+def initial_ends(
+    method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The state of both ends before their first step.
+
+    Args:
+        method: one of `METHODS`.
+        parameters: of the method.
+        start: (7,) X_WS of command and slave.
+    """
+    ends = np.zeros(_SIZE)
+    ends[_POSE_M][:7] = ends[_POSE_S][:7] = start
+    ends[_TRUSTED] = STOP
+    ends[_WATCH_M] = initial_master_watch()
+    ends[_WATCH_S] = initial_slave_watch(start)
+    memory = methods.initial_memory(method, parameters, start)
+    ends[MEMORY_M] = ends[MEMORY_S] = memory
+    return ends
+
+
+@njit(cache=True)
+def channel_step(
+    steps,
+    pose_command,
+    wrench_B,
+    load_B,
+    hand_B,
+    slave_pose,
+    saturated,
+    contact,
+    T,
+    timeout,
+    frame,
+    parameters,
+    forward_parameters,
+    backward_parameters,
+    forward,
+    backward,
+    ends,
+    pose_received,
+    ports,
+    wrench_received,
+):
+    """One step of both ends and of the lines between them.
+
+    Args:
+        steps: of the method, `methods.steps_of(method)`.
+        pose_command: (7,) X_WS before the channel.
+        wrench_B: (6,) F_E_B, what the hand should feel of the slave's wrench [N, N m].
+        load_B: (6,) its load's share of that: weight and inertia.
+        hand_B: (6,) of the hand on the stylus, in B [N, N m].
+        slave_pose: (7,) X_WS, actual.
+        saturated: whether the wrench is not to be trusted: the last good one is kept.
+        contact: the flag of the slave's detector, 0 or 1; it travels with the slave's packets.
+        T, timeout: [s].
+        frame: (11,) R_WB by rows, scale of translation and of rotation.
+        parameters: of the method.
+        forward_parameters, backward_parameters: of the lines.
+        forward, backward: their states, updated.
+        ends: of both ends, updated.
+        pose_received: (7,) X_WS that the slave shall follow, written.
+        ports: (PORTS,) energy that hand and slave have put in, by group [J], updated; for how long
+            master and slave have heard nothing [s], written; what the slave's wrench would have
+            put in along the command, by group [J], updated.
+        wrench_received: (7,) F_E_B that the hand shall feel, and the flag of the newest packet,
+            written.
+    """
+    k = int(ends[_STEP])
+    ends[_STEP] += 1.0
+    before_M, before_S = ends[_POSE_M], ends[_POSE_S]
+    held_M, held_S = ends[_WRENCH_M], ends[_WRENCH_S]
+    watch_M, watch_S = ends[_WATCH_M], ends[_WATCH_S]
+    memory_M, memory_S = ends[MEMORY_M], ends[MEMORY_S]
+    work_M, work_S = ports[_WORK_M], ports[_WORK_S]
+    dx, twist, hand, wrench = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
+    limits, command, left = np.empty(2), np.empty(13), pose_received.copy()
+    received, packet = np.zeros(PACKET_SIZE), np.empty(PACKET_SIZE)
+
+    # The master's end.
+    good = _moved(pose_command, before_M, dx)
+    for i in range(6):
+        twist[i] = dx[i] / T
+    for g in range(2):
+        work_M[g] -= dot(held_M, dx, g)
+    hand[:] = 0.0
+    if sound(hand_B):
+        _to_world(hand_B, frame, hand)
+    else:
+        good = False
+    _, fresh = network.receive(backward_parameters, backward, k, received)
+    alive = fresh and received[HEALTHY] > 0.5
+    fault = (fresh and not alive) or not good
+    master_limits_into(alive, fault, T, timeout, parameters[LIMIT], held_M, watch_M, limits)
+    methods.master_step(
+        steps, received, fresh, before_M[:7], twist, dx, hand, limits, T, parameters, memory_M,
+        held_M, packet,
+    )  # fmt: skip
+    if not good:
+        packet[HEALTHY] = 0.0
+    network.send(forward_parameters, forward, k, packet)
+    _to_master(held_M, frame, wrench_received[_FELT])
+    wrench_received[_TOLD] = received[CONTACT]
+
+    # The slave's end.
+    good = _moved(slave_pose, before_S, dx)
+    for i in range(6):
+        twist[i] = dx[i] / T
+    for g in range(2):
+        work_S[g] += dot(held_S, dx, g)
+    load = memory_S[OF_LOAD]
+    if not (sound(wrench_B) and sound(load_B)):
+        good = False
+        ends[_TRUSTED] = 0.0
+    elif saturated:
+        ends[_TRUSTED] = 0.0
+    else:
+        # From a wrench that was kept to the measured one, all of the way at last.
+        _to_world(wrench_B, frame, wrench)
+        share = T / max(STOP - ends[_TRUSTED], T)
+        for i in range(6):
+            held_S[i] = (1.0 - share) * held_S[i] + share * wrench[i]
+        _to_world(load_B, frame, wrench)
+        for i in range(6):
+            load[i] = (1.0 - share) * load[i] + share * wrench[i]
+        ends[_TRUSTED] += T
+    put(wrench, 0, held_S, 0, 6)
+    _, fresh = network.receive(forward_parameters, forward, k + 1, received)
+    alive = fresh and received[HEALTHY] > 0.5
+    methods.slave_step(
+        steps, received, fresh, before_S[:7], twist, dx, wrench, T, parameters, memory_S, command,
+        packet,
+    )  # fmt: skip
+    if not good:
+        packet[HEALTHY] = 0.0
+    packet[CONTACT] = contact
+    network.send(backward_parameters, backward, k, packet)
+    fault, wanted = (fresh and not alive) or not good, command[:7]
+    slave_command_into(alive, fault, T, timeout, wanted, watch_S, pose_received)
+    methods.command_left(steps, wanted, pose_received, before_S[:7], twist, parameters, memory_S)
+    difference_into(pose_received, left, dx)
+    for g in range(2):
+        ports[_WORK_C][g] += dot(held_S, dx, g)
+    ports[_SILENCE][0], ports[_SILENCE][1] = watch_M[SILENT], watch_S[SILENT]
+
+
+@njit(cache=True)
+def _moved(pose, before, dx):
+    """Writes the increment since the last step, none from or to a pose that is not finite.
+
+    Args:
+        pose: (7,) now.
+        before: (8,) the last pose that was finite; 1 if the last pose was not. Updated.
+        dx: (6,) written.
+
+    Returns:
+        Whether the pose is finite.
+    """
+    good = sound(pose)
+    if good:
+        difference_into(pose, before, dx)
+        put(before, 0, pose, 0, 7)
+    if not good or before[7] > 0.0:
+        dx[:] = 0.0
+    before[7] = 0.0 if good else 1.0
+    return good
+
+
+@njit(cache=True)
+def _to_world(wrench_B, frame, out):
+    """The wrench in W and in the master's power units."""
+    R, scales = frame[_ROTATION], frame[_SCALES]
+    for g in range(2):
+        for i in range(3):
+            total = 0.0
+            for j in range(3):
+                total += R[3 * i + j] * wrench_B[3 * g + j]
+            out[3 * g + i] = total / scales[g]
+
+
+@njit(cache=True)
+def _to_master(wrench, frame, out):
+    """The inverse of `_to_world`."""
+    R, scales = frame[_ROTATION], frame[_SCALES]
+    for g in range(2):
+        for i in range(3):
+            total = 0.0
+            for j in range(3):
+                total += R[3 * j + i] * wrench[3 * g + j]
+            out[3 * g + i] = total * scales[g]
+
+
+class TeleopChannel(LeafSystem):
+    """The network, and at both of its ends the method that keeps the station passive.
+
+    A packet takes at least one period. Both ends have a safe state for silence and for data that
+    are not finite, see `drake_teleop.station.passivity.safe_state`. While the wrist sensor is
+    saturated, its last valid wrench is used.
+
+    The wrench that follows from a pose acts at once, while the device leaves that pose, so that
+    wrench times increment of the command is the work of the device's port: exactly for translation,
+    and for rotation that is scaled by 1 (a scaled turn whose axis moves has not the scaled angular
+    velocity of the hand). Hence it is an output that depends on the inputs, and means something at
+    the instants of the period only.
+
+    .. pydrake_system::
+
+        name: TeleopChannel
+        input_ports:
+        - pose_command: (7,) X_WS, after kinematic scaling
+        - wrench_B: (6,) F_E_B, what the hand should feel, from force scaling [N, N m]
+        - hand_wrench_E: (6,) of the hand on the stylus at E, in B [N, N m]
+        - pose_slave: (7,) X_WS, actual
+        - saturated: (1,) 1 while the wrench is not to be trusted
+        - contact: (1,) whether the slave's detector notices a contact; unconnected 0
+        - load_wrench_B: (6,) the load's share of wrench_B, for `ledger`; unconnected 0
+        output_ports:
+        - pose_received: (7,) X_WS that the slave shall follow
+        - wrench_received: (6,) F_E_B that the hand shall feel [N, N m]
+        - ports: (8,) energy that the hand has put in by translation and by rotation, and what the
+          slave has [J]; for how long master and slave have heard nothing [s]; what the slave's
+          wrench would have put in along the command [J]
+        - contact_at_hand: (1,) the flag that the master's end has received last
+
+    Args:
+        channel: the network.
+        passivity: the method.
+        R_WB: (3, 3) alignment of the master's base with the world.
+        scales: (2,) slave over master, of translation and rotation.
+        force_scale: slave to master.
+        start: (7,) X_WS of the slave at the start.
+        period: between packets [s].
+        seed: of the network.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self,
+        channel: Channel,
+        passivity: PassivityConfig,
+        R_WB: NDArray[np.float64],
+        scales: NDArray[np.float64],
+        force_scale: float,
+        start: NDArray[np.float64],
+        period: float,
+        seed: int,
+    ) -> None:
+        super().__init__()
+        # Where motion is scaled to zero there is no energy, and any unit will do.
+        scales = np.where(scales > 0.0, scales, 1.0)
+        lines = [
+            network.parameters(line, seed, direction, period, least=_LEAST_DELAY)
+            for line, direction in zip(channel.lines(), _DIRECTIONS, strict=True)
+        ]
+        parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
+        self._steps = methods.steps_of(passivity.method)
+        self._tells_apart = passivity.method == "ledger"
+        self._constants = (
+            *(
+                period,
+                channel.silent_after(period),
+                np.concatenate([R_WB.ravel(), scales]),
+                parameters,
+            ),
+            *lines,
+        )
+        self._pose = self.DeclareVectorInputPort("pose_command", 7)
+        self._wrench = self.DeclareVectorInputPort("wrench_B", 6)
+        self._hand = self.DeclareVectorInputPort("hand_wrench_E", 6)
+        self._slave = self.DeclareVectorInputPort("pose_slave", 7)
+        self._saturated = self.DeclareVectorInputPort("saturated", 1)
+        self._contact = self.DeclareVectorInputPort("contact", 1)
+        self._load = self.DeclareVectorInputPort("load_wrench_B", 6)
+        ends = initial_ends(passivity.method, parameters, start)
+        carried = np.zeros(PACKET_SIZE if self._tells_apart else LOAD.start)
+        receivers, flying = zip(*(network.initial_state(p, carried) for p in lines), strict=True)
+        state = [*receivers, ends, np.array(start), np.zeros(PORTS)]
+        self._begin = (passivity.method, parameters)
+        received = np.zeros(7)
+        groups = [self.DeclareDiscreteState(part) for part in state]
+        self._groups = [int(group) for group in groups]  # faster than Drake's own indices
+        # What is in flight is part of the context, and cloned with it, but no discrete state: Drake
+        # would copy all of it several times a step, 1.5 MB on the way from the moon.
+        self._flying = [self.DeclareAbstractParameter(AbstractValue.Make(f)) for f in flying]
+        self.DeclareStateOutputPort("pose_received", groups[3])
+        self.DeclareStateOutputPort("ports", groups[4])
+        # The step is taken once, for the wrench that acts now and for the state after it.
+        step = self.DeclareCacheEntry(
+            "step",
+            ValueProducer(
+                allocate=lambda: AbstractValue.Make([*map(np.array, state), received.copy()]),
+                calc=weak_callback(self._calc_step),
+            ),
+            {self.all_input_ports_ticket(), self.xd_ticket()},
+        )
+        self._step = step.cache_index()  # the entry itself would keep the block alive
+        taken = {step.ticket()}
+        self.DeclareVectorOutputPort("wrench_received", 6, weak_callback(self._calc_wrench), taken)
+        self.DeclareVectorOutputPort("contact_at_hand", 1, weak_callback(self._calc_contact), taken)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def Begin(
+        self,
+        context: Context,
+        command: NDArray[np.float64],
+        slave: NDArray[np.float64],
+        fills: float,
+    ) -> None:
+        """Begins in a running station: nothing is on its way yet, and the slave keeps its command.
+
+        Args:
+            context: of this block.
+            command: (7,) X_WS that the slave follows now; the master's command has to be the same.
+            slave: (7,) X_WS of the slave, actual.
+            fills: for how long the clutch is open [s]. The slave of `wave` keeps its command
+                until then, and reflects the wrench that stands.
+        """
+        ends = initial_ends(*self._begin, command)
+        ends[_POSE_S][:7], ends[MEMORY_S][FILLS] = slave, fills
+        context.SetDiscreteState(self._groups[2], ends)
+        context.SetDiscreteState(self._groups[3], command)
+
+    def _calc_step(self, context: Context, step: AbstractValue) -> None:
+        *state, received = step.get_mutable_value()
+        for part, group in zip(state, self._groups, strict=True):
+            part[:] = context.get_discrete_state(group).value()
+        # A step that is taken again, with other inputs, writes there at the same places.
+        flying = [context.get_abstract_parameter(k).get_value() for k in self._flying]
+        forward, backward = zip(state[:2], flying, strict=True)
+        load = _NO_LOAD
+        if self._tells_apart and self._load.HasValue(context):  # to work it out takes time
+            load = self._load.Eval(context)
+        channel_step(
+            self._steps,
+            self._pose.Eval(context),
+            self._wrench.Eval(context),
+            load,
+            self._hand.Eval(context),
+            self._slave.Eval(context),
+            self._saturated.Eval(context)[0] > 0.5,
+            self._contact.Eval(context)[0] if self._contact.HasValue(context) else 0.0,
+            *self._constants,
+            forward,
+            backward,
+            *state[2:],
+            received,
+        )
+
+    def _taken(self, context: Context) -> list[NDArray[np.float64]]:
+        """The state after the step, and what the hand's end received."""
+        return self.get_cache_entry(self._step).Eval(context)
+
+    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._taken(context)[-1][_FELT])
+
+    def _calc_contact(self, context: Context, output: BasicVector) -> None:
+        output[0] = self._taken(context)[-1][_TOLD]
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        for part, group in zip(self._taken(context), self._groups, strict=False):
+            discrete_state.set_value(group, part)

@@ -1,0 +1,404 @@
+"""A network: which packet is the newest that the receiver has, at every step.
+
+One packet leaves at each step k. It is lost, or it travels d steps, and so may a second copy of it.
+All counters and integrals in a packet are cumulative, so the receiver only ever needs the newest:
+a ring of slots holds the newest packet that arrives at each step, newest_at[k + d] = k, and what is
+older than a packet received before is dropped. Loss, reordering and duplicates then change nothing
+but which packet is the newest.
+
+* Delay. `jitter` j spreads it about its mean D with standard deviation j D / sqrt(3), whatever the
+  distribution: uniform from (1 - j) D to (1 + j) D; normal; or (1 - j) D, the way through an empty
+  network, plus a gamma distribution of shape 3, the wait in queues (shifted gamma: Mukherjee 1992;
+  for teleoperation Chen et al., ROBIO 2008). A normal delay that would be negative is 0: at j = 1
+  that raises the mean by 1 %. Delays are rounded to whole steps.
+* Reordering follows from jitter. Delays are independent of one another, so at a high packet rate
+  some packet of many is always early and the newest one is not much older than (1 - j) D. A queue
+  that keeps the order is better played from a recorded trace.
+* Loss. Gilbert and Elliott's chain (Gilbert 1960) in continuous time, so that it means the same at
+  every packet rate: in the good state nothing is lost, in the bad one the share `burst_loss`; bad
+  states last `burst` on average, and as often as makes the mean loss `loss`. burst = 0 makes the
+  losses independent.
+* Rate limit. The sender keeps to `rate_hz`, evenly; the steps between send nothing.
+* Playout buffer. A packet is used no sooner than `playout` after it was sent. If the packets are
+  `redundant`, each repeats the samples that may still be waited for, and a lost sample is played in
+  time from a later packet: with `playout` above the age of the newest packet at every step, loss
+  included, the network is a constant delay, bit by bit.
+
+Everything random is a hash of (seed, direction, step): no generator, no hidden state.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import settings
+from drake_teleop.common.noise import random_bits
+from drake_teleop.common.quantities import check_ranges, choice, plain, quantity
+from drake_teleop.common.vectors import put
+from drake_teleop.station.passivity.packet import LOAD, POSE, VELOCITY, WRENCH, arrived, moved_into
+
+FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
+LONGEST_DELAY = 10.0  # [s], which bounds the memory
+LONGEST_TRACE = 36000.0  # [s]
+LONGEST_EXTRAPOLATION = 0.1  # [s]; what is not known after that stands still
+
+# Distribution -> how far after the mean the last packet comes, in units of jitter times delay. What
+# would come later comes then: one packet in 1e7.
+_TAILS = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
+_SILENCE = ("hold", "zero", "extrapolate")
+_ZERO, _EXTRAPOLATE = 1, 2
+_TRACE_STEP = 1e-3  # [s], as fine as a mean needs
+_MINUTE, _OTHER_SEED = 60.0, 20090101  # [s], and a seed, with which a network is looked at
+
+
+@settings
+@dataclass
+class NetworkConfig:
+    """One direction of a network; the default is ideal: packet k arrives at step k."""
+
+    delay: float = quantity(0.0, "s", 0.0, LONGEST_DELAY, "mean one-way delay")
+    jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) standard deviations over the mean delay")
+    distribution: str = choice("uniform", tuple(_TAILS), "distribution of the delay")
+    loss: float = quantity(0.0, "1", 0.0, 1.0, "share of the packets that is lost, mean")
+    burst: float = quantity(0.0, "s", 0.0, 100.0, "mean length of a bad state; 0: independent loss")
+    burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share that is lost in the bad state")
+    duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of the arriving packets that come twice")
+    rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "packets per second at most; null: all")
+    playout: float = quantity(0.0, "s", 0.0, LONGEST_DELAY, "least age of a packet that is used")
+    redundant: bool = plain(
+        False, "each packet repeats the samples that the playout buffer may still wait for"
+    )
+    trace: str | None = plain(
+        None,
+        "a recording of the delay, in the place of delay, jitter and distribution: a CSV file with "
+        "the columns `time` [s], increasing, and `delay` [s], one-way, empty if the packet was "
+        "lost; between its rows the last one holds, after its end it starts again",
+    )
+    silence: str = choice(
+        "hold",
+        _SILENCE,
+        "what the receiver reads at steps without a new packet: the newest one's values; no "
+        "velocity and no wrench, the null packet of wave variables; or a pose that moves on with "
+        "its velocity for 0.1 s. Cumulative parts stay as they are",
+    )
+
+    def check(self, where: str = "network") -> None:
+        """Checks every value, but not the trace, which is read by `parameters`.
+
+        Raises:
+            DrakeTeleopError: naming `where` and the field.
+        """
+        check_ranges(self, where)
+        if self.loss > self.burst_loss:
+            raise DrakeTeleopError(
+                f"{self.loss:g} cannot be reached if bad states lose {self.burst_loss:g}",
+                where=f"{where}.loss" if ":" in where else f"{where}:loss",
+                remedy="raise burst_loss to at least the mean loss",
+            )
+
+
+PRESETS: dict[str, NetworkConfig] = {
+    "ideal": NetworkConfig(),
+    "lan": NetworkConfig(delay=0.5e-3, jitter=0.5, distribution="gamma", loss=1e-5),
+    "wan": NetworkConfig(delay=15e-3, jitter=0.1, distribution="gamma", loss=1e-3, burst=5e-3),
+    "internet": NetworkConfig(
+        delay=50e-3, jitter=0.2, distribution="gamma", loss=0.01, burst=0.02, duplicate=1e-3
+    ),
+    "geostationary": NetworkConfig(
+        delay=0.3, jitter=0.03, distribution="gamma", loss=5e-3, burst=0.05
+    ),
+    "lunar": NetworkConfig(delay=1.3, jitter=0.01, distribution="gamma", loss=0.01, burst=0.1),
+}
+"""Networks by name, the same in both directions. The delays have grounds, the rest is plausible.
+
+lan: a switched network, RTT 1 ms, most of it in the hosts. wan: 1500 km of fibre at 5 us/km (ITU-T
+G.114) and as much again for detours and routers, RTT 30 ms; loss at the bound of the classes 0 to 4
+of ITU-T Y.1541. internet: an ocean, 5000 km with the same overhead, RTT 100 ms; best effort, hence
+loss in bursts. geostationary: up and down 240 to 279 ms (RFC 2488, section 2), the rest is coding
+and the way on the ground, RTT 600 ms. lunar: 384 400 km are 1.28 s; with the stations RTT 2.6 s.
+"""
+
+# The parameters of a line as one array: these, then the trace in steps, -1 where it lost a packet.
+_KEY, _PERIOD, _DELAY, _JITTER, _DISTRIBUTION, _LONGEST, _BAD_SHARE, _BAD_MEMORY = range(8)
+_BURST_LOSS, _DUPLICATE, _RATE, _PLAYOUT, _REDUNDANT, _SLOTS, _POLICY, _LEAST, _TRACE = range(8, 17)
+# What a receiver has: these, then the packet received last. In flight: the slots, the packets sent.
+_BAD, _ARRIVED, _RECEIVED, _SILENT, _LAST = range(5)
+
+
+def parameters(
+    config: NetworkConfig,
+    seed: int,
+    direction: int,
+    period: float,
+    least: int = 0,
+    delays: NDArray[np.int64] | None = None,
+) -> NDArray[np.float64]:
+    """The parameters of one direction of a network, for the compiled functions below.
+
+    Args:
+        config: of this direction.
+        seed: of the scenario.
+        direction: FORWARD or BACKWARD, which are random independently of each other.
+        period: time between steps [s].
+        least: steps that any packet takes at least.
+        delays: (M,) steps that each packet travels, -1 where it is lost, in the place of the
+            config's trace; after its end it starts again.
+
+    Raises:
+        DrakeTeleopError: for a value out of range, or naming file, column and row of a bad trace.
+    """
+    config.check()
+    trace = np.zeros(0) if config.trace is None else _read_trace(Path(config.trace), period)
+    trace = trace if delays is None else np.asarray(delays, np.float64)
+    mean, playout = config.delay / period, math.floor(config.playout / period + 0.5)
+    longest = math.floor(mean * (1 + _TAILS[config.distribution] * config.jitter) + 0.5)
+    if trace.size:
+        longest = max(int(trace.max()), 0)
+    longest = max(longest, least)
+    bad = config.loss / config.burst_loss
+    sojourn = config.burst * (1 - bad)  # time constant of the chain
+    p = np.empty(_TRACE + trace.size)
+    # 53 bits of a key are exact in a float.
+    p[_KEY] = random_bits(np.uint64(random_bits(np.uint64(seed % 2**64), 0)), direction)
+    p[_PERIOD], p[_DELAY], p[_JITTER], p[_LONGEST] = period, mean, config.jitter, longest
+    p[_DISTRIBUTION] = list(_TAILS).index(config.distribution)
+    p[_BAD_SHARE], p[_BAD_MEMORY] = bad, math.exp(-period / sojourn) if sojourn > 0 else 0.0
+    p[_BURST_LOSS], p[_DUPLICATE] = config.burst_loss, config.duplicate
+    p[_RATE] = min(1.0, period * config.rate_hz) if config.rate_hz is not None else 1.0
+    p[_PLAYOUT], p[_REDUNDANT], p[_SLOTS] = playout, config.redundant, max(longest, playout) + 1
+    p[_POLICY], p[_LEAST] = _SILENCE.index(config.silence), least
+    p[_TRACE:] = trace
+    return p
+
+
+def mean_delay(config: NetworkConfig) -> float:
+    """How long a packet that is used has been on its way, on average [s]; lost ones left out."""
+    if config.trace is None:
+        return max(config.delay, config.playout)
+    delays = _read_trace(Path(config.trace), _TRACE_STEP) * _TRACE_STEP
+    used = np.maximum(delays[delays >= 0], config.playout)
+    return float(used.mean()) if used.size else config.playout
+
+
+def longest_delay(config: NetworkConfig) -> float:
+    """How long a packet that is not lost has been on its way at most, when it is used [s]."""
+    longest = config.delay * (1 + _TAILS[config.distribution] * config.jitter)
+    if config.trace is not None:
+        longest = float(_read_trace(Path(config.trace), _TRACE_STEP).max()) * _TRACE_STEP
+    return max(longest, config.playout)
+
+
+def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
+    """(N,) delays in steps, for packets sent one a period; -1 where the packet is lost."""
+    # The reader of tables is not needed by those who have no trace, and takes its time to start.
+    from drake_teleop.logs.read.tables import read_table
+
+    table = read_table(path)
+    time = table.numbers(["time"], 1, str(path))[:, 0]
+    delay = table.single("delay", str(path))
+    if len(delay) != len(time):
+        what = f"has {len(delay)} rows, and time {len(time)}"
+        raise DrakeTeleopError(what, where=f"{path}:delay")
+    lost, age = np.isnan(delay), time - time[0]
+    for column, bad, what in (
+        ("time", np.diff(time, prepend=-np.inf) <= 0, "does not increase"),
+        ("time", age > LONGEST_TRACE, f"is more than {LONGEST_TRACE:g} s after the first"),
+        ("delay", (delay < 0) | (delay > LONGEST_DELAY), f"is not 0 to {LONGEST_DELAY:g} s"),
+    ):
+        if bad.any():
+            raise DrakeTeleopError(
+                f"row {int(np.argmax(bad)) + table.first_row} {what}",
+                where=f"{path}:{column}",
+                remedy="give seconds, sorted by time; an empty delay is a lost packet",
+            )
+    sent = np.arange(math.floor(age[-1] / period + 0.5) + 1) * period
+    row = np.searchsorted(age, sent + 1e-6 * period, side="right") - 1
+    return np.where(lost, -1.0, np.floor(delay / period + 0.5))[row]
+
+
+@njit(cache=True)
+def _uniform(p, k, draw):
+    """The random number of the packet k, uniform in (0, 1]; `draw` tells its 16 numbers apart."""
+    return (float(random_bits(np.uint64(p[_KEY]), 16 * k + draw)) + 1.0) * 2.0**-53
+
+
+@njit(cache=True)
+def _travel(p, k, draw):
+    """How many steps the packet k travels, -1 if the trace has lost it. Takes three numbers."""
+    if p.shape[0] > _TRACE:
+        steps = p[_TRACE + k % (p.shape[0] - _TRACE)]
+        return int(max(steps, p[_LEAST])) if steps >= 0.0 else -1
+    mean, spread = p[_DELAY], p[_DELAY] * p[_JITTER]
+    if spread == 0.0:
+        return int(p[_LONGEST])
+    u = _uniform(p, k, draw)
+    if p[_DISTRIBUTION] == 0:
+        delay = mean + spread * (2.0 * u - 1.0)
+    elif p[_DISTRIBUTION] == 1:  # Box and Muller
+        angle = 2.0 * math.pi * _uniform(p, k, draw + 1)
+        delay = mean + spread / math.sqrt(3.0) * math.sqrt(-2.0 * math.log(u)) * math.cos(angle)
+    else:  # three exponential waits one after the other
+        u *= _uniform(p, k, draw + 1) * _uniform(p, k, draw + 2)
+        delay = mean - spread - spread / 3.0 * math.log(u)
+    return int(min(max(delay + 0.5, p[_LEAST]), p[_LONGEST]))
+
+
+@njit(cache=True)
+def _fate(p, k, bad):
+    """The chain's state at step k, the steps that its packet travels, and its copy; -1 for none.
+
+    `bad` is the state a step before: 0 good, 1 bad; before step 0 the probability of the bad one.
+    """
+    if p[_BAD_SHARE] > 0.0:
+        likely = p[_BAD_SHARE] + (bad - p[_BAD_SHARE]) * p[_BAD_MEMORY]
+        bad = 1.0 if _uniform(p, k, 0) <= likely else 0.0
+    if p[_RATE] < 1.0 and math.floor(k * p[_RATE] + 1e-9) == math.floor((k - 1) * p[_RATE] + 1e-9):
+        return bad, -1, -1
+    if bad == 1.0 and _uniform(p, k, 1) <= p[_BURST_LOSS]:
+        return bad, -1, -1
+    first = _travel(p, k, 2)
+    second = -1
+    if first >= 0 and p[_DUPLICATE] > 0.0 and _uniform(p, k, 5) <= p[_DUPLICATE]:
+        second = _travel(p, k, 6)
+    return bad, first, second
+
+
+def initial_state(
+    p: NDArray[np.float64], neutral: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The state of a line before step 0.
+
+    Args:
+        p: the line's `parameters`.
+        neutral: (N,) what the receiver reads before the first packet arrives. The line carries
+            so many numbers of a packet, the first ones.
+
+    Returns:
+        The receiver's (4 + N,), with the packet that it read last, and what is in flight, which is
+        long: step k writes there only what belongs to packet k, and writes the same if it is
+        taken again with the same packet.
+    """
+    slots = int(p[_SLOTS])
+    receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])
+    return receiver, np.concatenate([np.full(slots, -1.0), np.zeros(slots * len(neutral))])
+
+
+@njit(cache=True)
+def send(p, state, k, packet):
+    """Sends the packet (N,) of step k. Steps count up from 0, none is left out.
+
+    `state` is as `initial_state` makes it, and updated.
+    """
+    receiver, flying = state
+    slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST
+    receiver[_BAD], first, second = _fate(p, k, receiver[_BAD])
+    for travel in (first, second):
+        if travel >= 0:
+            if p[_REDUNDANT] == 0.0:
+                travel = max(travel, int(p[_PLAYOUT]))
+            # What the slot held was sent before.
+            flying[(k + travel) % slots] = k
+    # What is lost is written too: a redundant packet after it may bring it.
+    put(flying, slots + size * (k % slots), packet, 0, size)
+
+
+@njit(cache=True)
+def receive(p, state, k, packet):
+    """What the receiver has at step k, after `send` of the same step.
+
+    Args:
+        p, state, k: as of `send`.
+        packet: (N,) the newest packet, with what the policy `silence` makes of it while nothing
+            new comes; written.
+
+    Returns:
+        The step at which the newest packet was sent, -1 before there is one; whether it is new.
+    """
+    receiver, flying = state
+    slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST
+    # What a slot still holds from a round ago is older, and changes nothing.
+    receiver[_ARRIVED] = max(receiver[_ARRIVED], flying[k % slots])
+    newest = receiver[_ARRIVED]
+    if p[_REDUNDANT] != 0.0:
+        newest = min(newest, k - p[_PLAYOUT])
+    fresh = newest > receiver[_RECEIVED]
+    if fresh:
+        receiver[_RECEIVED], receiver[_SILENT] = newest, 0.0
+        put(receiver, _LAST, flying, slots + size * (int(newest) % slots), size)
+    else:
+        receiver[_SILENT] += 1.0
+    put(packet, 0, receiver, _LAST, size)
+    if not fresh:
+        _fill_silence(p[_POLICY], receiver[_SILENT] * p[_PERIOD], packet)
+    return int(receiver[_RECEIVED]), fresh
+
+
+@njit(cache=True)
+def _fill_silence(policy, silent, packet):
+    """What to read `silent` seconds after the newest packet came; see `NetworkConfig.silence`."""
+    velocity, pose = packet[VELOCITY], packet[POSE]
+    if policy == _ZERO:
+        velocity[:] = 0.0
+        packet[WRENCH] = packet[LOAD] = 0.0
+    elif policy == _EXTRAPOLATE and arrived(packet):
+        moved_into(pose, velocity * min(silent, LONGEST_EXTRAPOLATION), pose)
+        if silent > LONGEST_EXTRAPOLATION:
+            velocity[:] = 0.0
+
+
+def packet_delays(
+    config: NetworkConfig, seed: int, direction: int, steps: int, period: float
+) -> NDArray[np.int64]:
+    """(steps, 2) how many steps each packet travels, and its copy; -1 for none.
+
+    Args:
+        config, seed, direction, period: as for `parameters`.
+    """
+    return _fates(parameters(config, seed, direction, period), steps)
+
+
+@njit(cache=True)
+def _fates(p, steps):
+    fates, bad = np.empty((steps, 2), np.int64), p[_BAD_SHARE]
+    for k in range(steps):
+        bad, fates[k, 0], fates[k, 1] = _fate(p, k, bad)
+    return fates
+
+
+def newest_packets(
+    config: NetworkConfig, seed: int, direction: int, steps: int, period: float
+) -> NDArray[np.int64]:
+    """(steps,) which packet is the newest at each step, -1 before there is one.
+
+    The same as `receive` says, for all steps at once.
+
+    Args:
+        config, seed, direction, period: as for `parameters`.
+    """
+    p = parameters(config, seed, direction, period)
+    sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT])
+    for travel in _fates(p, steps).T:
+        used = travel if config.redundant else np.maximum(travel, playout)
+        seen = (travel >= 0) & (sent + used < steps)
+        np.maximum.at(arrived, (sent + used)[seen], sent[seen])
+    newest = np.maximum.accumulate(arrived)
+    return np.minimum(newest, np.maximum(sent - playout, -1)) if config.redundant else newest
+
+
+def longest_silence(config: NetworkConfig, direction: int, period: float) -> float:
+    """For how long no new packet comes, at the longest in a minute after the first [s].
+
+    Args:
+        config, direction, period: as for `parameters`. The seed is one of its own, so that nobody
+            is told what comes in a run.
+    """
+    steps = math.ceil((_MINUTE + longest_delay(config)) / period)
+    newest = newest_packets(config, _OTHER_SEED, direction, steps, period)
+    fresh = np.flatnonzero(np.diff(newest, prepend=-1) > 0)
+    return float(np.diff(fresh, append=steps).max(initial=0) * period) if len(fresh) else math.inf

@@ -1,0 +1,134 @@
+"""The channel: what lies between master and slave; nothing, or a network and a passivity method."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RollPitchYaw
+from pydrake.systems.framework import Diagram, DiagramBuilder
+from pydrake.systems.primitives import PassThrough
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.channel.channel import TeleopChannel
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.scenario import Scenario, check_scenario
+from drake_teleop.station.slave.plant import NominalSlave, start_pose
+from drake_teleop.station.slave.servo import servo_at_tool
+from drake_teleop.station.wiring import export
+
+Array = NDArray[np.float64]
+
+
+def MakeChannel(scenario: Scenario) -> Diagram:
+    """The network with the method that keeps the station passive at both of its ends.
+
+    An ideal network without a method is nothing but wires.
+
+    .. pydrake_system::
+
+        name: channel
+        input_ports:
+        - pose_command: (7,) X_WS, from the master side
+        - wrench_B: (6,) F_E_B, what the hand should feel, from the slave side [N, N m]
+        - contact: (1,) the flag of the slave's detector (with contact detection)
+        - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m] (over a network)
+        - pose_slave: (7,) X_WS of the slave, actual (over a network)
+        - saturated: (1,) 1 while the wrench is not to be trusted (over a network)
+        - load_wrench_B: (6,) what of wrench_B is the load's weight and inertia; read by `ledger`,
+          may be left unconnected (over a network)
+        output_ports:
+        - pose_to_slave: (7,) X_WS that the slave shall follow
+        - wrench_to_master: (6,) F_E_B that the hand shall feel [N, N m]
+        - contact_at_hand: signal (with contact detection)
+        - pose_received, ports: signals (over a network)
+    """
+    check_scenario(scenario)
+    builder = DiagramBuilder()
+    if scenario.is_direct:
+        wires = [("pose_command", "pose_to_slave", 7), ("wrench_B", "wrench_to_master", 6)]
+        if scenario.contact_detection is not None:
+            wires.append(("contact", "contact_at_hand", 1))
+        for entry, exit_, size in wires:
+            wire = builder.AddNamedSystem(f"wire_of_{entry}", PassThrough(size))
+            builder.ExportInput(wire.get_input_port(), entry)
+            builder.ExportOutput(wire.get_output_port(), exit_)
+        return builder.Build()
+    scaling = scenario.kinematic_scaling
+    channel = builder.AddNamedSystem(
+        "channel",
+        TeleopChannel(
+            scenario.channel,
+            _told_of_the_device(scenario, told_of_the_arm(scenario)),
+            RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
+            np.array([scaling.translation_scale, scaling.rotation_scale]),
+            scenario.force_scaling.force_scale,
+            start_pose(scenario.slave),
+            1 / scenario.rates.hand_hz,
+            scenario.simulation.seed,
+        ),
+    )
+    own = ("pose_command", "wrench_B", "hand_wrench_E", "pose_slave", "saturated", "load_wrench_B")
+    for name in own:
+        builder.ExportInput(channel.GetInputPort(name), name)
+    if scenario.contact_detection is not None:
+        builder.ExportInput(channel.GetInputPort("contact"), "contact")
+        export(builder, channel, "contact_at_hand")
+    export(
+        builder,
+        channel,
+        "pose_received",
+        "ports",
+        pose_to_slave="pose_received",
+        wrench_to_master="wrench_received",
+    )
+    return builder.Build()
+
+
+def _told_of_the_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
+    """A method's limits at the hand are no larger than what the device displays.
+
+    Otherwise an account would hold a wrench that the hand does not feel.
+    """
+    device = scenario.master.device(0.0, 0.0)
+    return dataclasses.replace(
+        passivity,
+        force_limit=min(passivity.force_limit, device.peak_force),
+        torque_limit=min(passivity.torque_limit, float(device.peak_torque.min())),
+    )
+
+
+def told_of_the_arm(scenario: Scenario) -> PassivityConfig:
+    """A scenario's method; `ledger`, whose promise rests on the mass, is told the arm's.
+
+    Raises:
+        DrakeTeleopError: for an arm of less than six joints, which has none in some direction.
+    """
+    passivity = scenario.passivity
+    if passivity.method != "ledger" or passivity.slave_mass is not None:
+        return passivity
+    slave = NominalSlave(scenario.slave)
+    if slave.arm.num_joints < 6:
+        raise DrakeTeleopError(
+            f"an arm of {slave.arm.num_joints} joints gives way in no direction but those",
+            where="passivity.method",
+            remedy="take another method, or give passivity.slave_mass with its servo yourself",
+        )
+    servo = servo_at_tool(slave.arm, slave.start, scenario.joint_control)
+    return dataclasses.replace(
+        passivity,
+        servo_stiffness=servo.stiffness,
+        servo_damping=servo.damping,
+        slave_mass=servo.mass,
+    )
+
+
+def power_scale(scenario: Scenario) -> Array:
+    """(2,) the master's power units over the slave's, of translation and rotation.
+
+    Where motion is scaled to zero there is no energy, and any unit will do.
+    """
+    scaling = scenario.kinematic_scaling
+    scales = np.array([scaling.translation_scale, scaling.rotation_scale])
+    return scenario.force_scaling.force_scale / np.where(scales > 0.0, scales, 1.0)

@@ -1,0 +1,101 @@
+"""A block on a table, to be pushed: it slides, turns, tips over and falls as a rigid body does.
+
+Drake's point contact makes one point of the contact of two boxes, on which no box can stand. So the
+block stands on balls of 2 mm in its corners, inside its faces; the tool touches the box.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from pydrake.geometry import Box as BoxShape
+from pydrake.geometry import SceneGraph, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, SpatialInertia
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import quantity
+from drake_teleop.station.environment.box import AddFixedBox
+from drake_teleop.station.environment.environment import (
+    ExcludeContact,
+    LetFloat,
+    NewInstance,
+    OnSensor,
+    Stand,
+)
+from drake_teleop.station.environment.surface import Surface
+
+_FOOT, _TABLE = 0.002, 0.05  # m: radius of the balls, thickness of the table
+_NAME, _FEET = "block", "foot_of_block_"
+_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
+
+
+@settings
+@dataclass
+class Block(Surface):
+    """Where the block stands at first, its size and mass, and the table below it."""
+
+    position: list[float] = quantity(
+        [0.6, 0.0, 0.2], "m", -2.0, 2.0, "the middle of its underside at the start, in W"
+    )
+    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "of the block about z_W at the start")
+    size: list[float] = quantity([0.1, 0.1, 0.1], "m", 0.01, 1.0, "lengths of its edges")
+    mass: float = quantity(0.5, "kg", 0.01, 100.0, "of the block, evenly distributed")
+    table: list[float] = quantity(
+        [0.5, 0.5], "m", 0.0, 4.0, "size of the table below it, of the same surface; 0: none"
+    )
+
+    def check(self, where: str) -> None:
+        """Refuses a table on which the block does not stand."""
+        if 0.0 < min(self.table) < max(self.size[:2]):
+            raise DrakeTeleopError(
+                "the table is smaller than the block",
+                where=f"{where}.table",
+                remedy="give a larger one, or [0, 0] for none, and a !Box to stand on",
+            )
+
+    @property
+    def stand(self) -> Stand | None:
+        """From the floor to the table."""
+        x, y, top = self.position
+        across = 0.6 * min(self.table)
+        return Stand(across, across, x, y, top - _TABLE) if across > 0.0 else None
+
+    def AddTo(self, plant: MultibodyPlant) -> None:
+        """The block, at rest on its table; without a scene graph they have no shapes."""
+        if min(self.table) > 0.0:
+            below = np.array(self.position) - [0.0, 0.0, _TABLE / 2]
+            AddFixedBox(plant, "table", RigidTransform(below), [*self.table, _TABLE], self)
+        inertia = SpatialInertia.SolidBoxWithMass(self.mass, *self.size)
+        body = plant.AddRigidBody(_NAME, NewInstance(plant, _NAME), inertia)
+        x, y, foot = self.position
+        turned = RollPitchYaw(0.0, 0.0, self.yaw)
+        X_WBlock = RigidTransform(turned, [x, y, foot + self.size[2] / 2])
+        LetFloat(plant, body, X_WBlock)
+        if not plant.geometry_source_is_registered():
+            return
+        here, box = RigidTransform(), BoxShape(*self.size)
+        plant.RegisterCollisionGeometry(body, here, box, _NAME, self.material())
+        plant.RegisterVisualGeometry(body, here, box, _NAME, _COLOUR)
+        for k, corner in enumerate(product((-1.0, 1.0), repeat=3)):
+            place = RigidTransform(np.array(corner) * (np.array(self.size) / 2 - _FOOT))
+            ball = Sphere(_FOOT)
+            plant.RegisterCollisionGeometry(body, place, ball, f"{_FEET}{k}", self.material())
+
+    def PrepareContact(
+        self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
+    ) -> None:
+        """The tool touches the box alone, everything else the balls alone."""
+        bodies = [BodyIndex(index) for index in range(plant.num_bodies())]
+        blocks = [body for body in map(plant.get_body, bodies) if body.name() == _NAME]
+        shapes = [shape for body in blocks for shape in plant.GetCollisionGeometriesForBody(body)]
+        name = scene_graph.model_inspector().GetName
+        feet = [shape for shape in shapes if _FEET in name(shape)]
+        boxes = [shape for shape in shapes if shape not in feet]
+        on_sensor = OnSensor(plant, tool)
+        ExcludeContact(plant, scene_graph, feet, on_sensor)
+        others = {*on_sensor, *(body.index() for body in blocks)}
+        ExcludeContact(plant, scene_graph, boxes, [k for k in bodies if k not in others])

@@ -1,0 +1,188 @@
+"""Where bodies are that move, from the plant's state, compiled: for contact between its steps.
+
+They hang on each other and on the world by joints that turn, slide, are free or do not move at all:
+all that a scene may have. From parent to child, with F on the parent P and M on the body B,
+
+    X_WB = X_WP X_PF X_FM(q) X_MB,   and velocities likewise, expressed in W.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import cos, sin
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    BodyIndex,
+    Joint,
+    JointIndex,
+    PrismaticJoint,
+    QuaternionFloatingJoint,
+    RevoluteJoint,
+)
+from pydrake.systems.framework import Context
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.quaternions import conjugate, multiply, normalized, rotate
+from drake_teleop.common.vectors import cross, plus, three, times
+
+Array = NDArray[np.float64]
+
+_FIXED, _TURNS, _SLIDES, _FLOATS = range(4)
+_PARENT, _KIND, _Q, _V, _AXIS, _F, _M = 0, 1, 2, 3, 4, 7, 14
+#: Columns of the table of joints.
+JOINT_WIDTH = 21
+#: Of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
+POSE_AND_TWIST = 13
+
+
+def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[int]]:
+    """By which joints bodies hang on the world.
+
+    Args:
+        plant: finalized.
+        bodies: that are not anchored.
+
+    Returns:
+        (m, 21) table, parents first: 0 row of the parent, or -1 if it is anchored; 1 the kind; 2
+        and 3 where its positions and velocities begin in the plant's state [q; v]; 4-6 its axis;
+        7-13 and 14-20 X_PF, or X_WF, and X_MB, a quaternion and a place each. And the body of each
+        row, as a number; besides `bodies` those on which they hang.
+    """
+    # Numbers alone: a joint that is held would hold the plant, and that the joint.
+    above: dict[int, tuple[int, int]] = {}
+    anchored: set[int] = set()
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        child, parent = int(joint.child_body().index()), int(joint.parent_body().index())
+        above[child] = int(index), parent
+        if plant.IsAnchored(joint.parent_body()):
+            anchored.add(parent)
+    order: list[int] = []
+    for body in bodies:
+        chain, number = [], int(body)
+        while number not in order and number not in anchored:
+            chain.append(number)
+            number = above[number][1]
+        order += reversed(chain)
+    context, rows = plant.CreateDefaultContext(), []
+    for number in order:
+        index, parent = above[number]
+        row = order.index(parent) if parent in order else -1
+        rows.append(_row(plant, context, plant.get_joint(JointIndex(index)), row))
+    return np.array(rows).reshape(len(rows), JOINT_WIDTH), order
+
+
+def _row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) -> Array:
+    F = joint.frame_on_parent()
+    X_PF = F.CalcPoseInWorld(context) if row < 0 else F.GetFixedPoseInBodyFrame()
+    X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+    kind, axis = _kind(joint)
+    places = joint.position_start(), plant.num_positions() + joint.velocity_start()
+    return np.array([row, kind, *places, *axis, *_numbers(X_PF), *_numbers(X_MB)])
+
+
+def _kind(joint: Joint) -> tuple[int, Array]:
+    if isinstance(joint, RevoluteJoint):
+        return _TURNS, joint.revolute_axis()
+    if isinstance(joint, PrismaticJoint):
+        return _SLIDES, joint.translation_axis()
+    return _FLOATS if isinstance(joint, QuaternionFloatingJoint) else _FIXED, np.zeros(3)
+
+
+def _numbers(X: RigidTransform) -> Array:
+    return np.concatenate([X.rotation().ToQuaternion().wxyz(), X.translation()])
+
+
+@njit(cache=True)
+def _quaternion(x, i):
+    return x[i], x[i + 1], x[i + 2], x[i + 3]
+
+
+@njit(cache=True)
+def bodies_into(joints, state, out):
+    """Pose and twist of each body (m, 13), see `POSE_AND_TWIST`, in a state of the plant [q; v]."""
+    still = (0.0, 0.0, 0.0)
+    for k in range(joints.shape[0]):
+        row = joints[k]
+        turn, place, spin, speed = (1.0, 0.0, 0.0, 0.0), still, still, still
+        if row[_PARENT] >= 0.0:
+            above = out[int(row[_PARENT])]
+            turn, place = _quaternion(above, 0), three(above, 4)
+            spin, speed = three(above, 7), three(above, 10)
+        # From parent to F.
+        lever = rotate(turn, three(row, _F + 4))
+        place, speed = plus(place, lever), plus(speed, cross(spin, lever))
+        turn = multiply(turn, _quaternion(row, _F))
+        # From F to M.
+        q, v, kind, axis = int(row[_Q]), int(row[_V]), row[_KIND], three(row, _AXIS)
+        if kind == _TURNS:
+            spin = plus(spin, times(state[v], rotate(turn, axis)))
+            half = 0.5 * state[q]
+            x, y, z = times(sin(half), axis)
+            turn = multiply(turn, (cos(half), x, y, z))
+        elif kind == _SLIDES:
+            axis = rotate(turn, axis)
+            lever = times(state[q], axis)
+            place = plus(place, lever)
+            speed = plus(plus(speed, cross(spin, lever)), times(state[v], axis))
+        elif kind == _FLOATS:
+            lever = rotate(turn, three(state, q + 4))
+            place = plus(place, lever)
+            speed = plus(plus(speed, cross(spin, lever)), rotate(turn, three(state, v + 3)))
+            spin = plus(spin, rotate(turn, three(state, v)))
+            turn = multiply(turn, normalized(_quaternion(state, q)))
+        # From M to B.
+        lever = rotate(turn, three(row, _M + 4))
+        place, speed = plus(place, lever), plus(speed, cross(spin, lever))
+        turn = multiply(turn, _quaternion(row, _M))
+        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = turn
+        out[k, 4], out[k, 5], out[k, 6] = place
+        out[k, 7], out[k, 8], out[k, 9] = spin
+        out[k, 10], out[k, 11], out[k, 12] = speed
+
+
+@njit(cache=True)
+def _hermite(h, u, a, a_dot, b, b_dot):
+    """Value and rate at the part u of h of what goes from a to b, by a cubic."""
+    d = b - a
+    c2, c3 = 3.0 * d - h * (2.0 * a_dot + b_dot), h * (a_dot + b_dot) - 2.0 * d
+    value = a + u * (h * a_dot + u * (c2 + u * c3))
+    return value, a_dot + u * (2.0 * c2 + 3.0 * u * c3) / h
+
+
+@njit(cache=True)
+def _rate(spin, turn):
+    """Of a quaternion at an angular velocity."""
+    return multiply((0.0, 0.5 * spin[0], 0.5 * spin[1], 0.5 * spin[2]), turn)
+
+
+@njit(cache=True)
+def interpolate_bodies(joints, h, u, start, end, out):
+    """State of the joints at the part u of a step of h [s], from that at its start and its end.
+
+    Positions by cubics, velocities as theirs: to the third order, as the integrator. The rest of
+    the plant's state is left as it is.
+    """
+    for k in range(joints.shape[0]):
+        q, v, kind = int(joints[k, _Q]), int(joints[k, _V]), joints[k, _KIND]
+        if kind in (_TURNS, _SLIDES):
+            out[q], out[v] = _hermite(h, u, start[q], start[v], end[q], end[v])
+        elif kind == _FLOATS:
+            for i in range(3):
+                out[q + 4 + i], out[v + 3 + i] = _hermite(
+                    h, u, start[q + 4 + i], start[v + 3 + i], end[q + 4 + i], end[v + 3 + i]
+                )
+            a, b = _quaternion(start, q), _quaternion(end, q)
+            a_dot, b_dot = _rate(three(start, v), a), _rate(three(end, v), b)
+            w, w_dot = _hermite(h, u, a[0], a_dot[0], b[0], b_dot[0])
+            x, x_dot = _hermite(h, u, a[1], a_dot[1], b[1], b_dot[1])
+            y, y_dot = _hermite(h, u, a[2], a_dot[2], b[2], b_dot[2])
+            z, z_dot = _hermite(h, u, a[3], a_dot[3], b[3], b_dot[3])
+            out[q], out[q + 1], out[q + 2], out[q + 3] = w, x, y, z
+            spin = multiply((w_dot, x_dot, y_dot, z_dot), conjugate((w, x, y, z)))
+            scale = 2.0 / (w * w + x * x + y * y + z * z)
+            out[v], out[v + 1], out[v + 2] = scale * spin[1], scale * spin[2], scale * spin[3]

@@ -1,0 +1,299 @@
+"""Drake's compliant point contact between the tool's spheres and boxes, compiled.
+
+The wrist sensor samples at instants between the steps of the plant, where the plant's own contact
+results are not to be had. The law is that of Drake for continuous plants (Hunt and Crossley 1975
+along the normal, regularised Coulomb friction across it); a test ties it to the plant.
+
+    f_n = k x (1 + d x'), never pulling;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Box, GeometryId, Obb, ProximityProperties, SceneGraphInspector, Sphere
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import CalcContactFrictionFromSurfaceProperties, MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex, PrismaticJoint, RigidBody
+from pydrake.systems.framework import Context
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.vectors import (
+    apply,
+    dot,
+    minus,
+    nine,
+    plus,
+    rows,
+    three,
+    times,
+    transposed,
+)
+
+Array = NDArray[np.float64]
+
+#: Columns of the table of pairs: stiffness; static and dynamic friction; which body it moves with.
+STIFFNESS, FRICTION, BODY = 22, slice(24, 26), 27
+#: Their number, and that of pairs that are watched.
+WIDTH, WATCHED_WIDTH = 28, 40
+_STIFFNESS, _DISSIPATION = "point_contact_stiffness", "hunt_crossley_dissipation"
+_NO_SLIP = 1e-14  # m/s, as in Drake: a point at rest has a direction
+
+
+class Pairs(NamedTuple):
+    """What may touch.
+
+    Attributes:
+        known: (k, 28), for the kernel. Of each pair of a sphere of the tool and a box: 0-2 centre
+            of the sphere in S [m], 3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest, or
+            of the box in its body if that moves, 16-18 half the box's edges, 19-21 direction in W
+            in which it moves as a leaf (zero if it does not), 22 stiffness k [N/m], 23 dissipation
+            d [s/m], 24 and 25 static and dynamic friction, 26 slip at which it is complete [m/s],
+            27 the row of its body in a `JointTable`, or -1.
+        watched: (l, 40), of the others: boxes around both. They do not touch as long as these do
+            not, see `apart`. As above, with 0-2 the middle of the tool's box, 3 unused; 28-36
+            R_SBox of that by rows, 37-39 half its edges.
+        unknown: of the first of the others, why it is one.
+    """
+
+    known: Array
+    watched: Array
+    unknown: str
+
+
+def ContactPairs(
+    plant: MultibodyPlant,
+    inspector: SceneGraphInspector,
+    tool: Mapping[GeometryId, RigidTransform],
+    environment: Iterable[ModelInstanceIndex],
+    slip: float,
+    moving: Sequence[int] = (),
+) -> Pairs:
+    """The pairs of a shape of the tool and one of the environment.
+
+    Args:
+        plant: finalized; a leaf of the environment is at 0 by default.
+        inspector: of the scene graph, with the shapes and their compliance.
+        tool: its shapes, and where their bodies are in S.
+        environment: what it may touch.
+        slip: at which friction is complete [m/s]; the plant's stiction tolerance.
+        moving: the bodies of a `JointTable`, row by row.
+
+    Raises:
+        DrakeTeleopError: for a shape that no box is around.
+    """
+    context = plant.CreateDefaultContext()
+    known: list[Array] = []
+    watched: list[Array] = []
+    unknown = ""
+    touched = (body for instance in environment for body in plant.GetBodyIndices(instance))
+    for body in map(plant.get_body, touched):
+        row = moving.index(int(body.index())) if int(body.index()) in moving else -1
+        X_Body = plant.EvalBodyPoseInWorld(context, body) if row < 0 else RigidTransform()
+        direction = _direction(plant, context, body)
+        for thing in plant.GetCollisionGeometriesForBody(body):
+            for own, X_SOwn in tool.items():
+                if inspector.CollisionFiltered(own, thing):
+                    continue
+                X_Thing = X_Body @ inspector.GetPoseInFrame(thing)
+                X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)
+                try:
+                    sphere, edges = _sphere_and_box(inspector, own, thing)
+                    law = _law(*map(inspector.GetProximityProperties, (own, thing)))
+                    half = np.array(edges.size()) / 2
+                    place = [X_SShape.translation(), [sphere.radius()]]
+                    known.append(_row(place, X_Thing, half, [direction, law, [slip, row]]))
+                except DrakeTeleopError as beyond:
+                    unknown = unknown or str(beyond)
+                    around, box = _around(inspector, own), _around(inspector, thing)
+                    X_SBox, X_Thing = X_SShape @ around.pose(), X_Thing @ box.pose()
+                    place = [X_SBox.translation(), [0.0]]
+                    turned = [X_SBox.rotation().matrix().ravel(), around.half_width()]
+                    last = [direction, [0.0] * 4, [slip, row], *turned]
+                    watched.append(_row(place, X_Thing, box.half_width(), last))
+    return Pairs(
+        np.array(known).reshape(len(known), WIDTH),
+        np.array(watched).reshape(len(watched), WATCHED_WIDTH),
+        unknown,
+    )
+
+
+def _row(first: list[Any], X_Thing: RigidTransform, half: Array, last: list[Any]) -> Array:
+    return np.concatenate(
+        [*first, X_Thing.rotation().matrix().ravel(), X_Thing.translation(), half, *last]
+    )
+
+
+def _around(inspector: SceneGraphInspector, shape: GeometryId) -> Obb:
+    box = inspector.GetObbInGeometryFrame(shape)
+    if box is None:
+        raise DrakeTeleopError(
+            f"a {type(inspector.GetShape(shape)).__name__} has no end",
+            where=inspector.GetName(shape),
+        )
+    return box
+
+
+def _sphere_and_box(
+    inspector: SceneGraphInspector, ball: GeometryId, box: GeometryId
+) -> tuple[Sphere, Box]:
+    sphere, edges = inspector.GetShape(ball), inspector.GetShape(box)
+    if isinstance(sphere, Sphere) and isinstance(edges, Box):
+        return sphere, edges
+    raise DrakeTeleopError(
+        f"the wrist sensor feels spheres on boxes only, not a {type(sphere).__name__} on a "
+        f"{type(edges).__name__}",
+        where=inspector.GetName(box),
+        remedy="build the tool's tip of spheres and the environment of boxes",
+    )
+
+
+def _direction(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
+    """In which the body moves for a unit of the environment's one speed, in W."""
+    plant.SetVelocities(context, np.zeros(plant.num_velocities()))
+    direction = np.zeros(3)
+    for joint in map(plant.get_joint, plant.GetJointIndices()):
+        if joint.child_body().index() == body.index() and isinstance(joint, PrismaticJoint):
+            R_WJ = joint.frame_on_parent().CalcPoseInWorld(context).rotation()
+            direction = R_WJ @ joint.translation_axis()
+    return direction
+
+
+def _law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
+    """k, d and friction of a pair, as in Drake.
+
+    Springs in series, dissipation by what each deforms, the harmonic mean of friction.
+    """
+    for shape in (ball, box):
+        if not all(shape.HasProperty("material", name) for name in (_STIFFNESS, _DISSIPATION)):
+            raise DrakeTeleopError(
+                "leaves stiffness or dissipation to Drake",
+                where="drake:proximity_properties",
+                remedy="give drake:point_contact_stiffness and drake:hunt_crossley_dissipation",
+            )
+    k_1, k_2 = (float(shape.GetProperty("material", _STIFFNESS)) for shape in (ball, box))
+    d_1, d_2 = (float(shape.GetProperty("material", _DISSIPATION)) for shape in (ball, box))
+    both = CalcContactFrictionFromSurfaceProperties(
+        *(shape.GetProperty("material", "coulomb_friction") for shape in (ball, box))
+    )
+    d = (k_2 * d_1 + k_1 * d_2) / (k_1 + k_2)
+    return [k_1 * k_2 / (k_1 + k_2), d, both.static_friction(), both.dynamic_friction()]
+
+
+@njit(cache=True)
+def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal: Array) -> float:
+    """How deep a sphere is in its box [m], below 0 if it is not.
+
+    Args:
+        pair: (28,) row of `Pairs`.
+        p_WS: (3,) origin of the tool's frame in W [m].
+        R_WS: (3, 3) its rotation.
+        deflection: of the environment [m].
+        normal: (6,) filled, if the result is not below 0: out of the box in W (3), and the point
+            of contact in W [m] (3).
+    """
+    radius = pair[3]
+    # The sphere's centre, from the box's, in the box.
+    w0 = p_WS[0] + R_WS[0, 0] * pair[0] + R_WS[0, 1] * pair[1] + R_WS[0, 2] * pair[2]
+    w1 = p_WS[1] + R_WS[1, 0] * pair[0] + R_WS[1, 1] * pair[1] + R_WS[1, 2] * pair[2]
+    w2 = p_WS[2] + R_WS[2, 0] * pair[0] + R_WS[2, 1] * pair[1] + R_WS[2, 2] * pair[2]
+    w0 -= pair[13] + deflection * pair[19]
+    w1 -= pair[14] + deflection * pair[20]
+    w2 -= pair[15] + deflection * pair[21]
+    R_WBox, w = nine(pair, 4), (w0, w1, w2)
+    d = apply(transposed(R_WBox), w)
+    outside, deepest, face = 0.0, -np.inf, 0
+    for i in range(3):
+        beyond = abs(d[i]) - pair[16 + i]
+        if beyond > radius:
+            return -1.0
+        if beyond > 0.0:
+            outside += beyond * beyond
+        if beyond > deepest:
+            deepest, face = beyond, i
+    distance = np.sqrt(outside) if outside > 0.0 else deepest
+    if distance >= radius:
+        return radius - distance
+    # The normal in the box: from its nearest point, or through its nearest face.
+    for i in range(3):
+        normal[3 + i] = 0.0
+        beyond = abs(d[i]) - pair[16 + i]
+        if (outside > 0.0 and beyond > 0.0) or (outside == 0.0 and i == face):
+            normal[3 + i] = np.copysign(beyond / distance if outside > 0.0 else 1.0, d[i])
+    n_W = apply(R_WBox, three(normal, 3))
+    # Halfway between the sphere's deepest point and the box's surface.
+    inwards = (radius + distance) / 2
+    for i in range(3):
+        normal[i] = n_W[i]
+        origin = pair[13 + i] + deflection * pair[19 + i] + w[i]
+        normal[3 + i] = origin - inwards * normal[i]
+    return radius - distance
+
+
+@njit(cache=True)
+def apart(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float) -> float:
+    """How far two boxes are apart at least [m], below 0 if they may touch.
+
+    The largest gap along the edges of either (Gottschalk 1996, without the cross products).
+
+    Args:
+        pair: (40,) row of `Pairs.watched`, for the tool's box.
+        box: (28,) the same row with the other box where it is.
+        p_WS, R_WS: of the tool's frame in W.
+        deflection: of the environment [m].
+    """
+    R, between = rows(R_WS), minus(three(p_WS, 0), three(box, 13))
+    between = plus(between, apply(R, three(pair, 0)))
+    between = minus(between, times(deflection, three(box, 19)))
+    edges, halves, largest = np.empty((6, 3)), np.empty(6), -np.inf
+    for i in range(3):
+        k = WIDTH + i  # columns of a rotation: directions of edges
+        edge = apply(R, (pair[k], pair[k + 3], pair[k + 6]))
+        edges[i, 0], edges[i, 1], edges[i, 2] = edge
+        edges[3 + i, 0], edges[3 + i, 1], edges[3 + i, 2] = box[4 + i], box[7 + i], box[10 + i]
+        halves[i], halves[3 + i] = pair[WIDTH + 9 + i], box[16 + i]
+    for i in range(6):
+        axis = three(edges[i], 0)
+        gap = abs(dot(between, axis))
+        for j in range(6):
+            gap -= halves[j] * abs(dot(three(edges[j], 0), axis))
+        largest = max(largest, gap)
+    return largest
+
+
+@njit(cache=True)
+def _friction(static: float, dynamic: float, slip: float) -> float:
+    """The regularised coefficient at a slip in units of v_s (Drake's StribeckModel)."""
+    if slip < 1.0:
+        return static * slip**3 * (10.0 + slip * (6.0 * slip - 15.0))
+    if slip < 3.0:
+        u = (slip - 1.0) / 2.0
+        return static - (static - dynamic) * u**3 * (10.0 + u * (6.0 * u - 15.0))
+    return dynamic
+
+
+@njit(cache=True)
+def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
+    """The force on the sphere that is `x` [m] deep in its box.
+
+    Args:
+        pair: (28,) row of `Pairs`.
+        x: its indentation [m].
+        normal: (3,) out of the box.
+        velocity: (3,) of the sphere at the point of contact, relative to the box [m/s].
+        force: (3,) filled [N].
+    """
+    out = dot(velocity, normal)
+    f_n = max(pair[22] * x * (1.0 - pair[23] * out), 0.0)
+    speed = 0.0
+    for i in range(3):
+        force[i] = velocity[i] - out * normal[i]
+        speed += force[i] * force[i]
+    speed = np.sqrt(speed + _NO_SLIP * _NO_SLIP)
+    mu = _friction(pair[24], pair[25], speed / pair[26])
+    for i in range(3):
+        force[i] = f_n * (normal[i] - mu * force[i] / speed)

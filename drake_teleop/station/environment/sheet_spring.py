@@ -1,0 +1,113 @@
+"""The sheet spring of the paper's Fig. 5: a clamped-free leaf that the ball tip runs into.
+
+The leaf's first bending mode is one degree of freedom (Euler-Bernoulli stiffness, Rayleigh mass);
+the contact between ball and leaf is Drake's compliant point contact.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+from xml.etree import ElementTree
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, PrismaticSpring
+
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import quantity
+from drake_teleop.common.resources import models_dir
+from drake_teleop.station.environment.environment import (
+    Environment,
+    ExcludeContact,
+    OnSensor,
+    Stand,
+)
+
+_BENCH = 0.15  # from the lower face of the model's bench to the leaf [m]
+
+
+@settings
+@dataclass
+class SheetSpring(Environment):
+    """Where the leaf is and what it is made of. Lengths in m, SI throughout."""
+
+    position: list[float] = quantity(
+        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WLeaf, middle of the leaf's top at rest, in W"
+    )
+    length: float = quantity(0.170, "m", 0.02, 1.0, "free length of the leaf")
+    width: float = quantity(0.060, "m", 0.005, 0.5, "width of the section")
+    thickness: float = quantity(0.002, "m", 0.0002, 0.02, "thickness of the section")
+    youngs_modulus: float = quantity(210e9, "Pa", 1e9, 500e9, "Young's modulus, spring steel")
+    density: float = quantity(7850.0, "kg/m^3", 500.0, 20000.0, "density, spring steel")
+    damping_ratio: float = quantity(
+        0.03, "1", 0.0, 100.0, "damping ratio of the first mode; above 1 it creeps back"
+    )
+    slip: float = quantity(1e-4, "m/s", 1e-6, 1.0, "at which friction is complete (E)")
+
+    @property
+    def stiffness(self) -> float:
+        """k = 3 E I / L^3 [N/m] at the free end, I = b h^3 / 12 (Euler-Bernoulli)."""
+        second_moment = self.width * self.thickness**3 / 12
+        return 3 * self.youngs_modulus * second_moment / self.length**3
+
+    @property
+    def effective_mass(self) -> float:
+        """33/140 of the leaf's mass [kg] (Rayleigh, static deflection shape)."""
+        return 33 / 140 * self.density * self.length * self.width * self.thickness
+
+    @property
+    def damping(self) -> float:
+        """Viscous damping of the mode [N s/m]."""
+        return 2 * self.damping_ratio * np.sqrt(self.stiffness * self.effective_mass)
+
+    @property
+    def largest_small_deflection(self) -> float:
+        """10 % of the length [m]: beyond it the linear leaf is no longer a good model."""
+        return 0.1 * self.length
+
+    @property
+    def moving_part(self) -> tuple[float, float, float]:
+        """Mass [kg], stiffness [N/m] and damping [N s/m] of the leaf's end."""
+        return self.effective_mass, self.stiffness, self.damping
+
+    @property
+    def stand(self) -> Stand:
+        """From the floor to the model's bench."""
+        x, y, z = self.position
+        return Stand(0.34, 0.24, x + 0.065, y, z - _BENCH)
+
+    def AddTo(self, plant: MultibodyPlant) -> None:
+        """See `AddSheetSpring`."""
+        AddSheetSpring(plant, self)
+
+    def PrepareContact(
+        self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
+    ) -> None:
+        """The tool alone touches the leaf, whose shape reaches down to where others may stand."""
+        leaf = plant.GetBodyByName("leaf")
+        on_sensor = OnSensor(plant, tool)
+        others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in on_sensor]
+        shapes = plant.GetCollisionGeometriesForBody(leaf)
+        ExcludeContact(plant, scene_graph, shapes, others)
+
+
+def AddSheetSpring(plant: MultibodyPlant, sheet: SheetSpring) -> ModelInstanceIndex:
+    """Adds the leaf to a plant that is registered with a scene graph and not yet finalized.
+
+    Its one degree of freedom, "bending", is the deflection of its end along z_W [m], 0 at rest.
+    """
+    tree = ElementTree.parse(models_dir() / "sheet_spring.sdf")
+    # A body's mass is fixed once it is parsed, so it goes into the file's text.
+    tree.find(".//link[@name='leaf']/inertial/mass").text = repr(sheet.effective_mass)  # type: ignore[union-attr]
+    # Without this the prefix becomes ns0 and Drake drops the leaf's contact properties.
+    ElementTree.register_namespace("drake", "drake.mit.edu")
+    text = ElementTree.tostring(tree.getroot(), encoding="unicode")
+    (instance,) = Parser(plant).AddModelsFromString(text, "sdf")
+    base = plant.GetFrameByName("base", instance)
+    plant.WeldFrames(plant.world_frame(), base, RigidTransform(sheet.position))
+    bending = plant.GetJointByName("bending", instance)
+    bending.set_default_damping(sheet.damping)
+    plant.AddForceElement(PrismaticSpring(bending, nominal_position=0.0, stiffness=sheet.stiffness))
+    return instance

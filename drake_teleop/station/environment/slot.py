@@ -1,0 +1,169 @@
+r"""A chamfered slot that the tool is put into as a peg: walls, chamfers, floor, nothing that moves.
+
+Seen along the slot, M being the middle of its mouth, z up::
+
+    top                       top        2 sides of y_M, 3 boxes each, and the floor. A box is
+    ------.       M       .------        convex and the contact of a ball with it is a spring; where
+           \.     |     ./  chamfer      two boxes meet in an edge that sticks out, a ball on the
+             |    |    |                 edge is in contact with both, which makes the edge up to
+             |  width  |  wall           twice as stiff as a face. The slot is open at its ends.
+             |_________|
+                floor
+
+The tool's ball and a second one further up its shank, of the same radius, are the peg: between two
+parallel walls two balls can be jammed, as a cylinder can, and one cannot.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import (
+    AddContactMaterial,
+    Box,
+    ProximityProperties,
+    RoleAssign,
+    SceneGraph,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, SpatialInertia
+
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import quantity
+from drake_teleop.station.environment.environment import Environment, Stand
+
+#: The peg's balls [m]: their radius, and z_S of their centres. The first is that of tool.sdf; where
+#: the second sits is E: as far up as leaves the nut above it outside the deepest slot.
+PEG_RADIUS, TIP_BALL, UPPER_BALL = 0.012, 0.188, 0.158
+#: The blocks on both sides [m]: along the slot, and across it beyond the mouth's edge (E).
+LENGTH, _SIDE = 0.10, 0.04
+_FLOOR = 0.02
+_BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 0.55])  # the peg is seen through them
+_BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
+
+
+@settings
+@dataclass
+class Slot(Environment):
+    """Where the slot is, its shape, and how the balls of the peg touch it."""
+
+    position: list[float] = quantity(
+        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WM, middle of the slot's mouth, in W"
+    )
+    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "of the slot about z_W; 0: it runs along x_W")
+    clearance: float = quantity(1e-3, "m", 1e-6, 0.05, "width of the slot less the peg's")
+    depth: float = quantity(0.040, "m", 0.02, 0.05, "from the mouth to the floor")
+    chamfer: float = quantity(
+        3e-3, "m", 5e-4, 0.015, "depth of the chamfers of 45 degrees, and their width on each side"
+    )
+    stiffness: float = quantity(
+        1e4, "N/m", 1e2, 1e6, "of a ball on a face, with what gives way in part and fixture (E)"
+    )
+    dissipation: float = quantity(
+        1.0, "s/m", 0.0, 100.0, "of the contact, by Hunt and Crossley; as of the leaf (E)"
+    )
+    friction: float = quantity(0.2, "1", 0.0, 2.0, "of a ball on a face, at rest and in motion (E)")
+
+    @property
+    def width(self) -> float:
+        """From wall to wall [m]."""
+        return 2 * PEG_RADIUS + self.clearance
+
+    @property
+    def slip(self) -> float:
+        """At which friction is complete [m/s] (E).
+
+        A peg that stands on the floor or sticks creeps, more slowly than this. A tenth of it, as
+        on the leaf, would make every second of that three times as long to simulate.
+        """
+        return 1e-3
+
+    @property
+    def foot(self) -> float:
+        """z_W of the floor's lower face [m], on which the slot stands."""
+        return self.position[2] - self.depth - _FLOOR
+
+    @property
+    def X_WM(self) -> RigidTransform:
+        """M is the middle of the mouth, x along the slot, z up."""
+        return RigidTransform(RollPitchYaw(0.0, 0.0, self.yaw), self.position)
+
+    @property
+    def stand(self) -> Stand:
+        """From the floor to the slot's foot."""
+        return Stand(0.16, 0.16, self.position[0], self.position[1], self.foot)
+
+    def AddTo(self, plant: MultibodyPlant) -> None:
+        """See `AddSlot`."""
+        AddSlot(plant, self)
+
+    def PrepareContact(
+        self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
+    ) -> None:
+        """See `TouchAsSlot`."""
+        TouchAsSlot(plant, scene_graph, self, tool)
+
+
+def AddSlot(plant: MultibodyPlant, slot: Slot) -> ModelInstanceIndex:
+    """Adds the slot and the tool's second ball to a plant that has the tool, and is not finalized.
+
+    The body "slot" is welded to the world. The second ball has shape only: the mass of the tool is
+    what it was. Without a scene graph there are no shapes, as when a model is parsed.
+    """
+    instance = plant.AddModelInstance("slot")
+    body = plant.AddRigidBody("slot", instance, SpatialInertia.Zero())
+    plant.WeldFrames(plant.world_frame(), body.body_frame(), slot.X_WM)
+    if not plant.geometry_source_is_registered():
+        return instance
+    tool, above = plant.GetBodyByName("tool"), RigidTransform([0.0, 0.0, UPPER_BALL])
+    ball, properties = Sphere(PEG_RADIUS), _material(slot)
+    plant.RegisterCollisionGeometry(tool, above, ball, "upper_ball", properties)
+    plant.RegisterVisualGeometry(tool, above, ball, "upper_ball", _BALL_COLOUR)
+    for name, (X_MBox, box) in _boxes(slot).items():
+        plant.RegisterCollisionGeometry(body, X_MBox, box, name, properties)
+        plant.RegisterVisualGeometry(body, X_MBox, box, name, _BLOCK_COLOUR)
+    return instance
+
+
+def TouchAsSlot(
+    plant: MultibodyPlant, scene_graph: SceneGraph, slot: Slot, tool: BodyIndex
+) -> None:
+    """Gives the tool's balls the slot's contact, so that of both it is what the slot says."""
+    source = plant.get_source_id()
+    for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
+        scene_graph.AssignRole(source, ball, _material(slot), RoleAssign.kReplace)
+
+
+def _material(slot: Slot) -> ProximityProperties:
+    """Of either side: two springs in series, the means of dissipation and of friction."""
+    properties = ProximityProperties()
+    friction = CoulombFriction(slot.friction, slot.friction)
+    AddContactMaterial(properties, slot.dissipation, 2 * slot.stiffness, friction)
+    return properties
+
+
+def _boxes(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
+    """The boxes in M, by name."""
+    edge, c, depth = slot.width / 2, slot.chamfer, slot.depth
+    boxes = {}
+    for name, side in (("left", 1.0), ("right", -1.0)):
+
+        def block(inner: float, top: float, side: float = side) -> tuple[RigidTransform, Box]:
+            """From `inner` outwards, from `top` down to the floor."""
+            across, height = edge + c + _SIDE - inner, depth + top
+            middle = RigidTransform([0.0, side * (inner + across / 2), top - height / 2])
+            return middle, Box(LENGTH, across, height)
+
+        # Its upper face is the chamfer; it is as thick as fills what wall and top leave open.
+        tilt, thick = RotationMatrix.MakeXRotation(side * np.pi / 4), c / np.sqrt(2)
+        face = np.array([0.0, side * (edge + c / 2), -c / 2])
+        into = RigidTransform(tilt, face - tilt.matrix()[:, 2] * thick / 2)
+        boxes[f"{name}_wall"] = block(edge, -c)
+        boxes[f"{name}_top"] = block(edge + c, 0.0)
+        boxes[f"{name}_chamfer"] = into, Box(LENGTH, c * np.sqrt(2), thick)
+    across = slot.width + 2 * (c + _SIDE)
+    below = RigidTransform([0.0, 0.0, -depth - _FLOOR / 2])
+    boxes["floor"] = below, Box(LENGTH, across, _FLOOR)
+    return boxes

@@ -1,0 +1,127 @@
+"""Contact at the slave: noticed in the eliminated wrench, sample by sample, and told to the hand.
+
+What is noticed, and why fast motion is not contact, says `drake_teleop.load.contact`. The
+noise floor and the threshold come from free motion of the same load with the same sensor: the
+identification run that precedes the station.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.fault import sound
+from drake_teleop.common.fields import settings
+from drake_teleop.common.lifetime import ONE_DICT
+from drake_teleop.common.quantities import choice, quantity
+from drake_teleop.load.compensation import scaled_wrench_into
+from drake_teleop.load.contact.detection import ContactDetector, flag_update
+from drake_teleop.load.contact.memory import FLAG
+from drake_teleop.load.contact.noise_floor import MARGIN, STATISTICS, NoiseFloor
+from drake_teleop.load.sample import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    BEFORE_JOINTS,
+    SATURATED,
+    SPECIFIC_FORCE,
+    TIME,
+    WRENCH,
+    sample_size,
+)
+from drake_teleop.station.slave.arm import ArmModel, acceleration_into
+
+
+@settings
+@dataclass
+class ContactDetectionConfig:
+    """How contact is noticed; a scenario without this block has no detector."""
+
+    statistic: str = choice("glr", STATISTICS, "what is compared with the threshold")
+    margin: float = quantity(
+        MARGIN, "1", 1.0, 10.0, "threshold over the most that the identification's motion reached"
+    )
+    hold: float = quantity(0.02, "s", 0.0, 1.0, "quiet after which a contact is over")
+    drift_time: float = quantity(
+        5.0, "s", 0.5, 1e4, "within which the detector follows the offsets while nothing stands out"
+    )
+    recovery: float = quantity(
+        5e-3, "s", 0.0, 1.0, "for which a saturation still shows in the sensor's low-pass"
+    )
+
+
+@njit(cache=True)
+def _detected(memory, sample, estimate, arm, settings):
+    """Takes one sample; whether there is contact, as before if there is a fault."""
+    if not (sound(sample) and sound(estimate)):
+        return memory[FLAG] != 0.0
+    contact, acceleration = np.empty(6), np.empty(3)
+    s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
+    wrench, offset, phi = sample[WRENCH], estimate[:6], estimate[6:]
+    scaled_wrench_into(wrench, offset, s, omega, alpha, phi, np.zeros(10), 0.0, 0.0, 1.0, contact)
+    acceleration_into(arm, sample[BEFORE_JOINTS:TIME], s, acceleration)
+    return flag_update(memory, contact, s, omega, alpha, acceleration, *settings)
+
+
+class ContactDetection(LeafSystem):
+    """Says whether the slave touches something.
+
+    While the wrist sensor is saturated, and while that shows in its low-pass, nothing is known, and
+    the flag stays as it is.
+
+    .. pydrake_system::
+
+        name: ContactDetection
+        input_ports:
+        - sample: the wrist sensor's, see `drake_teleop.load.sample`
+        - load_estimate: (16,) Eq. (7), [offsets; phi]
+        output_ports:
+        - contact: (1,) 1 in contact, else 0
+
+    Args:
+        config: how contact is noticed.
+        floor: of the free motion, fitted at the rate of this block.
+        arm: the slave's kinematics.
+        period: between samples [s].
+
+    Raises:
+        DrakeTeleopError: if the floor was not fitted to a motion.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self, config: ContactDetectionConfig, floor: NoiseFloor, arm: ArmModel, period: float
+    ) -> None:
+        super().__init__()
+        self._arm = arm.table
+        self._settings = ContactDetector(
+            floor,
+            floor.threshold(config.statistic, config.margin),
+            statistic=config.statistic,
+            hold=round(config.hold / period),
+            following=period / config.drift_time,
+        ).settings
+        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
+        self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
+        self._flag = self.DeclareDiscreteState(1)
+        self._memory = self.DeclareDiscreteState(ContactDetector.initial_memory())
+        self._recovery = round(config.recovery / period)
+        self._blind = self.DeclareDiscreteState(1)  # samples for which nothing will be known
+        self.DeclareStateOutputPort("contact", self._flag)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        sample = self._sample.Eval(context)
+        blind = discrete_state.get_mutable_value(self._blind)
+        if sample[SATURATED] > 0.5:
+            blind[0] = self._recovery
+            return
+        if blind[0] > 0.0:
+            blind[0] -= 1.0
+            return
+        memory = discrete_state.get_mutable_value(self._memory)
+        estimate = self._estimate.Eval(context)
+        flag = discrete_state.get_mutable_value(self._flag)
+        flag[0] = _detected(memory, sample, estimate, self._arm, self._settings)

@@ -1,0 +1,187 @@
+"""The estimator of Fig. 2: recursive, for the load and the offsets, in the loop.
+
+The same kernels work on logs (`drake_teleop.load.online.recursive`, `recursive_tls`). It sees the
+sensor's samples only. There is no choice of instrumental variables: instruments would be the
+accelerations of the encoders' readings, and a sample has the readings alone.
+
+With `watch` it freezes what it has learnt once that is settled, keeps the offsets, and notices
+another load (`drake_teleop.load.online.watched`). That needs variances that can be believed, hence
+"rtls": noise of the accelerations biases "rls" by many of its standard deviations, and every motion
+would look like another load.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import settings
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.quantities import choice, plain, quantity
+from drake_teleop.load.online.change import change_parameters
+from drake_teleop.load.online.methods import METHODS
+from drake_teleop.load.online.watched import (
+    LEARNING,
+    SETTLED,
+    SIZE,
+    watched_memory,
+    watched_state,
+    watched_update,
+)
+from drake_teleop.load.sample import SATURATED
+
+# Samples between two looks at whether it has settled.
+_CHECK = 16
+
+
+@settings
+@dataclass
+class LoadEstimatorConfig:
+    """Recursive estimation with offsets, Eqs. (7)-(8)."""
+
+    enabled: bool = plain(
+        False,
+        "learn from every sample; only in free motion: a contact wrench would be taken for load",
+    )
+    forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor a sample; 1 = none")
+    method: str = choice(
+        "rls", tuple(METHODS), "recursive least squares, or total: allows for noisy accelerations"
+    )
+    settled_bound: float = quantity(
+        0.05, "1", 1e-6, 10.0, "predicted uncertainty that counts as settled, of a natural value"
+    )
+    watch: bool = plain(
+        False,
+        "freeze a load that has settled, or was given with its covariance; notice when it changes",
+    )
+    model_error: float = quantity(
+        0.0, "1", 0.0, 0.5, "watch: share of the wrench that gains, cross-talk and delays make"
+    )
+
+    def check(self, where: str) -> None:
+        """Raises DrakeTeleopError, naming `where`, if what it would watch cannot be trusted."""
+        if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
+            raise DrakeTeleopError(
+                f"the covariance of '{self.method}' is too small to notice a change by",
+                where=f"{where}.method",
+                remedy="set method: rtls, or watch: false",
+            )
+
+
+class LoadEstimator(LeafSystem):
+    """Holds the load estimate; improves it with every sample, or watches it, or first one.
+
+    .. pydrake_system::
+
+        name: LoadEstimator
+        input_ports:
+        - sample: the wrist sensor's sample
+        output_ports:
+        - load_estimate: (16,) Eq. (7), [offsets (6); phi (10)] in S about So
+        - load_state: (1,) index into `drake_teleop.load.online.watched.LOAD_STATES`; 1, settled,
+          once every parameter is predicted to be known within the config's bound
+
+    Args:
+        config: whether to learn, how, and how fast to forget; whether to watch.
+        noise_std: (6,) weights, 1 sigma of the wrench channels [N, N m].
+        motion_std: (9,) 1 sigma of s [m/s^2], omega [rad/s] and alpha [rad/s^2], for "rtls" and for
+            watching. For learning only the ratios among all of them matter, so they may be those
+            before a filter.
+        period: sampling period [s].
+        sample_size: length of the sample.
+        initial: (16,) the estimate to start from.
+        covariance: (16, 16) of it, or None if nothing is known about it. With it, watching begins
+            at once.
+        fallback: (10,) what remains known of phi when the load has changed.
+
+    Raises:
+        DrakeTeleopError: if it shall watch, and neither learns nor is given a covariance.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self,
+        config: LoadEstimatorConfig,
+        noise_std: NDArray[np.float64],
+        motion_std: NDArray[np.float64],
+        period: float,
+        sample_size: int,
+        initial: NDArray[np.float64],
+        covariance: NDArray[np.float64] | None = None,
+        fallback: ArrayLike | None = None,
+    ) -> None:
+        super().__init__()
+        if config.watch and not config.enabled and covariance is None:
+            raise DrakeTeleopError(
+                "there is no load to watch",
+                where="load_estimator.watch",
+                remedy="set load_estimator.enabled, or pass load_estimate with load_covariance",
+            )
+        self._estimator = METHODS[config.method].for_noise(
+            noise_std, motion_std, forgetting=config.forgetting, bound=config.settled_bound
+        )
+        start = np.asarray(initial, dtype=float)
+        memory = self._estimator.initial_memory(start)
+        self._shape, self._watches, self._period = memory.shape, config.watch, period
+        self._sample = self.DeclareVectorInputPort("sample", sample_size)
+        estimate = self.DeclareDiscreteState(start)
+        self.DeclareDiscreteState(memory.ravel())
+        self.DeclareStateOutputPort("load_estimate", estimate)
+        self.DeclareVectorOutputPort(
+            "load_state", 1, weak_callback(self._calc_state), {self.xd_ticket()}
+        )
+        if config.watch:
+            unknown = np.zeros(SIZE)
+            self.DeclareDiscreteState(
+                unknown if covariance is None else watched_memory(start, covariance)
+            )
+            change = change_parameters(
+                noise_std, motion_std, period, model_error=config.model_error
+            )
+            self._watching = (
+                np.zeros(10) if fallback is None else np.array(fallback, dtype=float),
+                period,
+                *change,
+            )
+        if config.enabled or config.watch:
+            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        sample = self._sample.Eval(context)
+        if sample[SATURATED] > 0.0:  # the wrench is not the load's
+            return
+        estimate = discrete_state.get_mutable_value(0)
+        if self._state(discrete_state) == LEARNING:
+            self._learn(estimate, sample, discrete_state, context.get_time())
+        else:
+            watched_update(estimate, discrete_state.get_mutable_value(2), sample, *self._watching)
+
+    def _learn(
+        self,
+        estimate: NDArray[np.float64],
+        sample: NDArray[np.float64],
+        discrete_state: DiscreteValues,
+        time: float,
+    ) -> None:
+        memory = discrete_state.get_mutable_value(1).reshape(self._shape)
+        self._estimator.update_into(estimate, memory, sample)
+        # To know whether it has settled takes longer than to learn from a sample.
+        due = self._watches and round(time / self._period) % _CHECK == 0
+        if due and self._estimator.settled_at(estimate, memory):
+            covariance = self._estimator.covariance_of(estimate, memory)
+            discrete_state.set_value(2, watched_memory(estimate, covariance))
+
+    def _state(self, discrete_state: DiscreteValues) -> int:
+        return watched_state(discrete_state.value(2)) if self._watches else LEARNING
+
+    def _calc_state(self, context: Context, output: BasicVector) -> None:
+        state = context.get_discrete_state()
+        output[0] = self._state(state)
+        if not self._watches:
+            estimate, memory = state.value(0), state.value(1)
+            settled = self._estimator.settled_at(estimate, memory.reshape(self._shape))
+            output[0] = SETTLED if settled else LEARNING

@@ -1,0 +1,307 @@
+"""Haptic devices by name: the Phantom of the paper, and others by what their data sheets say.
+
+How sure each number is: D the manufacturer's figure, recalled and not read again; E an engineering
+estimate. A workspace of another form is the largest box inside it: of an omega a cylinder of 160 mm
+across and 110 mm, of a Virtuose a ball of 450 mm across, D.
+
+| name | mass at the grip | friction | peak force | workspace, depth x width x height |
+|---|---|---|---|---|
+| geomagic_touch | 45 g D | 0.26 N D | 3.3 N D | 70 x 160 x 120 mm D |
+| omega_3, _6, _7 | 0.25, 0.3, 0.35 kg E | 0.3 N E | 12 N D | 110 x 113 x 113 mm E |
+| falcon | 0.2 kg E | 0.5 N E | 8.9 N D | 102 mm cube D |
+| haply_inverse3 | 0.2 kg E | 0.15 N E | 10 N D | 200 x 340 x 190 mm E |
+| virtuose_6d | 1 kg E | 1 N E | 35 N D | 260 mm cube E |
+
+| name | step of position | of the turns | own rate |
+|---|---|---|---|
+| geomagic_touch | 55 um, 450 dpi D | 2 mrad E | 1 kHz D |
+| omega_3, _6, _7 | 10 um D | 0.09 degrees D | 4 kHz D |
+| falcon | 64 um, 400 dpi D | - | 1 kHz D |
+| haply_inverse3 | 20 um E | 2 mrad E | 4 kHz E |
+| virtuose_6d | 20 um E | 0.2 mrad E | 1 kHz D |
+
+Of them only the Virtuose displays torque (3.1 N m D); an omega.3 and a Falcon do not turn. The
+omega.7's gripper and the buttons of all are left out.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import copy
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import choice, quantity
+from drake_teleop.station.master.dynamics import HapticDevice
+from drake_teleop.station.master.leader import LeaderDevice
+from drake_teleop.station.master.leader_model import JOINTS, Leader
+from drake_teleop.station.master.numbers import (
+    CENTRE,
+    COULOMB,
+    HALF_SIZE,
+    HAND_INERTIA,
+    HAND_MASS,
+    IN_TASK_SPACE,
+    INERTIA,
+    MASS,
+    NUMBERS,
+    PEAK_FORCE,
+    PEAK_TORQUE,
+    TURN,
+    VISCOUS,
+)
+from drake_teleop.station.master.phantom import FORCE_LIMIT, WRIST_TORQUE_LIMIT
+
+PHANTOM, LEADER = "phantom_premium_15", "leader"
+
+
+@settings
+@dataclass
+class JointFriction:
+    """Friction of the six joints: coulomb * tanh(velocity / 0.01 rad/s) + viscous * velocity."""
+
+    coulomb: list[float] = quantity(
+        [0.01, 0.01, 0.01, 0.001, 0.001, 0.001], "N m", 0.0, 1.0, "main axes P, wrist E"
+    )
+    viscous: list[float] = quantity(
+        [5e-4, 5e-4, 5e-4, 5e-5, 5e-5, 5e-5], "N m s/rad", 0.0, 10.0, "main axes P, wrist E"
+    )
+
+
+@settings
+@dataclass
+class DeviceFigures:
+    """A device by its data sheet, see `task_space`; x of its base points to the operator, z up."""
+
+    apparent_mass: float = quantity(0.1, "kg", 1e-3, 20.0, "that the hand moves with the grip")
+    inertia: float = quantity(1e-4, "kg m^2", 1e-7, 0.1, "likewise, about every axis")
+    friction: float = quantity(0.2, "N", 0.0, 50.0, "against the motion of the grip")
+    friction_torque: float = quantity(1e-3, "N m", 0.0, 2.0, "against its turning")
+    damping: float = quantity(0.1, "N s/m", 0.0, 100.0, "of its motion")
+    turning_damping: float = quantity(5e-5, "N m s/rad", 0.0, 1.0, "of its turning")
+    peak_force: float = quantity(10.0, "N", 0.0, 500.0, "that it displays")
+    peak_torque: list[float] = quantity(
+        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "about yaw, pitch and roll; 0: a turn is only measured"
+    )
+    size: list[float] = quantity(
+        [0.15, 0.15, 0.15], "m", 1e-3, 2.0, "of the workspace along x, y, z"
+    )
+    centre: list[float] = quantity(
+        [0.27, 0.0, 0.03],
+        "m",
+        -2.0,
+        2.0,
+        "of the workspace, p_B; the default is where scenarios start",
+    )
+    turn: list[float] = quantity(
+        [1.2, 1.2, 2.4], "rad", 0.0, math.pi, "largest yaw, pitch (below 1.5) and roll, both ways"
+    )
+    resolution: float = quantity(0.0, "m", 0.0, 0.01, "step in which its position is read; 0: none")
+    turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "likewise of its turns")
+    rate_hz: float = quantity(
+        0.0, "Hz", 0.0, 1e5, "at which it is read and takes a force; 0, or above: rates.hand_hz"
+    )
+
+
+def _sheet(mass: float, friction: float, force: float, size: list[float], **others: Any) -> Any:
+    return DeviceFigures(
+        apparent_mass=mass, friction=friction, peak_force=force, size=size, **others
+    )
+
+
+_FIXED = [0.0, 0.0, 0.0]
+_OMEGA = [0.11, 0.113, 0.113]
+_OMEGA_TURN = np.radians([120.0, 70.0, 160.0]).tolist()  # D
+_OMEGA_READ = {"resolution": 1e-5, "turn_resolution": math.radians(0.09), "rate_hz": 4000.0}
+
+#: What the devices by name have, for `Master.figures`.
+FIGURES: dict[str, DeviceFigures] = {
+    "geomagic_touch": _sheet(
+        0.045,
+        0.26,
+        3.3,
+        [0.07, 0.16, 0.12],
+        resolution=5.5e-5,
+        turn_resolution=2e-3,
+        rate_hz=1000.0,
+    ),
+    "omega_3": _sheet(0.25, 0.3, 12.0, _OMEGA, turn=_FIXED, **_OMEGA_READ),
+    "omega_6": _sheet(0.3, 0.3, 12.0, _OMEGA, turn=_OMEGA_TURN, **_OMEGA_READ),
+    "omega_7": _sheet(0.35, 0.3, 12.0, _OMEGA, turn=_OMEGA_TURN, **_OMEGA_READ),
+    "falcon": _sheet(0.2, 0.5, 8.9, [0.102] * 3, turn=_FIXED, resolution=6.35e-5, rate_hz=1000.0),
+    "haply_inverse3": _sheet(
+        0.2,
+        0.15,
+        10.0,
+        [0.2, 0.34, 0.19],
+        resolution=2e-5,
+        turn_resolution=2e-3,
+        rate_hz=4000.0,
+    ),
+    "virtuose_6d": _sheet(
+        1.0,
+        1.0,
+        35.0,
+        [0.26] * 3,
+        inertia=5e-3,
+        friction_torque=0.03,
+        peak_torque=[3.1] * 3,
+        resolution=2e-5,
+        turn_resolution=2e-4,
+        rate_hz=1000.0,
+    ),
+}
+
+
+@settings
+@dataclass
+class Master:
+    """Which haptic device, and where it starts."""
+
+    model: str = choice(
+        PHANTOM,
+        (PHANTOM, *FIGURES, "custom", LEADER),
+        "the device; custom: by `figures` alone; leader: an arm of a file",
+    )
+    position: list[float] = quantity(
+        [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
+    )
+    friction: JointFriction = field(default_factory=JointFriction)
+    figures: DeviceFigures | None = None
+    leader: Leader | None = None
+
+    def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
+        """The device with a hand on it.
+
+        Args:
+            hand_mass: [kg], moves with the stylus.
+            hand_inertia: [kg m^2], about every axis through E.
+
+        Raises:
+            DrakeTeleopError: as `Leader.device`.
+        """
+        if self.leader is not None:
+            return self.leader.device(self.position, hand_mass, hand_inertia)
+        numbers = np.zeros(NUMBERS)
+        numbers[HAND_MASS], numbers[HAND_INERTIA] = hand_mass, hand_inertia
+        if self.model == PHANTOM:
+            numbers[COULOMB], numbers[VISCOUS] = self.friction.coulomb, self.friction.viscous
+            numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = FORCE_LIMIT, WRIST_TORQUE_LIMIT
+            return HapticDevice(numbers, self.model)
+        figures = self._figures()
+        numbers[IN_TASK_SPACE] = 1.0
+        numbers[COULOMB] = np.repeat([figures.friction, figures.friction_torque], 3)
+        numbers[VISCOUS] = np.repeat([figures.damping, figures.turning_damping], 3)
+        numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = figures.peak_force, figures.peak_torque
+        numbers[MASS], numbers[INERTIA] = figures.apparent_mass, figures.inertia
+        numbers[CENTRE], numbers[HALF_SIZE] = figures.centre, 0.5 * np.array(figures.size)
+        numbers[TURN] = figures.turn
+        return HapticDevice(numbers, self.model)
+
+    @property
+    def leads_joints(self) -> bool:
+        """Whether it is a leader that leads joint by joint."""
+        return self.leader is not None and self.leader.leads == JOINTS
+
+    def check_leads_the_pose(self, what: str) -> None:
+        """Refuses a leader that leads joint by joint.
+
+        Raises:
+            DrakeTeleopError: if it does, for what knows poses alone.
+        """
+        if self.leads_joints:
+            raise DrakeTeleopError(
+                f"{what} knows a hand that leads the pose",
+                where="master.leader.leads",
+                remedy="set it to pose there: the hand feels the same",
+            )
+
+    def steps(self) -> NDArray[np.float64]:
+        """(6,) in which its axes are read [m, rad]; 0 if exactly."""
+        if self.model in (PHANTOM, LEADER):
+            return np.zeros(6)
+        figures = self._figures()
+        return np.repeat([figures.resolution, figures.turn_resolution], 3)
+
+    def own_period(self, hand_hz: float) -> float | None:
+        """Of a device that is slower than the rate of the hand [s]; None of any other."""
+        rate = 0.0 if self.model in (PHANTOM, LEADER) else self._figures().rate_hz
+        return 1 / rate if 0.0 < rate < hand_hz else None
+
+    def without_coulomb_friction(self) -> "Master":
+        """The same, linear: its encoders have no steps either."""
+        if self.model == PHANTOM:
+            friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
+            return dataclasses.replace(self, friction=friction)
+        if self.leader is not None:
+            return dataclasses.replace(self, leader=dataclasses.replace(self.leader, friction=[]))
+        figures = dataclasses.replace(
+            self._figures(), friction=0.0, friction_torque=0.0, resolution=0.0, turn_resolution=0.0
+        )
+        return dataclasses.replace(self, figures=figures)
+
+    def found_from(self, folder: Path) -> "Master":
+        """The same with its file found from a folder."""
+        if self.leader is None:
+            return self
+        return dataclasses.replace(self, leader=self.leader.found_from(folder))
+
+    def _figures(self) -> DeviceFigures:
+        return self.figures or FIGURES.get(self.model, DeviceFigures())
+
+    def check(self, where: str) -> None:
+        """Checks what belongs to which device.
+
+        Raises:
+            DrakeTeleopError: naming `where` and the field.
+        """
+        if self.model == PHANTOM and self.figures is not None:
+            raise DrakeTeleopError(
+                "the Phantom's own dynamics are used, not a data sheet's",
+                where=f"{where}.figures",
+                remedy="leave them out, or choose another model, such as custom",
+            )
+        if self.model != PHANTOM and self.friction != JointFriction():
+            raise DrakeTeleopError(
+                "these are the joints of a Phantom",
+                where=f"{where}.friction",
+                remedy="leave it out, and set figures.friction and figures.damping",
+            )
+        if (self.leader is None) == (self.model == LEADER):
+            raise DrakeTeleopError(
+                "a leader arm and `model: leader` belong together",
+                where=f"{where}.leader",
+                remedy="give both, with leader.file and leader.hand_frame, or none",
+            )
+        if self.leader is not None:
+            self.leader.check(f"{where}.leader")
+            if self.figures is not None:
+                raise DrakeTeleopError(
+                    "a leader arm has its own dynamics",
+                    where=f"{where}.figures",
+                    remedy="leave them out",
+                )
+        if self.figures is not None and self.figures.turn[1] > _STEEPEST:
+            raise DrakeTeleopError(
+                f"a pitch of {self.figures.turn[1]:g} rad: there yaw and roll are the same",
+                where=f"{where}.figures.turn",
+                remedy=f"choose at most {_STEEPEST:g} rad",
+            )
+
+
+_STEEPEST = 1.5  # rad
+
+
+def figures_of(block: Mapping[str, Any] | None) -> DeviceFigures | None:
+    """The defaults for a scenario's `master.figures`: those of the model that it names.
+
+    A name that is not known is left to the check of the loaded block.
+    """
+    return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

@@ -1,0 +1,160 @@
+"""The haptic device as a block: its dynamics, one step a period."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fault import sound
+from drake_teleop.common.lifetime import ONE_DICT
+from drake_teleop.common.vectors import put
+from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step, twist_into
+from drake_teleop.station.master.force_display import ForceDisplay, initial_display
+from drake_teleop.station.master.leader import LeaderArm, LeaderDevice, LeaderDisplay
+
+_LARGEST_PERIOD = 1e-3  # s, slower than any haptic device
+# The Runge-Kutta step is stable up to 2.8 for (friction's slope / inertia) * period.
+_LARGEST_FRICTION_STEP = 2.0
+
+
+@njit(cache=True, borrows=True)
+def _advance(state, pose, twist, display, hand_wrench, drive, device, period, work, stages):
+    """`step`, and the pose and twist that follow: one call of compiled code instead of three.
+
+    What the display remembers (`display`, `drive[6:]`) is kept for it, beside the angles. A device
+    that is pushed by what is no force stays where it is.
+    """
+    put(display, 6, drive, 6, drive.shape[0] - 6)
+    if sound(hand_wrench) and sound(drive[:6]):
+        step(state, hand_wrench, drive[:6], device, period, work, stages)
+        pose_into(state[:6], device, pose)
+        twist_into(state[:6], state[6:], device, work[0], twist)
+    put(display, 0, state, 0, 6)
+
+
+def check_period(
+    device: HapticDevice | LeaderDevice, q: NDArray[np.float64], period: float
+) -> None:
+    """Checks that a step a period is short enough for the device at the joints q.
+
+    Raises:
+        DrakeTeleopError: if it is not, for any device or for the friction of this one.
+    """
+    if not 0 < period <= _LARGEST_PERIOD:
+        raise DrakeTeleopError(
+            f"a period of {period:g} s is too long for the haptic device",
+            where="master.period",
+            remedy=f"choose at most {_LARGEST_PERIOD:g} s (1 kHz); the paper uses above 2 kHz",
+        )
+    device.check_limits(q)
+    slope = device.damping_matrix(q, creeping=True)
+    rate = float(np.max(np.linalg.eigvals(np.linalg.solve(device.mass_matrix(q), slope)).real))
+    if rate * period > _LARGEST_FRICTION_STEP:
+        raise DrakeTeleopError(
+            f"the friction stops the device within {1e3 / rate:.2g} ms, too fast for a "
+            f"period of {1e3 * period:g} ms",
+            where=device.friction_field,
+            remedy="choose less friction, or a higher hand rate",
+        )
+
+
+class MasterDevice(LeafSystem):
+    """The device and the passive mass of the hand on it, advanced once a period.
+
+    The full nonlinear dynamics (gravity, Coriolis, friction, end stops) take one classical
+    Runge-Kutta step a period while the inputs are held. A joint at its limit runs into a stiff,
+    damped end stop.
+
+    .. pydrake_system::
+
+        name: MasterDevice
+        input_ports:
+        - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
+        - drive: from the force display: torque at the joints (6) [N m; N], what it remembers
+        output_ports:
+        - state: (12,) [q; qdot] [rad, rad/s; of axes that slide m, m/s]
+        - pose_master: (7,) X_BE
+        - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
+        - for_display: the angles (6) [rad], and what the force display remembers
+
+    Args:
+        period: [s], at most 1 ms.
+        device: with the mass of the hand that moves with it; the hand's weight is carried by the
+            operator.
+        q_initial: (6,) joints at the start [rad; in task space m, rad], at rest.
+
+    Raises:
+        DrakeTeleopError: if the period is too long, for the device or for its friction, or the
+            start is beyond a joint's limit.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, period: float, device: HapticDevice, q_initial: NDArray[np.float64]) -> None:
+        super().__init__()
+        check_period(device, q_initial, period)
+        self._period = period
+        self._numbers = device.numbers
+        self._work = np.zeros((2, 6, 6))
+        self._stages = np.zeros((3, 12))
+        self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
+        # A port of its own for what the display remembers would be a call of its own.
+        display = initial_display(q_initial, device.numbers)
+        self._drive = self.DeclareVectorInputPort("drive", len(display))
+        # Pose and twist are kept beside the state: they are read more often than they change.
+        state = np.concatenate([q_initial, np.zeros(6)])
+        for name, start in (
+            ("state", state),
+            ("pose_master", device.forward_kinematics(q_initial)),
+            ("twist_master", np.zeros(6)),
+            ("for_display", display),
+        ):
+            self.DeclareStateOutputPort(name, self.DeclareDiscreteState(start))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        _advance(
+            discrete_state.get_mutable_value(0),
+            discrete_state.get_mutable_value(1),
+            discrete_state.get_mutable_value(2),
+            discrete_state.get_mutable_value(3),
+            self._hand_wrench.Eval(context),
+            self._drive.Eval(context),
+            self._numbers,
+            self._period,
+            self._work,
+            self._stages,
+        )
+
+
+def AddDevice(
+    builder: DiagramBuilder,
+    period: float,
+    device: HapticDevice | LeaderDevice,
+    q_initial: NDArray[np.float64],
+) -> tuple[LeafSystem, LeafSystem]:
+    """Adds "master_device" and "force_display", wired to each other, of a device or a leader arm.
+
+    Args:
+        builder: the diagram.
+        period, device, q_initial: as for `MasterDevice`.
+
+    Returns:
+        Both; what remains to be connected is the hand's wrench and the command.
+    """
+    check_period(device, q_initial, period)
+    if isinstance(device, LeaderDevice):
+        block: LeafSystem = LeaderArm(period, device, q_initial)
+        display: LeafSystem = LeaderDisplay(period, device)
+    else:
+        block, display = MasterDevice(period, device, q_initial), ForceDisplay(period, device)
+    builder.AddNamedSystem("master_device", block)
+    builder.AddNamedSystem("force_display", display)
+    builder.Connect(block.GetOutputPort("for_display"), display.GetInputPort("for_display"))
+    builder.Connect(display.GetOutputPort("drive"), block.GetInputPort("drive"))
+    if isinstance(device, LeaderDevice):
+        builder.Connect(block.GetOutputPort("state"), display.GetInputPort("state"))
+    return block, display

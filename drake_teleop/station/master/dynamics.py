@@ -1,0 +1,198 @@
+"""The motion of a haptic device, the Phantom's or one in task space: one row of numbers says which.
+
+Compiled code asks the numbers (`numbers.IN_TASK_SPACE`); Python asks a `HapticDevice`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.vectors import put
+from drake_teleop.station.master import phantom, task_space
+from drake_teleop.station.master.numbers import (
+    COULOMB,
+    HAND_INERTIA,
+    HAND_MASS,
+    IN_TASK_SPACE,
+    PEAK_FORCE,
+    PEAK_TORQUE,
+    VISCOUS,
+)
+
+
+@njit(cache=True)
+def jacobian_into(q, device, J):
+    """Writes the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    if device[IN_TASK_SPACE] != 0.0:
+        task_space.jacobian_into(q, J)
+    else:
+        phantom.jacobian_into(q, J)
+
+
+@njit(cache=True)
+def gravity_torque_into(q, device, out):
+    """Writes the joint forces (6,) that hold the device against its weight."""
+    if device[IN_TASK_SPACE] != 0.0:
+        out[:6] = 0.0
+    else:
+        phantom.gravity_torque_into(q, out)
+
+
+@njit(cache=True)
+def pose_into(q, device, pose):
+    """Writes X_BE (7,) [qw, qx, qy, qz, px, py, pz]."""
+    if device[IN_TASK_SPACE] != 0.0:
+        task_space.pose_into(q, pose)
+    else:
+        phantom.pose_into(q, pose)
+
+
+@njit(cache=True)
+def twist_into(q, v, device, J, twist):
+    """Writes [v; omega] of E in B (6,) = J v; `J` (6, 6) is scratch."""
+    jacobian_into(q, device, J)
+    for i in range(6):
+        twist[i] = 0.0
+        for k in range(6):
+            twist[i] += J[i, k] * v[k]
+
+
+@njit(cache=True)
+def step(state, hand_wrench, motor, device, period, work, stages):
+    """One classical Runge-Kutta step of `state` (12,) [q; v] in place, inputs held.
+
+    Error per step O(period^5).
+
+    Args:
+        state: (12,), changed.
+        hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
+        motor: (6,) torques (or forces) at the joints.
+        device: (NUMBERS,) of the device, see `numbers`.
+        period: [s].
+        work, stages: (2, 6, 6) and (3, 12) scratch.
+    """
+    stage, slope, total = stages[0], stages[1], stages[2]
+    put(stage, 0, state, 0, 12)
+    total[:] = 0.0
+    for i in range(4):
+        put(slope, 0, stage, 6, 6)
+        if device[IN_TASK_SPACE] != 0.0:
+            task_space.acceleration_into(
+                stage[:6], stage[6:], hand_wrench, motor, device, work, slope[6:]
+            )
+        else:
+            phantom.acceleration_into(
+                stage[:6], stage[6:], hand_wrench, motor, device, work, slope[6:]
+            )
+        weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
+        ahead = 1.0 if i == 2 else 0.5
+        for k in range(12):
+            total[k] += weight * slope[k]
+            stage[k] = state[k] + ahead * period * slope[k]
+    for k in range(12):
+        state[k] += period * total[k]
+
+
+@dataclass(frozen=True)
+class HapticDevice:
+    """A device with the passive mass of a hand on it.
+
+    Attributes:
+        numbers: (NUMBERS,), see `numbers`.
+        name: for messages.
+    """
+
+    numbers: NDArray[np.float64]
+    name: str = "phantom_premium_15"
+
+    @property
+    def peak_force(self) -> float:
+        """That it displays [N]."""
+        return float(self.numbers[PEAK_FORCE])
+
+    @property
+    def peak_torque(self) -> NDArray[np.float64]:
+        """(3,) that it displays about its three turning axes [N m]."""
+        return self.numbers[PEAK_TORQUE]
+
+    @property
+    def num_joints(self) -> int:
+        """The number of its axes."""
+        return 6
+
+    @property
+    def friction_field(self) -> str:
+        """Where a scenario has its friction."""
+        return "master.friction" if self.is_phantom else "master.figures"
+
+    def display_axes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(6,) what the force display takes for its axes at the joints q (6,): these."""
+        return q
+
+    @property
+    def is_phantom(self) -> bool:
+        """Whether its kinematics are the Phantom's; otherwise those of `task_space`."""
+        return not self.numbers[IN_TASK_SPACE]
+
+    def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The joints (6,) that put E at X_BE (7,).
+
+        Raises:
+            DrakeTeleopError: if it is out of reach.
+        """
+        if self.is_phantom:
+            return phantom.inverse_kinematics(pose)
+        return task_space.inverse_kinematics(pose, self.numbers)
+
+    def forward_kinematics(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """X_BE (7,) at the joints q (6,)."""
+        pose = np.empty(7)
+        pose_into(q, self.numbers, pose)
+        return pose
+
+    def check_limits(self, q: NDArray[np.float64]) -> None:
+        """Checks that the joints q (6,) are within their limits.
+
+        Raises:
+            DrakeTeleopError: if they are not.
+        """
+        if self.is_phantom:
+            phantom.check_limits(q)
+        else:
+            task_space.check_limits(q, self.numbers)
+
+    def at_an_end(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(N,) whether an end stop holds, at the joints q (N, 6)."""
+        if self.is_phantom:
+            return phantom.at_an_end(q)
+        return task_space.at_an_end(q, self.numbers)
+
+    def jacobian(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(6, 6), rows [v; omega] of E in B."""
+        J = np.empty((6, 6))
+        jacobian_into(q, self.numbers, J)
+        return J
+
+    def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(6, 6) with the hand."""
+        if self.is_phantom:
+            return phantom.mass_matrix(q, self.numbers[HAND_MASS], self.numbers[HAND_INERTIA])
+        M = np.empty((6, 6))
+        task_space.mass_matrix_into(q, self.jacobian(q), self.numbers, M)
+        return M
+
+    def damping_matrix(self, q: NDArray[np.float64], creeping: bool = False) -> NDArray[np.float64]:
+        """(6, 6) of the joint forces against dq/dt.
+
+        Args:
+            q: (6,) joints.
+            creeping: with the slope of Coulomb friction at standstill.
+        """
+        if self.is_phantom:
+            slope = creeping * self.numbers[COULOMB] / phantom.FRICTION_SPEED
+            return np.diag(slope + self.numbers[VISCOUS])
+        return task_space.damping_matrix(q, self.numbers, creeping)

@@ -1,0 +1,215 @@
+"""The display of force on the master: J_M^T, gravity compensation, the device's limits."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.fault import Fault, sound
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.vectors import put
+from drake_teleop.station.master.dynamics import gravity_torque_into, jacobian_into
+from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
+from drake_teleop.station.passivity.memory import Slots
+from drake_teleop.station.passivity.packet import limit
+from drake_teleop.station.passivity.safe_state import (
+    MASTER_WATCH,
+    STOP,
+    initial_master_watch,
+    master_limits_into,
+)
+
+# What comes from the device: its angles, and what is remembered of the last period: angles that
+# were numbers, the wrench that was displayed and the fault, whether the wrench was changed after
+# one, for how long there has been none [s], the watch. What goes to it: the motors' torque in place
+# of the angles, and what to remember.
+_places = Slots(6 + 6 + 7 + 1 + 1 + MASTER_WATCH)
+_ANGLES, _LAST_ANGLES, _LAST = _places.vector(6), _places.vector(6), _places.vector(6)
+_FAULT, _CHANGED, _SOUND = _places.number(), _places.number(), _places.number()
+_WATCH = _places.vector(MASTER_WATCH)
+_SHOWN = slice(_LAST.start, _FAULT + 1)
+_NONE, _WRENCH, _HAND, _RESUMING = map(int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING))
+
+
+@njit(cache=True)
+def _full(numbers):
+    """(2,) of force and torque; from the limits on the device's own hold, motor by motor."""
+    return np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
+
+
+def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What the display is told before the first period.
+
+    Args:
+        q: (6,) the device's joints.
+        numbers: (NUMBERS,) of the device.
+    """
+    display = np.zeros(_WATCH.stop)
+    display[_ANGLES] = display[_LAST_ANGLES] = q
+    display[_WATCH] = initial_master_watch(_full(numbers))
+    return display
+
+
+@njit(cache=True)
+def limit_wrench_into(wrench, numbers, J, displayed):
+    """Writes what the device of these numbers can display of `wrench` (6,) [f; tau] at E, in B.
+
+    The force is shortened to the peak force and the torque until no wrist motor is beyond its
+    peak torque; both keep their directions. A wrench that is not finite gives zero.
+    """
+    for k in range(6):
+        if not math.isfinite(wrench[k]):
+            displayed[:] = 0.0
+            return
+    # hypot does not overflow, however large the command.
+    force = math.hypot(math.hypot(wrench[0], wrench[1]), wrench[2])
+    scale = 1.0 if force <= numbers[PEAK_FORCE] else numbers[PEAK_FORCE] / force
+    for k in range(3):
+        displayed[k] = scale * wrench[k]
+    scale, peak = 1.0, numbers[PEAK_TORQUE]
+    for i in range(3):
+        motor = abs(J[3, 3 + i] * wrench[3] + J[4, 3 + i] * wrench[4] + J[5, 3 + i] * wrench[5])
+        if motor * scale > peak[i]:
+            scale = peak[i] / motor
+    for k in range(3, 6):
+        displayed[k] = scale * wrench[k]
+
+
+@njit(cache=True)
+def motor_torque_into(displayed, q, numbers, J, torque):
+    """Writes J_M^T F + gravity compensation (6,) for a wrench F `displayed` (6,), J (6, 6) of q."""
+    gravity_torque_into(q, numbers, torque)
+    for i in range(6):
+        for k in range(6):
+            torque[i] += J[k, i] * displayed[k]
+
+
+@njit(cache=True, borrows=True)
+def display_into(wrench, device, numbers, period, J, drive):
+    """One period of the display; see `ForceDisplay` for its safe state.
+
+    Args:
+        wrench: (6,) F_E_B that the hand shall feel.
+        device: (27,) of `MasterDevice`.
+        numbers: (NUMBERS,) of the device.
+        period: [s].
+        J: (6, 6) scratch.
+        drive: (27,) written, for `MasterDevice`; in it what is displayed, and a `Fault`.
+    """
+    q, fault = device[_ANGLES], _NONE
+    put(drive, 6, device, 6, _WATCH.stop - 6)
+    if sound(q):
+        put(drive, _LAST_ANGLES.start, q, 0, 6)
+    else:
+        q, fault = device[_LAST_ANGLES], _HAND
+    if not sound(wrench):
+        fault = _WRENCH
+    displayed, drive[_FAULT] = drive[_LAST], fault
+    jacobian_into(q, numbers, J)
+    limit_wrench_into(wrench, numbers, J, displayed)
+    if fault != _NONE or device[_CHANGED] != 0.0:
+        _change(device, numbers, period, drive)
+    motor_torque_into(displayed, q, numbers, J, drive[:6])
+
+
+@njit(cache=True)
+def _change(device, numbers, period, drive):
+    """Of a fault, and after one: fades what was displayed, and goes over to what is wanted.
+
+    Arguments as of `display_into`; `drive` has what is wanted and the fault, and is changed.
+    """
+    displayed, last, limits, full = drive[_LAST], device[_LAST], np.empty(2), _full(numbers)
+    fault = drive[_FAULT] != _NONE
+    drive[_SOUND] = 0.0 if fault else device[_SOUND] + period
+    # All of the way within STOP, so that it does not turn at once either.
+    share = 0.0 if fault else period / max(STOP + period - drive[_SOUND], period)
+    for i in range(6):
+        displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
+    master_limits_into(not fault, fault, period, 0.0, full, last, drive[_WATCH], limits)
+    drive[_CHANGED] = 0.0
+    for g in range(2):
+        limit(displayed, g, limits[g])
+        if limits[g] < full[g]:
+            drive[_CHANGED] = 1.0
+    if not fault:
+        drive[_FAULT] = _RESUMING
+
+
+class Numbered(Protocol):
+    """A device of any kind, as the display knows it."""
+
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """(NUMBERS,), see `numbers`."""
+
+
+class ForceDisplay(LeafSystem):
+    """Turns the wrench that the hand shall feel into motor torques of the master.
+
+    Safe state: while the command is no wrench, or the device's angles are no numbers, what was
+    displayed fades to zero in 50 ms, and the gravity compensation goes on, of the last good angles.
+    Afterwards the wrench comes back as after silence in a channel
+    (`drake_teleop.station.passivity.safe_state`). The memory for that is in the device's state: an
+    event of this block would cost time.
+
+    .. pydrake_system::
+
+        name: ForceDisplay
+        input_ports:
+        - wrench_command: (6,) F_E_B, [f; tau] that the hand shall feel at E, in B [N, N m]
+        - for_display: from the device: its angles (6) [rad], and what was remembered
+        output_ports:
+        - drive: for the device: J_M^T F + gravity compensation (6) [N m], what to remember
+        - force_to_master: (6,) F, what is displayed within the device's limits [N, N m]
+        - fault_at_hand: a `Fault`
+        - displayed_and_fault: the last two, one after the other, for a log
+
+    Args:
+        period: of the device [s].
+        device: what displays it.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, period: float, device: Numbered) -> None:
+        super().__init__()
+        self._period = period
+        self._numbers = device.numbers
+        self._jacobian = np.zeros((6, 6))
+        self._command = self.DeclareVectorInputPort("wrench_command", 6)
+        self._device = self.DeclareVectorInputPort("for_display", _WATCH.stop)
+        inputs = {self.all_input_ports_ticket()}
+        self._drive = self.DeclareVectorOutputPort(
+            "drive", _WATCH.stop, weak_callback(self._calc_drive), inputs
+        )
+        # A log looks when the device does: for both the drive is calculated once.
+        for name, size, calc in (
+            ("force_to_master", 6, self._calc_force),
+            ("fault_at_hand", 1, self._calc_fault),
+            ("displayed_and_fault", 7, self._calc_both),
+        ):
+            self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
+
+    def _calc_drive(self, context: Context, output: BasicVector) -> None:
+        display_into(
+            self._command.Eval(context),
+            self._device.Eval(context),
+            self._numbers,
+            self._period,
+            self._jacobian,
+            output.get_mutable_value(),
+        )
+
+    def _calc_force(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._drive.Eval(context)[_LAST])
+
+    def _calc_fault(self, context: Context, output: BasicVector) -> None:
+        output[0] = self._drive.Eval(context)[_FAULT]
+
+    def _calc_both(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._drive.Eval(context)[_SHOWN])

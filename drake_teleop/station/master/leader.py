@@ -1,0 +1,407 @@
+"""A leader arm: any serial arm as a haptic device, by its own dynamics, in task space.
+
+    M(q) dv/dt + h(q, v) = motors + J^T F_hand - friction,  motors = J^T F + weight
+
+The dynamics are `slave.arm`'s, of the model's file. The hand holds it at E: the point of
+`hand_frame`, along the axes of B where the arm is at home. There the hand's mass moves with it,
+whose weight the operator carries. The motors carry the arm's weight, unless it is to be felt.
+
+The force display (`force_display`) sees it as a device whose axes are E's: what it drives is the
+wrench F, in the order of `task_space`, and J^T is done here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fault import sound
+from drake_teleop.common.lifetime import ONE_DICT
+from drake_teleop.common.quaternions import quaternion_of
+from drake_teleop.common.vectors import cross, put, three
+from drake_teleop.station.master.force_display import ForceDisplay, display_into, initial_display
+from drake_teleop.station.master.numbers import HAND_MASS, PEAK_FORCE, PEAK_TORQUE
+from drake_teleop.station.slave.arm import (
+    DAMPING,
+    GRAVITY,
+    ArmModel,
+    forward_dynamics,
+    forward_kinematics,
+    inverse_dynamics,
+    jacobian,
+    jacobian_and_pose,
+)
+from drake_teleop.station.slave.inverse_kinematics import IkStatus
+from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
+from drake_teleop.station.slave.servo import mass_matrix
+
+Array = NDArray[np.float64]
+
+# Rows of what belongs to the joints.
+(_COULOMB, _VISCOUS, _LOWER, _UPPER, _STOP_STIFFNESS, _STOP_DAMPING, _TORQUE_LIMIT, _CARRIED) = (
+    range(8)
+)
+# Coulomb friction is tanh(speed / this): below it a joint creeps instead of sticking.
+FRICTION_SPEED = 0.02  # rad/s or m/s, E
+# End stops: so fast as a spring under the joint's inertia, and critically damped, E.
+_STOP_HZ = 12.0
+
+
+@njit(cache=True)
+def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
+    """Forward dynamics of leader and hand.
+
+    Args:
+        arm: `ArmModel.table`, with the hand's mass, to E in B.
+        joints: (8, n) of the joints, see `LeaderDevice`.
+        q, v: (n,) [rad, rad/s].
+        applied: (6,) [f; tau] on E, in B: of the hand, and what carries its weight.
+        motor: (n,) [N m].
+        vdot: (n,) filled.
+    """
+    n = q.shape[0]
+    R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
+    forward_kinematics(arm, q, R_BE, p_BE)
+    put(wrench, 0, applied, 0, 6)  # about the origin of B
+    moment = cross(three(p_BE, 0), three(applied, 0))
+    for i in range(3):
+        wrench[3 + i] += moment[i]
+    for i in range(n):
+        tau[i] = motor[i] - joints[_COULOMB, i] * math.tanh(v[i] / FRICTION_SPEED)
+        tau[i] -= joints[_VISCOUS, i] * v[i]
+        over, under = q[i] - joints[_UPPER, i], q[i] - joints[_LOWER, i]
+        damping = joints[_STOP_DAMPING, i] * v[i]
+        if over > 0.0:
+            tau[i] += min(0.0, -joints[_STOP_STIFFNESS, i] * over - damping)
+        elif under < 0.0:
+            tau[i] += max(0.0, -joints[_STOP_STIFFNESS, i] * under - damping)
+    forward_dynamics(arm, q, v, tau, wrench, vdot)
+
+
+@njit(cache=True)
+def _pose_and_twist(arm, q, v, pose, twist):
+    """X_BE with the sign of the quaternion that `pose` had, and [v; omega] of E in B."""
+    n = q.shape[0]
+    J, x = np.empty((6, n)), np.empty(21)
+    jacobian_and_pose(arm, q, J, x)
+    turn = quaternion_of(x[12:].reshape((3, 3)))
+    same = 0.0
+    for i in range(4):
+        same += turn[i] * pose[i]
+    for i in range(4):
+        pose[i] = turn[i] if same >= 0.0 else -turn[i]
+    for i in range(3):
+        pose[4 + i] = x[9 + i]
+    for i in range(6):
+        twist[i] = 0.0
+        for k in range(n):
+            twist[i] += J[i, k] * v[k]
+
+
+@njit(cache=True)
+def motors_into(bare, arm, joints, q, F, torque):
+    """Writes J^T F and what carries the arm (n,), within the motors' limits, for F (6,) at E."""
+    n = q.shape[0]
+    J, still = np.empty((6, n)), np.zeros(n)
+    inverse_dynamics(bare, q, still, still, torque)
+    jacobian(arm, q, J)
+    for i in range(n):
+        torque[i] *= joints[_CARRIED, i]
+        for k in range(6):
+            torque[i] += J[k, i] * F[k]
+        limit = joints[_TORQUE_LIMIT, i]
+        torque[i] = min(max(torque[i], -limit), limit)
+
+
+@njit(cache=True)
+def step_leader(
+    bare, arm, joints, hand_weight, state, pose, twist, display, hand_wrench, drive, period
+):  # fmt: skip
+    """One classical Runge-Kutta step of `state` (2 n,) in place, inputs held; pose, twist follow.
+
+    Args:
+        bare, arm: tables without and with the hand.
+        joints: (8, n).
+        hand_weight: [N], which the operator carries.
+        state, pose, twist, display: see the ports of `LeaderArm`; changed.
+        hand_wrench: (6,) of the hand on E, in B.
+        drive: of the force display: F [f; tau_z, tau_y, tau_x] (6), what it remembers.
+        period: [s].
+    """
+    n = joints.shape[1]
+    put(display, 6, drive, 6, drive.shape[0] - 6)
+    if sound(hand_wrench) and sound(drive[:6]) and sound(state):
+        F, applied, motor = np.empty(6), np.empty(6), np.empty(n)
+        for i in range(3):
+            F[i], F[3 + i] = drive[i], drive[5 - i]
+        put(applied, 0, hand_wrench, 0, 6)
+        # Against gravity, wherever that points.
+        g = arm[n, GRAVITY : GRAVITY + 3]
+        size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+        for i in range(3):
+            applied[i] -= hand_weight * g[i] / size if size > 0.0 else 0.0
+        motors_into(bare, arm, joints, state[:n], F, motor)
+        stage, slope, total = np.empty(2 * n), np.empty(2 * n), np.zeros(2 * n)
+        put(stage, 0, state, 0, 2 * n)
+        for i in range(4):
+            put(slope, 0, stage, n, n)
+            leader_acceleration(arm, joints, stage[:n], stage[n:], applied, motor, slope[n:])
+            weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
+            ahead = 1.0 if i == 2 else 0.5
+            for k in range(2 * n):
+                total[k] += weight * slope[k]
+                stage[k] = state[k] + ahead * period * slope[k]
+        for k in range(2 * n):
+            state[k] += period * total[k]
+        _pose_and_twist(arm, state[:n], state[n:], pose, twist)
+    for i in range(3):  # what the display knows of where it is
+        display[i] = pose[4 + i] if sound(state) else math.nan
+
+
+@njit(cache=True)
+def _strongest(bare, arm, joints, q, wrench, shortened):
+    """Writes the largest share of `wrench` (6,) that the motors can display at q, at most all."""
+    n = q.shape[0]
+    weight, J, share = np.empty(n), np.empty((6, n)), 1.0
+    motors_into(bare, arm, joints, q, np.zeros(6), weight)
+    jacobian(arm, q, J)
+    for i in range(n):
+        torque = 0.0
+        for k in range(6):
+            torque += J[k, i] * wrench[k]
+        room = joints[_TORQUE_LIMIT, i] - (weight[i] if torque > 0.0 else -weight[i])
+        if abs(torque) * share > room:
+            share = max(room, 0.0) / abs(torque)
+    for k in range(6):
+        shortened[k] = share * wrench[k]
+
+
+@dataclass(frozen=True)
+class LeaderDevice:
+    """A leader arm with the passive mass of a hand on it; see `HapticDevice` for its methods.
+
+    Attributes:
+        arm: its dynamics in B to E, with the hand's mass.
+        bare: the same without the hand, of which the motors carry the weight.
+        joints: (8, n) Coulomb friction [N m], damping besides the model's [N m s/rad], limits
+            [rad], stiffness and damping of the end stops, limits of torque [N m], the share of
+            their weight that the motors carry.
+        home: (n,) where E has the axes of B [rad].
+        numbers: (NUMBERS,) what the force display is told.
+        name: for messages.
+    """
+
+    arm: ArmModel
+    bare: ArmModel
+    joints: Array
+    home: Array
+    numbers: Array
+    name: str = "leader"
+    is_phantom = False
+    #: Where a scenario has its friction.
+    friction_field = "master.leader"
+
+    @property
+    def num_joints(self) -> int:
+        """The number of joints n."""
+        return self.arm.num_joints
+
+    @property
+    def peak_force(self) -> float:
+        """That it displays [N]; in some postures its motors give less."""
+        return float(self.numbers[PEAK_FORCE])
+
+    @property
+    def peak_torque(self) -> Array:
+        """(3,) that it displays [N m]."""
+        return self.numbers[PEAK_TORQUE]
+
+    @property
+    def constants(self) -> tuple[Array, Array, Array]:
+        """What the compiled code takes."""
+        return self.bare.table, self.arm.table, self.joints
+
+    def display_axes(self, q: Array) -> Array:
+        """(6,) what the force display takes for its axes: where E is."""
+        return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
+
+    def inverse_kinematics(self, pose: Array) -> Array:
+        """The joints (n,) that put E at X_BE (7,), found from home.
+
+        Raises:
+            DrakeTeleopError: if it is out of reach.
+        """
+        if np.allclose(pose, self.forward_kinematics(self.home), rtol=0, atol=1e-9):
+            return self.home.copy()
+        q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
+        if status != IkStatus.OK:
+            raise DrakeTeleopError(
+                f"the leader cannot reach ({', '.join(f'{x:.3g}' for x in pose[4:])}) m"
+                f" ({status.name})",
+                where="pose_master",
+                remedy="choose a pose that its joints reach, or another home",
+            )
+        return q
+
+    def forward_kinematics(self, q: Array) -> Array:
+        """X_BE (7,) at the joints q (n,)."""
+        pose = np.array([1.0, *np.zeros(6)])
+        _pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
+        return pose
+
+    def check_limits(self, q: Array) -> None:
+        """Checks that the joints q (n,) are within their limits.
+
+        Raises:
+            DrakeTeleopError: if they are not.
+        """
+        for k in np.flatnonzero((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])):
+            raise DrakeTeleopError(
+                f"joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, its limits are"
+                f" {self.joints[_LOWER, k]:.3g} and {self.joints[_UPPER, k]:.3g}",
+                where="master.leader.home",
+                remedy="start within the limits of its joints",
+            )
+
+    def at_an_end(self, q: Array) -> NDArray[np.bool_]:
+        """(N,) whether an end stop holds, at the joints q (N, n)."""
+        return ((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])).any(axis=1)
+
+    def jacobian(self, q: Array) -> Array:
+        """(6, n), rows [v; omega] of E in B."""
+        J = np.empty((6, self.num_joints))
+        jacobian(self.arm.table, np.asarray(q), J)
+        return J
+
+    def mass_matrix(self, q: Array) -> Array:
+        """(n, n) with the hand."""
+        return mass_matrix(self.arm, np.asarray(q))
+
+    def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
+        """(n, n) of the joint forces against dq/dt; see `HapticDevice.damping_matrix`."""
+        own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING]
+        return np.diag(own + creeping * self.joints[_COULOMB] / FRICTION_SPEED)
+
+
+def of_the_joints(
+    arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, carried: float
+) -> Array:
+    """(8, n) for `LeaderDevice.joints`; end stops after the inertia at home.
+
+    Args:
+        arm: with the hand.
+        home: (n,).
+        coulomb, viscous: (n,) friction besides the model's damping.
+        limit: (n,) of the motors.
+        carried: share of the arm's weight that the motors carry.
+    """
+    inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _STOP_HZ
+    rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]
+    return np.array([*rows, np.full(len(home), carried)])
+
+
+class LeaderArm(LeafSystem):
+    """The leader and the passive mass of the hand on it, advanced once a period.
+
+    .. pydrake_system::
+
+        name: LeaderArm
+        input_ports:
+        - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand at E, in B [N, N m]
+        - drive: from `LeaderDisplay`: the wrench F (6), what it remembers
+        output_ports:
+        - state: (2 n,) [q; qdot] [rad, rad/s]
+        - pose_master: (7,) X_BE
+        - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
+        - for_display: where E is (6), and what the force display remembers
+
+    Args:
+        period: [s].
+        device: with the mass of the hand that moves with it.
+        q_initial: (n,) joints at the start, at rest.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, period: float, device: LeaderDevice, q_initial: Array) -> None:
+        super().__init__()
+        self._constants = (*device.constants, _hand_weight(device))
+        self._period = period
+        self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
+        display = initial_display(device.display_axes(q_initial), device.numbers)
+        self._drive = self.DeclareVectorInputPort("drive", len(display))
+        for name, start in (
+            ("state", np.concatenate([q_initial, np.zeros(device.num_joints)])),
+            ("pose_master", device.forward_kinematics(q_initial)),
+            ("twist_master", np.zeros(6)),
+            ("for_display", display),
+        ):
+            self.DeclareStateOutputPort(name, self.DeclareDiscreteState(start))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        step_leader(
+            *self._constants,
+            discrete_state.get_mutable_value(0),
+            discrete_state.get_mutable_value(1),
+            discrete_state.get_mutable_value(2),
+            discrete_state.get_mutable_value(3),
+            self._hand_wrench.Eval(context),
+            self._drive.Eval(context),
+            self._period,
+        )
+
+
+def _hand_weight(device: LeaderDevice) -> float:
+    gravity = np.linalg.norm(device.arm.table[-1, GRAVITY : GRAVITY + 3])
+    return float(device.numbers[HAND_MASS] * gravity)
+
+
+class LeaderDisplay(ForceDisplay):
+    """The force display of a leader: no more than its motors give besides what carries it.
+
+    .. pydrake_system::
+
+        name: LeaderDisplay
+        input_ports:
+        - wrench_command: (6,) F_E_B, [f; tau] that the hand shall feel at E, in B [N, N m]
+        - for_display: from `LeaderArm`
+        - state: (2 n,) of it
+        output_ports:
+        - drive: for `LeaderArm`
+        - force_to_master: (6,) F, what is displayed within the limits [N, N m]
+        - fault_at_hand: a `Fault`
+        - displayed_and_fault: the last two, one after the other, for a log
+
+    Args:
+        period: of the device [s].
+        device: what displays it.
+    """
+
+    __slots__ = ()
+
+    def __init__(self, period: float, device: LeaderDevice) -> None:
+        super().__init__(period, device)
+        self._joints = self.DeclareVectorInputPort("state", 2 * device.num_joints)
+        self._constants, self._n = device.constants, device.num_joints
+        self._shortened = np.zeros(6)
+
+    def _calc_drive(self, context: Context, output: BasicVector) -> None:
+        wrench, q = self._command.Eval(context), self._joints.Eval(context)[: self._n]
+        if np.isfinite(wrench).all() and np.isfinite(q).all():
+            _strongest(*self._constants, q, wrench, self._shortened)
+            wrench = self._shortened
+        display_into(
+            wrench,
+            self._device.Eval(context),
+            self._numbers,
+            self._period,
+            self._jacobian,
+            output.get_mutable_value(),
+        )

@@ -1,0 +1,177 @@
+"""A leader arm out of its file: whatever the slave's arm may be read from."""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import choice, plain, quantity
+from drake_teleop.station.master.leader import LeaderDevice, of_the_joints
+from drake_teleop.station.master.numbers import (
+    HAND_INERTIA,
+    HAND_MASS,
+    IN_TASK_SPACE,
+    NUMBERS,
+    PEAK_FORCE,
+    PEAK_TORQUE,
+)
+from drake_teleop.station.slave.arm import (
+    PHI,
+    ROTATION,
+    ROTOR,
+    TRANSLATION,
+    ArmModel,
+    forward_kinematics,
+)
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.models import ParsedModel, ParseModel, drakes_errors_said
+
+Array = NDArray[np.float64]
+JOINTS = "joints"
+
+
+@settings
+@dataclass
+class Leader:
+    """An arm that the hand leads; it stands so that E is at `position` when it is at home."""
+
+    file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder")
+    package_paths: list[str] = plain(
+        [], "folders for package:// addresses in it, from the scenario's folder"
+    )
+    hand_frame: str = plain("", "frame or link of it where the hand holds it")
+    home: list[float] = plain(
+        [], "joint positions at the start [rad, m]; by default 0, or the middle of their limits"
+    )
+    base_rotation: list[float] = quantity(
+        [0.0, 0.0, 0.0], "rad", -2 * math.pi, 2 * math.pi, "R_BBase: roll, pitch, yaw; B's z is up"
+    )
+    weight_carried: float = quantity(
+        1.0, "1", 0.0, 1.0, "share of its weight that motors or springs carry"
+    )
+    friction: list[float] = plain(
+        [], "Coulomb friction of the joints [N m], one for all or each; by default none"
+    )
+    damping: list[float] = plain(
+        [], "of the joints [N m s/rad], likewise, besides what the model has"
+    )
+    torque_limit: list[float] = plain([], "of the motors [N m], likewise; by default the model's")
+    peak_force: float = quantity(30.0, "N", 0.0, 500.0, "that it displays at most")
+    peak_torque: float = quantity(3.0, "N m", 0.0, 50.0, "likewise, about each axis")
+    leads: str = choice(
+        "pose",
+        ("pose", JOINTS),
+        "the pose of S; or each joint its own of a slave of the same kinematics, home to start",
+    )
+
+    def check(self, where: str) -> None:
+        """Checks what needs no file.
+
+        Raises:
+            DrakeTeleopError: naming `where` and the field.
+        """
+        for name in ("file", "hand_frame"):
+            if not getattr(self, name):
+                raise DrakeTeleopError(
+                    "a leader arm needs it", where=f"{where}.{name}", remedy="name it"
+                )
+        for name in ("home", "friction", "damping", "torque_limit"):
+            values = getattr(self, name)
+            if not np.isfinite(values).all() or (name != "home" and min(values, default=0.0) < 0.0):
+                raise DrakeTeleopError(
+                    "has to be a list of finite numbers" + ("" if name == "home" else " from 0 on"),
+                    where=f"{where}.{name}",
+                )
+
+    def found_from(self, folder: Path) -> "Leader":
+        """The same with its files found from a folder, wherever the program runs."""
+        return dataclasses.replace(
+            self,
+            file=str((folder / self.file).resolve()) if self.file else "",
+            package_paths=[str((folder / path).resolve()) for path in self.package_paths],
+        )
+
+    def parse(self, plant: MultibodyPlant, X_Table: RigidTransform | None = None) -> ParsedModel:
+        """Adds the arm to a plant, with its base at the origin of B, which stands at X_Table.
+
+        Raises:
+            DrakeTeleopError: if it cannot be read, see `ParseModel`.
+        """
+        X_BBase = RigidTransform(RollPitchYaw(self.base_rotation), np.zeros(3))
+        X_WBase = X_BBase if X_Table is None else X_Table @ X_BBase
+        packages = tuple(map(Path, self.package_paths))
+        return ParseModel(plant, Path(self.file), self.hand_frame, packages, X_WBase)
+
+    def device(self, position: list[float], hand_mass: float, hand_inertia: float) -> LeaderDevice:
+        """The arm with a hand on it.
+
+        Args:
+            position: (3,) p_BE at home [m].
+            hand_mass, hand_inertia: as of `Master.device`.
+
+        Raises:
+            DrakeTeleopError: if it cannot be read, is no chain of joints, or a list has not as many
+                numbers as it has joints.
+        """
+        plant = MultibodyPlant(0.0)
+        parsed = self.parse(plant)
+        with drakes_errors_said(Path(self.file)):
+            plant.Finalize()
+        frame = parsed.sensor_frame
+        arm = ArmModelFromPlant(plant, frame.model_instance(), frame.name())
+        home = self._home(arm)
+        bare = _at_E(arm, home, np.array(position))
+        phi = bare.phi_load
+        phi[0] += hand_mass
+        phi[[4, 7, 9]] += hand_inertia
+        held = bare.with_load(phi)
+        coulomb, viscous = (self._of_all(name, arm, 0.0) for name in ("friction", "damping"))
+        limit = self._of_all("torque_limit", arm, arm.effort_limit)
+        joints = of_the_joints(held, home, coulomb, viscous, limit, self.weight_carried)
+        numbers = np.zeros(NUMBERS)
+        numbers[HAND_MASS], numbers[HAND_INERTIA] = hand_mass, hand_inertia
+        numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = self.peak_force, self.peak_torque
+        numbers[IN_TASK_SPACE] = 1.0
+        return LeaderDevice(held, bare, joints, home, numbers)
+
+    def _home(self, arm: ArmModel) -> Array:
+        if self.home:
+            return self._of_all("home", arm, 0.0)
+        within = (arm.lower <= 0.0) & (arm.upper >= 0.0)
+        return np.where(within, 0.0, 0.5 * (arm.lower + arm.upper))
+
+    def _of_all(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
+        """(n,) of a list with a number for each joint, or one for all (not of home), or none."""
+        values, n = getattr(self, name), arm.num_joints
+        if len(values) not in ((n,) if name == "home" else (0, 1, n)):
+            raise DrakeTeleopError(
+                f"has {len(values)} numbers, the arm has {n} joints",
+                where=f"master.leader.{name}",
+                remedy=f"give {n}, for {', '.join(arm.joint_names)}",
+            )
+        return np.broadcast_to(np.array(values if values else otherwise, float), (n,)).copy()
+
+
+def _at_E(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
+    """The arm to E in place of the hand's frame, standing where p_BE (3,) is E at home."""
+    R, p = np.empty((3, 3)), np.empty(3)
+    forward_kinematics(arm.table, home, R, p)
+    table, n = arm.table.copy(), arm.num_joints
+    table[0, TRANSLATION:PHI] += p_BE - p
+    # R at home turns the hand's frame into B: E has B's axes there.
+    R_LS = table[n, ROTATION:TRANSLATION].reshape(3, 3)
+    table[n, ROTATION:TRANSLATION] = (R_LS @ R.T).ravel()
+    phi, upper = table[n, PHI:ROTOR], np.triu_indices(3)
+    inertia = np.zeros((3, 3))
+    inertia[upper] = phi[4:]
+    inertia = inertia + np.triu(inertia, 1).T
+    phi[1:4], phi[4:] = R @ phi[1:4], (R @ inertia @ R.T)[upper]
+    return dataclasses.replace(arm, table=table)

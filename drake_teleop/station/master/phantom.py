@@ -1,0 +1,391 @@
+"""The Phantom Premium 1.5 HighForce/6DoF: its closed forms and its dynamics.
+
+Frames. B is the device's base: origin where the yaw axis meets the shoulder axis, z_B up, x_B from
+the device towards the operator. E is the stylus frame: its origin is the gimbal point, where the
+three wrist axes meet. With all joints at zero (`HOME`) the inner link points along x_B, the outer
+link hangs straight down, the stylus points along x_B and R_BE is the identity.
+
+Joints q (6,) [rad]: q1 yaw about z_B; q2 inner link, up from the horizontal; q3 outer link, from
+the downward vertical towards x_B. The five-bar makes q3 absolute: q2 alone turns nothing but the
+inner link. The wrist is yaw q4 about the outer link, pitch q5 and roll q6 about the stylus:
+
+    p_BE = Rz(q1) [l1 cos q2 + l2 sin q3, 0, l1 sin q2 - l2 cos q3]
+    R_BE = Rz(q1) Ry(-q3) Rz(q4) Ry(q5) Rx(q6)
+
+The wrist is singular at q5 = +-90 degrees (stylus along the outer link), the main axes at
+q2 - q3 = +-90 degrees, which is beyond their limits.
+
+How sure each number is: P = read in a public source (Cavusoglu, Feygin, Tendick 2002, as used by
+mahilab/Phantom), D = the manufacturer's figure, recalled, E = an engineering estimate.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RollPitchYaw, RotationMatrix
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.quaternions import multiply
+from drake_teleop.common.vectors import cross, dot, plus, solve, times
+from drake_teleop.station.master.numbers import COULOMB, HAND_INERTIA, HAND_MASS, VISCOUS
+
+GRAVITY = 9.81  # m/s^2, along -z_B
+
+L1, L2, L3, L5, L6 = 0.215, 0.170, 0.0325, -0.0368, 0.0527  # m, P
+# Mass [kg]; moments of inertia [kg m^2] about x (the pitch axis), y and z of the source, P.
+MASS_A, MASS_C, MASS_BE, MASS_DF = 0.0202, 0.0249, 0.2359, 0.1906
+INERTIA_A = (0.4864e-4, 0.001843e-4, 0.4864e-4)
+INERTIA_C = (0.959e-4, 0.959e-4, 0.0051e-4)
+INERTIA_BE = (11.09e-4, 10.06e-4, 0.591e-4)
+INERTIA_DF = (7.11e-4, 0.629e-4, 6.246e-4)
+INERTIA_BASE_YY = 11.87e-4
+TRANSMISSION = (13.3, 11.2, 11.2)  # P
+MOTOR_INERTIA = 1.08e-6  # kg m^2, P
+WRIST_MASS = 0.15  # kg, three links, each with its centre of mass at the gimbal point, E
+WRIST_INERTIA = 5e-5  # kg m^2, each wrist link, about every axis, E
+
+#: Joint limits [rad]: main axes P, wrist (297, 260, 335 degrees in all) D.
+JOINT_LOWER = np.radians([-90.0, -124.0, -29.0, -148.5, -130.0, -167.5])
+JOINT_UPPER = np.radians([90.0, 119.0, 214.0, 148.5, 130.0, 167.5])
+#: Range of q2 - q3 [rad]: the five-bar folds and stretches no further, P.
+FIVE_BAR_RANGE = (math.radians(-55.0), math.radians(65.0))
+FORCE_LIMIT = 37.5  # N, peak at the gimbal point, D
+WRIST_TORQUE_LIMIT = np.array([0.515, 0.515, 0.170])  # N m, peak at q4, q5, q6, D
+
+#: The posture in which R_BE is the identity, in the middle of the workspace.
+HOME = np.zeros(6)
+
+# Coulomb friction is tanh(velocity / this): below it the device creeps instead of sticking.
+FRICTION_SPEED = 0.01  # rad/s, E
+# End stops, a spring and a damper that never pulls back, E: 7 kN/m at the tip.
+_STOP_STIFFNESS, _STOP_DAMPING = 300.0, 1.5  # N m/rad, N m s/rad, main axes
+_WRIST_STOP_STIFFNESS, _WRIST_STOP_DAMPING = 5.0, 0.01
+
+# M11 = _YAW_CONSTANT + _YAW_2 cos 2 q2 + _YAW_3 cos 2 q3 + 2 _COUPLING cos q2 sin q3.
+_YAW_CONSTANT = INERTIA_BASE_YY + 0.5 * (
+    sum(sum(inertia[1:]) for inertia in (INERTIA_A, INERTIA_BE, INERTIA_C, INERTIA_DF))
+    + L1**2 * (MASS_A + MASS_C / 4)
+    + L2**2 * MASS_A / 4
+    + L3**2 * MASS_C
+)
+_YAW_2 = 0.5 * (
+    INERTIA_BE[1] - INERTIA_BE[2] + INERTIA_C[1] - INERTIA_C[2] + L1**2 * (MASS_A + MASS_C / 4)
+)
+_YAW_3 = 0.5 * (
+    INERTIA_A[1]
+    - INERTIA_A[2]
+    + INERTIA_DF[1]
+    - INERTIA_DF[2]
+    - L2**2 * MASS_A / 4
+    - L3**2 * MASS_C
+)
+_COUPLING = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
+_M22 = INERTIA_BE[0] + INERTIA_C[0] + L1**2 * (MASS_A + MASS_C / 4)
+_M33 = INERTIA_A[0] + INERTIA_DF[0] + L2**2 * MASS_A / 4 + L3**2 * MASS_C
+_MOTOR_1, _MOTOR_2, _MOTOR_3 = (gear**2 * MOTOR_INERTIA for gear in TRANSMISSION)
+_GRAVITY_2 = 0.5 * GRAVITY * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
+_GRAVITY_3 = 0.5 * GRAVITY * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
+
+
+@njit(cache=True)
+def _main_mass_matrix_into(q, M):
+    """Sets M (6, 6) to the three main axes' closed form; the rest is zero."""
+    M[:, :] = 0.0
+    M[0, 0] = (
+        _YAW_CONSTANT
+        + _YAW_2 * math.cos(2.0 * q[1])
+        + _YAW_3 * math.cos(2.0 * q[2])
+        + 2.0 * _COUPLING * math.cos(q[1]) * math.sin(q[2])
+    )
+    M[1, 1] = _M22
+    M[2, 2] = _M33
+    M[1, 2] = M[2, 1] = -_COUPLING * math.sin(q[1] - q[2])
+
+
+@njit(cache=True)
+def jacobian_into(q, J):
+    """Writes the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    s1, c1 = math.sin(q[0]), math.cos(q[0])
+    s2, c2 = math.sin(q[1]), math.cos(q[1])
+    s3, c3 = math.sin(q[2]), math.cos(q[2])
+    s4, c4 = math.sin(q[3]), math.cos(q[3])
+    s5, c5 = math.sin(q[4]), math.cos(q[4])
+    reach = L1 * c2 + L2 * s3
+    J[:, :] = 0.0
+    J[0, 0], J[1, 0] = -s1 * reach, c1 * reach
+    J[0, 1], J[1, 1], J[2, 1] = -c1 * L1 * s2, -s1 * L1 * s2, L1 * c2
+    J[0, 2], J[1, 2], J[2, 2] = c1 * L2 * c3, s1 * L2 * c3, L2 * s3
+    J[5, 0] = 1.0
+    J[3, 2], J[4, 2] = s1, -c1
+    J[3, 3], J[4, 3], J[5, 3] = -c1 * s3, -s1 * s3, c3
+    # The last two axes in the yawed frame, then turned by q1.
+    x5, y5 = -c3 * s4, c4
+    J[3, 4], J[4, 4], J[5, 4] = c1 * x5 - s1 * y5, s1 * x5 + c1 * y5, -s3 * s4
+    x6, y6 = c3 * c4 * c5 + s3 * s5, s4 * c5
+    J[3, 5], J[4, 5], J[5, 5] = c1 * x6 - s1 * y6, s1 * x6 + c1 * y6, s3 * c4 * c5 - c3 * s5
+
+
+@njit(cache=True)
+def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
+    """Writes the whole device's mass matrix, hand and reflected motors included, into M (6, 6).
+
+    `J` is the Jacobian at q. Each wrist link (and the hand, with the last one) is a point mass at
+    E and an inertia that is the same about every axis.
+    """
+    _main_mass_matrix_into(q, M)
+    M[0, 0] += _MOTOR_1
+    M[1, 1] += _MOTOR_2
+    M[2, 2] += _MOTOR_3
+    tip_mass = WRIST_MASS + hand_mass
+    for j in range(6):
+        # Joint j carries the wrist links from max(j, 3) on.
+        carried = WRIST_INERTIA * (6 - max(j, 3)) + hand_inertia
+        for i in range(j + 1):
+            value = carried * (J[3, i] * J[3, j] + J[4, i] * J[4, j] + J[5, i] * J[5, j])
+            value += tip_mass * (J[0, i] * J[0, j] + J[1, i] * J[1, j] + J[2, i] * J[2, j])
+            M[i, j] += value
+            if i != j:
+                M[j, i] += value
+
+
+@njit(cache=True)
+def gravity_torque_into(q, out):
+    """Writes the torque (6,) that holds the device, wrist included, against its weight.
+
+    The operator carries the weight of the hand.
+    """
+    weight = WRIST_MASS * GRAVITY
+    out[0] = 0.0
+    out[1] = (_GRAVITY_2 + weight * L1) * math.cos(q[1])
+    out[2] = (_GRAVITY_3 + weight * L2) * math.sin(q[2])
+    out[3:6] = 0.0
+
+
+@njit(cache=True)
+def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
+    """Subtracts C(q, v) v of the whole device from `torque` (6,)."""
+    # Main axes: Christoffel symbols of their closed-form M.
+    coupling = _COUPLING * math.cos(q[1] - q[2])
+    yaw_2 = -2.0 * (_YAW_2 * math.sin(2.0 * q[1]) + _COUPLING * math.sin(q[1]) * math.sin(q[2]))
+    yaw_3 = -2.0 * (_YAW_3 * math.sin(2.0 * q[2]) - _COUPLING * math.cos(q[1]) * math.cos(q[2]))
+    torque[0] -= (yaw_2 * v[1] + yaw_3 * v[2]) * v[0]
+    torque[1] -= coupling * v[2] * v[2] - 0.5 * yaw_2 * v[0] * v[0]
+    torque[2] -= -coupling * v[1] * v[1] - 0.5 * yaw_3 * v[0] * v[0]
+
+    # Point mass at E: J_v^T m (dJ_v/dt) v.
+    s1, c1 = math.sin(q[0]), math.cos(q[0])
+    s2, c2 = math.sin(q[1]), math.cos(q[1])
+    s3, c3 = math.sin(q[2]), math.cos(q[2])
+    tip_mass = WRIST_MASS + hand_mass
+    radial = -L1 * c2 * v[1] ** 2 - L2 * s3 * v[2] ** 2 - (L1 * c2 + L2 * s3) * v[0] ** 2
+    tangential = 2.0 * (-L1 * s2 * v[1] + L2 * c3 * v[2]) * v[0]
+    fx = tip_mass * (c1 * radial - s1 * tangential)
+    fy = tip_mass * (s1 * radial + c1 * tangential)
+    fz = tip_mass * (-L1 * s2 * v[1] ** 2 + L2 * c3 * v[2] ** 2)
+    for i in range(3):
+        torque[i] -= J[0, i] * fx + J[1, i] * fy + J[2, i] * fz
+
+    # Wrist links: angular velocity and velocity-product acceleration from link to link. Their
+    # inertia is the same about every axis, so there is no gyroscopic moment.
+    omega, alpha = (0.0, 0.0, v[0]), (0.0, 0.0, 0.0)
+    for k in range(2, 6):
+        turn = times(v[k], (J[3, k], J[4, k], J[5, k]))
+        alpha = plus(alpha, cross(omega, turn))
+        omega = plus(omega, turn)
+        if k >= 3:
+            inertia = WRIST_INERTIA + (hand_inertia if k == 5 else 0.0)
+            for i in range(k + 1):
+                torque[i] -= inertia * dot((J[3, i], J[4, i], J[5, i]), alpha)
+
+
+@njit(cache=True)
+def _stop_torque(angle, rate, lower, upper, stiffness, damping):
+    if angle > upper:
+        return min(0.0, -stiffness * (angle - upper) - damping * rate)
+    if angle < lower:
+        return max(0.0, -stiffness * (angle - lower) - damping * rate)
+    return 0.0
+
+
+@njit(cache=True)
+def _add_friction_and_stops(q, v, coulomb, viscous, torque):
+    for i in range(6):
+        torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_SPEED) + viscous[i] * v[i]
+        stiffness = _STOP_STIFFNESS if i < 3 else _WRIST_STOP_STIFFNESS
+        damping = _STOP_DAMPING if i < 3 else _WRIST_STOP_DAMPING
+        torque[i] += _stop_torque(q[i], v[i], JOINT_LOWER[i], JOINT_UPPER[i], stiffness, damping)
+    five_bar = _stop_torque(
+        q[1] - q[2],
+        v[1] - v[2],
+        FIVE_BAR_RANGE[0],
+        FIVE_BAR_RANGE[1],
+        _STOP_STIFFNESS,
+        _STOP_DAMPING,
+    )
+    torque[1] += five_bar
+    torque[2] -= five_bar
+
+
+@njit(cache=True)
+def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
+    """Forward dynamics of device and hand; writes the joint accelerations (6,) into `vdot`.
+
+    Args:
+        q, v: joint angles and rates (6,).
+        hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
+        motor_torque: (6,) at the joints.
+        device: (NUMBERS,) of the device, see `numbers`.
+        work: (2, 6, 6) scratch.
+        vdot: (6,) written.
+    """
+    J, M = work[0], work[1]
+    jacobian_into(q, J)
+    mass_matrix_into(q, J, device[HAND_MASS], device[HAND_INERTIA], M)
+    gravity_torque_into(q, vdot)
+    for i in range(6):
+        vdot[i] = motor_torque[i] - vdot[i]
+        for k in range(6):
+            vdot[i] += J[k, i] * hand_wrench[k]
+    _subtract_coriolis(q, v, J, device[HAND_MASS], device[HAND_INERTIA], vdot)
+    _add_friction_and_stops(q, v, device[COULOMB], device[VISCOUS], vdot)
+    solve(M, vdot, 6)
+
+
+@njit(cache=True)
+def pose_into(q, pose):
+    """Writes X_BE (7,) [qw, qx, qy, qz, px, py, pz]; even the signs are continuous in q."""
+    s1, c1 = math.sin(0.5 * q[0]), math.cos(0.5 * q[0])
+    s3, c3 = math.sin(-0.5 * q[2]), math.cos(0.5 * q[2])
+    s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
+    s5, c5 = math.sin(0.5 * q[4]), math.cos(0.5 * q[4])
+    s6, c6 = math.sin(0.5 * q[5]), math.cos(0.5 * q[5])
+    # Rz(q1) Ry(-q3), then Rz(q4) Ry(q5), their product, then Rx(q6).
+    a = c1 * c3, -s1 * s3, c1 * s3, s1 * c3
+    b = c4 * c5, -s4 * s5, c4 * s5, s4 * c5
+    w, x, y, z = multiply(a, b)
+    pose[0] = w * c6 - x * s6
+    pose[1] = x * c6 + w * s6
+    pose[2] = y * c6 + z * s6
+    pose[3] = z * c6 - y * s6
+    reach = L1 * math.cos(q[1]) + L2 * math.sin(q[2])
+    pose[4] = math.cos(q[0]) * reach
+    pose[5] = math.sin(q[0]) * reach
+    pose[6] = L1 * math.sin(q[1]) - L2 * math.cos(q[2])
+
+
+def closed_form_mass_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The three main axes' mass matrix (3, 3) [kg m^2] without wrist, motors or hand."""
+    M = np.empty((6, 6))
+    _main_mass_matrix_into(q, M)
+    return M[:3, :3]
+
+
+def closed_form_gravity(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The three main axes' gravity torque (3,) [N m] without wrist."""
+    return np.array([0.0, _GRAVITY_2 * np.cos(q[1]), _GRAVITY_3 * np.sin(q[2])])
+
+
+def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The geometric Jacobian of E (6, 6), rows [v; omega] in B."""
+    J = np.empty((6, 6))
+    jacobian_into(q, J)
+    return J
+
+
+def mass_matrix(
+    q: NDArray[np.float64], hand_mass: float = 0.0, hand_inertia: float = 0.0
+) -> NDArray[np.float64]:
+    """The whole device's mass matrix (6, 6) with wrist, reflected motors and hand."""
+    M = np.empty((6, 6))
+    mass_matrix_into(q, jacobian(q), hand_mass, hand_inertia, M)
+    return M
+
+
+def gravity_torque(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The torque (6,) [N m] that holds the device, wrist included, against its weight."""
+    torque = np.empty(6)
+    gravity_torque_into(q, torque)
+    return torque
+
+
+def potential_energy(q: NDArray[np.float64]) -> float:
+    """The device's potential energy [J], wrist included; its gradient is `gravity_torque`."""
+    weight = WRIST_MASS * GRAVITY
+    energy = (_GRAVITY_2 + weight * L1) * np.sin(q[1]) - (_GRAVITY_3 + weight * L2) * np.cos(q[2])
+    return float(energy)
+
+
+def forward_kinematics(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at the joint angles q (6,)."""
+    pose = np.empty(7)
+    pose_into(q, pose)
+    return pose
+
+
+def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The joint angles (6,) that put the stylus at X_BE (7,), elbow up, |q5| <= 90 degrees.
+
+    Raises:
+        DrakeTeleopError: if the pose is out of reach or needs a joint beyond its limit.
+    """
+    x, y, z = pose[4:7]
+    reach = math.hypot(x, y)
+    # Two-link arm whose second link points along q3 - 90 degrees; elbow = q2 - (q3 - 90 degrees).
+    cosine = (reach**2 + z**2 - L1**2 - L2**2) / (2 * L1 * L2)
+    if abs(cosine) > 1:
+        raise DrakeTeleopError(
+            f"the master cannot reach ({x:g}, {y:g}, {z:g}) m",
+            where="pose_master",
+            remedy="choose a start pose inside the device's workspace, in its base frame B",
+        )
+    elbow = math.acos(cosine)
+    q2 = math.atan2(z, reach) + math.atan2(L2 * math.sin(elbow), L1 + L2 * math.cos(elbow))
+    q3 = q2 - elbow + math.pi / 2
+    q1 = math.atan2(y, x)
+    R_BO = RotationMatrix.MakeZRotation(q1) @ RotationMatrix.MakeYRotation(-q3)
+    R_BE = RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4])))
+    wrist = RollPitchYaw(R_BO.inverse() @ R_BE)
+    q = np.array([q1, q2, q3, wrist.yaw_angle(), wrist.pitch_angle(), wrist.roll_angle()])
+    check_limits(q)
+    return q
+
+
+def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The joint angles of the serial tree in `phantom.sdf` for the device's q (..., 6).
+
+    The tree's third joint turns relative to the inner link, the device's q3 is absolute.
+    """
+    serial = np.array(q, dtype=float)
+    serial[..., 2] -= serial[..., 1]
+    return serial
+
+
+def at_an_end(q: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) whether an end stop, of a joint or of the five-bar, holds at q (N, 6)."""
+    folded = q[:, 1] - q[:, 2]
+    beyond = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=1)
+    return beyond | (folded < FIVE_BAR_RANGE[0]) | (folded > FIVE_BAR_RANGE[1])
+
+
+def check_limits(q: NDArray[np.float64]) -> None:
+    """Raises a DrakeTeleopError for the first of six joint angles [rad] out of its range."""
+    margin = 1e-9
+    for i in range(6):
+        if not JOINT_LOWER[i] - margin <= q[i] <= JOINT_UPPER[i] + margin:
+            raise DrakeTeleopError(
+                f"joint {i + 1} would be at {np.degrees(q[i]):.1f} degrees, its range is "
+                f"{np.degrees(JOINT_LOWER[i]):.1f} to {np.degrees(JOINT_UPPER[i]):.1f}",
+                where="pose_master",
+                remedy="choose a start pose inside the device's workspace",
+            )
+    if not FIVE_BAR_RANGE[0] - margin <= q[1] - q[2] <= FIVE_BAR_RANGE[1] + margin:
+        raise DrakeTeleopError(
+            f"q2 - q3 would be {np.degrees(q[1] - q[2]):.1f} degrees, its range is -55 to 65",
+            where="pose_master",
+            remedy="choose a start pose inside the device's workspace",
+        )

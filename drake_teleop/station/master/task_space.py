@@ -1,0 +1,201 @@
+"""A haptic device by its data sheet: what the hand feels of it at the grip, not how it is built.
+
+Six axes, as of a gantry with a wrist on it: three slide along x, y and z of B, three turn through
+one point E. With all turns at zero R_BE is the identity.
+
+    q (6,) = [x, y, z, yaw, pitch, roll] [m, rad],  p_BE = q[:3],  R_BE = Rz(q4) Ry(q5) Rx(q6)
+
+The device is a mass and an inertia that are the same in every direction (`apparent_mass`,
+`inertia`), Coulomb friction and damping against the grip's velocity and angular velocity, end stops
+at the workspace's faces and the turns' ends, and its weight is balanced. So a data sheet gives it,
+and so it is for a delta or a counterbalanced arm in the middle of its workspace: there the mass
+of a Phantom changes by a third from one direction to another, which this leaves out.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RollPitchYaw, RotationMatrix
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.vectors import cross, plus, times
+from drake_teleop.station.master.numbers import (
+    CENTRE,
+    COULOMB,
+    HALF_SIZE,
+    HAND_INERTIA,
+    HAND_MASS,
+    INERTIA,
+    MASS,
+    TURN,
+    VISCOUS,
+)
+
+# Coulomb friction is tanh(speed / this): below it the device creeps instead of sticking.
+SLIDING_SPEED, TURNING_SPEED = 0.002, 0.01  # m/s, rad/s, E
+# End stops, a spring and a damper that never pulls back, E.
+_STOP_STIFFNESS, _STOP_DAMPING = 5000.0, 20.0  # N/m, N s/m
+_TURN_STIFFNESS, _TURN_DAMPING = 5.0, 0.01  # N m/rad, N m s/rad
+
+
+@njit(cache=True)
+def jacobian_into(q, J):
+    """Writes the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    s4, c4 = math.sin(q[3]), math.cos(q[3])
+    s5, c5 = math.sin(q[4]), math.cos(q[4])
+    J[:, :] = 0.0
+    J[0, 0] = J[1, 1] = J[2, 2] = J[5, 3] = 1.0
+    J[3, 4], J[4, 4] = -s4, c4
+    J[3, 5], J[4, 5], J[5, 5] = c4 * c5, s4 * c5, -s5
+
+
+@njit(cache=True)
+def mass_matrix_into(q, J, device, M):
+    """Writes the mass matrix of device and hand (6, 6) into M; `J` is the Jacobian at q."""
+    M[:, :] = 0.0
+    inertia = device[INERTIA] + device[HAND_INERTIA]
+    for i in range(3):
+        M[i, i] = device[MASS] + device[HAND_MASS]
+        for k in range(3):
+            for row in range(3, 6):
+                M[3 + i, 3 + k] += inertia * J[row, 3 + i] * J[row, 3 + k]
+
+
+@njit(cache=True)
+def _against(motion, coulomb, viscous, speed_of_tanh):
+    """The factor of a velocity in the friction against it."""
+    speed = math.hypot(math.hypot(motion[0], motion[1]), motion[2])
+    if speed < 1e-9 * speed_of_tanh:  # tanh(x) = x, without 0 / 0
+        return viscous + coulomb / speed_of_tanh
+    return viscous + coulomb * math.tanh(speed / speed_of_tanh) / speed
+
+
+@njit(cache=True)
+def _stop(beyond, rate, stiffness, damping):
+    """Of an end stop that is passed by `beyond`, of either sign, at `rate`: never pulls back."""
+    if beyond > 0.0:
+        return min(0.0, -stiffness * beyond - damping * rate)
+    if beyond < 0.0:
+        return max(0.0, -stiffness * beyond - damping * rate)
+    return 0.0
+
+
+@njit(cache=True)
+def _beyond(x, half):
+    return x - half if x > half else (x + half if x < -half else 0.0)
+
+
+@njit(cache=True)
+def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
+    """Forward dynamics of device and hand; arguments as of `phantom.acceleration_into`."""
+    J = work[0]
+    jacobian_into(q, J)
+    mass = device[MASS] + device[HAND_MASS]
+    drag = _against(v[:3], device[COULOMB.start], device[VISCOUS.start], SLIDING_SPEED)
+    for i in range(3):
+        beyond = _beyond(q[i] - device[CENTRE][i], device[HALF_SIZE][i])
+        stop = _stop(beyond, v[i], _STOP_STIFFNESS, _STOP_DAMPING)
+        vdot[i] = (hand_wrench[i] + motor[i] + stop - drag * v[i]) / mass
+
+    # Of the turns: alpha = sum (axis vdot + omega of the axis x axis v), solved for vdot.
+    inertia = device[INERTIA] + device[HAND_INERTIA]
+    omega, bias = (0.0, 0.0, v[3]), (0.0, 0.0, 0.0)
+    for k in range(4, 6):
+        turn = times(v[k], (J[3, k], J[4, k], J[5, k]))
+        bias = plus(bias, cross(omega, turn))
+        omega = plus(omega, turn)
+    drag = _against(omega, device[COULOMB.start + 3], device[VISCOUS.start + 3], TURNING_SPEED)
+    # Joint torques: of motors and stops, then of what acts about B's axes.
+    pushed = np.empty(3)
+    for i in range(3):
+        beyond = _beyond(q[3 + i], device[TURN][i])
+        pushed[i] = motor[3 + i] + _stop(beyond, v[3 + i], _TURN_STIFFNESS, _TURN_DAMPING)
+        for k in range(3):
+            about = hand_wrench[3 + k] - drag * omega[k] - inertia * bias[k]
+            pushed[i] += J[3 + k, 3 + i] * about
+    # J^T J of the turns is [[1, 0, -s5], [0, 1, 0], [-s5, 0, 1]].
+    s5 = math.sin(q[4])
+    of_two = 1.0 - s5 * s5
+    vdot[3] = (pushed[0] + s5 * pushed[2]) / (of_two * inertia)
+    vdot[4] = pushed[1] / inertia
+    vdot[5] = (pushed[2] + s5 * pushed[0]) / (of_two * inertia)
+
+
+@njit(cache=True)
+def pose_into(q, pose):
+    """Writes X_BE (7,) [qw, qx, qy, qz, px, py, pz]; even the signs are continuous in q."""
+    s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
+    s5, c5 = math.sin(0.5 * q[4]), math.cos(0.5 * q[4])
+    s6, c6 = math.sin(0.5 * q[5]), math.cos(0.5 * q[5])
+    w, x, y, z = c4 * c5, -s4 * s5, c4 * s5, s4 * c5
+    pose[0] = w * c6 - x * s6
+    pose[1] = x * c6 + w * s6
+    pose[2] = y * c6 + z * s6
+    pose[3] = z * c6 - y * s6
+    for i in range(3):
+        pose[4 + i] = q[i]
+
+
+def damping_matrix(
+    q: NDArray[np.float64], device: NDArray[np.float64], creeping: bool
+) -> NDArray[np.float64]:
+    """(6, 6) of the joint forces against dq/dt; see `HapticDevice.damping_matrix`."""
+    J = np.empty((6, 6))
+    jacobian_into(q, J)
+    of_tanh = np.array([SLIDING_SPEED, TURNING_SPEED])
+    drag = device[VISCOUS][[0, 3]] + creeping * device[COULOMB][[0, 3]] / of_tanh
+    return J.T @ np.diag(np.repeat(drag, 3)) @ J
+
+
+def inverse_kinematics(
+    pose: NDArray[np.float64], device: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The axes q (6,) that put the grip at X_BE (7,).
+
+    Raises:
+        DrakeTeleopError: if the pose is outside the workspace.
+    """
+    turned = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
+    turns = [turned.yaw_angle(), turned.pitch_angle(), turned.roll_angle()]
+    q = np.concatenate([pose[4:7], turns])
+    check_limits(q, device)
+    return q
+
+
+def _beyond_workspace(
+    q: NDArray[np.float64], device: NDArray[np.float64], margin: float
+) -> NDArray[np.bool_]:
+    """(..., 6) which axes of q are beyond the workspace by more than a margin [m, rad]."""
+    centre = np.append(device[CENTRE], np.zeros(3))
+    return np.abs(q - centre) > np.append(device[HALF_SIZE], device[TURN]) + margin
+
+
+def at_an_end(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) whether an end stop holds at q (N, 6); an axis that does not turn has none."""
+    return (_beyond_workspace(q, device, 0.0) & np.append([True] * 3, device[TURN] > 0.0)).any(
+        axis=1
+    )
+
+
+def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
+    """Checks that the axes q (6,) are within the workspace.
+
+    Raises:
+        DrakeTeleopError: if they are not.
+    """
+    if _beyond_workspace(q, device, 1e-9).any():
+        low, high = device[CENTRE] - device[HALF_SIZE], device[CENTRE] + device[HALF_SIZE]
+        axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
+        turns = ", ".join(f"{a:.0f}" for a in np.degrees(device[TURN]))
+        raise DrakeTeleopError(
+            f"the grip would be at ({', '.join(f'{x:.3g}' for x in q[:3])}) m, turned by "
+            f"({', '.join(f'{x:.0f}' for x in np.degrees(q[3:]))}) degrees; the device's workspace "
+            f"is {axes} m, +-({turns}) degrees",
+            where="pose_master",
+            remedy="choose a start pose inside the device's workspace, in its base frame B",
+        )

@@ -1,0 +1,132 @@
+"""The master side: the operator holds the haptic device, whose motion is scaled for the slave."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RollPitchYaw
+from pydrake.systems.framework import Diagram, DiagramBuilder
+
+from drake_teleop.station.channel.network import mean_delay
+from drake_teleop.station.master.device import AddDevice
+from drake_teleop.station.master.dynamics import HapticDevice
+from drake_teleop.station.master.electronics import Encoders, Held
+from drake_teleop.station.master.leader import LeaderDevice
+from drake_teleop.station.operator.decision import Training
+from drake_teleop.station.operator.operator import Operator
+from drake_teleop.station.scaling.joint_coupling import JointCoupling
+from drake_teleop.station.scaling.kinematic_scaling import KinematicScaling
+from drake_teleop.station.scenario import Scenario, check_scenario
+from drake_teleop.station.slave.plant import NominalSlave, start_pose
+from drake_teleop.station.wiring import export
+
+#: How often the clutch is looked at [s]; an event at 2 kHz would cost time.
+CLUTCH_PERIOD = 0.01
+
+
+def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diagram:
+    """Operator, haptic device, kinematic scaling and force display.
+
+    .. pydrake_system::
+
+        name: master_side
+        input_ports:
+        - wrench_command: (6,) F_E_B, what the hand shall feel [N, N m]
+        - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
+        - intended_pose: (7,) X_BE that the operator wants, in place of the scenario's intent; may
+          be left unconnected
+        - intended_twist: (6,) its twist [v; omega] in B; unconnected zero
+        - slave_state: [q; v] of the slave, whose tool the operator sees (with a task)
+        output_ports:
+        - pose_command: (7,) X_WS, setpoint of the slave
+        - leader_joints: (n,) setpoint of its joints (of a leader that leads them) [rad]
+        - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m]
+        - intent, master_state, pose_master, twist_master, force_to_master, fault_at_hand: signals
+        - displayed_and_fault: the last two side by side, for the log
+        - task_state: signal (with a task)
+
+    Args:
+        scenario: what the station is made of.
+        operator: who holds the device, "live_hand"; None for the scenario's operator.
+
+    Raises:
+        DrakeTeleopError: for a value that cannot be right.
+    """
+    check_scenario(scenario)
+    hand, scaling = scenario.operator.hand, scenario.kinematic_scaling
+    start_B = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
+    start_W = start_pose(scenario.slave)
+    builder = DiagramBuilder()
+
+    name = "operator" if operator is None else "live_hand"
+    operator = builder.AddNamedSystem(name, operator or _operator(scenario, start_B))
+    period, model = 1 / scenario.rates.hand_hz, scenario.master.device(hand.mass, hand.inertia)
+    q_start = model.inverse_kinematics(start_B)
+    device, display = AddDevice(builder, period, model, q_start)
+    builder.Connect(operator.GetOutputPort("hand_wrench_E"), device.GetInputPort("hand_wrench_E"))
+    builder.Connect(device.GetOutputPort("pose_master"), operator.GetInputPort("pose_master"))
+    builder.Connect(device.GetOutputPort("twist_master"), operator.GetInputPort("twist_master"))
+    for name in ("intended_pose", "intended_twist"):
+        if operator.HasInputPort(name):
+            builder.ExportInput(operator.GetInputPort(name), name)
+    if scenario.operator.task is not None:
+        builder.ExportInput(operator.GetInputPort("slave_state"), "slave_state")
+        export(builder, operator, "task_state")
+    export(builder, operator, "intent", "hand_wrench_E")
+    export(builder, device, "pose_master", "twist_master", master_state="state")
+
+    if isinstance(model, LeaderDevice) and scenario.master.leads_joints:
+        slave = NominalSlave(scenario.slave)
+        kinematic_scaling = builder.AddNamedSystem(
+            "kinematic_scaling", JointCoupling(slave.arm, slave.start, model.home, CLUTCH_PERIOD)
+        )
+    else:
+        kinematic_scaling = builder.AddNamedSystem(
+            "kinematic_scaling", KinematicScaling(scaling, CLUTCH_PERIOD, start_W)
+        )
+    read, command = device.GetOutputPort("pose_master"), display.GetInputPort("wrench_command")
+    if scenario.master.steps().any() and isinstance(model, HapticDevice):
+        encoders = Encoders(model, q_start, scenario.master.steps())
+        builder.AddNamedSystem("encoders", encoders)
+        builder.Connect(device.GetOutputPort("state"), encoders.get_input_port())
+        read = encoders.get_output_port()
+    own_period = scenario.master.own_period(scenario.rates.hand_hz)
+    if own_period is not None:
+        held_pose = builder.AddNamedSystem("held_pose", Held(own_period, start_B))
+        held_wrench = builder.AddNamedSystem("held_wrench", Held(own_period, np.zeros(6)))
+        builder.Connect(read, held_pose.get_input_port())
+        builder.Connect(held_wrench.get_output_port(), command)
+        read, command = held_pose.get_output_port(), held_wrench.get_input_port()
+    if scenario.master.leads_joints:
+        state = device.GetOutputPort("state")
+        builder.Connect(state, kinematic_scaling.GetInputPort("master_state"))
+        export(builder, kinematic_scaling, "leader_joints")
+    else:
+        builder.Connect(read, kinematic_scaling.GetInputPort("pose_master"))
+    builder.ExportInput(kinematic_scaling.GetInputPort("clutch"), "clutch")
+    export(builder, kinematic_scaling, "pose_command")
+
+    builder.ExportInput(command, "wrench_command")
+    export(builder, display, "force_to_master", "fault_at_hand", "displayed_and_fault")
+    return builder.Build()
+
+
+def _operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator:
+    """The operator; for a task it sees the tool, and has been trained on this station."""
+    if scenario.operator.task is None:
+        return Operator(scenario.operator, start_B)
+    scaling, forces = scenario.kinematic_scaling, scenario.force_scaling
+    forward, backward = (mean_delay(line) for line in scenario.channel.lines())
+    training = Training(
+        RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
+        scaling.translation_scale,
+        forces.scales()[2] * forces.force_scale,
+        forward,
+        backward,
+        scenario.simulation.seed,
+    )
+    slave = NominalSlave(scenario.slave)
+    tip_W = slave.start_tip
+    return Operator(
+        scenario.operator, start_B, training, slave.arm, np.concatenate([slave.tip, tip_W])
+    )

@@ -1,0 +1,67 @@
+"""Moving the hand: minimum-jerk movements, planned from whatever motion it is in.
+
+Hoff and Arbib, J. Motor Behav. 25, 1993. A plan is a part of the operator's memory: start [s],
+length [s], and coefficients of a quintic in time over length, for each axis.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drake_teleop.common.compiled import njit
+
+PLAN, PLAN_SIZE = 7, 20
+"""Where the plan is in the operator's memory, and its size."""
+STOP = 0.15  # s, in which the hand stops, E
+
+
+@njit(cache=True)
+def plan_at(plan, time, i):
+    """Place, speed and acceleration of axis i; after the plan's end it goes on at its speed."""
+    h = plan[1]
+    u = min((time - plan[0]) / h, 1.0)
+    c = plan[2 + 6 * i : 8 + 6 * i]
+    x = c[0] + u * (c[1] + u * (c[2] + u * (c[3] + u * (c[4] + u * c[5]))))
+    v = c[1] + u * (2 * c[2] + u * (3 * c[3] + u * (4 * c[4] + u * 5 * c[5])))
+    a = 2 * c[2] + u * (6 * c[3] + u * (12 * c[4] + u * 20 * c[5]))
+    late = time - plan[0] - h
+    if late > 0.0:
+        return x + v / h * late, v / h, 0.0
+    return x, v / h, a / (h * h)
+
+
+@njit(cache=True)
+def add_plan_into(memory, time, pose, twist):
+    """Adds where the operator wants to be at `time` to an intended pose (7,) and twist (6,)."""
+    plan = memory[PLAN : PLAN + PLAN_SIZE]
+    for i in range(3):
+        x, v, _ = plan_at(plan, time, i)
+        pose[4 + i] += x
+        twist[i] += v
+
+
+@njit(cache=True)
+def plan_move(memory, time, length, change, end_speed):
+    """The minimum-jerk motion from the present one, by `change` (3,), in `length`.
+
+    It ends without acceleration and with the velocity `end_speed` (3,).
+    """
+    plan, h = memory[PLAN : PLAN + PLAN_SIZE], length
+    for i in range(3):
+        x, v, a = plan_at(plan, time, i)
+        v, a, w, d = v * h, a * h * h, end_speed[i] * h, change[i]
+        c = plan[2 + 6 * i : 8 + 6 * i]
+        c[0], c[1], c[2] = x, v, 0.5 * a
+        c[3] = 10 * d - 6 * v - 4 * w - 1.5 * a
+        c[4] = -15 * d + 8 * v + 7 * w + 1.5 * a
+        c[5] = 6 * d - 3 * v - 3 * w - 0.5 * a
+    plan[0], plan[1] = time, h
+
+
+@njit(cache=True)
+def plan_stop(memory, time):
+    """Plans from now to rest, in `STOP` seconds, as far on as the motion takes it."""
+    plan, change = memory[PLAN : PLAN + PLAN_SIZE], np.empty(3)
+    for i in range(3):
+        change[i] = 0.5 * STOP * plan_at(plan, time, i)[1]
+    plan_move(memory, time, STOP, change, np.zeros(3))

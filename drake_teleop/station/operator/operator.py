@@ -1,0 +1,450 @@
+"""The operator: an intended path of the hand, followed through the hand's impedance.
+
+The hand is a two-port: it pulls the stylus towards where the operator wants it, and gives way to
+the force that it feels. Its passive mass moves with the stylus and is part of the device.
+
+With a task the operator is closed-loop: it sees the tool and feels the stylus, both late, and plans
+its movements from them (`decision.py`, `perception.py`); the intent's segments are added to these.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DependencyTicket,
+    DiscreteValues,
+    LeafSystem,
+)
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import settings
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.quantities import choice, plain, quantity
+from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply, rotate
+from drake_teleop.common.vectors import put
+from drake_teleop.station.operator import decision
+from drake_teleop.station.operator import perception as feeling
+from drake_teleop.station.operator.decision import Training
+from drake_teleop.station.operator.intended import unit_pose_into
+from drake_teleop.station.operator.minimum_jerk import add_plan_into
+from drake_teleop.station.operator.perception import Perception, perceive_into
+from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Task, Touch
+from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
+
+_FORCE_LIMIT = 60.0  # N, what a hand can exert on a stylus and still control, E
+_TORQUE_LIMIT = 2.0  # N m, E
+
+
+@dataclass(frozen=True)
+class HandImpedance:
+    """The hand between the operator's intent and the stylus; every value E.
+
+    Translational values are common in the haptics literature. The inertia is that of the mass at
+    a radius of gyration of 30 mm; the rotational damping ratio is about 0.7.
+    """
+
+    mass: float  # kg, moves with the stylus
+    damping: float  # N s/m
+    stiffness: float  # N/m
+    inertia: float  # kg m^2, about every axis through E, moves with the stylus
+    rotational_damping: float  # N m s/rad
+    rotational_stiffness: float  # N m/rad
+
+
+#: The hand by grip.
+GRIPS = {
+    "light": HandImpedance(0.10, 2.0, 50.0, 0.9e-4, 0.015, 0.5),
+    "medium": HandImpedance(0.25, 8.0, 250.0, 2.25e-4, 0.035, 1.5),
+    "firm": HandImpedance(0.50, 20.0, 700.0, 4.5e-4, 0.060, 3.0),
+}
+
+
+@settings
+@dataclass
+class MinimumJerk:
+    """A move by an offset on the minimum-jerk profile 10 u^3 - 15 u^4 + 6 u^5."""
+
+    t_start: float = quantity(0.0, "s", 0.0, 1e6, "when the move starts")
+    duration: float = quantity(1.0, "s", 1e-3, 1e6, "how long it takes")
+    translation: list[float] = quantity([0.0, 0.0, 0.0], "m", -1.0, 1.0, "offset in B")
+    rotation: list[float] = quantity(
+        [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "rotation vector of the offset, about axes of B"
+    )
+
+
+@settings
+@dataclass
+class Sine:
+    """An oscillation that fades in and out on minimum-jerk ramps, so that it is C2 throughout.
+
+    At full swing the offset is amplitude * sin(2 pi frequency (t - t_start) + phase).
+    """
+
+    t_start: float = quantity(0.0, "s", 0.0, 1e6, "when it starts to fade in")
+    duration: float = quantity(1.0, "s", 1e-3, 1e6, "from start to end, both ramps included")
+    ramp: float = quantity(0.1, "s", 1e-3, 1e6, "length of each ramp, at most half the duration")
+    frequency: float = quantity(1.0, "Hz", 0.0, 100.0, "frequency")
+    phase: float = quantity(0.0, "rad", -7.0, 7.0, "phase at t_start")
+    translation: list[float] = quantity([0.0, 0.0, 0.0], "m", -1.0, 1.0, "amplitude in B")
+    rotation: list[float] = quantity(
+        [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "rotation vector of the amplitude, about axes of B"
+    )
+
+
+@settings
+@dataclass
+class OperatorConfig:
+    """How the hand holds the stylus and what it wants to do with it."""
+
+    grip: str = choice("medium", tuple(GRIPS), "stiffness, damping and mass of the hand")
+    intent: list[MinimumJerk | Sine] = plain([], "moves relative to the start pose; they add up")
+    task: Reach | Touch | Press | Insert | None = plain(None, "by eye and feel, beside the intent")
+    perception: Perception = field(default_factory=Perception)
+    movement: Movement = field(default_factory=Movement)
+
+    @property
+    def hand(self) -> HandImpedance:
+        """The hand's impedance."""
+        return GRIPS[self.grip]
+
+
+def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
+    """The segments as an array (n, 12) for the compiled functions.
+
+    Columns: ramp in [start, length], ramp out [start, length], 2 pi frequency, phase, translation
+    (3), rotation (3). A minimum-jerk move is a ramp that never fades out, times sin(pi / 2).
+    """
+    packed = np.zeros((len(segments), 12))
+    for row, segment in zip(packed, segments, strict=True):
+        if isinstance(segment, MinimumJerk):
+            row[:6] = segment.t_start, segment.duration, np.inf, 1.0, 0.0, 0.5 * np.pi
+        else:
+            ramp = min(segment.ramp, 0.5 * segment.duration)
+            end = segment.t_start + segment.duration
+            speed = 2 * np.pi * segment.frequency
+            row[:6] = segment.t_start, ramp, end - ramp, ramp, speed, segment.phase
+        row[6:9] = segment.translation
+        row[9:12] = segment.rotation
+    return packed
+
+
+@njit(cache=True)
+def _ramp(time, length):
+    """Minimum-jerk ramp from 0 at time 0 to 1 at `length`, and its rate."""
+    u = time / length
+    if u <= 0.0:
+        return 0.0, 0.0
+    if u >= 1.0:
+        return 1.0, 0.0
+    return u * u * u * (10.0 + u * (6.0 * u - 15.0)), 30.0 * (u * (1.0 - u)) ** 2 / length
+
+
+@njit(cache=True)
+def intent_into(packed, start, t, pose, twist):
+    """Writes the intended pose X_BE (7,) and twist [v; omega] (6,) at time t.
+
+    `packed` comes from `pack_intent`, `start` (7,) is X_BE before the first segment. Translations
+    add; rotations follow one another in the order of the list, each about axes of B.
+    """
+    orientation = (start[0], start[1], start[2], start[3])
+    omega = (0.0, 0.0, 0.0)
+    put(pose, 4, start, 4, 3)
+    twist[:3] = 0.0
+    for n in range(packed.shape[0]):
+        row = packed[n]
+        fade_in, fade_in_rate = _ramp(t - row[0], row[1])
+        fade_out, fade_out_rate = _ramp(t - row[2], row[3])
+        angle = row[4] * (t - row[0]) + row[5]
+        level = (fade_in - fade_out) * math.sin(angle)
+        rate = (fade_in_rate - fade_out_rate) * math.sin(angle)
+        rate += (fade_in - fade_out) * row[4] * math.cos(angle)
+        for k in range(3):
+            pose[4 + k] += level * row[6 + k]
+            twist[k] += rate * row[6 + k]
+        turn = exponential((level * row[9], level * row[10], level * row[11]))
+        orientation = multiply(turn, orientation)
+        omega = rotate(turn, omega)
+        omega = (omega[0] + rate * row[9], omega[1] + rate * row[10], omega[2] + rate * row[11])
+    for k in range(4):
+        pose[k] = orientation[k]
+    for k in range(3):
+        twist[3 + k] = omega[k]
+
+
+def intent_at(
+    segments: Sequence[MinimumJerk | Sine], start: NDArray[np.float64], t: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The intended motion at the times t (n,) [s].
+
+    Args:
+        segments: the intent, relative to the start pose.
+        start: (7,) X_BE before the first segment.
+
+    Returns:
+        (n, 7) poses X_BE and (n, 6) twists [v; omega] of E in B.
+    """
+    times = np.atleast_1d(np.asarray(t, dtype=float))
+    packed = pack_intent(segments)
+    poses, twists = np.empty((len(times), 7)), np.empty((len(times), 6))
+    for time, pose, twist in zip(times, poses, twists, strict=True):
+        intent_into(packed, start, time, pose, twist)
+    return poses, twists
+
+
+@njit(cache=True)
+def _limit(vector, limit):
+    """Shortens a vector (3,) in place to `limit`, keeping its direction."""
+    length = math.hypot(math.hypot(vector[0], vector[1]), vector[2])
+    if length > limit:
+        for k in range(3):
+            vector[k] *= limit / length
+
+
+@njit(cache=True)
+def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
+    """Writes the wrench [f; tau] (6,) of the hand on the stylus at E, in B.
+
+    f = K (x_intent - x) + B (v_intent - v); tau likewise with the rotation vector (in B) of the
+    orientation error, the shorter way round. Both are bounded by what a hand can exert.
+
+    Args:
+        impedance: (4,) [K, B, rotational K, rotational B].
+        intent_pose, pose: (7,) X_BE wanted and actual.
+        intent_twist, twist: (6,) [v; omega] of E in B, wanted and actual.
+        wrench: (6,) written.
+    """
+    wanted = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
+    error = logarithm(multiply(wanted, conjugate((pose[0], pose[1], pose[2], pose[3]))))
+    for k in range(3):
+        wrench[k] = impedance[0] * (intent_pose[4 + k] - pose[4 + k])
+        wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
+        wrench[3 + k] = impedance[2] * error[k]
+        wrench[3 + k] += impedance[3] * (intent_twist[3 + k] - twist[3 + k])
+    _limit(wrench[:3], _FORCE_LIMIT)
+    _limit(wrench[3:], _TORQUE_LIMIT)
+
+
+@njit(cache=True)
+def _wanted_into(packed, start, moving, memory, time, pose, twist):
+    """The intent's segments, and on top of them what the task asks for; no memory: no task.
+
+    `start` (7,) moves by itself with the twist `moving` (6,).
+    """
+    intent_into(packed, start, time, pose, twist)
+    for k in range(6):
+        twist[k] += moving[k]
+    if memory.shape[0] > 0:
+        add_plan_into(memory, time, pose, twist)
+
+
+@njit(cache=True, borrows=True)
+def _wrench_now(
+    packed, start, moving, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench
+):  # fmt: skip
+    """`_wanted_into` and `hand_wrench_into` in one call of compiled code."""
+    _wanted_into(packed, start, moving, memory, time, wanted, wanted_twist)
+    hand_wrench_into(impedance, wanted, wanted_twist, pose, twist, wrench)
+
+
+@njit(cache=True)
+def _look_feel_decide(
+    task, person, senses, hand_mass, arm, tip, time, hand_wrench, twist, slave_q, task_state,
+    memory, feelings, sights, touches,
+):  # fmt: skip
+    """One step of the operator's head, see `Operator`; compiled, checks nothing.
+
+    Args:
+        task, person: of `pack_task`, `pack_person`.
+        senses: (4,) of `Perception.parameters`.
+        hand_mass: [kg].
+        arm: the slave's table.
+        tip: (6,) the tool's tip in S, and where it starts in W [m].
+        time: now [s].
+        hand_wrench, twist: (6,) of the hand on the stylus and of the stylus, in B.
+        slave_q: (n,) [rad].
+        task_state, memory, feelings: states of `decide` and `perceive_into`, updated.
+        sights: (m, 3) what is seen and has not reached the mind yet, a ring; updated.
+        touches: (n, 5) likewise what is felt.
+    """
+    step = int(memory[0])
+    R_WS, p_WS, displacement = np.empty((3, 3)), np.empty(3), np.empty(3)
+    forward_kinematics(arm, slave_q, R_WS, p_WS)
+    for i in range(3):
+        displacement[i] = p_WS[i] - tip[3 + i]
+        for k in range(3):
+            displacement[i] += R_WS[i, k] * tip[k]
+    decision.look_into(person, step, displacement, sights[step % sights.shape[0]])
+    # Until contact is expected the operator learns what moving alone feels like.
+    attentive = task_state[decision.PHASE] > decision.MOVING
+    felt = touches[step % touches.shape[0]]
+    perceive_into(
+        feelings, senses, decision.PERIOD, hand_mass, hand_wrench[:3], twist[:3], attentive, felt
+    )
+    # The next to be written over is the oldest.
+    seen, felt = sights[(step + 1) % sights.shape[0]], touches[(step + 1) % touches.shape[0]]
+    decision.decide(task, person, time, seen, felt, task_state, memory)
+
+
+def _ring(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, k) what is on its way for `delay` [s]."""
+    return np.tile(start, (round(delay / decision.PERIOD) + 1, 1))
+
+
+class Operator(LeafSystem):
+    """Holds the stylus and moves it towards the intended pose; feels what pushes back.
+
+    .. pydrake_system::
+
+        name: Operator
+        input_ports:
+        - pose_master: (7,) X_BE
+        - twist_master: (6,) [v; omega] of E in B
+        - intended_pose: (7,) X_BE that the operator wants, in place of the config's intent; may be
+          left unconnected
+        - intended_twist: (6,) its twist [v; omega] of E in B; unconnected zero
+        - slave_state: [q; v] of the slave, for what is seen of the tool (with a task)
+        output_ports:
+        - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
+        - intent: (7,) the intended X_BE
+        - task_state: (5,) phase, 1 done or -1 given up, 1 while contact is noticed, threshold of
+          the felt force [N], trust (with a task)
+
+    Args:
+        config: grip, intent and task.
+        start: (7,) X_BE to which the intent is relative.
+        training: what a task needs to be known of the station.
+        arm: the slave's, likewise.
+        tip: (6,) the tool's tip in S and where it starts in W [m], likewise.
+
+    Raises:
+        DrakeTeleopError: from the simulation, if what is intended is not finite.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self,
+        config: OperatorConfig,
+        start: NDArray[np.float64],
+        training: Training | None = None,
+        arm: ArmModel | None = None,
+        tip: NDArray[np.float64] | None = None,
+    ) -> None:
+        super().__init__()
+        hand = config.hand
+        self._impedance = np.array(
+            [hand.stiffness, hand.damping, hand.rotational_stiffness, hand.rotational_damping]
+        )
+        # Segments, the pose that they are relative to, and how that moves.
+        self._intent = (pack_intent(config.intent), np.array(start, dtype=float), np.zeros(6))
+        self._wanted, self._wanted_twist, self._intended = np.empty(7), np.empty(6), np.empty(7)
+        self._no_memory, self._no_segments = np.empty(0), self._intent[0][:0]
+        self._has_task = config.task is not None
+        self._pose = self.DeclareVectorInputPort("pose_master", 7)
+        self._twist = self.DeclareVectorInputPort("twist_master", 6)
+        moving = self._declare_intention() | {self.time_ticket()}
+        if config.task is not None:
+            if training is None or arm is None or tip is None:
+                raise ValueError("a task needs training, arm and tip")
+            moving.add(self._declare_task(config, config.task, training, arm, tip))
+        calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
+        self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
+        self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
+
+    def _declare_intention(self) -> set[DependencyTicket]:
+        """Ports that the intention is taken from; what it depends on, besides time and task."""
+        pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
+        twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
+        return {pose.ticket(), twist.ticket()}
+
+    def _declare_task(
+        self,
+        config: OperatorConfig,
+        task: Task,
+        training: Training,
+        arm: ArmModel,
+        tip: NDArray[np.float64],
+    ) -> DependencyTicket:
+        """Ports, states and event of the head; what the plan depends on."""
+        senses = config.perception
+        nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
+        self._sights = _ring(senses.vision_delay + training.backward, np.zeros(3))
+        self._touches = _ring(senses.reaction_time, nothing_felt)
+        self._head = (
+            decision.pack_task(task),
+            decision.pack_person(training, senses, config.movement),
+            senses.parameters(decision.PERIOD),
+            config.hand.mass,
+            arm.table,
+            np.array(tip, dtype=float),
+        )
+        self._joints = arm.num_joints
+        self._slave = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
+        state = (
+            np.zeros(decision.STATE),
+            decision.initial_memory(),
+            feeling.initial_memory(),
+            self._sights.ravel(),
+            self._touches.ravel(),
+        )
+        self._groups = [self.DeclareDiscreteState(part) for part in state]
+        self.DeclareStateOutputPort("task_state", self._groups[0])
+        self.DeclarePeriodicDiscreteUpdateEvent(decision.PERIOD, 0.0, self._decide)
+        return self.discrete_state_ticket(self._groups[1])
+
+    def _decide(self, context: Context, discrete_state: DiscreteValues) -> None:
+        state = [discrete_state.get_mutable_value(group) for group in self._groups]
+        state[3] = state[3].reshape(self._sights.shape)
+        state[4] = state[4].reshape(self._touches.shape)
+        _look_feel_decide(
+            *self._head,
+            context.get_time(),
+            self._wrench.Eval(context),
+            self._twist.Eval(context),
+            self._slave.Eval(context)[: self._joints],
+            *state,
+        )
+
+    def _memory(self, context: Context) -> NDArray[np.float64]:
+        if not self._has_task:
+            return self._no_memory
+        return context.get_discrete_state(self._groups[1]).value()
+
+    def _intention(self, context: Context) -> tuple[NDArray[np.float64], ...]:
+        """What the plan is added to: segments, the pose they are relative to, its twist."""
+        if not self._intended_pose.HasValue(context):
+            return self._intent
+        pose = self._intended_pose.Eval(context)
+        known = self._intended_twist.HasValue(context)
+        twist = self._intended_twist.Eval(context) if known else self._intent[2]
+        if not unit_pose_into(pose, twist, self._intended):
+            raise DrakeTeleopError(
+                f"what the operator wants at {context.get_time():g} s is no finite pose or twist",
+                where="intended_pose",
+                remedy="give X_BE [qw qx qy qz px py pz] in m, and [v; omega] in m/s, rad/s",
+            )
+        return self._no_segments, self._intended, twist
+
+    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
+        _wrench_now(
+            *self._intention(context),
+            self._memory(context),
+            context.get_time(),
+            self._impedance,
+            self._wanted,
+            self._wanted_twist,
+            self._pose.Eval(context),
+            self._twist.Eval(context),
+            output.get_mutable_value(),
+        )
+
+    def _calc_intent(self, context: Context, output: BasicVector) -> None:
+        time, pose, memory = context.get_time(), output.get_mutable_value(), self._memory(context)
+        _wanted_into(*self._intention(context), memory, time, pose, self._wanted_twist)

@@ -1,0 +1,102 @@
+"""The operator's tasks: what is to be done, where, how long and how hard; and how the hand moves.
+
+`docs/operator.md` has every assumption and its source; `decision` goes about them.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import quantity
+
+
+@dataclass
+class _Task:
+    t_start: float = quantity(0.5, "s", 0.0, 1e6, "when it begins, from the simulation's start")
+    timeout: float = quantity(10.0, "s", 0.1, 3600.0, "after which the operator gives up")
+    translation: list[float] = quantity(
+        [0.0, 0.0, -0.1], "m", -2.0, 2.0, "from the tool at the start to the target, in W"
+    )
+
+    @property
+    def distance(self) -> float:
+        """From the tool at the start to the target [m]."""
+        return math.hypot(*self.translation)
+
+
+@settings
+@dataclass
+class Reach(_Task):
+    """Brings the tool's tip into a sphere in free space and keeps it there (Fitts)."""
+
+    width: float = quantity(0.01, "m", 5e-4, 0.5, "diameter of the target")
+    dwell: float = quantity(0.3, "s", 0.0, 10.0, "time in the target")
+
+
+@settings
+@dataclass
+class Touch(_Task):
+    """Approaches a surface at the target, notices contact, and stops."""
+
+    standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
+    dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest after the stop")
+
+
+@settings
+@dataclass
+class Press(_Task):
+    """Approaches a surface at the target and presses on it with a set force for a while."""
+
+    standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
+    force: float = quantity(8.0, "N", 0.1, 500.0, "to press with, tool on surface")
+    tolerance: float = quantity(2.0, "N", 0.05, 100.0, "of that force")
+    hold: float = quantity(1.0, "s", 0.0, 60.0, "how long")
+
+
+@settings
+@dataclass
+class Insert(_Task):
+    """Puts the tool down into a slot whose mouth is the target, and pushes it to the floor."""
+
+    timeout: float = quantity(20.0, "s", 0.1, 3600.0, "after which the operator gives up")
+    standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
+    depth: float = quantity(0.04, "m", 1e-3, 0.5, "of the slot")
+    push: float = quantity(10.0, "N", 0.1, 500.0, "force down, tool in slot")
+    dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest on the floor")
+
+
+Task: TypeAlias = Reach | Touch | Press | Insert
+REACH, TOUCH, PRESS, INSERT = range(4)
+KINDS = (Reach, Touch, Press, Insert)
+
+
+@settings
+@dataclass
+class Movement:
+    """How the operator moves; see docs/operator.md."""
+
+    acceleration: float = quantity(1.5, "m/s^2", 0.01, 50.0, "peak, of the hand in a submovement")
+    shortest: float = quantity(0.2, "s", 0.05, 2.0, "least duration of a submovement")
+    noise: float = quantity(0.05, "1", 0.0, 0.5, "standard deviation of its end over its length")
+    approach_speed: float = quantity(0.03, "m/s", 1e-3, 1.0, "careful, of the tool, at full trust")
+    gentle_force: float = quantity(
+        2.0, "N", 0.01, 100.0, "a contact that does no harm, at the tool"
+    )
+
+
+def check_task(task: Task, where: str) -> None:
+    """Checks what no range of one field can say.
+
+    Raises:
+        DrakeTeleopError: naming `where` and the field.
+    """
+    least = task.width / 2 if isinstance(task, Reach) else task.standoff
+    if task.distance <= least:
+        raise DrakeTeleopError(
+            f"the target is {task.distance:g} m away, not more than {least:g} m",
+            where=f"{where}.translation",
+            remedy="set the target farther from where the tool starts",
+        )

@@ -1,0 +1,109 @@
+"""Lawrence's four-channel architecture with local force feedback, tuned for transparency.
+
+Both ends send motion and force (Lawrence 1993; Hashtrudi-Zaad and Salcudean 2001):
+
+    (1 + C6) F_h = Z_cm V_m + C4 V_s + C2 F_e        Z_cs V_s = C1 V_m + C3 F_h - (1 + C5) F_e
+
+with C1 = C_s, C4 = -C_m, C2 = 1 + C6, C3 = 1 + C5: transparent without delay but for the masses,
+whose accelerations are not fed forward. The master's controller C_m is a spring and damper between
+hand and slave; the slave's is its servo, to which force comes as a shift of the command by F / K.
+C5 and C6 are local force feedback at slave and hand; C6 needs a sensor of the hand's force, and so
+does C3. There is no account of energy, and any delay makes it active; but C_m, which holds the hand
+to where the slave was, damps it, at the price of a drag in free motion.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import quantity
+from drake_teleop.common.vectors import put
+from drake_teleop.station.passivity.memory import (
+    COMMAND,
+    COMMAND_POSE,
+    COMMAND_TWIST,
+    DAMPING,
+    HELD,
+    STIFFNESS,
+    own_memory,
+    own_parameters,
+)
+from drake_teleop.station.passivity.packet import (
+    POSE,
+    VELOCITY,
+    WRENCH,
+    arrived,
+    difference_into,
+    fill,
+    limit,
+    moved_into,
+)
+
+# Parameters; those of two numbers are for translation and rotation.
+_places = own_parameters()
+_SPRING, _DAMPER = _places.vector(2), _places.vector(2)
+_SLAVE, _HAND = _places.number(), _places.number()
+# Memory.
+_DIFFERENCE = own_memory().vector(6)
+
+
+@settings
+@dataclass
+class FourChannelConfig:
+    """Parameters of the four-channel architecture."""
+
+    stiffness: list[float] = quantity(
+        [100.0, 1.0], "N/m, N m/rad", 0.0, 1e6, "of C_m, between the hand and the slave it hears of"
+    )
+    damping: list[float] = quantity([10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "of C_m")
+    slave_feedback: float = quantity(
+        0.0, "1", -1.0, 10.0, "C5: the slave's own contact force; 1 + C5 is C3, the hand's force"
+    )
+    hand_feedback: float = quantity(
+        0.0, "1", -1.0, 10.0, "C6: the hand's own force; 1 + C6 is C2, the contact force"
+    )
+
+    def pack_into(self, p: NDArray[np.float64]) -> None:
+        """Writes the values to where the steps read them."""
+        p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
+        p[_SLAVE], p[_HAND] = self.slave_feedback, self.hand_feedback
+
+
+@njit(cache=True)
+def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
+    """One step of the master's end; see `methods.master_step`. It sends the hand's wrench."""
+    difference = memory[_DIFFERENCE]
+    difference[:] = 0.0
+    behind = arrived(received)
+    if behind:
+        difference_into(received[POSE], pose, difference)
+    for i in range(6):
+        g = i // 3
+        wrench[i] = (1.0 + p[_HAND]) * received[WRENCH][i] + p[_HAND] * hand[i]
+        if behind:
+            wrench[i] += p[_SPRING][g] * difference[i]
+            wrench[i] += p[_DAMPER][g] * (received[VELOCITY][i] - twist[i])
+    for g in range(2):
+        limit(wrench, g, limits[g])
+    put(memory, HELD.start, wrench, 0, 6)
+    fill(pose, twist, hand, packet)
+
+
+@njit(cache=True)
+def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
+    """One step of the slave's end; see `methods.slave_step`."""
+    if arrived(received):
+        shift = memory[_DIFFERENCE]
+        for i in range(6):
+            g = i // 3
+            force = (1.0 + p[_SLAVE]) * received[WRENCH][i] + p[_SLAVE] * wrench[i]
+            shift[i] = (force + p[DAMPING][g] * received[VELOCITY][i]) / p[STIFFNESS][g]
+        moved_into(received[POSE], shift, memory[COMMAND_POSE])
+        put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
+    put(command, 0, memory, COMMAND.start, 13)
+    put(memory, HELD.start, wrench, 0, 6)
+    fill(pose, twist, wrench, packet)

@@ -1,0 +1,297 @@
+"""The methods by name, their parameters, and one step of either end of the channel.
+
+The two ports of the station's bilateral part are
+
+- the master's: the wrench that the hand shall feel, and the motion of the slave's command before
+  the channel (after kinematic scaling);
+- the slave's: the contact wrench, and the actual motion of the slave.
+
+Motion and wrenches are in world axes. Wrenches are in the *master's power units*: scaled so that
+wrench times motion of the slave's command is the work at the hand. The hand puts -f . dx into the
+channel, the environment f . dx; what comes out of a passive channel never exceeds what was put in.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from drake_teleop.common.compiled import address_of, call_at, njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import choice, quantity
+from drake_teleop.common.vectors import put
+from drake_teleop.station.passivity import none
+from drake_teleop.station.passivity.force_limit import ForceLimitConfig
+from drake_teleop.station.passivity.four_channel import FourChannelConfig
+from drake_teleop.station.passivity.ledger import LedgerConfig
+from drake_teleop.station.passivity.memory import (
+    COMMAND,
+    COMMAND_POSE,
+    COMMAND_TWIST,
+    DAMPING,
+    LIMIT,
+    MASS,
+    MEMORY,
+    MOTION_SCALE,
+    PACKET,
+    PARAMETERS,
+    RETREAT,
+    STEPS,
+    STIFFNESS,
+)
+from drake_teleop.station.passivity.packet import HEALTHY, PACKET_SIZE, POSE, SEQUENCE, finite
+from drake_teleop.station.passivity.pspm import PspmConfig
+from drake_teleop.station.passivity.retreat import retreat
+from drake_teleop.station.passivity.tdpa import TdpaConfig, charged
+from drake_teleop.station.passivity.two_layer import TwoLayerConfig
+from drake_teleop.station.passivity.wave import WaveConfig
+
+
+@settings
+@dataclass
+class Methods:
+    """The methods and the parameters of each: a line here enters one, by its field's name.
+
+    The file of a method is that of its parameters' class, which has `pack_into(p)`. It holds the
+    compiled `master_step` and `slave_step`, called with the arguments of those below but for the
+    first. It may hold `initialize(p, memory)`, which changes the memory of an end before its first
+    step; and the compiled `command_left(wanted, command, pose, twist, p, memory)`, which tells a
+    method how the safe state has changed what it `wanted` (7,). One whose account is of the slave's
+    motors, and not of its command, says `AT_THE_MOTOR = True`.
+    """
+
+    wave: WaveConfig = field(default_factory=WaveConfig)
+    tdpa: TdpaConfig = field(default_factory=TdpaConfig)
+    charged_tdpa: TdpaConfig = field(default_factory=charged)
+    two_layer: TwoLayerConfig = field(default_factory=TwoLayerConfig)
+    pspm: PspmConfig = field(default_factory=PspmConfig)
+    ledger: LedgerConfig = field(default_factory=LedgerConfig)
+    four_channel: FourChannelConfig = field(default_factory=FourChannelConfig)
+    local_force_limit: ForceLimitConfig = field(
+        default_factory=ForceLimitConfig, metadata={"method": "force_limit"}
+    )
+
+
+_FIELDS = {entry.metadata.get("method", entry.name): entry for entry in fields(Methods)}
+_FILES: dict[str, Any] = {"none": none} | {
+    name: import_module(entry.type.__module__) for name, entry in _FIELDS.items()
+}
+METHODS = tuple(_FILES)
+"""The names of all methods."""
+AT_THE_MOTOR = tuple(name for name, file in _FILES.items() if hasattr(file, "AT_THE_MOTOR"))
+"""Those that act at the port of the slave's motors."""
+
+
+_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
+
+
+@dataclass
+class _Common:
+    method: str = choice("none", METHODS, "what keeps the channel passive")
+    force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest force that the hand shall feel")
+    torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest torque that the hand shall feel")
+    retreat: list[float] = quantity(
+        [0.1, 1.0],
+        "m/s, rad/s",
+        1e-3,
+        1e3,
+        "of the hand along the wrench, where that begins to fade; at twice as much it is gone",
+    )
+    servo_stiffness: list[float] = quantity(
+        [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in the slave's units (E)"
+    )
+    servo_damping: list[float] = quantity(
+        [3.5e3, 117.0], "N s/m, N m s/rad", 0.0, 1e8, "D of the slave's servo, likewise (E)"
+    )
+    slave_mass: list[float] | None = quantity(
+        None,
+        "kg, kg m^2",
+        1e-6,
+        1e6,
+        "of arm and tool where they are pushed, likewise; null: 15.13, 0.5 (E), but with ledger"
+        " mass and servo of the station's arm at the start",
+    )
+
+
+@settings
+@dataclass
+class PassivityConfig(Methods, _Common):
+    """Which method keeps the station passive, and the parameters of each.
+
+    The servo is what the methods that act at the slave's motor port (`two_layer`, `pspm`, `ledger`)
+    and `four_channel` believe of it: it pulls the slave with K (x_command - x) - D v. The mass is
+    what `two_layer` and `ledger` believe.
+    """
+
+
+def parameters(
+    config: PassivityConfig,
+    power_scale: Sequence[float] = (1.0, 1.0),
+    motion_scale: Sequence[float] = (1.0, 1.0),
+) -> NDArray[np.float64]:
+    """The parameters of the chosen method as one vector for the compiled steps.
+
+    Args:
+        config: the method and its parameters.
+        power_scale: (2,) the master's power units over the slave's, for translation and rotation:
+            force scale over kinematic scale.
+        motion_scale: (2,) kinematic scale, slave over master, of translation and rotation: a wrench
+            at the hand over one in the master's power units.
+
+    Returns:
+        (PARAMETERS,) packed as `drake_teleop.station.passivity.memory` says.
+    """
+    p = np.zeros(PARAMETERS)
+    p[LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
+    p[STIFFNESS] = np.multiply(config.servo_stiffness, power_scale)
+    p[DAMPING] = np.multiply(config.servo_damping, power_scale)
+    p[MASS] = np.multiply(config.slave_mass or _SLAVE_MASS, power_scale)
+    p[MOTION_SCALE] = motion_scale
+    p[RETREAT] = np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
+    if config.method in _FIELDS:
+        getattr(config, _FIELDS[config.method].name).pack_into(p)
+    return p
+
+
+def initial_memory(
+    method: str, parameters: NDArray[np.float64], pose: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(MEMORY,) the memory of an end before its first step.
+
+    Args:
+        method: one of `METHODS`.
+        parameters: of `parameters`.
+        pose: (7,) X_WS where this end starts: the slave's command until a packet arrives.
+
+    Raises:
+        DrakeTeleopError: for a method that does not exist.
+    """
+    if method not in METHODS:
+        raise DrakeTeleopError(
+            f"there is no method '{method}'",
+            where="passivity.method",
+            remedy=f"choose one of {', '.join(METHODS)}",
+        )
+    memory = np.zeros(MEMORY)
+    memory[COMMAND_POSE] = pose
+    memory[PACKET][POSE] = pose
+    if hasattr(_FILES[method], "initialize"):
+        _FILES[method].initialize(parameters, memory)
+    return memory
+
+
+@njit(cache=True)
+def _as_wanted(wanted, command, pose, twist, p, memory):
+    """What a method does that need not know which command has left."""
+
+
+_ROW = types.Array(types.float64, 1, "C")
+_MASTER = (_ROW, types.boolean, *[_ROW] * 5, types.float64, *[_ROW] * 4)
+_SLAVE = (_ROW, types.boolean, *[_ROW] * 4, types.float64, *[_ROW] * 4)
+_LEFT = (_ROW,) * 6
+_master_step, _slave_step, _command_left = map(call_at, (_MASTER, _SLAVE, _LEFT))
+
+
+@cache
+def steps_of(method: str) -> tuple[int, int, int]:
+    """The addresses of a method's `master_step`, `slave_step` and `command_left`, compiled here.
+
+    By these a channel calls them. By name it would contain all methods, and take nine times as long
+    to compile.
+
+    Args:
+        method: one of `METHODS`.
+    """
+    file = _FILES[method]
+    return (
+        address_of(file.master_step, _MASTER),
+        address_of(file.slave_step, _SLAVE),
+        address_of(getattr(file, "command_left", _as_wanted), _LEFT),
+    )
+
+
+@njit(cache=True)
+def _finish(healthy, memory, packet):
+    """Numbers the packet; one of an end whose inputs are not finite repeats the last good one."""
+    if healthy:
+        packet[HEALTHY] = 1.0
+        put(memory, PACKET.start, packet, 0, PACKET_SIZE)
+    else:
+        put(packet, 0, memory, PACKET.start, PACKET_SIZE)
+        packet[HEALTHY] = 0.0
+    packet[SEQUENCE] = memory[STEPS]
+    memory[STEPS] += 1.0
+
+
+@njit(cache=True)
+def master_step(
+    steps, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
+):  # fmt: skip
+    """One step of the master's end, allocation-free: what the hand feels, and what is sent.
+
+    Args:
+        steps: of the method, `steps_of(method)`.
+        received: (PACKET_SIZE,) the newest packet of the slave; zeros before the first.
+        fresh: whether it is seen for the first time.
+        pose: (7,) X_WS of the command, after kinematic scaling, before the channel.
+        twist: (6,) its twist [v; omega], in W.
+        dx: (6,) its increment since the last step [dp; log(R_k R_(k-1)^T)], in W.
+        hand: (6,) wrench of the hand on the device, in W and master power units (0 if it is not
+            measured; `four_channel` alone uses it).
+        limits: (2,) that force and torque keep, in the master's power units [N, N m].
+        T: time between steps [s].
+        p: (PARAMETERS,) of `parameters`.
+        memory: (MEMORY,) of `initial_memory`, changed.
+        wrench: (6,) written: what the hand shall feel until the next step. Zero if an input is
+            not finite.
+        packet: (PACKET_SIZE,) written: what is sent.
+    """
+    packet[:] = 0.0  # a method writes only what it uses
+    healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(hand)
+    if not healthy:
+        wrench[:] = 0.0
+    else:
+        _master_step(
+            steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
+        )
+        retreat(twist, T, p, memory, wrench)
+    _finish(healthy, memory, packet)
+
+
+@njit(cache=True)
+def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
+    """One step of the slave's end, allocation-free: where the slave shall go, and what is sent.
+
+    Args:
+        steps, received, fresh, T, p, memory, packet: as for `master_step`; the newest packet is
+            the master's.
+        pose: (7,) X_WS of the slave, actual.
+        twist: (6,) its twist [v; omega], in W.
+        dx: (6,) its increment since the last step, in W.
+        wrench: (6,) contact wrench, scaled, in W and master power units.
+        command: (13,) written: pose (7,) and twist (6,) that the slave shall follow. The last one,
+            at rest, if an input is not finite.
+    """
+    packet[:] = 0.0  # a method writes only what it uses
+    healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(wrench)
+    if not healthy:
+        memory[COMMAND_TWIST] = 0.0
+        put(command, 0, memory, COMMAND.start, 13)
+    else:
+        _slave_step(
+            steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
+        )
+    _finish(healthy, memory, packet)
+
+
+@njit(cache=True)
+def command_left(steps, wanted, command, pose, twist, p, memory):
+    """Tells a method which command has left; see `Methods`."""
+    _command_left(steps[2], wanted, command, pose, twist, p, memory)

@@ -1,0 +1,34 @@
+"""No method: the wrench and the pose are passed on as they come.
+
+Energy is created in the channel as soon as there is delay or loss. It is the baseline.
+"""
+
+from __future__ import annotations
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.vectors import put
+from drake_teleop.station.passivity.memory import COMMAND, COMMAND_POSE, COMMAND_TWIST, HELD
+from drake_teleop.station.passivity.packet import POSE, VELOCITY, WRENCH, arrived, fill, limit
+
+
+@njit(cache=True)
+def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
+    """One step of the master's end; see `methods.master_step`."""
+    wanted = received[WRENCH]
+    for i in range(6):
+        wrench[i] = wanted[i]
+    for g in range(2):
+        limit(wrench, g, limits[g])
+    put(memory, HELD.start, wrench, 0, 6)
+    fill(pose, twist, wrench, packet)
+
+
+@njit(cache=True)
+def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
+    """One step of the slave's end; see `methods.slave_step`."""
+    if arrived(received):
+        put(memory, COMMAND_POSE.start, received, POSE.start, 7)
+        put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
+    put(command, 0, memory, COMMAND.start, 13)
+    put(memory, HELD.start, wrench, 0, 6)
+    fill(pose, twist, wrench, packet)

@@ -1,0 +1,384 @@
+"""A simulation as a film: `replay.html` of a run, and `drake-teleop replay` of any logged run.
+
+The slave at its bench, the haptic device on a table beside it, and forces as arrows. Blue at wrist
+and stylus: what the wrist sensor measures, which is what the hand would feel. Orange at the tool's
+tip and at the stylus: the calculated contact force. All are drawn in the size that they have at the
+slave, 3 mm a newton.
+
+`replay` finds the scenario of a log beside it: `scenario.yaml` beside `log.parquet`, which `run`
+writes, or the YAML file of the log's own name, as in the folder `logs` of `reproduce`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Container, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.geometry import Box, Meshcat, Rgba, SceneGraph
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.resources import models_dir
+from drake_teleop.common.style import BLUE, VERMILION, contact_spans
+from drake_teleop.common.writing import output_folder, write_json
+from drake_teleop.station.film import (
+    Arrow,
+    Canvas,
+    Film,
+    Reading,
+    Show,
+    add_shapes,
+    frame_times,
+    plain_room,
+)
+from drake_teleop.station.master.data_sheets import PHANTOM
+from drake_teleop.station.master.leader_model import Leader
+from drake_teleop.station.master.phantom import serial_joint_angles
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import LoadScenario, Scenario
+from drake_teleop.station.signals import POSE_OF
+from drake_teleop.station.slave.moving_pose import positions_of
+from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
+from drake_teleop.station.slave.skeleton import AddSkeleton
+from drake_teleop.station.slave.surroundings import AddEnvironment, MovingBodies, Touched
+
+Array = NDArray[np.float64]
+Signals = Mapping[str, Array]
+
+_TABLE_TOP = 0.60
+# Where the haptic device stands: origin of its base frame B in W [m].
+_P_WB = np.array([1.15, -0.10, _TABLE_TOP + 0.28])  # the device's foot is 0.28 m below B
+_CAMERA, _TARGET = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
+_WITHOUT_MASTER = np.array([-0.3, 0.0, 0.0])  # where both are then
+
+
+_FLOOR, _WOOD, _STEEL = Rgba(0.93, 0.94, 0.95), Rgba(0.78, 0.66, 0.50), Rgba(0.40, 0.43, 0.47)
+_GRIP_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
+_WRIST_S = np.array([0.0, 0.0, -0.085])  # of the arm
+# In arm and tool themselves an arrow would be hidden.
+_BESIDE_WRIST_W, _BESIDE_TIP_W = np.array([0.07, -0.09, 0.0]), np.array([-0.06, 0.0, 0.0])
+
+# Signals without which there is nothing to see, and those that are shown if they were recorded.
+_NEEDED = ("slave_state", "measured_wrench_S", "load_estimate")
+_SHOWN = ("master_state", "contact_wrench_S", "force_to_master", "sheet_state")
+
+
+def replay_command(
+    run: Path, out: Path, *, scenario: str | Path | None = None, quiet: bool = False
+) -> dict[str, Any]:
+    """Writes the films of logged runs and summary.json, which says where they are.
+
+    Args:
+        run: a folder that `run` or `reproduce` wrote, or a log in it.
+        out: the folder of the films: replay.html, or for several runs one by the name of each log.
+        scenario: of the log, a shipped one or a YAML file; by default what lies beside it.
+        quiet: prints nothing.
+
+    Returns:
+        The summary.
+
+    Raises:
+        DrakeTeleopError: if there is no log of a run, or not its scenario.
+    """
+    logs = _logs(run)
+    films = []
+    with output_folder(out):
+        for log in logs:
+            path = out / ("replay.html" if len(logs) == 1 else f"{log.stem}.html")
+            result = SimulationResult.scan_parquet(log)
+            write_replay(path, result, LoadScenario(scenario or _scenario_of(log)))
+            films.append({"log": str(log), "film": str(path), "duration_s": float(result.t[-1])})
+            if not quiet:
+                print(f"written {path} ({path.stat().st_size / 1e6:.1f} MB): open it in a browser")
+        summary = {"films": films}
+        write_json(out / "summary.json", summary)
+    return summary
+
+
+def write_replay(
+    path: Path, result: SimulationResult, scenario: Scenario, *, slow_motion: float | None = None
+) -> None:
+    """Writes the film of a run.
+
+    Args:
+        path: of the HTML file.
+        result: with slave_state, measured_wrench_S, load_estimate and, for all that there is to
+            see, master_state, contact_wrench_S, force_to_master and sheet_state.
+        scenario: that was run.
+        slow_motion: seconds of the film for one second of the run, to begin with; by default as
+            many as make it last 6 s.
+
+    Raises:
+        DrakeTeleopError: if signals are missing.
+    """
+    missing = [name for name in _NEEDED if name not in result]
+    if missing or not len(result.t):
+        raise DrakeTeleopError(
+            f"cannot be shown: it holds no {', '.join(missing) or 'samples'}",
+            where="replay",
+            remedy="give the log of a station with its own slave",
+        )
+    times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
+    rows = _nearest(result.t, times)
+    # Of a log on the disk each signal is read once, and no more of it is kept than is shown.
+    moving = [name for name in result.signals if name.startswith(POSE_OF)]
+    shown = [name for name in (*_NEEDED, *_SHOWN, *moving) if name in result]
+    signals = {name: result[name][rows] for name in shown}
+    contact = np.zeros(len(result.t), dtype=bool)
+    if "true_contact_wrench_W" in result:
+        contact = np.any(result["true_contact_wrench_W"] != 0, axis=1)
+    film = Film(
+        scenario.description or "A run of the station",
+        times,
+        slow_motion,
+        readings=_readings(signals),
+        shaded=contact_spans(result.t, contact),
+        notes=("Arrows: 3 mm a newton, as large as at the slave.",),
+        curves="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
+    )
+
+    def make_scene(meshcat: Meshcat) -> Show:
+        scene = ReplayScene(meshcat, scenario, signals)
+        return lambda film_time, frame: scene.show(film_time, signals, frame)
+
+    film.write(path, make_scene)
+
+
+def _nearest(t: Array, times: Array) -> NDArray[np.int64]:
+    """The rows of sorted (N,) `t` that are nearest to `times`."""
+    after = np.clip(np.searchsorted(t, times), 1, max(len(t) - 1, 1))
+    after = np.minimum(after, len(t) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(times - t[before] <= t[after] - times, before, after)
+
+
+def _readings(signals: Signals) -> list[Reading]:
+    measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
+    readings = [Reading("Measured at the wrist", "N", _norm(measured), BLUE, arrow=True)]
+    if "contact_wrench_S" in signals:
+        contact = _norm(signals["contact_wrench_S"][:, :3])
+        readings.append(Reading("Contact, calculated", "N", contact, VERMILION, arrow=True))
+    if "force_to_master" in signals:
+        readings.append(Reading("Shown to the hand", "N", _norm(signals["force_to_master"][:, :3])))
+    return readings
+
+
+def _norm(vectors: Array) -> Array:
+    return np.linalg.norm(vectors, axis=1)
+
+
+def _logs(run: Path) -> list[Path]:
+    """The logs with a scenario beside them in a folder, or the log itself."""
+    if not os.path.exists(run):
+        raise DrakeTeleopError("there is no such folder", where=str(run))
+    if run.suffix == ".parquet":
+        return [run]
+    if (run / "log.parquet").exists():
+        return [run / "log.parquet"]
+    logs = sorted(log for log in run.glob("logs/*.parquet") if log.with_suffix(".yaml").exists())
+    if not logs:
+        raise DrakeTeleopError(
+            "holds no log of a run",
+            where=str(run),
+            remedy="give a folder that drake-teleop run or reproduce wrote, or a log.parquet; a"
+            " study keeps measures, no logs: run one of its points as a scenario",
+        )
+    return logs
+
+
+def _scenario_of(log: Path) -> Path:
+    for path in (log.with_suffix(".yaml"), log.parent / "scenario.yaml"):
+        if path.exists():
+            return path
+    raise DrakeTeleopError(
+        "does not say of which scenario it is",
+        where=str(log),
+        remedy="give --scenario, a shipped one or a YAML file",
+    )
+
+
+class ReplayScene:
+    """Everything that is seen in a replay; shows one sample after the other.
+
+    Attributes:
+        plant: slave, what it touches and haptic device, for their shapes and kinematics only.
+        context: of the plant, in the posture that was shown last.
+        canvas: receives poses and sizes; Meshcat, unless it is replaced.
+    """
+
+    def __init__(self, meshcat: Meshcat, scenario: Scenario, recorded: Container[str]) -> None:
+        """What was not `recorded` is not shown."""
+        self.canvas: Canvas = meshcat
+        self.plant, self._shapes = MultibodyPlant(time_step=0.0), SceneGraph()
+        self.plant.RegisterAsSourceForSceneGraph(self._shapes)
+        self._parsed = ParseSlave(self.plant, scenario.slave)
+        self._slave, self._sensor = self._parsed.instance, self._parsed.sensor_frame
+        nominal = NominalSlave(scenario.slave)
+        self._joints, self._tip = nominal.arm.num_joints, nominal.tip
+        AddSkeleton(self.plant, self._sensor)
+        touched = Touched([], None)
+        if scenario.surroundings is not None:
+            touched = AddEnvironment(self.plant, scenario.surroundings)
+        self._sheet = touched.sheet
+        self._master = None
+        if "master_state" in recorded:
+            self._master = _add_master(self.plant, scenario)
+        finalize(self.plant)
+        self._moving = {POSE_OF + k: body for k, body in MovingBodies(self.plant, touched).items()}
+        self.context = self.plant.CreateDefaultContext()
+        self._bodies = dict(self._add_bodies(meshcat))
+        _furnish(meshcat, scenario, with_table=self._master is not None)
+        # The device's base stands along the world's axes here, whatever its alignment in the run.
+        alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
+        self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
+        kinds = (("measured", "wrist", BLUE), ("contact", "tip", VERMILION))
+        self._arrows = [
+            (force, place, Arrow(meshcat, f"{force}_at_{place}", colour))
+            for force, at_slave, colour in kinds
+            if f"{force}_wrench_S" in recorded
+            for place in ((at_slave,) if self._master is None else (at_slave, "stylus"))
+        ]
+
+    def _add_bodies(self, meshcat: Meshcat) -> Iterator[tuple[str, RigidBody]]:
+        """Adds the shapes of all bodies; yields path and body of each that moves."""
+        plant, inspector = self.plant, self._shapes.model_inspector()
+        for body in (plant.get_body(BodyIndex(k)) for k in range(plant.num_bodies())):
+            path = f"/station/{int(body.index())}_{body.name()}"
+            shapes = plant.GetVisualGeometriesForBody(body)
+            add_shapes(meshcat, path, inspector, shapes)
+            if shapes and plant.IsAnchored(body):
+                meshcat.SetTransform(path, plant.EvalBodyPoseInWorld(self.context, body))
+            elif shapes:
+                yield path, body
+
+    def show(self, film_time: float, signals: Mapping[str, Array], sample: int) -> None:
+        """Shows a sample (its index) of signals of a run, at a time of the recording [s]."""
+        plant, context = self.plant, self.context
+        plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
+        if self._master is not None:
+            state = signals["master_state"][sample]
+            q = self._master.positions(state[: len(state) // 2])
+            plant.SetPositions(context, self._master.instance, q)
+        if self._sheet is not None:
+            plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
+        for name, body in self._moving.items():
+            if name in signals:
+                self._move(body, signals[name][sample])
+        for path, body in self._bodies.items():
+            self.canvas.SetTransform(path, plant.EvalBodyPoseInWorld(context, body), film_time)
+        if not self._arrows:
+            return
+        forces, places = self._forces(signals, sample), self._places()
+        for force, place, arrow in self._arrows:
+            f_W = forces[force]
+            f_W = self._R_BW @ f_W if place == "stylus" else f_W
+            arrow.show(self.canvas, film_time, places[place], f_W)
+
+    def _move(self, index: BodyIndex, pose: Array) -> None:
+        """Puts a body of the surroundings where it was, after those that it hangs on."""
+        joints = map(self.plant.get_joint, self.plant.GetJointIndices())
+        (joint,) = (joint for joint in joints if joint.child_body().index() == index)
+        X_WBody = RigidTransform(Quaternion(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
+        X_WF = joint.frame_on_parent().CalcPoseInWorld(self.context)
+        X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
+        q, first = self.plant.GetPositions(self.context), joint.position_start()
+        moved = positions_of(joint, X_WF.inverse() @ X_WBody @ X_BM)
+        q[first : first + joint.num_positions()] = moved
+        self.plant.SetPositions(self.context, q)
+
+    def _forces(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
+        """In W. Eq. (1) is what the sensor exerts on the load; these are what the load exerts."""
+        R_WS = self._sensor.CalcPoseInWorld(self.context).rotation().matrix()
+        offset = signals["load_estimate"][sample, :3]
+        forces = {"measured": -R_WS @ (signals["measured_wrench_S"][sample, :3] - offset)}
+        if "contact_wrench_S" in signals:
+            forces["contact"] = -R_WS @ signals["contact_wrench_S"][sample, :3]
+        return forces
+
+    def _places(self) -> dict[str, Array]:
+        """Where arrows begin, in W."""
+
+        X_WS = self._sensor.CalcPoseInWorld(self.context)
+        places = {
+            "wrist": X_WS @ _WRIST_S + _BESIDE_WRIST_W,
+            "tip": X_WS @ self._tip + _BESIDE_TIP_W,
+        }
+        if self._master is not None:
+            places["stylus"] = self._master.hand.CalcPoseInWorld(self.context) @ self._master.grip
+        return places
+
+
+class _Device(NamedTuple):
+    """The haptic device in the plant.
+
+    Attributes:
+        instance: of its joints.
+        hand: its frame in the hand.
+        grip: (3,) where in that the hand is [m].
+        positions: of its joints in the plant, from those of its state.
+        folder: of converted meshes, to be kept as long as shapes are looked at.
+    """
+
+    instance: ModelInstanceIndex
+    hand: Frame
+    grip: Array
+    positions: Callable[[Array], Array]
+    folder: object = None
+
+
+def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _Device:
+    if scenario.master.leader is not None:
+        return _add_leader(plant, scenario.master.leader)
+    is_phantom = scenario.master.model == PHANTOM
+    name = "phantom" if is_phantom else "grip"
+    (master,) = Parser(plant, "master").AddModels(str(models_dir() / f"{name}.sdf"))
+    base = plant.GetFrameByName("base", master)
+    plant.WeldFrames(plant.world_frame(), base, RigidTransform(_P_WB))
+    positions = serial_joint_angles if is_phantom else np.copy
+    return _Device(master, plant.GetFrameByName("stylus", master), _GRIP_E, positions)
+
+
+def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
+    """The leader, whose base stands on the table here, wherever B is."""
+    order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
+    parsed = leader.parse(plant, RigidTransform([*_P_WB[:2], _TABLE_TOP]))
+
+    def positions(q: Array) -> Array:
+        ordered = np.empty(len(q))
+        ordered[order] = q
+        return ordered
+
+    return _Device(parsed.instance, parsed.sensor_frame, np.zeros(3), positions, parsed.folder)
+
+
+def _furnish(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
+    """Floor, the device's table, the plinth below what is touched, light and camera."""
+
+    def box(name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba):
+        meshcat.SetObject(f"/room/{name}", Box(*size), colour)
+        meshcat.SetTransform(f"/room/{name}", RigidTransform(np.array(centre)))
+
+    box("floor", (8.0, 8.0, 0.02), (0.6, 0.5, -0.011), _FLOOR)
+    if with_table:
+        x, y, _ = _P_WB
+        box("table", (0.50, 0.60, 0.03), (x - 0.09, y, _TABLE_TOP - 0.015), _WOOD)
+        height = _TABLE_TOP - 0.03
+        for i, (dx, dy) in enumerate(((-0.31, -0.27), (-0.31, 0.27), (0.13, -0.27), (0.13, 0.27))):
+            box(f"leg_{i}", (0.04, 0.04, height), (x + dx, y + dy, height / 2), _STEEL)
+    surroundings = scenario.surroundings
+    for k, part in enumerate(() if surroundings is None else surroundings.parts):
+        stand = part.stand
+        if stand is not None and stand.height > 0:
+            size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
+            box(f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL)
+    plain_room(meshcat)
+    aside = np.zeros(3) if with_table else _WITHOUT_MASTER
+    meshcat.SetCameraPose(_CAMERA + aside, _TARGET + aside)

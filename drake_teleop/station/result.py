@@ -1,0 +1,412 @@
+"""What a simulation gives back: named signals that know their units, plot and save themselves."""
+
+from __future__ import annotations
+
+import difflib
+import html
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drake_teleop.common.arrays import numbers
+from drake_teleop.common.errors import DrakeTeleopError, expect, install_extra, reading, refuse_fork
+from drake_teleop.common.writing import PARTS_OF_LOG, make_folder, part_of_log, write_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import polars as pl
+    from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike, NDArray
+
+_METADATA_KEY = "drake_teleop.station.signals"
+# A part of a log is named after the number of its first row.
+# More points than this on a line are drawn as the least and the largest of their neighbours.
+_DRAWN = 20_000
+# The canonical log (README, "Logs"): which signal fills which columns.
+_CANONICAL = {
+    "sample_time": ("t",),
+    "measured_wrench_S": ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"),
+    "specific_force_S": ("s_x", "s_y", "s_z"),
+    "angular_velocity_S": ("omega_x", "omega_y", "omega_z"),
+    "angular_acceleration_S": ("alpha_x", "alpha_y", "alpha_z"),
+}
+
+
+@dataclass(frozen=True)
+class Signal:
+    """What a signal is.
+
+    Args:
+        name: the port it comes from, in the paper's words ("measured_wrench_S").
+        components: the name of each of its k components ("f_x", ...).
+        units: the unit of each component; one string if all have the same ("1" for none).
+        description: one line for people.
+
+    Raises:
+        DrakeTeleopError: if there are not as many units as components.
+    """
+
+    name: str
+    components: tuple[str, ...]
+    units: str | tuple[str, ...]
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "components", tuple(self.components))
+        units = self.units
+        units = (units,) * len(self.components) if isinstance(units, str) else tuple(units)
+        object.__setattr__(self, "units", units)
+        for text in (self.name, self.description, *self.components, *units):
+            expect(str, text, "signal")
+        if len(units) != len(self.components):
+            raise DrakeTeleopError(
+                f"{len(self.components)} components, {len(units)} units", where=self.name
+            )
+
+    @property
+    def columns(self) -> list[str]:
+        """Its columns' names in a table: "measured_wrench_S.f_x" and so on."""
+        return [f"{self.name}.{component}" for component in self.components]
+
+
+class SimulationResult:
+    """Sampled signals of one simulation, on one time base.
+
+    ``result["measured_wrench_S"]`` is an (N, k) array; a column of the data frame, by its own name,
+    is an (N,) one: ``result["measured_wrench_S.f_x"]``, ``result["t"]``. ``len(result)`` and
+    iteration speak of the signals' names. Arrays are read-only.
+
+    Args:
+        t: (N,) sample times [s].
+        signals: the arrays by name, (N, k) or (N,) for one component.
+        specs: what each signal is; the result keeps their order.
+
+    Raises:
+        DrakeTeleopError: if names, lengths or numbers of components do not fit together.
+    """
+
+    def __init__(
+        self, t: ArrayLike, signals: Mapping[str, ArrayLike], specs: Sequence[Signal]
+    ) -> None:
+        self._t = _read_only(numbers("t", t))
+        self._specs = {spec.name: spec for spec in specs}
+        if self._specs.keys() != signals.keys():
+            odd = sorted(self._specs.keys() ^ signals.keys())
+            raise DrakeTeleopError(f"names and specs differ in {', '.join(odd)}", where="signals")
+        self._values: Mapping[str, NDArray[np.float64]]
+        if isinstance(signals, _SignalsOnDisk):
+            self._values = signals
+        else:
+            self._values = {name: self._checked(name, signals[name]) for name in self._specs}
+
+    def _checked(self, name: str, values: ArrayLike) -> NDArray[np.float64]:
+        array = numbers(name, values)
+        shape = (len(self._t), len(self._specs[name].components))
+        if array.ndim == 1:
+            array = array[:, np.newaxis]
+        if array.shape != shape:
+            raise DrakeTeleopError(f"has shape {array.shape}, expected {shape}", where=name)
+        return _read_only(array)
+
+    @property
+    def t(self) -> NDArray[np.float64]:
+        """(N,) sample times [s]."""
+        return self._t
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The signals' names."""
+        return tuple(self._specs)
+
+    @property
+    def specs(self) -> tuple[Signal, ...]:
+        """What each signal is, in the order of `signals`."""
+        return tuple(self._specs.values())
+
+    @property
+    def units(self) -> dict[str, dict[str, str]]:
+        """Per signal, the unit of each component: ``units["measured_wrench_S"]["f_x"] == "N"``."""
+        return {
+            spec.name: dict(zip(spec.components, spec.units, strict=True)) for spec in self.specs
+        }
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        if name == "t":
+            return self._t
+        if (found := self._column(name)) is not None:
+            return self._values[found[0]][:, found[1]]
+        try:
+            return self._values[name]
+        except KeyError:
+            names = self._ipython_key_completions_()
+            near = difflib.get_close_matches(str(name), names, n=3) or self.signals
+            raise KeyError(f"no signal {name!r}; there are {', '.join(near)}") from None
+
+    def _column(self, name: object) -> tuple[str, int] | None:
+        """Of a column of the data frame, its signal and the number of its component."""
+        signal = str(name).partition(".")[0]
+        if signal not in self._specs or name not in self._specs[signal].columns:
+            return None
+        return signal, self._specs[signal].columns.index(str(name))
+
+    def __contains__(self, name: object) -> bool:
+        return name == "t" or name in self._specs or self._column(name) is not None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._specs)
+
+    def __len__(self) -> int:
+        return len(self._specs)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        columns = (column for spec in self.specs for column in spec.columns)
+        return ["t", *self._specs, *columns]
+
+    def to_pandas(self) -> pd.DataFrame:
+        """`to_dataframe` as pandas has it, which comes with the extra `notebook`.
+
+        Raises:
+            DrakeTeleopError: if pandas is not installed.
+        """
+        try:
+            return self.to_dataframe().to_pandas()
+        except ModuleNotFoundError as error:
+            raise DrakeTeleopError(
+                f"{error.name or 'a library'} is not installed",
+                where="to_pandas",
+                remedy=install_extra("notebook"),
+            ) from None
+
+    def to_dataframe(self) -> pl.DataFrame:
+        """One row per sample: ``t``, then a column ``signal.component`` for every component."""
+        import polars as pl
+
+        columns = {"t": self._t}
+        for spec in self.specs:
+            columns |= dict(zip(spec.columns, self._values[spec.name].T, strict=True))
+        return pl.DataFrame(columns)
+
+    def sensor_log(self) -> pl.DataFrame:
+        """The wrist sensor's samples as a canonical log, for `identify` and `eliminate`.
+
+        Columns ``t``, ``f_x`` ... ``tau_z``, ``s_x`` ..., ``omega_x`` ..., ``alpha_x`` ... in S
+        and SI units, wrench with the sign of Eq. (1). ``t`` is when the sample was taken. A sample
+        that was recorded in several rows, by a log faster than the sensor, is one row.
+
+        Raises:
+            DrakeTeleopError: if the sensor's signals were not recorded.
+        """
+        import polars as pl
+
+        missing = [name for name in _CANONICAL if name not in self]
+        if missing:
+            raise DrakeTeleopError(
+                f"this result holds no {', '.join(missing)}",
+                where="sensor log",
+                remedy="record the wrist sensor's signals",
+            )
+        columns: dict[str, NDArray[np.float64]] = {}
+        for name, names in _CANONICAL.items():
+            columns |= dict(zip(names, self[name].T, strict=True))
+        return pl.DataFrame(columns).unique("t", keep="first", maintain_order=True)
+
+    def write_parquet(self, path: str | Path) -> None:
+        """Writes `to_dataframe` with names, units and descriptions in the file's metadata.
+
+        The same data give the same bytes.
+        """
+        self._write(Path(path))
+
+    def _write(self, path: Path, aside: Path | None = None) -> None:
+        specs = [asdict(spec) for spec in self.specs]
+        # Fixed row groups: polars' default may follow the number of threads.
+        metadata = {_METADATA_KEY: json.dumps(specs)}
+        table = self.to_dataframe()
+        write_table(path, table, aside=aside, metadata=metadata, row_group_size=2**16)
+
+    def write_part(self, folder: Path, first_row: int) -> None:
+        """Writes these rows of a longer log into its folder; `write_parquet` has the format.
+
+        The folder is one table for polars, DuckDB and others, whenever a process dies: a part is
+        complete or absent. The same rows written again replace themselves.
+
+        Args:
+            folder: that `remove_log` has seen.
+            first_row: number of the first of these rows in the whole log.
+        """
+        part = part_of_log(folder, first_row)
+        if len(self.t) or not part.exists():
+            make_folder(folder)
+            self._write(part, aside=folder)
+
+    @classmethod
+    def read_parquet(cls, path: str | Path) -> SimulationResult:
+        """Reads what `write_parquet` or `simulate` wrote.
+
+        Args:
+            path: a file, or a folder of parts.
+
+        Raises:
+            DrakeTeleopError: if it is something else, or absent.
+        """
+        on_disk = cls.scan_parquet(path)
+        return cls(on_disk.t, {name: on_disk[name] for name in on_disk}, on_disk.specs)
+
+    @classmethod
+    def scan_parquet(cls, path: str | Path) -> SimulationResult:
+        """Opens what `write_parquet` or `simulate` wrote, for logs that would fill the memory.
+
+        Only the times are read now. A signal is read each time it is asked for and not kept here.
+
+        Args:
+            path: a file, or a folder of parts.
+
+        Raises:
+            DrakeTeleopError: if it is something else, or absent.
+        """
+        import polars as pl
+
+        expect((str, Path), path, "result")
+        path = Path(path)
+        remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
+        with reading(path, remedy, "is not a simulation result"):
+            part = min(path.glob(PARTS_OF_LOG), default=path)
+            text = pl.read_parquet_metadata(part)[_METADATA_KEY]
+            specs = [Signal(**entry) for entry in json.loads(text)]
+            t = _columns_of_numbers(path, ["t"])[:, 0]
+        return cls(t, _SignalsOnDisk(path, specs), specs)
+
+    def plot(self, *names: str, contact: ArrayLike | None = None) -> Figure:
+        """Draws signals over time, one subplot for each signal and unit.
+
+        Args:
+            names: the signals, or columns such as "contact_wrench_S.f_z"; all signals if none is
+                named.
+            contact: (N,) booleans; the time in contact is shaded.
+
+        Raises:
+            KeyError: for an unknown name.
+        """
+        from drake_teleop.common.style import Picture, house_style, shade_contact
+
+        panels = [panel for name in names or self.signals for panel in self._panels(name)]
+        with house_style():
+            figure = Picture(figsize=(8.0, 0.6 + 1.9 * len(panels)))
+            rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+            for axes, (name, unit, indices) in zip(rows, panels, strict=True):
+                components, values = self._specs[name].components, self._values[name]
+                for index in indices:
+                    axes.plot(*_drawn(self._t, values[:, index]), label=components[index])
+                if contact is not None:
+                    shade_contact(axes, self._t, contact)
+                axes.set_title(name)
+                axes.set_ylabel(unit if unit != "1" else "")
+                axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+                axes.margins(x=0)
+            rows[-1].set_xlabel("t [s]")
+        return figure
+
+    def _panels(self, name: str) -> list[tuple[str, str, list[int]]]:
+        """The subplots of a signal: its components, neighbours of the same unit together."""
+        if (found := self._column(name)) is not None:
+            signal, index = found
+            return [(signal, self._specs[signal].units[index], [index])]
+        if name not in self._specs:
+            self[name]  # a KeyError with a suggestion
+        units = self._specs[name].units
+        groups = groupby(range(len(units)), key=lambda index: units[index])
+        return [(name, unit, list(indices)) for unit, indices in groups]
+
+    def _span(self) -> str:
+        if not len(self._t):
+            return "no samples"
+        return f"{len(self._t)} samples, {self._t[0]:g} to {self._t[-1]:g} s"
+
+    def __repr__(self) -> str:
+        width = max((len(name) for name in self.signals), default=0)
+        lines = [f"SimulationResult: {self._span()}"]
+        lines += [f"  {spec.name:{width}}  {_describe(spec)}" for spec in self.specs]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td style='text-align:left'><code>{html.escape(spec.name)}</code></td>"
+            f"<td style='text-align:left'>{html.escape(_components(spec))}</td>"
+            f"<td style='text-align:left'>{html.escape(spec.description)}</td></tr>"
+            for spec in self.specs
+        )
+        head = "".join(
+            f"<th style='text-align:left'>{title}</th>"
+            for title in ("signal", "components [unit]", "what it is")
+        )
+        return (
+            f"<b>SimulationResult</b>: {self._span()}"
+            f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+        )
+
+
+class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
+    """Arrays by the signal's name, read when they are asked for."""
+
+    def __init__(self, path: Path, specs: Sequence[Signal]) -> None:
+        self._path, self._columns = path, {spec.name: spec.columns for spec in specs}
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        columns = self._columns[name]
+        with reading(self._path, "write it again"):
+            return _read_only(_columns_of_numbers(self._path, columns))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._columns
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+
+def _drawn(
+    t: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A line of N points, or of about _DRAWN that look the same: no peak is lost."""
+    length = 2 * len(t) // _DRAWN
+    if length < 2:
+        return t, values
+    starts = np.arange(0, len(t), length)
+    extremes = [ufunc.reduceat(values, starts) for ufunc in (np.minimum, np.maximum)]
+    return np.repeat(t[starts], 2), np.ravel(extremes, order="F")
+
+
+def _components(spec: Signal) -> str:
+    """ "f_x, f_y, f_z [N], tau_x [N m]": neighbours of the same unit share it."""
+    pairs = zip(spec.components, spec.units, strict=True)
+    groups = groupby(pairs, key=lambda pair: pair[1])
+    return ", ".join(f"{', '.join(c for c, _ in pairs)} [{unit}]" for unit, pairs in groups)
+
+
+def _describe(spec: Signal) -> str:
+    text = _components(spec)
+    return f"{text}  {spec.description}" if spec.description else text
+
+
+def _columns_of_numbers(path: Path, columns: list[str]) -> NDArray[np.float64]:
+    """(N, k) the columns of a Parquet file; whatever goes wrong is for `reading`."""
+    import polars as pl
+
+    refuse_fork()
+    table = pl.read_parquet(sorted(path.glob(PARTS_OF_LOG)) or path, columns=columns)
+    if not all(dtype.is_numeric() for dtype in table.dtypes):
+        raise ValueError(f"{', '.join(columns)} hold no numbers")
+    return table.to_numpy()
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    view = array.view()
+    view.flags.writeable = False
+    return view

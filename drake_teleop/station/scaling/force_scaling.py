@@ -1,0 +1,301 @@
+"""The paper's 'Force scaling/elimination' block (Figs. 2 and 4)."""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fault import Fault, sound
+from drake_teleop.common.fields import settings
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.quantities import quantity
+from drake_teleop.load.compensation import scaled_wrench_into, scales_from_eta
+from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.load.sample import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    BEFORE_JOINTS,
+    LOST,
+    MOTION,
+    SATURATED,
+    SPECIFIC_FORCE,
+    TIME,
+    WRENCH,
+    sample_size,
+)
+from drake_teleop.station.scaling.wrench_mapping import wrench_to_master_into
+from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
+
+#: sigma_gripper, sigma_object, gamma that leave the contact wrench alone, Eq. (13).
+_ELIMINATION = np.array([0.0, 0.0, 1.0])
+
+#: A sample that is older is none [s]; so is one that is younger than now by as much.
+OLDEST = 0.05
+_NONE, _STALE, _READING, _JOINTS, _LOAD = map(
+    int, (Fault.NONE, Fault.STALE, Fault.READING, Fault.JOINTS, Fault.LOAD)
+)
+
+
+@settings
+@dataclass
+class ForceScalingConfig:
+    """sigma, gamma, eta of the paper and the scale from slave to master."""
+
+    sigma: float = quantity(1.0, "1", 0.0, 100.0, "share of the non-contact wrench that is kept")
+    gamma: float = quantity(1.0, "1", 0.0, 100.0, "scale of the contact wrench")
+    eta: float | None = quantity(
+        None, "1", 0.0, 1.0, "Eq. (14): share of the object kept; needs sigma = 0 and gamma = 1"
+    )
+    gripper_phi: list[float] | None = quantity(
+        None, "kg, kg m, kg m^2", -1e3, 1e3, "phi of the gripper alone; null: all is gripper"
+    )
+    force_scale: float = quantity(
+        1 / 17.5, "1", 0.0, 100.0, "force and torque, slave to master (VI-B)"
+    )
+
+    def scales(self, where: str = "force_scaling") -> tuple[float, float, float]:
+        """(sigma_gripper, sigma_object, gamma); `where` is the place for the message.
+
+        Raises:
+            DrakeTeleopError: if eta is given and sigma is not 0 or gamma is not 1 (section V).
+        """
+        if self.eta is None:
+            return self.sigma, self.sigma, self.gamma
+        if self.sigma != 0 or self.gamma != 1 or self.gripper_phi is None:
+            raise DrakeTeleopError(
+                "eta works on the object alone",
+                where=f"{where}.eta",
+                remedy="set sigma: 0, gamma: 1 and gripper_phi (section V of the paper)",
+            )
+        return scales_from_eta(self.eta)
+
+
+@njit(cache=True)
+def scales_at(change, time, scales):
+    """Writes the four scales at `time` into `scales`: a minimum-jerk blend from old to new.
+
+    Args:
+        change: (10,) old scales (4), new scales (4), start of the change [s], its length [s].
+        time: now [s].
+        scales: (4,) written: sigma_gripper, sigma_object, gamma, force scale.
+    """
+    u = min(max((time - change[8]) / change[9], 0.0), 1.0) if change[9] > 0.0 else 1.0
+    share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
+    for i in range(4):
+        # Exact at both ends: the scales of a station that never changes them are as configured.
+        scales[i] = (1.0 - share) * change[i] + share * change[4 + i]
+
+
+@njit(cache=True)
+def _scaled_into(sample, estimate, gripper, scales, out):
+    """F' of one sample; what of the load is not gripper is object. Both (16,) as the estimate."""
+    phi_gripper, phi_object = gripper[6:], np.empty(10)
+    for i in range(10):
+        phi_object[i] = estimate[6 + i] - phi_gripper[i]
+    scaled_wrench_into(
+        sample[WRENCH], estimate[:6],
+        sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION],
+        phi_gripper, phi_object, scales[0], scales[1], scales[2], out,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def fault_of(sample, estimate, time, believed):
+    """What is wrong with the numbers that a wrench is to be made of, as a plain `Fault`.
+
+    Args:
+        sample: of the wrist sensor, see `drake_teleop.load.sample`.
+        estimate: (16,) [offsets; phi].
+        time: now [s].
+        believed: (7,) the largest wrench that is a reading [N, N m], the largest age [s].
+    """
+    if not abs(time - sample[TIME]) <= believed[6]:
+        return _STALE
+    reading = sample[SATURATED] < LOST and sound(sample[MOTION])
+    for i in range(6):
+        reading = reading and abs(sample[i]) <= believed[i]
+    if not reading:
+        return _READING
+    if not sound(sample[BEFORE_JOINTS:TIME]):
+        return _JOINTS
+    return _NONE if sound(estimate) else _LOAD
+
+
+@njit(cache=True)
+def _scaled_now_into(sample, estimate, gripper, change, time, out):
+    """F' of one sample with the scales of this time, see `scales_at`."""
+    scales = np.empty(4)
+    scales_at(change, time, scales)
+    _scaled_into(sample, estimate, gripper, scales, out)
+
+
+@njit(cache=True, borrows=True)
+def _all_into(sample, estimate, gripper, change, time, elimination, believed, out):
+    """F' with the scales of this time, the contact wrench, and the fault."""
+    _scaled_now_into(sample, estimate, gripper, change, time, out[:6])
+    _scaled_into(sample, estimate, gripper, elimination, out[6:12])
+    out[12] = fault_of(sample, estimate, time, believed)
+
+
+@njit(cache=True)
+def _felt_into(sample, estimate, gripper, change, time, arm, R_WB, believed, contact, out):
+    """What the hand shall feel of F'; the orientation of S comes from the same sample.
+
+    `contact` is 1, or 0 for what the load alone has in it.
+    """
+    if fault_of(sample, estimate, time, believed) != _NONE:
+        out[:] = np.nan
+        return
+    scales, scaled_S, R_WS, p_WS = np.empty(4), np.empty(6), np.empty((3, 3)), np.empty(3)
+    scales_at(change, time, scales)
+    scales[2] *= contact
+    _scaled_into(sample, estimate, gripper, scales, scaled_S)
+    forward_kinematics(arm, sample[BEFORE_JOINTS:TIME], R_WS, p_WS)
+    wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
+
+
+class ForceScaling(LeafSystem):
+    """Removes or scales the non-contact wrench, then scales the rest down and turns it to the hand.
+
+    F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj). The scales are a numeric parameter of
+    the context, so that they may be changed while a simulation runs (`SetScales`), and without a
+    step of the force.
+
+    .. pydrake_system::
+
+        name: ForceScaling
+        input_ports:
+        - sample: the wrist sensor's, see `drake_teleop.load.sample`
+        - load_estimate: (16,) Eq. (7), [offsets; phi]
+        output_ports:
+        - scaled_wrench_S: F' of Fig. 2
+        - contact_wrench_S: Eq. (13)
+        - fault: what is wrong with sample or estimate, a `Fault`
+        - scaled_contact_and_fault: the last three, one after the other, for a log
+        - non_contact_wrench_S: Eq. (12)
+        - wrench_B: F_E_B, what the hand shall feel: -force_scale F', in the master's base B; not a
+          number while there is a fault
+        - load_wrench_B: what of that is weight and inertia of the load, zero for sigma = 0
+
+    Args:
+        config: the scales.
+        arm: the slave's kinematics.
+        R_WB: (3, 3) alignment of the master's base with the world.
+        largest_wrench: (6,) beyond which a reading is none [N, N m]; None for no end.
+        oldest: a sample that is older is none [s].
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self,
+        config: ForceScalingConfig,
+        arm: ArmModel,
+        R_WB: NDArray[np.float64],
+        largest_wrench: NDArray[np.float64] | None = None,
+        oldest: float = OLDEST,
+    ) -> None:
+        super().__init__()
+        largest = np.full(6, np.inf) if largest_wrench is None else largest_wrench
+        self._believed = np.append(largest, oldest)
+        self._gripper: NDArray[np.float64] | None = None
+        if config.gripper_phi is not None:
+            self._gripper = np.concatenate([np.zeros(6), config.gripper_phi])
+        self._arm, self._R_WB = arm.table, np.ascontiguousarray(R_WB)
+        # Old and new scales, start and length of the change; see `scales_at`.
+        scales = [*config.scales(), config.force_scale]
+        self._change = self.DeclareNumericParameter(BasicVector([*scales, *scales, 0.0, 0.0]))
+        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
+        self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
+        # Not time: a change of scales goes on with each new sample, which is soon enough.
+        inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
+        for name, calc in (
+            ("scaled_wrench_S", self._calc_scaled),
+            ("contact_wrench_S", self._calc_contact),
+            ("non_contact_wrench_S", self._calc_non_contact),
+            ("wrench_B", self._calc_wrench_B),
+            ("load_wrench_B", self._calc_load_wrench_B),
+        ):
+            self.DeclareVectorOutputPort(name, 6, weak_callback(calc), inputs)
+        self.DeclareVectorOutputPort("fault", 1, weak_callback(self._calc_fault), inputs)
+        self.DeclareVectorOutputPort(
+            "scaled_contact_and_fault", 13, weak_callback(self._calc_all), inputs
+        )
+
+    def SetScales(
+        self,
+        context: Context,
+        *,
+        sigma_gripper: float,
+        sigma_object: float,
+        gamma: float,
+        force_scale: float,
+        duration: float = 0.25,
+    ) -> None:
+        """Changes the scales in a running simulation, from now on, within `duration` [s].
+
+        The scales go over on a minimum-jerk ramp (the force takes no step), from where they are if
+        an earlier change is not over yet.
+
+        Raises:
+            DrakeTeleopError: for a scale or duration that is negative or not finite.
+        """
+        wanted = np.array([sigma_gripper, sigma_object, gamma, force_scale, duration], dtype=float)
+        if not (wanted >= 0.0).all() or not np.isfinite(wanted).all():
+            raise DrakeTeleopError(
+                "scales and duration are not finite or negative", where="SetScales"
+            )
+        parameter = context.get_mutable_numeric_parameter(self._change)
+        now, start = np.empty(4), context.get_time()
+        scales_at(parameter.value(), start, now)
+        parameter.SetFromVector(np.concatenate([now, wanted[:4], [start, wanted[4]]]))
+
+    def _calc_scaled(self, context: Context, output: BasicVector) -> None:
+        _scaled_now_into(*self._inputs(context), output.get_mutable_value())
+
+    def _calc_all(self, context: Context, output: BasicVector) -> None:
+        inputs = self._inputs(context)
+        _all_into(*inputs, _ELIMINATION, self._believed, output.get_mutable_value())
+
+    def _calc_fault(self, context: Context, output: BasicVector) -> None:
+        sample, estimate, _, _, time = self._inputs(context)
+        output[0] = fault_of(sample, estimate, time, self._believed)
+
+    def _calc_contact(self, context: Context, output: BasicVector) -> None:
+        _scaled_into(*self._inputs(context)[:3], _ELIMINATION, output.get_mutable_value())
+
+    def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
+        sample, phi = self._sample.Eval(context), self._estimate.Eval(context)[6:]
+        non_contact_wrench_into(
+            sample[SPECIFIC_FORCE],
+            sample[ANGULAR_VELOCITY],
+            sample[ANGULAR_ACCELERATION],
+            phi,
+            output.get_mutable_value(),
+        )
+
+    def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
+        self._calc_felt(context, 1.0, output)
+
+    def _calc_load_wrench_B(self, context: Context, output: BasicVector) -> None:
+        self._calc_felt(context, 0.0, output)
+
+    def _calc_felt(self, context: Context, contact: float, output: BasicVector) -> None:
+        constants = self._arm, self._R_WB, self._believed, contact
+        _felt_into(*self._inputs(context), *constants, output.get_mutable_value())
+
+    def _inputs(self, context: Context) -> tuple[Any, ...]:
+        """The sample, the estimate, the gripper's part of it, and of the scales: change, time."""
+        estimate = self._estimate.Eval(context)
+        return (
+            self._sample.Eval(context),
+            estimate,
+            estimate if self._gripper is None else self._gripper,
+            context.get_numeric_parameter(self._change).value(),
+            context.get_time(),
+        )

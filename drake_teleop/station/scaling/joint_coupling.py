@@ -1,0 +1,86 @@
+"""A leader arm that leads joint by joint, instead of by the pose of the hand.
+
+    q_slave = q_start + (q_leader - q_home)
+
+Both arms have the same joints, in the same order, and may be of different sizes. What the hand
+feels is the wrench as ever, through the leader's own Jacobian.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.station.slave.arm import ArmModel
+from drake_teleop.station.slave.forward_kinematics import pose_into
+
+Array = NDArray[np.float64]
+
+
+class JointCoupling(LeafSystem):
+    """Where the slave's joints shall be, through a clutch.
+
+    While the clutch is open they stay where they are; when it closes, the slave goes back to the
+    posture of its leader, as fast as it may.
+
+    .. pydrake_system::
+
+        name: JointCoupling
+        input_ports:
+        - master_state: (2 n,) [q; dq/dt] of the leader [rad, rad/s]
+        - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
+        output_ports:
+        - leader_joints: (n,) of the slave [rad]
+        - pose_command: (7,) X_WS that they are
+
+    Args:
+        slave: the slave's arm.
+        start: (n,) its joints when the leader is at home [rad].
+        home: (n,) of the leader [rad].
+        period: how often the clutch is looked at [s].
+
+    Raises:
+        DrakeTeleopError: if the arms have different joints.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, slave: ArmModel, start: Array, home: Array, period: float) -> None:
+        super().__init__()
+        if len(home) != len(start):
+            raise DrakeTeleopError(
+                f"the leader has {len(home)} joints, the slave {len(start)}",
+                where="master.leader.leads",
+                remedy="lead by the pose, or give arms of the same kinematics",
+            )
+        self._table, self._offset, n = slave.table, np.array(start) - home, len(start)
+        self._state = self.DeclareVectorInputPort("master_state", 2 * n)
+        self._clutch = self.DeclareVectorInputPort("clutch", 1)
+        self.DeclareDiscreteState(np.append(start, 0.0))  # where they stay; if the clutch is closed
+        sources = {self._state.ticket(), self.xd_ticket()}
+        for name, size, calc in (
+            ("leader_joints", n, self._calc_joints),
+            ("pose_command", 7, self._calc_pose),
+        ):
+            self.DeclareVectorOutputPort(name, size, weak_callback(calc), sources)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclareInitializationDiscreteUpdateEvent(self._update)
+
+    def _joints(self, context: Context) -> Array:
+        memory, n = context.get_discrete_state(0).value(), len(self._offset)
+        joints: Array = memory[:n]
+        return self._state.Eval(context)[:n] + self._offset if memory[n] > 0.5 else joints
+
+    def _calc_joints(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._joints(context))
+
+    def _calc_pose(self, context: Context, output: BasicVector) -> None:
+        pose_into(self._table, np.array(self._joints(context)), output.get_mutable_value())
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        memory = discrete_state.get_mutable_value(0)
+        memory[:-1] = self._joints(context)
+        memory[-1] = not self._clutch.HasValue(context) or self._clutch.Eval(context)[0] > 0.5

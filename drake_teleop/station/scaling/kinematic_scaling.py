@@ -1,0 +1,151 @@
+"""The paper's 'kinematic scaling' block (Fig. 4): the master's motion becomes the slave's command.
+
+Translations are scaled, orientations by quaternions: since the clutch was closed the master has
+turned about one axis by one angle, and the slave turns about the same axis by the scaled angle.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RollPitchYaw
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.fields import settings
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.quantities import quantity
+from drake_teleop.common.quaternions import (
+    conjugate,
+    exponential,
+    logarithm,
+    multiply,
+    normalized,
+    rotate,
+)
+from drake_teleop.common.vectors import put
+
+
+@settings
+@dataclass
+class KinematicScalingConfig:
+    """How the master's motion is scaled, and how the master's base lies in the world."""
+
+    translation_scale: float = quantity(1.0, "1", 0.0, 100.0, "slave over master translation")
+    rotation_scale: float = quantity(1.0, "1", 0.0, 10.0, "slave over master angle")
+    alignment: list[float] = quantity(
+        [0.0, 0.0, 0.0], "rad", -7.0, 7.0, "R_WB as roll, pitch, yaw (Drake's RollPitchYaw)"
+    )
+
+
+@njit(cache=True)
+def scaled_rotation(rotation, scale):
+    """The quaternion of the same axis and `scale` times the angle (the shorter way round).
+
+    With a scale that is not a whole number the result jumps where the angle passes 180 degrees.
+    """
+    v = logarithm(rotation)
+    return exponential((scale * v[0], scale * v[1], scale * v[2]))
+
+
+@njit(cache=True)
+def scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out):
+    """Writes the commanded X_WS (7,) into `out`.
+
+        p_WS = p_command + translation_scale R_WB (p_BE - p_master)
+        R_WS = R_WB (R_BE R_master^T)^rotation_scale R_WB^T R_command
+
+    Args:
+        pose: (7,) X_BE now.
+        master: (7,) X_BE when the clutch was closed.
+        command: (7,) X_WS when the clutch was closed.
+        alignment: (4,) quaternion of R_WB.
+        out: (7,) written; the quaternion has norm 1. It may be `command` itself.
+    """
+    R_WB = (alignment[0], alignment[1], alignment[2], alignment[3])
+    offset = rotate(R_WB, (pose[4] - master[4], pose[5] - master[5], pose[6] - master[6]))
+    now = (pose[0], pose[1], pose[2], pose[3])
+    reference = (master[0], master[1], master[2], master[3])
+    turn_B = scaled_rotation(multiply(now, conjugate(reference)), rotation_scale)
+    turn_W = multiply(multiply(R_WB, turn_B), conjugate(R_WB))
+    orientation = normalized(multiply(turn_W, (command[0], command[1], command[2], command[3])))
+    for k in range(4):
+        out[k] = orientation[k]
+    for k in range(3):
+        out[4 + k] = command[4 + k] + translation_scale * offset[k]
+
+
+@njit(cache=True, borrows=True)
+def _command_into(pose, references, alignment, translation_scale, rotation_scale, out):
+    """The commanded X_WS (7,), see the state of `KinematicScaling`."""
+    if references[14] > 0.5:
+        command, master = references[:7], references[7:14]
+        scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)
+    else:
+        put(out, 0, references, 0, 7)
+
+
+class KinematicScaling(LeafSystem):
+    """Scales the master's motion into the slave's commanded pose, through a clutch.
+
+    While the clutch is open the command stays where it is; when it closes, motion goes on from
+    there with the master's pose of that instant as its new reference (re-indexing). Neither makes
+    a jump. A clutch that is engaged at the start is closed before the first sample. It neither
+    opens nor closes while the master's pose is no pose.
+
+    .. pydrake_system::
+
+        name: KinematicScaling
+        input_ports:
+        - pose_master: (7,) X_BE
+        - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
+        output_ports:
+        - pose_command: (7,) X_WS
+
+    Args:
+        config: scales and alignment.
+        period: how often the clutch is looked at [s].
+        start: (7,) X_WS commanded at the start.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self, config: KinematicScalingConfig, period: float, start: NDArray[np.float64]
+    ) -> None:
+        super().__init__()
+        R_WB = RollPitchYaw(config.alignment).ToQuaternion().wxyz()
+        self._scaling = (R_WB, float(config.translation_scale), float(config.rotation_scale))
+        self._pose = self.DeclareVectorInputPort("pose_master", 7)
+        self._clutch = self.DeclareVectorInputPort("clutch", 1)
+        # X_WS and X_BE at the last change of the clutch, and whether it is closed.
+        identity = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        self.DeclareDiscreteState(np.concatenate([start, identity, [0.0]]))
+        sources = {self._pose.ticket(), self.xd_ticket()}
+        self.DeclareVectorOutputPort("pose_command", 7, weak_callback(self._calc_command), sources)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        # The command follows from the first instant on.
+        self.DeclareInitializationDiscreteUpdateEvent(self._update)
+
+    def Open(self, context: Context, command: NDArray[np.float64]) -> None:
+        """Opens the clutch with the slave's command (7,) at `command`, X_WS."""
+        references = context.get_discrete_state(0).CopyToVector()
+        references[:7], references[14] = command, 0.0
+        context.SetDiscreteState(0, references)
+
+    def _calc_command(self, context: Context, output: BasicVector) -> None:
+        pose, references = self._pose.Eval(context), context.get_discrete_state(0).value()
+        _command_into(pose, references, *self._scaling, output.get_mutable_value())
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        references = discrete_state.get_mutable_value(0)
+        engage = not self._clutch.HasValue(context) or self._clutch.Eval(context)[0] > 0.5
+        if engage == (references[14] > 0.5):
+            return
+        pose = self._pose.Eval(context)
+        if not np.isfinite(pose).all():  # it would be the reference for good
+            return
+        _command_into(pose, references, *self._scaling, references[:7])
+        references[7:14] = pose
+        references[14] = float(engage)

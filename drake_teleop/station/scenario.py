@@ -1,0 +1,334 @@
+"""Scenarios: what a station is made of and what happens in it, as dataclasses from YAML.
+
+Every field has a unit and a plausible range; a file that cannot be right is refused with one
+message that names file and field. Times are in s, rates in Hz, lengths in m.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import dataclasses
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from pydrake.common.yaml import yaml_dump, yaml_load_typed
+
+from drake_teleop.common.errors import DrakeTeleopError, expect, meant
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import (
+    check_name,
+    check_ranges,
+    check_structure,
+    choice,
+    plain,
+    quantity,
+)
+from drake_teleop.common.resources import scenarios_dir
+from drake_teleop.common.texts import read_yaml
+from drake_teleop.station.channel.channel import LONGEST_TIMEOUT, Channel
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.environment.block import Block
+from drake_teleop.station.environment.box import Box
+from drake_teleop.station.environment.environment import Environment, Several
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.environment.slot import Slot
+from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
+from drake_teleop.station.master.data_sheets import Master, figures_of
+from drake_teleop.station.operator.operator import OperatorConfig
+from drake_teleop.station.operator.task import check_task
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
+from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
+from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
+from drake_teleop.station.sensor.presets import preset_of
+from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
+from drake_teleop.station.slave.joint_control import JointControlConfig, interface_of
+from drake_teleop.station.slave.scene import Scene
+from drake_teleop.station.slave.slave_config import Slave
+
+#: All kinds of things that `environment` may list.
+Thing: TypeAlias = (
+    Wall
+    | Box
+    | Block
+    | SheetSpring
+    | Slot
+    | Scene
+)  # fmt: skip
+#: What fixed steps need in contact [s]: ball on leaf vibrate at up to 700 Hz.
+_CONTACT_STEP = 1.25e-4
+
+
+@settings
+@dataclass
+class Rates:
+    """Sampling rates. The paper: sensor 8 kHz, hand above 2 kHz, joint control 10 kHz."""
+
+    sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
+    hand_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "haptic device and channel")
+    joint_control_hz: float = quantity(
+        2000.0, "Hz", 10.0, 1e5, "slave's joint control; what is beyond 2 kHz samples inside steps"
+    )
+    estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "load estimator, detection of contact")
+    log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "log")
+
+
+@settings
+@dataclass
+class Simulation:
+    """How long, and with which integrator.
+
+    The log begins after the settling time, with t = 0; the operator's intent counts its times from
+    the start of the simulation, `settle` earlier.
+    """
+
+    duration: float = quantity(1.0, "s", 1e-3, 36000.0, "logged time")
+    settle: float = quantity(0.5, "s", 0.0, 60.0, "time before the log starts, at t < 0")
+    integrator: str = choice(
+        "runge_kutta3",
+        ("runge_kutta3", "runge_kutta2", "semi_explicit_euler"),
+        "Drake's name of the integration scheme",
+    )
+    max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
+    accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "of error-controlled integrators")
+    seed: int = quantity(
+        0, "1", 0, 2**32 - 1, "of everything random; the same seed gives the same log"
+    )
+    end_with_task: bool = plain(
+        False, "end the run within 20 ms when the operator has done its task or given up"
+    )
+    on_fault: str = choice(
+        "continue",
+        ("continue", "stop"),
+        "after a fault (docs/station.md) the run goes on in its safe state, or ends with an error",
+    )
+
+
+@settings
+@dataclass
+class Scenario:
+    """One complete setup of the station of the paper's Fig. 4."""
+
+    description: str = plain("", "what the scenario is about")
+    simulation: Simulation = field(default_factory=Simulation)
+    rates: Rates = field(default_factory=Rates)
+    operator: OperatorConfig = field(default_factory=OperatorConfig)
+    master: Master = field(default_factory=Master)
+    kinematic_scaling: KinematicScalingConfig = field(default_factory=KinematicScalingConfig)
+    channel: Channel = field(default_factory=Channel)
+    passivity: PassivityConfig = field(default_factory=PassivityConfig)
+    slave: Slave = field(default_factory=Slave)
+    joint_control: JointControlConfig = field(default_factory=JointControlConfig)
+    wrist_sensor: WristSensorConfig = field(default_factory=WristSensorConfig)
+    motion_estimation: MotionEstimationConfig = field(default_factory=MotionEstimationConfig)
+    load_estimator: LoadEstimatorConfig = field(default_factory=LoadEstimatorConfig)
+    force_scaling: ForceScalingConfig = field(default_factory=ForceScalingConfig)
+    contact_detection: ContactDetectionConfig | None = None
+    sheet_spring: SheetSpring | None = None
+    slot: Slot | None = None
+    environment: list[Thing] = plain(
+        [], "all else there is to touch, such as [!Wall {stiffness: 2e4}, !Block {}]"
+    )
+
+    @property
+    def surroundings(self) -> Environment | None:
+        """What there is to touch; `Several`, if it is that."""
+        things = self._things
+        if not things:
+            return None
+        return things[0] if len(things) == 1 else Several(things)
+
+    @property
+    def leaf(self) -> SheetSpring | None:
+        """The sheet spring, wherever it stands."""
+        return next((thing for thing in self._things if isinstance(thing, SheetSpring)), None)
+
+    @property
+    def _things(self) -> list[Environment]:
+        own = (thing for thing in (self.sheet_spring, self.slot) if thing is not None)
+        return [*own, *self.environment]
+
+    def without_environment(self) -> "Scenario":
+        """The same with nothing to touch."""
+        return dataclasses.replace(self, sheet_spring=None, slot=None, environment=[])
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether nothing but wires lies between master and slave."""
+        return self.passivity.method == "none" and self.channel.lines() == (NetworkConfig(),) * 2
+
+    def check(self, where: str = "scenario") -> None:
+        """Checks every value.
+
+        Raises:
+            DrakeTeleopError: naming `where` and the field.
+        """
+        check_ranges(self, where)
+        self.force_scaling.scales(f"{where}:force_scaling")
+        self.load_estimator.check(f"{where}:load_estimator")
+        self.master.check(f"{where}:master")
+        self.slave.check(f"{where}:slave")
+        self.joint_control.check(f"{where}:joint_control", self.rates.joint_control_hz)
+        self.wrist_sensor.check(f"{where}:wrist_sensor", self.rates.sensor_hz)
+        for index, thing in enumerate(self.environment):
+            thing.check(f"{where}:environment[{index}]")
+        for kind, name in ((SheetSpring, "sheet spring"), (Slot, "slot")):
+            if sum(isinstance(thing, kind) for thing in self._things) > 1:
+                raise DrakeTeleopError(
+                    f"there is more than one {name}",
+                    where=f"{where}:environment",
+                    remedy="leave the others out",
+                )
+        _check_task(self, where)
+        _check_steps(self, where)
+        _check_channel(self, where)
+
+
+def check_scenario(scenario: Any) -> None:
+    """Checks that it is a scenario, and every value of it.
+
+    Raises:
+        DrakeTeleopError: as `Scenario.check`, or for something else, such as a scenario's name.
+    """
+    remedy = "load one: LoadScenario(name)"
+    if isinstance(scenario, (str, Path)):
+        remedy = f"write LoadScenario({str(scenario)!r})"
+    expect(Scenario, scenario, "scenario", remedy)
+    scenario.check()
+
+
+def ScenarioNames() -> list[str]:
+    """The names of the scenarios that are shipped."""
+    return sorted(path.stem for path in scenarios_dir().glob("*.yaml"))
+
+
+def LoadScenario(name_or_path: str | Path) -> Scenario:
+    """Loads a scenario that is shipped, by its name, or a YAML file.
+
+    Fields that the file leaves out keep their defaults. Files of models are found from its folder.
+
+    Raises:
+        DrakeTeleopError: if there is no such scenario, or naming file and field of what is wrong.
+    """
+    data, where = ReadScenario(name_or_path)
+    scenario = ScenarioFromData(data, where)
+    folder = Path(where).parent
+    scenario.slave = scenario.slave.found_from(folder)
+    scenario.master = scenario.master.found_from(folder)
+    scenario.environment = [
+        thing.found_from(folder) if isinstance(thing, Scene) else thing
+        for thing in scenario.environment
+    ]
+    return scenario
+
+
+def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
+    """What stands in the file of a scenario, not checked, and the file's name for messages.
+
+    Raises:
+        DrakeTeleopError: if there is no such scenario, or as `read_yaml`.
+    """
+    expect((str, Path), name_or_path, "scenario")
+    path, names = scenarios_dir() / f"{name_or_path}.yaml", ScenarioNames()
+    if str(name_or_path) not in names:
+        path = Path(name_or_path)
+    if not os.path.isfile(path):  # nor for a name that no file can have
+        raise DrakeTeleopError(
+            f"there is no scenario '{name_or_path}'",
+            remedy=meant(name_or_path, names, f"give a YAML file or one of {', '.join(names)}"),
+        )
+    return read_yaml(path, tagged=True), str(path)
+
+
+def ScenarioFromData(data: Any, where: str) -> Scenario:
+    """The scenario of a parsed YAML file; `where` is the place for messages.
+
+    Raises:
+        DrakeTeleopError: naming the field of what is wrong.
+    """
+    check_structure(Scenario, data, where)
+    defaults = Scenario(
+        wrist_sensor=preset_of(data.get("wrist_sensor")),
+        master=Master(figures=figures_of(data.get("master"))),
+        joint_control=JointControlConfig(interface=interface_of(data.get("joint_control"))),
+    )
+    scenario = yaml_load_typed(schema=Scenario, data=yaml_dump(data), defaults=defaults)
+    scenario.check(where)
+    return scenario
+
+
+def replace(scenario: Scenario, **changes: object) -> Scenario:
+    """A copy with some fields changed; `a__b` names field b of block a.
+
+    >>> replace(Scenario(), force_scaling__sigma=0.5).force_scaling.sigma
+    0.5
+
+    Raises:
+        DrakeTeleopError: if there is no such block or field; values are checked by `Scenario.check`
+            and by all that takes a scenario.
+    """
+    expect(Scenario, scenario, "scenario")
+    for name, value in changes.items():
+        block, _, inner = name.partition("__")
+        check_name(Scenario, block, f"scenario:{block}")
+        if inner:
+            config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
+            if config is None or isinstance(config, str):
+                raise DrakeTeleopError(f"there is no block {block} to change", where=place)
+            check_name(type(config), inner, place)
+            value = dataclasses.replace(config, **{inner: value})
+        scenario = dataclasses.replace(scenario, **{block: value})  # type: ignore[arg-type]
+    return scenario
+
+
+def _check_task(scenario: Scenario, where: str) -> None:
+    if scenario.operator.task is None:
+        return
+    check_task(scenario.operator.task, f"{where}:operator.task")
+    if scenario.kinematic_scaling.translation_scale == 0.0:
+        raise DrakeTeleopError(
+            "a hand that does not move the tool cannot do a task",
+            where=f"{where}:kinematic_scaling.translation_scale",
+            remedy="set it above 0, or operator.task: null",
+        )
+
+
+def _check_steps(scenario: Scenario, where: str) -> None:
+    simulation = scenario.simulation
+    controlled = simulation.integrator == "runge_kutta3"
+    if scenario.surroundings is not None and not controlled and simulation.max_step > _CONTACT_STEP:
+        raise DrakeTeleopError(
+            f"steps of {simulation.max_step:g} s are too long for contact",
+            where=f"{where}:simulation.max_step",
+            remedy=f"set it to {_CONTACT_STEP:g}, or integrator: runge_kutta3, which finds its own",
+        )
+
+
+def _check_channel(scenario: Scenario, where: str) -> None:
+    for line in scenario.channel.lines(f"{where}:channel"):
+        line.check(f"{where}:channel")
+        timeout = scenario.channel.timeout or LONGEST_TIMEOUT
+        if line.rate_hz is not None and timeout < 2 / line.rate_hz:
+            raise DrakeTeleopError(
+                f"{timeout:g} s are less than two packets of {line.rate_hz:g} Hz",
+                where=f"{where}:channel.timeout",
+                remedy="raise timeout or rate_hz, or the station is in its safe state all the time",
+            )
+    if scenario.master.leads_joints and not (
+        scenario.is_direct and scenario.contact_detection is None
+    ):
+        raise DrakeTeleopError(
+            "a channel carries poses, not joints",
+            where=f"{where}:master.leader.leads",
+            remedy="lead by the pose, or without network, passivity and contact_detection",
+        )
+    scaling = scenario.kinematic_scaling
+    scales = (scaling.translation_scale, scaling.rotation_scale)
+    if scenario.passivity.method != "none" and min(scales) == 0.0:
+        raise DrakeTeleopError(
+            "a motion that is scaled to zero carries no energy",
+            where=f"{where}:passivity.method",
+            remedy="set both scales of kinematic_scaling above 0, or method: none",
+        )

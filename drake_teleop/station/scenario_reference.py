@@ -1,0 +1,231 @@
+"""What a scenario can say, for people and for editors, made from the dataclasses themselves.
+
+`reference` is docs/scenario.md, `json_schema` docs/scenario.schema.json (python
+docs/make_reference.py writes both), `commented` what `drake-teleop scenario NAME` prints.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import FieldInfo, fields_of
+from drake_teleop.common.texts import yaml_data, yaml_scalar
+from drake_teleop.common.writing import write_text
+from drake_teleop.station.scenario import Scenario, ScenarioFromData
+from drake_teleop.station.sensor.presets import preset_of
+from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
+
+_COLUMN = 34  # at which the comments of a block begin, if its values leave them that place
+
+_HEAD = """\
+# Every field: its value, [what it may be] and what it means. What you leave out has its default.
+# Lines that begin with # say nothing until you take the # away: blocks that this scenario does
+# without, and the figures of the wrist sensor's preset.
+"""
+
+_REFERENCE = """\
+# Every field of a scenario
+
+A scenario is a YAML file; what it leaves out keeps the default that stands here. This page is made
+from the code (`python docs/make_reference.py`).
+
+- `drake-teleop scenario press > mine.yaml` writes the shipped scenario `press` with every field,
+  its range and its meaning, as a starting point; `drake-teleop run mine.yaml` runs it.
+- Files are read as YAML 1.2: `1e-3` is a number, `yes` and `1:30` are words. A field that stands
+  there twice, or that nothing reads, is an error, and so is `010`.
+- [scenario.schema.json](scenario.schema.json) is the JSON schema: an editor that knows it (for
+  instance by a first line `# yaml-language-server: $schema=scenario.schema.json`) completes and
+  checks the fields. Such an editor has to be told of tags like `!Touch`, which say what kind of
+  block follows: in VS Code `"yaml.customTags": ["!Touch mapping", ...]`.
+
+Frames: W is the world, z up; B the base of the master, E its end; S the wrist sensor, A its
+accelerometers. `p_WS` is the position of S's origin in W, `R_SA` the rotation of A in S. Equations
+and sections are those of the paper; (E) marks an estimate of ours, where the paper gives no figure.
+"""
+
+
+def commented(scenario: Scenario) -> str:
+    """The scenario as YAML with every field and its meaning; it loads back to the same scenario."""
+    return _HEAD + "\n".join(_block_lines(scenario)) + "\n"
+
+
+def _words(value: Any) -> list[str]:
+    """Return all texts in a scenario: what a wrong emitter would change."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = [getattr(value, field.name) for field in dataclasses.fields(value)]
+    if isinstance(value, dict):
+        value = [*value, *value.values()]
+    if isinstance(value, (list, tuple)):
+        return [word for each in value for word in _words(each)]
+    return [str(value)] if isinstance(value, (str, Path)) and str(value) else []
+
+
+def write_scenario(path: Path, scenario: Scenario) -> None:
+    """Write every field of a scenario to a YAML file, for `LoadScenario`.
+
+    Raises:
+        DrakeTeleopError: if the text would be read as another scenario, or cannot be written.
+    """
+    text, where = commented(scenario), str(path)
+    found = ScenarioFromData(yaml_data(text, where, tagged=True), where)
+    if scenario.master.figures is None:  # which are read from the data sheet then
+        found.master = dataclasses.replace(found.master, figures=None)
+    if found != scenario and _words(found) != _words(scenario):
+        raise DrakeTeleopError("the scenario cannot be written to YAML", where=where)
+    write_text(path, text)
+
+
+def reference() -> str:
+    """Markdown with a table for each block: field, default, range and meaning."""
+    return _REFERENCE + "".join(_sections(Scenario(), ""))
+
+
+def json_schema() -> str:
+    """The JSON schema of a scenario file, as text."""
+    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Scenario"}
+    return json.dumps(schema | _object_schema(Scenario()), indent=1) + "\n"
+
+
+def _takes(entry: FieldInfo) -> str:
+    """What may stand there, for people."""
+    words = entry.range if entry.unit or entry.choices else entry.kind
+    if entry.lists:
+        words = f"{entry.length or 'any number'} of {words}"
+    return f"{words}, or null" if entry.optional else words
+
+
+def _comment(entry: FieldInfo) -> str:
+    return f"[{_takes(entry)}] {entry.meaning}" if entry.kind != "block" else entry.meaning
+
+
+def _block_lines(config: Any) -> list[str]:
+    """The fields of a block and of what is in it, each on a line, not indented."""
+    entries = fields_of(config)
+    starts = {entry.name: f"{entry.name}: {yaml_scalar(entry.default)}"
+              for entry in entries if entry.kind != "block"}  # fmt: skip
+    column = min(_COLUMN, max(map(len, starts.values()), default=0))
+    preset = preset_of({"preset": config.preset}) if isinstance(config, WristSensorConfig) else None
+    lines = []
+    for entry in entries:
+        if entry.kind == "block":
+            lines += _inner_lines(entry)
+            continue
+        line = f"{starts[entry.name]:{column}}  # {_comment(entry)}"
+        of_preset = preset is not None and entry.default == getattr(preset, entry.name)
+        lines.append(f"# {line}" if of_preset and entry.name != "preset" else line)
+    return lines
+
+
+def _inner_lines(entry: FieldInfo) -> list[str]:
+    """A block or a list of blocks; if there is none, all that could be there, behind #."""
+    if entry.default:
+        return _named_lines(entry, entry.default)
+    blocks = [block() for block in entry.blocks]
+    if entry.lists:
+        return _out(_named_lines(entry, blocks))
+    return [line for block in blocks for line in _out(_named_lines(entry, block))]
+
+
+def _named_lines(entry: FieldInfo, value: Any) -> list[str]:
+    """`name:` and, indented, what is in it."""
+    if not entry.lists:
+        head = f"{entry.name}:{_tag(entry, value)}  # {entry.meaning}"
+        return [head, *_indented(_block_lines(value))]
+    lines = [f"{entry.name}:  # {entry.meaning}"]
+    for item in value:
+        lines += [f"  -{_tag(entry, item)}", *_indented(_indented(_block_lines(item)))]
+    return lines
+
+
+def _tag(entry: FieldInfo, config: Any) -> str:
+    return f" !{type(config).__name__}" if len(entry.blocks) > 1 else ""
+
+
+def _indented(lines: list[str]) -> list[str]:
+    return [f"  {line}" for line in lines]
+
+
+def _out(lines: list[str]) -> list[str]:
+    return [f"# {line}" for line in lines]
+
+
+def _sections(config: Any, path: str) -> Iterator[str]:
+    """The table of a block, then those of the blocks in it."""
+    entries = fields_of(config)
+    yield "\n| field | default | takes | meaning |\n|---|---|---|---|\n"
+    for entry in entries:
+        default = yaml_scalar(entry.default) if entry.kind != "block" or not entry.default else ""
+        takes = _links(entry, path) if entry.kind == "block" else _takes(entry)
+        cells = (f"`{entry.name}`", default, takes, entry.meaning)
+        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"
+    for entry in entries:
+        for title, block in _titles(entry, path):
+            yield f"\n## {title}\n"
+            inner = entry.default if isinstance(entry.default, block) else block()
+            yield f"\n{_first_paragraph(inner)}\n"
+            yield from _sections(inner, f"{path}{entry.name}.")
+
+
+def _titles(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
+    """Of the sections of the blocks that may stand there."""
+    several = len(entry.blocks) > 1
+    return [
+        (f"{path}{entry.name}{f': !{block.__name__}' if several else ''}", block)
+        for block in entry.blocks
+    ]
+
+
+def _links(entry: FieldInfo, path: str) -> str:
+    """To these sections, in a table."""
+    several = len(entry.blocks) > 1
+    links = [
+        f"[{f'!{block.__name__}' if several else 'block'}](#{_anchor(title)})"
+        for title, block in _titles(entry, path)
+    ]
+    return f"{'list of ' * entry.lists}{', '.join(links)}{', or null' * entry.optional}"
+
+
+def _anchor(title: str) -> str:
+    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+
+
+def _first_paragraph(config: Any) -> str:
+    return " ".join((type(config).__doc__ or "").partition("\n\n")[0].split())
+
+
+def _object_schema(config: Any) -> dict[str, Any]:
+    properties = {entry.name: _field_schema(entry) for entry in fields_of(config)}
+    return {"type": "object", "additionalProperties": False, "properties": properties}
+
+
+def _field_schema(entry: FieldInfo) -> dict[str, Any]:
+    forms = [_item_schema(entry, item) for item in entry.blocks or (None,)]
+    schema: dict[str, Any] = forms[0] if len(forms) == 1 else {"anyOf": forms}
+    for _ in range(entry.lists):
+        schema = {"type": "array", "items": schema}
+    if entry.length is not None:
+        schema |= {"minItems": entry.length, "maxItems": entry.length}
+    if entry.optional:
+        schema = {"anyOf": [schema, {"type": "null"}]}
+    schema["description"] = _comment(entry)
+    if entry.kind != "block":
+        schema["default"] = entry.default
+    return schema
+
+
+def _item_schema(entry: FieldInfo, block: type | None) -> dict[str, Any]:
+    if block is not None:
+        return _object_schema(entry.default if isinstance(entry.default, block) else block())
+    if entry.choices:
+        return {"enum": list(entry.choices)}
+    types = {"number": "number", "whole number": "integer", "true or false": "boolean"}
+    schema: dict[str, Any] = {"type": types.get(entry.kind, "string")}
+    if entry.unit:
+        schema |= {"minimum": entry.low, "maximum": entry.high}
+    return schema

@@ -1,0 +1,582 @@
+"""The wrist sensor as a chain of small parts (long: their parameters beside what they do).
+
+The truth is rigid-body mechanics: the wrench that the sensor exerts on the tool, the motion of the
+sensor frame S, and the joints' angles. A reading is what the electronics put out. Between them::
+
+    wrench at So in S        -> calibration errors ----.
+    motion of S -> moved to Ao, turned into A          |
+                             -> calibration errors ----+-> [low-pass] -> white noise + random walk
+                -> offset + drift -> quantisation -> saturation -> [low-pass] -> latency of its path
+    joints' angles           -> quantisation --------------------------------> latency of its path
+
+The acceleration part measures at its own place Ao, along its own axes A: specific force and angular
+acceleration. Angular velocity is not measured.
+
+The low-pass stands in one of two places. In the JR3 it is digital: its converter works at the full
+rate, the signal processor filters what comes out, noise and quantisation steps included
+(`after_converter`). An analog filter against aliasing, or a mechanical one, stands before the
+electronics that make the noise (`before_noise`).
+
+Each part is a group of fields of `WristSensorConfig` that is off when it is zero; `without` turns
+parts off by name. Calibration errors are off in the presets of sensors: what a maker's calibration
+sheet leaves is far below the bound of 1 % that is stated for such sensors, an error that is
+constant can be calibrated away, and a study of errors wants to see this one on its own.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import copy
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fault import LARGEST
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import choice, plain, quantity
+from drake_teleop.common.vectors import apply, cross, cross_matrix, nine, plus_cross, put, three
+from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
+
+#: Samples that share one block of random numbers: one event of a noise source, one step of a walk.
+NOISE_BLOCK = 128
+_CHANNELS = 12
+#: Standard normal numbers for NOISE_BLOCK samples: 12 for each, then 12 for the random walks.
+NOISE_SIZE = _CHANNELS * (NOISE_BLOCK + 1)
+
+#: Of what is in `drake_teleop.station.sensor.presets`.
+PRESET_NAMES = (
+    *("ideal", "jr3_85m35a3", "ati_gamma_imu", "ati_mini45", "bota_sensone", "bota_rokubi"),
+    *("robotiq_ft300", "onrobot_hex_e", "ur5e_built_in", "franka_estimated"),
+)
+_LOW_PASS = ("none", "before_noise", "after_converter")
+_SECTIONS = 2  # second-order sections of the fourth-order low-pass
+_ROTATION_ERROR = 1e-6
+# No sensor survives this many ranges of its own.
+_OVERLOAD = 10.0
+# A low-pass overshoots what saturates: by 11 % of a step, which may be from one end to the other.
+_OVERSHOOT = 1.5
+
+
+@settings
+@dataclass
+class WristSensorConfig:
+    """A force/torque sensor with accelerometers; the defaults are the paper's, `jr3_85m35a3`."""
+
+    preset: str = field(
+        default="custom",
+        init=False,
+        compare=False,
+        metadata={
+            "choices": ("custom", *PRESET_NAMES),
+            "doc": "in a file: whose figures the fields have that the file leaves out; custom: the "
+            'defaults. In Python: `dataclasses.replace(PRESETS["ati_gamma_imu"], force_noise=0.1)`',
+        },
+    )
+    ideal: bool = plain(False, "the truth at the sampling instant, at So in S: none of the parts")
+
+    gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest of force and torque")
+    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "largest, of one range for a full other one")
+    misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from S to the wrench's real axes")
+    acceleration_gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest of the accelerations")
+    acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from A to real axes")
+    unit: int = plain(
+        0, "which of many sensors of the kind: draws the calibration errors inside their bounds"
+    )
+
+    p_SoAo_S: list[float] = quantity(
+        [0.0, 0.0, 0.0175], "m", -1.0, 1.0, "place of the acceleration part"
+    )
+    R_SA: list[float] = quantity(
+        [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "1", -1.0, 1.0, "its axes, row by row"
+    )
+
+    low_pass: str = choice("after_converter", _LOW_PASS, "where the low-pass stands, if anywhere")
+    bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
+
+    force_noise: float = quantity(0.25, "N", 0.0, 100.0, "white, 1 sigma of each raw sample")
+    torque_noise: float = quantity(0.012, "N m", 0.0, 10.0, "white, 1 sigma of each raw sample")
+    acceleration_noise: float = quantity(0.06, "m/s^2", 0.0, 100.0, "white, 1 sigma")
+    angular_acceleration_noise: float = quantity(1.5, "rad/s^2", 0.0, 1e3, "white, 1 sigma")
+    force_walk: float = quantity(0.002, "N/sqrt(s)", 0.0, 10.0, "random walk")
+    torque_walk: float = quantity(4e-5, "N m/sqrt(s)", 0.0, 1.0, "random walk")
+    acceleration_walk: float = quantity(6e-4, "m/s^2/sqrt(s)", 0.0, 10.0, "random walk")
+    angular_acceleration_walk: float = quantity(0.015, "rad/s^2/sqrt(s)", 0.0, 100.0, "random walk")
+
+    offset: list[float] = quantity(
+        [6.2, -3.9, 8.1, 0.31, -0.42, 0.12], "N, N m", -100.0, 100.0, "offset, Eq. (7)"
+    )
+    drift: list[float] = quantity(
+        [4e-4, -3e-4, 8.3e-4, 2e-5, -2e-5, 1e-5],
+        "N/s, N m/s",
+        -10.0,
+        10.0,
+        "thermal, of the offset",
+    )
+    acceleration_offset: list[float] = quantity(
+        [0.0] * 6, "m/s^2, rad/s^2", -100.0, 100.0, "offset of specific force, angular acceleration"
+    )
+
+    resolution: float = quantity(2.5e-4, "1", 0.0, 0.1, "quantum as a fraction of the range")
+    encoder_resolution: float = quantity(1.745e-5, "rad", 0.0, 0.1, "resolver step, 0.001 deg")
+
+    saturates: bool = plain(True, "readings end at the ranges, and `saturated` says so")
+    force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "fx, fy, fz")
+    torque_range: list[float] = quantity([12.0, 12.0, 12.0], "N m", 0.01, 1e4, "about So")
+    acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "specific force")
+    angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "each axis")
+
+    force_latency: float = quantity(0.0, "s", 0.0, 0.1, "of force and torque, to whole samples")
+    acceleration_latency: float = quantity(0.0, "s", 0.0, 0.1, "of accelerations, to whole samples")
+    encoder_latency: float = quantity(0.0, "s", 0.0, 0.1, "of the joints' angles, likewise")
+
+    def noise_std(self) -> NDArray[np.float64]:
+        """The 12 standard deviations of the white noise [N, N m, m/s^2, rad/s^2], raw."""
+        return np.repeat(
+            [
+                self.force_noise,
+                self.torque_noise,
+                self.acceleration_noise,
+                self.angular_acceleration_noise,
+            ],
+            3,
+        )
+
+    def random_walk(self) -> NDArray[np.float64]:
+        """The 12 random walks: standard deviation after one second, in units per sqrt(s)."""
+        return np.repeat(
+            [
+                self.force_walk,
+                self.torque_walk,
+                self.acceleration_walk,
+                self.angular_acceleration_walk,
+            ],
+            3,
+        )
+
+    def ranges(self) -> NDArray[np.float64]:
+        """The 12 ranges in the order of the noise."""
+        return np.concatenate(
+            [
+                self.force_range,
+                self.torque_range,
+                np.full(3, self.acceleration_range),
+                np.full(3, self.angular_acceleration_range),
+            ]
+        )
+
+    def largest_wrench(self) -> NDArray[np.float64]:
+        """(6,) beyond which a reading is none [N, N m]."""
+        share = _OVERSHOOT if self.saturates and not self.ideal else _OVERLOAD
+        return share * self.ranges()[:6]
+
+    def wrench_std(self) -> NDArray[np.float64]:
+        """(6,) weights for an estimator: noise and quantisation, never quite zero [N, N m].
+
+        Of raw samples: before the low-pass if that comes after the converter.
+        """
+        quantum = self.resolution * self.ranges()[:6]
+        return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
+
+    def motion_std(self) -> NDArray[np.float64]:
+        """(9,) noise and quantisation of s [m/s^2], omega [rad/s], alpha [rad/s^2].
+
+        Of raw samples, as the wrench's. Nothing for omega: the rounding of the encoders is
+        differentiated, and the filter takes its high frequencies away; what is left is small.
+        """
+        quantum = self.resolution * self.ranges()[6:]
+        std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
+        return np.concatenate([std[:3], np.zeros(3), std[3:]])
+
+    def accelerometer(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """p_SoAo_S (3,) [m] and R_SA (3, 3) as calibrated: So and S if the sensor is ideal."""
+        if self.ideal:
+            return np.zeros(3), np.eye(3)
+        return np.array(self.p_SoAo_S), np.reshape(self.R_SA, (3, 3))
+
+    def latencies(self, period: float) -> NDArray[np.int64]:
+        """(3,) samples that force, acceleration and encoders are late, without the low-pass.
+
+        Whole samples: each latency is rounded to the nearest multiple of the period [s].
+        """
+        seconds = (self.force_latency, self.acceleration_latency, self.encoder_latency)
+        return np.rint(np.array(seconds) * (not self.ideal) / period).astype(np.int64)
+
+    def delays(self, period: float) -> NDArray[np.float64]:
+        """(3,) how old force, acceleration and encoders are when they are read [s].
+
+        Latency, and the group delay of the low-pass at zero frequency for the first two.
+        """
+        delays = self.latencies(period) * np.float64(period)
+        if not self.ideal and self.low_pass != "none":
+            for b0, b1, b2, a1, a2 in butterworth_sections(self.bandwidth_hz, 1 / period):
+                lag = (b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)
+                delays[:2] += lag * period
+        return delays
+
+    def check(self, where: str, rate_hz: float) -> None:
+        """Checks what the ranges of the fields cannot say.
+
+        Args:
+            where: the place for the message.
+            rate_hz: the sensor's sampling rate [Hz].
+
+        Raises:
+            DrakeTeleopError: naming `where` and the field.
+        """
+        R_SA = np.reshape(self.R_SA, (3, 3))
+        error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
+        if error > _ROTATION_ERROR or np.linalg.det(R_SA) < 0:
+            raise DrakeTeleopError(
+                "is not a rotation: its rows are not unit vectors at right angles, right-handed",
+                where=f"{where}.R_SA",
+                remedy="give nine numbers row by row; its columns are the axes of A in S",
+            )
+        filtered = not self.ideal and self.low_pass != "none"
+        if filtered and self.bandwidth_hz >= 0.45 * rate_hz:
+            raise DrakeTeleopError(
+                f"{self.bandwidth_hz:g} Hz is too near to half of rates.sensor_hz ({rate_hz:g} Hz)",
+                where=f"{where}.bandwidth_hz",
+                remedy="lower the bandwidth below 0.45 of the sensor's rate, or set low_pass: none",
+            )
+
+
+#: The parts by name, and the fields that turn each of them off.
+PARTS: dict[str, dict[str, Any]] = {
+    "calibration": {
+        "gain_error": 0.0,
+        "cross_talk": 0.0,
+        "misalignment": 0.0,
+        "acceleration_gain_error": 0.0,
+        "acceleration_misalignment": 0.0,
+    },
+    "place": {
+        "p_SoAo_S": [0.0] * 3,
+        "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+    },
+    "low_pass": {"low_pass": "none"},
+    "noise": {
+        "force_noise": 0.0,
+        "torque_noise": 0.0,
+        "acceleration_noise": 0.0,
+        "angular_acceleration_noise": 0.0,
+    },
+    "random_walk": {
+        "force_walk": 0.0,
+        "torque_walk": 0.0,
+        "acceleration_walk": 0.0,
+        "angular_acceleration_walk": 0.0,
+    },
+    "offset": {"offset": [0.0] * 6, "acceleration_offset": [0.0] * 6},
+    "drift": {"drift": [0.0] * 6},
+    "quantisation": {"resolution": 0.0, "encoder_resolution": 0.0},
+    "saturation": {"saturates": False},
+    "latency": {"force_latency": 0.0, "acceleration_latency": 0.0, "encoder_latency": 0.0},
+}
+
+
+def without(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
+    """A copy of the sensor with some of its `PARTS` off.
+
+    >>> without(WristSensorConfig(), "noise", "offset").force_noise
+    0.0
+    """
+    changes = {name: value for part in parts for name, value in PARTS[part].items()}
+    return dataclasses.replace(config, **copy.deepcopy(changes))
+
+
+def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
+    """Fourth-order Butterworth low-pass as two second-order sections, bilinear, prewarped.
+
+    The poles of `scipy.signal.butter`, whose import would double that of a scenario, and whose
+    sections have the gain of all in the first: `settle` takes each for one of unit gain.
+
+    Args:
+        cutoff_hz: -3 dB frequency [Hz], below half the rate.
+        rate_hz: sampling rate [Hz].
+
+    Returns:
+        (2, 5) rows [b0, b1, b2, a1, a2], each of unit gain at zero frequency.
+    """
+    warped = np.tan(np.pi * cutoff_hz / rate_hz)
+    sections = np.empty((_SECTIONS, 5))
+    for row, angle in enumerate((np.pi / 8, 3 * np.pi / 8)):
+        damping = 2 * np.cos(angle) * warped
+        a0 = 1 + damping + warped**2
+        sections[row] = (
+            warped**2 / a0,
+            2 * warped**2 / a0,
+            warped**2 / a0,
+            2 * (warped**2 - 1) / a0,
+            (1 - damping + warped**2) / a0,
+        )
+    return sections
+
+
+def calibration_matrices(
+    config: WristSensorConfig,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """What the channels make of the truth: (6, 6) for [f; tau] in S, (3, 3) for s and alpha in A.
+
+    (1 + gains + cross-talk) times the small rotation of the misalignment. Gains and cross-talk are
+    uniform inside their bounds, the axis of the misalignment has any direction. Always the same
+    numbers are drawn, so that one error does not change when another is switched on.
+    """
+    random = np.random.default_rng(config.unit)
+    gains, talk, axis = (
+        random.uniform(-1, 1, 6),
+        random.uniform(-1, 1, (6, 6)),
+        random.normal(size=3),
+    )
+    acceleration_gains, acceleration_axis = random.uniform(-1, 1, 6), random.normal(size=3)
+    ranges = config.ranges()[:6]
+    wrench = config.cross_talk * talk * ranges[:, None] / ranges
+    np.fill_diagonal(wrench, 1 + config.gain_error * gains)
+    scales = 1 + config.acceleration_gain_error * acceleration_gains
+    turned = _rotation(acceleration_axis, config.acceleration_misalignment)
+    both = np.kron(np.eye(2), _rotation(axis, config.misalignment))
+    return wrench @ both, scales[:3, None] * turned, scales[3:, None] * turned
+
+
+def _rotation(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+    """Rodrigues' formula; `axis` of any length."""
+    K = cross_matrix(axis / np.linalg.norm(axis))
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+#: In the constants: offset of force and torque, which may be changed while the sensor runs.
+OFFSET = slice(0, 6)
+# The truth: as a sample, see `drake_teleop.load.sample`, but for the flag.
+TRUE_ANGLES = slice(15, None)
+# A reading: wrench, accelerometer, whether a channel is saturated, angles.
+READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
+READ_SATURATED, READ_ANGLES = 12, slice(13, None)
+# Constants: 12 offsets, 12 drifts per sample, then these.
+_DRIFT, _NOISE, _WALK, _QUANTA, _LIMITS = range(12, 72, 12)
+_WRENCH = 72  # (6, 6)
+_MOTION = _WRENCH + 36  # (2, 3, 3) from S into A, for s and alpha
+_PLACE = _MOTION + 18  # (3,)
+_FILTER = _PLACE + 3  # (2, 5)
+_LOW_PASS_PLACE = _FILTER + 5 * _SECTIONS
+_LATENCIES = _LOW_PASS_PLACE + 1  # (3,)
+_ENCODER = _LATENCIES + 3
+_IDEAL = _ENCODER + 1
+_OVERLOADS = _IDEAL + 1  # (6,)
+_BEFORE, _AFTER = 1.0, 2.0  # as in _LOW_PASS
+# Memory: samples taken, 12 random walks, the filter (2, 2, 12), then the delay line, a row for each
+# of the last samples: 12 channels, whether force or acceleration is saturated, angles.
+_WALKS = 1
+FILTERED = _WALKS + _CHANNELS
+_LINE = FILTERED + 2 * _SECTIONS * _CHANNELS
+_ROW = _CHANNELS + 2
+
+
+def sensor_chain(
+    config: WristSensorConfig, num_joints: int, period: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What `read_into` needs: constants, and its memory before the first sample.
+
+    Args:
+        config: the sensor.
+        num_joints: n, of the arm.
+        period: sampling period [s].
+
+    Returns:
+        constants: `constants[OFFSET]` is the wrench's offset [N, N m] and may drift.
+        memory: its first entry counts samples.
+    """
+    wrench, force, angular = calibration_matrices(config)
+    p_SoAo_S, R_SA = config.accelerometer()
+    limits = config.ranges() if config.saturates else np.full(_CHANNELS, np.inf)
+    sections = np.zeros((_SECTIONS, 5))
+    if config.low_pass != "none" and not config.ideal:
+        sections = butterworth_sections(config.bandwidth_hz, 1 / period)
+    latencies = config.latencies(period)
+    constants = np.concatenate(
+        [
+            config.offset,
+            config.acceleration_offset,
+            np.array(config.drift) * period,
+            np.zeros(6),
+            config.noise_std(),
+            config.random_walk() * np.sqrt(NOISE_BLOCK * period),
+            config.resolution * config.ranges(),
+            limits,
+            wrench.ravel(),
+            (force @ R_SA.T).ravel(),
+            (angular @ R_SA.T).ravel(),
+            p_SoAo_S,
+            sections.ravel(),
+            [_LOW_PASS.index(config.low_pass), *latencies, config.encoder_resolution, config.ideal],
+            _OVERLOAD * config.ranges()[:6],
+        ]
+    )
+    rows = 0 if config.ideal else latencies.max() + 1
+    return constants, np.zeros(_LINE + rows * (_ROW + num_joints))
+
+
+@njit(cache=True)
+def believable(constants, truth):
+    """Whether there is something to read: finite, and nothing that would have broken the sensor.
+
+    Args:
+        constants, truth: of `read_into`. The offset counts: NaN in it is a dead channel.
+    """
+    good = True
+    for i in range(6):
+        good = good and abs(truth[i] + constants[i]) <= constants[_OVERLOADS + i]
+    for i in range(6, truth.shape[0]):
+        good = good and abs(truth[i]) <= LARGEST
+    return good
+
+
+@njit(cache=True)
+def read_into(constants, memory, noise, truth, reading):
+    """One sample of the sensor: `truth` (15 + n,) becomes `reading` (13 + n,).
+
+    Called once for each period. At the first sample the filters and delay lines settle on it.
+
+    Args:
+        constants, memory: of `sensor_chain`.
+        noise: (NOISE_SIZE,) standard normal numbers for this block of NOISE_BLOCK samples.
+        truth: [wrench (6) that the sensor exerts on the tool at So in S | specific force of So (3),
+            angular velocity (3), angular acceleration (3) in S | joints' angles (n)].
+        reading: [wrench (6) | specific force at Ao (3), angular acceleration (3) in A |
+            1 if a channel is saturated, else 0 | joints' angles (n)].
+    """
+    angles = truth[TRUE_ANGLES]
+    if constants[_IDEAL] != 0.0:
+        put(reading, READ_WRENCH.start, truth, WRENCH.start, 6)
+        put(reading, READ_ACCELERATION.start, truth, SPECIFIC_FORCE.start, 3)
+        put(reading, READ_ACCELERATION.start + 3, truth, ANGULAR_ACCELERATION.start, 3)
+        reading[READ_SATURATED] = 0.0
+        put(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
+        return
+    count = int(memory[0])
+    width = _ROW + angles.shape[0]
+    rows = (memory.shape[0] - _LINE) // width
+    shift(memory[_LINE:], width)
+    row = memory[_LINE:][:width]
+    channels = row[:_CHANNELS]
+    walks, filtered = memory[_WALKS:FILTERED], memory[FILTERED:_LINE]
+    sections, place = constants[_FILTER:_LOW_PASS_PLACE], constants[_LOW_PASS_PLACE]
+    if count % NOISE_BLOCK == 0:
+        for i in range(_CHANNELS):
+            walks[i] += constants[_WALK + i] * noise[_CHANNELS * NOISE_BLOCK + i]
+
+    _calibrate(constants, truth, channels)
+    if place == _BEFORE:
+        if count == 0:
+            settle(sections, filtered, channels)
+        low_pass(sections, filtered, channels)
+    for i in range(_CHANNELS):
+        channels[i] += constants[i] + count * constants[_DRIFT + i]
+    if place == _AFTER and count == 0:
+        settle(sections, filtered, channels)
+    first = _CHANNELS * (count % NOISE_BLOCK)
+    for i in range(_CHANNELS):
+        channels[i] += constants[_NOISE + i] * noise[first + i] + walks[i]
+    row[_CHANNELS] = _convert(constants, 0, 6, channels)
+    row[_CHANNELS + 1] = _convert(constants, 6, 12, channels)
+    if place == _AFTER:
+        low_pass(sections, filtered, channels)
+    quantum = constants[_ENCODER]
+    for i in range(_ROW, width):
+        angle = angles[i - _ROW]
+        row[i] = quantum * np.rint(angle / quantum) if quantum > 0.0 else angle
+
+    if count == 0:
+        for k in range(1, rows):
+            put(memory, _LINE + k * width, row, 0, width)
+    memory[0] += 1.0
+    late = constants[_LATENCIES:_ENCODER]
+    force = _LINE + int(late[0]) * width
+    acceleration = _LINE + int(late[1]) * width
+    encoders = _LINE + int(late[2]) * width
+    wrench, moved, turned = reading[READ_WRENCH], reading[READ_ACCELERATION], reading[READ_ANGLES]
+    for i in range(6):
+        wrench[i] = memory[force + i]
+        moved[i] = memory[acceleration + 6 + i]
+    reading[READ_SATURATED] = max(memory[force + _CHANNELS], memory[acceleration + _CHANNELS + 1])
+    for i in range(_ROW, width):
+        turned[i - _ROW] = memory[encoders + i]
+
+
+@njit(cache=True)
+def shift(line, width):
+    """Makes room for a new row at the start of a delay line, whose rows stand by age.
+
+    A ring would be no faster, and what is remembered would not be the same after a period.
+    """
+    for i in range(line.shape[0] - 1, width - 1, -1):
+        line[i] = line[i - width]
+
+
+@njit(cache=True)
+def _calibrate(constants, truth, out):
+    """The 12 channels as their gains, cross-talk, axes and place make them of the truth."""
+    wrench, s = truth[WRENCH], truth[SPECIFIC_FORCE]
+    omega, alpha = truth[ANGULAR_VELOCITY], truth[ANGULAR_ACCELERATION]
+    for i in range(6):
+        value = 0.0
+        for j in range(6):
+            value += constants[_WRENCH + 6 * i + j] * wrench[j]
+        out[i] = value
+    r = three(constants, _PLACE)
+    at_Ao = plus_cross(plus_cross(s, alpha, r), omega, cross(omega, r))
+    out[6], out[7], out[8] = apply(nine(constants, _MOTION), at_Ao)
+    out[9], out[10], out[11] = apply(nine(constants, _MOTION + 9), alpha)
+
+
+@njit(cache=True)
+def _convert(constants, first, end, channels):
+    """Quantisation and saturation in place; 1.0 if one of the channels is saturated."""
+    saturated = 0.0
+    for i in range(first, end):
+        quantum, limit, value = constants[_QUANTA + i], constants[_LIMITS + i], channels[i]
+        if quantum > 0.0:
+            value = quantum * np.rint(value / quantum)
+        if abs(value) >= limit:
+            value = np.copysign(limit, value)
+            saturated = 1.0
+        channels[i] = value
+    return saturated
+
+
+@njit(cache=True)
+def low_pass(sections, memory, values):
+    """Second-order sections one after the other, transposed direct form II, `values` in place.
+
+    Args:
+        sections: (5 k,) [b0, b1, b2, a1, a2] of each; one with b0 = 1 does nothing.
+        memory: (2 k n,) updated.
+        values: (n,) channels.
+    """
+    n = values.shape[0]
+    for k in range(sections.shape[0] // 5):
+        b0, b1, b2 = sections[5 * k], sections[5 * k + 1], sections[5 * k + 2]
+        a1, a2 = sections[5 * k + 3], sections[5 * k + 4]
+        if b0 == 1.0:
+            continue
+        first, second = 2 * k * n, (2 * k + 1) * n
+        for i in range(n):
+            value = values[i]
+            out = b0 * value + memory[first + i]
+            memory[first + i] = b1 * value - a1 * out + memory[second + i]
+            memory[second + i] = b2 * value - a2 * out
+            values[i] = out
+
+
+@njit(cache=True)
+def settle(sections, memory, values):
+    """Puts the memory of `low_pass` where it would be after a long time at `values`."""
+    n = values.shape[0]
+    for k in range(sections.shape[0] // 5):
+        b1, b2 = sections[5 * k + 1], sections[5 * k + 2]
+        a1, a2 = sections[5 * k + 3], sections[5 * k + 4]
+        for i in range(n):
+            second = (b2 - a2) * values[i]
+            memory[(2 * k + 1) * n + i] = second
+            memory[2 * k * n + i] = (b1 - a1) * values[i] + second

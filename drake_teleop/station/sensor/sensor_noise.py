@@ -1,0 +1,150 @@
+"""What the wrist sensor's noise looks like at rest: predicted from its parameters, and measured.
+
+A reading at rest is a constant, a drift, and three random parts: white noise of variance sigma^2 in
+each raw sample; rounding to a quantum q, which adds q^2/12 and is as white, as long as the noise
+moves the readings over the steps (sigma of q/2 or more: at q/2 it is 1 % less than said; without
+noise it is a constant error); and a random walk that grows by K sqrt(t). With the sampling period
+T, and the low-pass H if it stands after the converter, the one-sided spectral density is
+
+    S(f) = |H(f)|^2 (2 T (sigma^2 + q^2/12) + 2 K^2 T^2 / (2 sin(pi f T))^2)
+
+The Allan deviation at tau = m T is the root of half the mean square difference of neighbouring
+means of m samples; its square is the integral of S(f) 2 sin^4(pi f m T) / (m sin(pi f T))^2. White
+noise: sigma / sqrt(m), the slope -1/2; a random walk: K sqrt(tau / 3), the slope +1/2.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.station.sensor.sensor_chain import (
+    NOISE_BLOCK,
+    NOISE_SIZE,
+    WristSensorConfig,
+    butterworth_sections,
+    read_into,
+    sensor_chain,
+)
+
+_CHANNELS = 12
+_FILTER_LENGTHS = 32  # of 1 / bandwidth, after which its impulse response is gone
+
+
+def spectral_density(
+    config: WristSensorConfig, frequency: ArrayLike, period: float
+) -> NDArray[np.float64]:
+    """One-sided power spectral density of the 12 channels' readings at rest.
+
+    Args:
+        config: the sensor.
+        frequency: (m,) above zero, to half the sampling rate [Hz].
+        period: sampling period [s].
+
+    Returns:
+        (12, m) in N^2/Hz, (N m)^2/Hz, (m/s^2)^2/Hz, (rad/s^2)^2/Hz.
+    """
+    white, walk = _powers(config)
+    f = np.asarray(frequency, float)
+    densities = np.outer(white, 2 * period * np.ones_like(f))
+    densities += np.outer(walk, 2 * period**2 / (2 * np.sin(np.pi * f * period)) ** 2)
+    return densities * _gain(config, f, period)
+
+
+def predicted_allan_deviation(
+    config: WristSensorConfig, samples: ArrayLike, period: float
+) -> NDArray[np.float64]:
+    """Allan deviation of the 12 channels' readings at rest, drift left out.
+
+    Args:
+        config: the sensor.
+        samples: (m,) averaging times, in samples.
+        period: sampling period [s].
+
+    Returns:
+        (12, m) in the channels' units.
+    """
+    white, walk = _powers(config)
+    lengths = np.asarray(samples, int)
+    deviations = np.empty((_CHANNELS, len(lengths)))
+    for column, m in enumerate(lengths):
+        # The response to one white sample ends, so the integral is a finite sum (Parseval), here on
+        # odd multiples of half the spacing because the walk has a pole at zero.
+        count = 2 * m + int(np.ceil(_FILTER_LENGTHS / (config.bandwidth_hz * period)))
+        f = (np.arange(count) + 0.5) / (2 * count * period)
+        sine2 = np.sin(np.pi * f * period) ** 2
+        weight = 2 * np.sin(np.pi * f * m * period) ** 4 / (m**2 * sine2)
+        weight *= _gain(config, f, period) / count
+        variance = white * weight.sum() + walk * period * (weight / (4 * sine2)).sum()
+        deviations[:, column] = np.sqrt(variance)
+    return deviations
+
+
+def allan_deviation(record: NDArray[np.float64], samples: ArrayLike) -> NDArray[np.float64]:
+    """Overlapping Allan deviation of a record.
+
+    Args:
+        record: (N, channels) samples at a constant rate.
+        samples: (m,) averaging times in samples, each at most N / 2.
+
+    Returns:
+        (channels, m).
+    """
+    start = np.zeros((1, record.shape[1]))
+    sums = np.concatenate([start, np.cumsum(record - record.mean(axis=0), axis=0)])
+    lengths = np.asarray(samples, int)
+    deviations = np.empty((record.shape[1], len(lengths)))
+    for column, m in enumerate(lengths):
+        steps = (sums[2 * m :] - 2 * sums[m:-m] + sums[: -2 * m]) / m
+        deviations[:, column] = np.sqrt(0.5 * np.mean(steps**2, axis=0))
+    return deviations
+
+
+def rest_record(
+    config: WristSensorConfig, count: int, period: float, seed: int
+) -> NDArray[np.float64]:
+    """(count, 12) readings of a sensor that carries nothing and hangs at rest under gravity.
+
+    Args:
+        config: the sensor.
+        count: samples.
+        period: sampling period [s].
+        seed: of the noise.
+    """
+    constants, memory = sensor_chain(config, 1, period)
+    truth = np.zeros(16)
+    truth[8] = 9.81
+    noise = np.random.default_rng(seed).standard_normal((-(-count // NOISE_BLOCK), NOISE_SIZE))
+    record = np.empty((count, _CHANNELS))
+    _record_into(constants, memory, noise, truth, record)
+    return record
+
+
+@njit(cache=True)
+def _record_into(constants, memory, noise, truth, record):
+    reading = np.empty(14)
+    for k in range(record.shape[0]):
+        read_into(constants, memory, noise[k // NOISE_BLOCK], truth, reading)
+        record[k] = reading[:12]
+
+
+def _powers(config: WristSensorConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(12,) variance of a raw sample, and of a walk after one second."""
+    if config.ideal:
+        return np.zeros(_CHANNELS), np.zeros(_CHANNELS)
+    quantum = config.resolution * config.ranges()
+    return config.noise_std() ** 2 + quantum**2 / 12, config.random_walk() ** 2
+
+
+def _gain(
+    config: WristSensorConfig, f: NDArray[np.float64], period: float
+) -> NDArray[np.float64] | float:
+    """|H|^2 of what stands between the noise and the reading."""
+    if config.low_pass != "after_converter":
+        return 1.0
+    z = np.exp(-2j * np.pi * f * period)
+    gain = np.ones_like(f)
+    for b0, b1, b2, a1, a2 in butterworth_sections(config.bandwidth_hz, 1 / period):
+        gain *= np.abs((b0 + z * (b1 + z * b2)) / (1 + z * (a1 + z * a2))) ** 2
+    return gain

@@ -1,0 +1,659 @@
+"""The wrist sensor in the station: when it samples, and what (long: the step and its block).
+
+    truth --[sensor_chain]--> reading --[motion_estimation]--> sample
+
+The truth is rigid-body mechanics: the wrench that the sensor exerts on the tool is V phi of the
+tool minus what the environment exerts on it (Eqs. 1, 2), and the motion is that of S.
+
+The plant takes steps of its own, cut only where something drives it. When a step is over the sensor
+looks back: at each instant in it at which it samples, position and velocity are interpolated
+(Hermite), and the accelerations follow from the dynamics under the torque that the motors had. So
+8 kHz need no events, and what is sampled is exact for the state it belongs to. What the compiled
+law does not know of a tool that it knows otherwise (`Contact.watched`) Drake is asked for where it
+comes near, in a plant of its own (`ContactTwin`). Contact that it does not know at all
+(`Contact.beyond`) Drake tells, for the end of a step alone: then each sample is an event, and ends
+one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common import RandomDistribution
+from pydrake.common.value import Value
+from pydrake.multibody.plant import ContactResults
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    DiscreteValues,
+    EventStatus,
+    LeafSystem,
+    OutputPort,
+)
+from pydrake.systems.primitives import Demultiplexer, RandomSource
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.vectors import apply, cross, minus, nine, put, three, transposed
+from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.load.sample import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    BEFORE_JOINTS,
+    JOINT_POSITION,
+    LOST,
+    MOTION,
+    SATURATED,
+    SPECIFIC_FORCE,
+    WRENCH,
+    WRENCH_AND_MOTION,
+    sample_parts,
+    sample_size,
+)
+from drake_teleop.station.environment.moving_bodies import interpolate_bodies
+from drake_teleop.station.sensor.motion_estimation import (
+    MotionEstimationConfig,
+    estimate_into,
+    motion_estimator,
+)
+from drake_teleop.station.sensor.sensor_chain import (
+    FILTERED,
+    NOISE_BLOCK,
+    NOISE_SIZE,
+    OFFSET,
+    TRUE_ANGLES,
+    WristSensorConfig,
+    believable,
+    read_into,
+    sensor_chain,
+)
+from drake_teleop.station.slave.arm import (
+    MOTION_SIZE,
+    ArmModel,
+    forward_kinematics,
+    sensor_motion,
+)
+from drake_teleop.station.slave.contact_twin import ContactTwin
+from drake_teleop.station.slave.drake_contact import contact_wrench_W
+from drake_teleop.station.slave.plant import SlavePlant
+from drake_teleop.station.slave.plant_rates import joined, plant_rates, rates_under
+from drake_teleop.station.slave.tool_contact import (
+    FAR,
+    TOUCHING,
+    WATCHED,
+    environment_wrench,
+    nearness,
+)
+
+Array = NDArray[np.float64]
+
+#: A part of a period, within which two instants are one.
+_SAME = 1e-6
+#: Steps of the plant that wait to be sampled, at most.
+_LONGEST = 16
+#: How often the plant is asked whether it moves as the dynamics here say [s], and how alike they
+#: have to be: rounding is 1e-12, in a stiff contact 1e-9.
+_CHECK_PERIOD, _ALIKE = 0.1, 1e-6
+#: For so many samples a lost one shows, so that no log misses it.
+_SHOWS = 40
+#: Instead of a wrench that the plant tells, see `sample_step`.
+_BY_LAW = np.zeros(0)
+
+
+@njit(cache=True)
+def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
+    """Writes [f, tau, s, omega, alpha] of S into `out` (15,); `motion` (21,) is scratch.
+
+    The wrench is Eqs. (1)-(2) minus `contact_W` (6,), the wrench of the environment on the tool
+    about the world's origin, in W.
+    """
+    sensor_motion(arm, q, v, vdot, motion)
+    put(out, MOTION.start, motion, 0, 9)
+    s, omega, alpha = out[SPECIFIC_FORCE], out[ANGULAR_VELOCITY], out[ANGULAR_ACCELERATION]
+    wrench = out[WRENCH]
+    non_contact_wrench_into(s, omega, alpha, phi, wrench)
+    # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
+    f, p_WS, R_SW = three(contact_W, 0), three(motion, 9), transposed(nine(motion, 12))
+    tau = minus(three(contact_W, 3), cross(p_WS, f))
+    wrench[0], wrench[1], wrench[2] = minus(three(wrench, 0), apply(R_SW, f))
+    wrench[3], wrench[4], wrench[5] = minus(three(wrench, 3), apply(R_SW, tau))
+
+
+@njit(cache=True)
+def _interpolate(h, u, x, xdot, end, end_dot, out):
+    """Hermite: positions from values and two derivatives, velocities from values and one."""
+    half = x.shape[0] // 2
+    for i in range(half):
+        q, v, a = x[i], x[half + i], xdot[half + i]
+        dq = end[i] - q - h * v - 0.5 * h * h * a
+        dv = h * (end[half + i] - v) - h * h * a
+        da = h * h * (end_dot[half + i] - a)
+        c3 = 10.0 * dq - 4.0 * dv + 0.5 * da
+        c4 = -15.0 * dq + 7.0 * dv - da
+        c5 = 6.0 * dq - 3.0 * dv + 0.5 * da
+        out[i] = q + u * (h * v + u * (0.5 * h * h * a + u * (c3 + u * (c4 + u * c5))))
+        d2, d3 = 3.0 * dv - da, da - 2.0 * dv
+        out[half + i] = v + u * (h * h * a + u * (d2 + u * d3)) / h
+
+
+@njit(cache=True)
+def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
+    """One sample of the state x and what follows from it, into `memory`, see `sample_step`."""
+    arm, phi, _, _, _, _ = physics
+    constants, motion_constants, middle, end, ideal = sensor
+    half = x.shape[0] // 2
+    n = half - 1
+    truth = np.empty(15 + n)
+    v, vdot = x[half : half + n], xdot[half : half + n]
+    rigid = truth[WRENCH_AND_MOTION]
+    true_sample(arm, phi, x[:n], v, vdot, wrench_W, np.empty(MOTION_SIZE), rigid)
+    put(truth, TRUE_ANGLES.start, x, 0, n)
+    size = BEFORE_JOINTS + n
+    sample = memory[:size]
+    put(memory, size, memory, 0, size)
+    if not believable(constants, truth):  # filters would remember it for long
+        sample[SATURATED] = LOST + _SHOWS
+        return
+    lost = sample[SATURATED] - 1.0
+    if ideal:
+        put(sample, WRENCH_AND_MOTION.start, truth, WRENCH_AND_MOTION.start, WRENCH_AND_MOTION.stop)
+        sample[SATURATED] = 0.0
+        put(sample, JOINT_POSITION.start, truth, TRUE_ANGLES.start, n)
+    else:
+        reading = np.empty(13 + n)
+        read_into(constants, memory[2 * size : middle], noise, truth, reading)
+        estimate_into(motion_constants, memory[middle:end], arm, reading, sample)
+    if lost >= LOST:
+        sample[SATURATED] = lost
+
+
+@njit(cache=True)
+def remember_step(tail, time, state, around):
+    """Puts a step's end into the queue that `sample_step` works off; see its `memory`."""
+    width = state.shape[0] + 1 + around.shape[0]
+    entry = tail[2 + int(tail[1]) * width :][:width]
+    entry[0] = time
+    joined(state, around, entry[1:])
+    tail[1] += 1.0
+
+
+@njit(cache=True, borrows=True)
+def _postpone(memory, tail, longest, time, state, around):
+    """Puts a step's end into the queue in `memory`, see `sample_step`; whether there was room."""
+    if memory[tail + 1] >= longest:
+        return False
+    remember_step(memory[tail:], time, state, around)
+    return True
+
+
+@njit(cache=True)
+def _torque_at(held, after, torque):
+    """The motors' torque (n,) `after` now [s]; `held` as of `sample_step`."""
+    put(torque, 0, held[0], 0, torque.shape[0])
+    for i in range(held[1].shape[0]):
+        torque[i] += after * held[1][i]
+
+
+@njit(cache=True, borrows=True)
+def sample_step(
+    physics, sensor, period, time, state, around, held, applied_W, noise, memory, until_now,
+    touching_W, scratch, result,
+):  # fmt: skip
+    """Takes the samples that have become due in the steps since the last call.
+
+    Args:
+        physics: (arm's table, phi of the tool, contact pairs, leaf (4,): mass, stiffness, damping,
+            acceleration by gravity; joints of what else moves, wrenches that are told).
+        sensor: (chain's constants, estimator's, where its memory begins, where the tail does,
+            ideal).
+        period: of the sensor [s].
+        time: now [s], the end of a step.
+        state: (2 n,) [q; v] now.
+        around: [the sheet's deflection and its rate, the plant's state if anything else moves] now.
+        held: torque (n,) now, of these steps' motors [N m], and at which rate it changed in them;
+            (0,) if it was held.
+        applied_W: (6,), see `environment_wrench`.
+        noise: for the chain.
+        memory: [last sample (16 + n) | the one before (16 + n) | chain's | estimator's | tail:
+            samples taken, length of the queue, time and x of each step's end in it].
+        until_now: whether the sample that may be due this very instant is taken.
+        touching_W: (6,) what contacts exert on the tool now, as the plant says, about the world's
+            origin, in W, or (0,), as `physics` says. A stiff contact multiplies the last digit of
+            a position by 2e5 N/m: what has the plant's own penetration is the plant's to 1e-12 N.
+        scratch: (9, 2 n + 6 + size of the plant's state), whatever it holds.
+        result: filled: [last sample before now (16 + n) | when that was taken [s] | memory, its
+            queue now's end alone].
+    """
+    n = state.shape[0] // 2
+    size, half, tau, joints = BEFORE_JOINTS + n, n + 1, scratch[7, :n], physics[4]
+    extra = around.shape[0] - 2
+    full = 2 * half + extra
+    width = 1 + full
+    after = result[size + 1 :]
+    put(after, 0, memory, 0, memory.shape[0])
+    tail = after[sensor[3] :]
+    count, queued = tail[0], int(tail[1])
+    now, between = scratch[0, :full], scratch[1, :full]
+    now_dot, between_dot = scratch[2, : 2 * half], scratch[3, : 2 * half]
+    start_dot, end_dot = scratch[4, : 2 * half], now_dot
+    now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
+    joined(state, around, now)
+    put(between, 2 * half, now, 2 * half, extra)  # for what is not interpolated of it: the arm
+    _torque_at(held, 0.0, tau)
+    if touching_W.shape[0] > 0:
+        none, sheet, plant = physics[2][:0], around[:2], around[2:]
+        environment_wrench(
+            physics[0], none, joints, applied_W, state[:n], state[n:], sheet, plant, now_wrench_W
+        )
+        now_wrench_W += touching_W
+        rates_under(physics, now, tau, applied_W, now_wrench_W, now_dot)
+    else:
+        plant_rates(physics, now, tau, applied_W, now_wrench_W, now_dot)
+    for k in range(queued):
+        start = tail[2 + k * width :][:width]
+        until, end, end_dot = time, now, now_dot
+        if k < queued - 1:
+            following = tail[2 + (k + 1) * width :][:width]
+            until, end, end_dot = following[0], following[1:], scratch[8, : 2 * half]
+        if (count + _SAME) * period >= until:
+            continue
+        _torque_at(held, start[0] - time, tau)
+        plant_rates(physics, start[1:], tau, applied_W, wrench_W, start_dot)
+        if k < queued - 1:
+            _torque_at(held, until - time, tau)
+            plant_rates(physics, end, tau, applied_W, wrench_W, end_dot)
+        h = until - start[0]
+        while (count + _SAME) * period < until:
+            u = (count * period - start[0]) / h
+            _interpolate(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
+            if extra > 0:
+                at_start, at_end = start[width - extra :], end[2 * half :]
+                interpolate_bodies(joints, h, u, at_start, at_end, between[2 * half :])
+            _torque_at(held, count * period - time, tau)
+            plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
+            _take(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
+            count += 1.0
+    # A step that is all rounding may have ended a little before, and have taken this sample.
+    taken = (count - 1.0 + _SAME) * period > time
+    put(result, 0, after, size if taken else 0, size)
+    result[size] = (count - (2.0 if taken else 1.0)) * period
+    if until_now and (count - _SAME) * period < time:
+        _take(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
+        count += 1.0
+    tail[0], tail[1] = count, 0.0
+    remember_step(tail, time, state, around)
+
+
+class WristSensor(LeafSystem):
+    """Samples force, torque, motion of S and joint angles at the sensor's rate.
+
+    .. pydrake_system::
+
+        name: WristSensor
+        input_ports:
+        - slave_state: [q; v] of the arm
+        - joint_torque: (n,) of the motors now [N m]
+        - torque_rate: (n,) at which it changes [N m/s] (only with `ramps`)
+        - slave_acceleration: vdot of the arm, to see that nothing else moves it
+        - sheet_state: [z; v_z] of the sheet spring (only if there is one)
+        - plant_state: [q; v] of the whole plant (only if anything else moves)
+        - contact_results: the plant's (only with something to touch)
+        - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
+        - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, of whatever pushes it besides
+          contacts [N, N m] (may be left unconnected)
+        output_ports:
+        - step: [the last sample before now: the parts of `sample_parts` (16 + n) | when it was
+          taken [s] | memory]
+
+    Args:
+        slave: the plant, for its numbers: the tool's true inertial parameters, shapes that touch.
+        config: the sensor.
+        motion: how the motion of S is estimated from its readings.
+        period: sampling period [s].
+        held: for how long the motors hold a torque, or its rate [s].
+        q_start: (n,) where the arm rests before the first sample [rad].
+        ramps: whether they hold a rate.
+
+    Raises:
+        DrakeTeleopError: from the simulation, if something moves the arm that the sensor is not
+            told of: its samples would be wrong.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self,
+        slave: SlavePlant,
+        config: WristSensorConfig,
+        motion: MotionEstimationConfig,
+        period: float,
+        held: float,
+        q_start: Array,
+        *,
+        ramps: bool = False,
+    ) -> None:
+        super().__init__()
+        arm = slave.arm
+        n = self._n = arm.num_joints
+        constants, chain = sensor_chain(config, n, period)
+        motion_constants, estimator = motion_estimator(motion, config, n, period)
+        self._offset = constants[OFFSET]
+        self._physics, contact = slave.physics, slave.contact
+        first = sample_at_rest(arm, q_start)
+        if not config.ideal:
+            first[WRENCH] += config.offset
+        # Contact takes many steps for one torque, and to work off the queue takes longer than them.
+        self._beyond = contact.beyond
+        # To ask the plant takes as long as two samples. Noise is 1e9 times what that would tell.
+        self._exact = config.ideal or bool(contact.beyond)
+        self._longest = _LONGEST if slave.can_touch and not contact.beyond else 1
+        self._around = np.zeros(2 + contact.plant_size)
+        tail = np.zeros(2 + self._longest * (2 * n + 1 + len(self._around)))
+        memory = np.concatenate([first, first, chain, estimator, tail])
+        ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
+        self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
+        # Neither plant nor indices in it, which would hold the Diagram that holds this.
+        self._watched, self._moving, self._plant_size = (
+            contact.watched,
+            tuple(contact.moving),
+            contact.plant_size,
+        )
+        self._twins = slave.config, slave.environment, slave.start
+        self._twin: ContactTwin | None = None
+        self._most_told = 2 * self._longest + int(held / period) + 4
+        self._period = period
+        self._holds = (held, NOISE_BLOCK * period)
+        self._no_noise, self._nothing, self._no_rate = (
+            np.zeros(NOISE_SIZE),
+            np.zeros(6),
+            np.zeros(0),
+        )
+
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
+        self._torque = self.DeclareVectorInputPort("joint_torque", n)
+        self._rate = self.DeclareVectorInputPort("torque_rate", n) if ramps else None
+        self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
+        self._applied = self.DeclareVectorInputPort("applied_wrench_W", 6)
+        self._sheet = self._contacts = self._noise = self._plant = None
+        if slave.sensed_sheet is not None:
+            self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
+        if contact.plant_size:
+            self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_size)
+        if slave.can_touch:
+            contacts = Value[ContactResults]()
+            self._contacts = self.DeclareAbstractInputPort("contact_results", contacts)
+            self._tool = contact.bodies, contact.shapes
+        if not config.ideal:
+            self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
+        self.DeclareDiscreteState(memory)
+        self._result = np.zeros(len(first) + 1 + len(memory))
+        self._remains = slice(len(first) + 1, None)  # of a step: the memory
+        self._scratch = np.empty((9, 2 * n + 6 + contact.plant_size))
+        # Not the acceleration: whatever changes in the plant would be passed on twice.
+        pushes = (self._torque, self._rate, self._applied)
+        around = (self._sheet, self._plant, self._contacts)
+        seen = (self._state, *pushes, *around, self._noise)
+        tickets = {port.ticket() for port in seen if port is not None}
+        tickets |= {self.time_ticket(), self.xd_ticket()}
+        self._step = self.DeclareVectorOutputPort(
+            "step", len(self._result), weak_callback(self._calc_step), tickets
+        )
+        if self._beyond:
+            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        else:
+            self.DeclarePerStepDiscreteUpdateEvent(self._update)
+        self.DeclarePeriodicPublishEvent(_CHECK_PERIOD, 0.0, self._check)
+
+    @property
+    def offset(self) -> Array:
+        """(6,) of force and torque [N, N m], a view: an offset may drift during a simulation."""
+        return self._offset
+
+    @property
+    def phi(self) -> Array:
+        """(10,) of what hangs on the sensor, a view: something may be grasped in a simulation."""
+        return self._physics[1]
+
+    @property
+    def contact_pairs(self) -> Array:
+        """(k, 28) what may touch, see `Pairs`, a view."""
+        return self._physics[2]
+
+    @property
+    def beyond(self) -> str:
+        """What its own contact law does not know, see `Contact`."""
+        return self._beyond
+
+    @property
+    def moves(self) -> str:
+        """What of the surroundings moves besides a leaf, as a sentence, or nothing."""
+        names = ", ".join(self._moving)
+        return f"{names} can move" if names else ""
+
+    @property
+    def remembered(self) -> NDArray[np.intp]:
+        """Where in the discrete state stands what the motion has left there.
+
+        Not counters and flags, nor random walks, nor the sample before the last one.
+        """
+        _, _, chain_end, end, _ = self._sensor
+        size = sample_size(self._n)
+        before_and_walks = range(size, 2 * size + FILTERED)
+        others = [SATURATED, *before_and_walks, chain_end, chain_end + 1]
+        return np.delete(np.arange(end), others)
+
+    def take_samples(self, context: Context) -> None:
+        """Takes the samples before now, for who wants to see the state that results."""
+        seen = self._seen(context)
+        self._sample(context, seen, self._near(*seen), False, _BY_LAW, self._result)
+        context.SetDiscreteState(self._result[self._remains])
+
+    def bring_up_to_date(self, context: Context) -> None:
+        """Makes now the end of the last step, with the samples before now taken.
+
+        For who sets states by hand: as if the simulation had arrived here.
+        """
+        memory = context.get_mutable_discrete_state_vector().get_mutable_value()
+        tail, time = memory[self._sensor[3] :], context.get_time()
+        tail[0], tail[1] = np.ceil(time / self._period - _SAME), 0.0
+        remember_step(tail, time, *self._seen(context))
+
+    def _seen(self, context: Context) -> tuple[Array, Array]:
+        """[q; v] of the arm, and `_surroundings`."""
+        return self._state.Eval(context), self._surroundings(context)
+
+    def _surroundings(self, context: Context) -> Array:
+        """[Deflection, rate] of the leaf, or [0, 0, the plant's state]."""
+        if self._plant is not None:
+            self._around[2:] = self._plant.Eval(context)
+        return self._around if self._sheet is None else self._sheet.Eval(context)
+
+    def _applied_W(self, context: Context) -> Array:
+        return self._applied.Eval(context) if self._applied.HasValue(context) else self._nothing
+
+    def _near(self, state: Array, around: Array) -> int:
+        """See `nearness`."""
+        if self._contacts is None:
+            return FAR
+        if self._beyond:
+            return TOUCHING
+        arm, _, pairs, _, joints, _ = self._physics
+        q = state[: self._n]
+        return nearness(arm, pairs, self._watched, joints, q, around[:2], around[2:])
+
+    def _touching_W(self, context: Context) -> Array:
+        assert self._contacts is not None
+        return contact_wrench_W(self._contacts.Eval(context), *self._tool)
+
+    def _touching_So_W(self, context: Context) -> Array:
+        """What contacts exert on the tool, about So, as what is applied to it."""
+        wrench_W = self._touching_W(context).copy()
+        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+        forward_kinematics(self._physics[0], self._state.Eval(context)[: self._n], R_WS, p_WS)
+        wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
+        return wrench_W
+
+    def _inputs(self, context: Context, seen: tuple[Array, Array]) -> tuple[object, ...]:
+        return (
+            self._physics,
+            self._sensor,
+            self._period,
+            context.get_time(),
+            *seen,
+            (
+                self._torque.Eval(context),
+                self._no_rate if self._rate is None else self._rate.Eval(context),
+            ),
+            self._applied_W(context),
+            self._no_noise if self._noise is None else self._noise.Eval(context),
+            context.get_discrete_state_vector().value(),
+        )
+
+    def _calc_step(self, context: Context, output: BasicVector) -> None:
+        seen = self._seen(context)
+        near = self._near(*seen)
+        if near == FAR:
+            touching_W = self._nothing
+        elif near == WATCHED or self._exact:
+            touching_W = self._touching_W(context)
+        else:
+            touching_W = _BY_LAW
+        self._sample(context, seen, near, True, touching_W, output.get_mutable_value())
+
+    def _sample(
+        self,
+        context: Context,
+        seen: tuple[Array, Array],
+        near: int,
+        until_now: bool,
+        touching_W: Array,
+        result: Array,
+    ) -> None:
+        """`sample_step`, with Drake's contact at each instant if the tool is watched."""
+        inputs = self._inputs(context, seen)
+        if near != WATCHED:
+            sample_step(*inputs, until_now, touching_W, self._scratch, result)
+            return
+        if self._twin is None:
+            self._twin = ContactTwin(*self._twins)
+        own = 2 * self._n + 2
+        size = own + self._plant_size
+        told = np.zeros((1 + self._most_told, 2 + size))
+        physics = (*self._physics[:-1], told)
+        # The state of each wrench that is asked for follows from those before.
+        for k in range(self._most_told):
+            told[0, :2] = k, 0.0
+            sample_step(physics, *inputs[1:], until_now, touching_W, self._scratch, result)
+            if told[0, 1] <= k:
+                return
+            asked = told[0, 2:]
+            told[1 + k, :6] = self._twin.wrench_W(asked[:own], asked[own:])
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        if self._longest > 1 and not self._is_due(context.get_time()):
+            seen = self._seen(context)
+            if not self._watched.size or self._near(*seen) != WATCHED:
+                memory, time = discrete_state.get_mutable_value(0), context.get_time()
+                if _postpone(memory, self._sensor[3], self._longest, time, *seen):
+                    return
+        discrete_state.set_value(0, self._step.Eval(context)[self._remains])
+
+    def _is_due(self, time: float) -> bool:
+        """Whether now the torque may change, or the noise."""
+        # Written out, because in contact it is asked at every step.
+        margin, (held, block) = _SAME * self._period, self._holds
+        if abs(time - held * round(time / held)) < margin:
+            return True
+        return abs(time - block * round(time / block)) < margin
+
+    def _check(self, context: Context) -> EventStatus:
+        n = self._n
+        state, around = self._seen(context)
+        x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
+        joined(state, around, x)
+        if not np.isfinite(x).all():  # nothing is known; the samples say so
+            return EventStatus.Succeeded()
+        torque, applied = self._torque.Eval(context), self._applied_W(context)
+        physics = self._physics
+        if self._beyond or self._near(state, around) == WATCHED:
+            applied = applied + self._touching_So_W(context)
+            physics = (*physics[:2], physics[2][:0], *physics[3:])
+        plant_rates(physics, x, torque, applied, np.empty(6), xdot)
+        vdot = self._acceleration.Eval(context)
+        if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ALIKE * (1.0 + np.abs(vdot).max()):
+            raise DrakeTeleopError(
+                f"at {context.get_time():g} s something moves the slave that it knows nothing of",
+                where="wrist_sensor.applied_wrench_W",
+                remedy="connect whatever pushes the tool to this port too",
+            )
+        return EventStatus.Succeeded()
+
+
+def sample_at_rest(arm: ArmModel, q: Array) -> Array:
+    """The true sample (16 + n,) of the arm that rests at q (n,) [rad]: what stands before t = 0."""
+    sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
+    touching, motion, truth = np.zeros(6), np.zeros(MOTION_SIZE), sample[WRENCH_AND_MOTION]
+    true_sample(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
+    sample[JOINT_POSITION] = q
+    return sample
+
+
+def AddWristSensor(
+    builder: DiagramBuilder,
+    slave: SlavePlant,
+    config: WristSensorConfig,
+    motion: MotionEstimationConfig,
+    period: float,
+    held: float,
+    q_start: Array,
+    *,
+    ramps: bool = False,
+) -> dict[str, OutputPort]:
+    """Adds "wrist_sensor" and its noise, and what divides its port, for Drake numbers the parts.
+
+    What remains to be connected is the state, the acceleration and the torque of the arm.
+
+    Args:
+        builder: the diagram that holds the plant.
+        slave: the plant.
+        config: the sensor.
+        motion: how the motion of S is estimated.
+        period: sampling period [s].
+        held: for how long the motors hold a torque, or its rate [s].
+        q_start: (n,) where the arm rests before the first sample [rad].
+        ramps: whether they hold a rate.
+
+    Returns:
+        The ports by name: "sample", with each of its parts, see `sample_parts`, and "sample_time".
+    """
+    sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
+    builder.AddNamedSystem("wrist_sensor", sensor)
+    if not config.ideal:
+        noise = builder.AddNamedSystem(
+            "wrist_sensor_noise",
+            RandomSource(RandomDistribution.kGaussian, NOISE_SIZE, NOISE_BLOCK * period),
+        )
+        builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
+    if slave.sensed_sheet is not None:
+        builder.Connect(
+            slave.plant.get_state_output_port(slave.sensed_sheet),
+            sensor.GetInputPort("sheet_state"),
+        )
+    if slave.contact.plant_size:
+        builder.Connect(slave.plant.get_state_output_port(), sensor.GetInputPort("plant_state"))
+    if slave.can_touch:
+        builder.Connect(
+            slave.plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")
+        )
+    parts = sample_parts(slave.arm.num_joints)
+    sizes = list(parts.values())
+    step = sensor.GetOutputPort("step")
+    rest = step.size() - sum(sizes)
+    whole = builder.AddNamedSystem("wrist_sample", Demultiplexer([sum(sizes) + 1, rest - 1]))
+    divided = builder.AddNamedSystem("sample_parts", Demultiplexer([*sizes, 1, rest - 1]))
+    for splitter in (whole, divided):
+        builder.Connect(step, splitter.get_input_port())
+    ports = {name: divided.get_output_port(i) for i, name in enumerate([*parts, "sample_time"])}
+    return ports | {"sample": whole.get_output_port(0)}

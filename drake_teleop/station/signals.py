@@ -1,0 +1,128 @@
+"""The signals that a station records: name, components, units, meaning."""
+
+from __future__ import annotations
+
+from drake_teleop.station.result import Signal
+
+#: Name of the one log sink in a station; it holds the station's output ports side by side.
+LOG = "log"
+
+
+def _signal(name: str, components: str, units: str, description: str) -> Signal:
+    unit = tuple(units.split(","))
+    return Signal(name, tuple(components.split()), unit[0] if len(unit) == 1 else unit, description)
+
+
+#: Before the name of a body of the surroundings that moves: its pose is a signal of its own.
+POSE_OF = "pose_of_"
+
+_WRENCH = ("f_x f_y f_z tau_x tau_y tau_z", "N,N,N,N m,N m,N m")
+_POSE = ("q_w q_x q_y q_z p_x p_y p_z", "1,1,1,1,m,m,m")
+_TWIST = ("v_x v_y v_z omega_x omega_y omega_z", "m/s,m/s,m/s,rad/s,rad/s,rad/s")
+
+
+def _state(joints: int) -> tuple[str, str]:
+    names = [f"{letter}_{i + 1}" for letter in "qv" for i in range(joints)]
+    return " ".join(names), ",".join(joints * ["rad"] + joints * ["rad/s"])
+
+
+def _joints(joints: int) -> str:
+    return " ".join(f"joint_{i + 1}" for i in range(joints))
+
+
+_STATE, _STATE_UNITS = _state(6)
+_JOINTS = _joints(6)
+# Those of the slave have as many components as its arm has joints; so has a leader's state.
+_OF_JOINTS = ("joint_position", "joint_torque", "joint_command")
+
+
+#: Everything that a station can record, in the order of the log; of an arm with six joints.
+SIGNALS = {
+    signal.name: signal
+    for signal in (
+        _signal("measured_wrench_S", *_WRENCH, "of the sensor, sign of Eq. (1), at sample_time"),
+        _signal("specific_force_S", "s_x s_y s_z", "m/s^2", "a - g at So, at sample_time"),
+        _signal("angular_velocity_S", "omega_x omega_y omega_z", "rad/s", "of S, at sample_time"),
+        _signal(
+            "angular_acceleration_S", "alpha_x alpha_y alpha_z", "rad/s^2", "of S, at sample_time"
+        ),
+        _signal(
+            "saturated",
+            "saturated",
+            "1",
+            "1 if a channel of the sensor was, above that for a while if a reading was lost, at"
+            " sample_time",
+        ),
+        _signal("joint_position", _JOINTS, "rad", "the slave's encoders' reading, at sample_time"),
+        _signal(
+            "sample_time",
+            "t",
+            "s",
+            "when the wrist sensor took the sample of this row; slave_state is of t",
+        ),
+        _signal(
+            "load_estimate",
+            "fo_x fo_y fo_z tauo_x tauo_y tauo_z m mc_x mc_y mc_z I_xx I_xy I_xz I_yy I_yz I_zz",
+            "N,N,N,N m,N m,N m,kg,kg m,kg m,kg m" + ",kg m^2" * 6,
+            "offsets and phi, Eq. (7)",
+        ),
+        _signal("slave_state", _STATE, _STATE_UNITS, "true joint angles and velocities, at t"),
+        _signal("joint_torque", _JOINTS, "N m", "of the slave's motors"),
+        _signal(
+            "load_state",
+            "state",
+            "1",
+            "learning, settled, disturbed, changed: load/online/watched.py",
+        ),
+        _signal("true_contact_wrench_W", *_WRENCH, "environment on the tool, about the origin"),
+        _signal("sheet_state", "z v_z", "m,m/s", "deflection of the sheet spring's end, upwards"),
+        _signal("intent", *_POSE, "where the operator wants the stylus, X_BE"),
+        _signal("hand_wrench_E", *_WRENCH, "hand on the stylus at Eo, in B"),
+        _signal("master_state", _STATE, _STATE_UNITS, "joint angles and velocities of the device"),
+        _signal("pose_master", *_POSE, "of the stylus, X_BE"),
+        _signal("twist_master", *_TWIST, "of the stylus in the device's base"),
+        _signal("pose_command", *_POSE, "setpoint of the slave, X_WS"),
+        _signal("joint_command", _JOINTS, "rad", "from the inverse kinematics"),
+        _signal("ik_status", "status", "1", "of the inverse kinematics, 0 = fine"),
+        _signal("scaled_wrench_S", *_WRENCH, "F' of Fig. 2, before the scale to the master"),
+        _signal("contact_wrench_S", *_WRENCH, "Eq. (13), calculated contact wrench"),
+        _signal("fault", "fault", "1", "of sample or load estimate, 0 = none: fault.py"),
+        _signal("force_to_master", *_WRENCH, "what the device displays, within its limits"),
+        _signal("fault_at_hand", "fault", "1", "of what the device shall display: fault.py"),
+        _signal(
+            "task_state",
+            "phase outcome noticed threshold trust",
+            "1,1,1,N,1",
+            "of the operator's task: phase, 1 done or -1 given up, 1 while contact is noticed, from"
+            " which felt force on it is, and trust: operator/task.py",
+        ),
+        _signal("pose_received", *_POSE, "of the setpoint, what comes out of the channel, X_WS"),
+        _signal(
+            "ports",
+            "hand hand_rotation slave slave_rotation master_silent slave_silent"
+            " command command_rotation",
+            "J,J,J,J,s,s,J,J",
+            "energy put into the channel at its ends, in the master's power units; how long each"
+            " end has heard nothing; what the slave's wrench puts in along the command",
+        ),
+        _signal("contact", "contact", "1", "1 while the slave's detector notices a contact"),
+        _signal("contact_at_hand", "contact", "1", "the same as it has arrived at the hand"),
+    )
+}
+
+
+def signal_of(name: str, size: int) -> Signal:
+    """The signal of that name in a station whose port has so many components.
+
+    Where a joint slides, rad stands for m and N m for N.
+    """
+    if name.startswith(POSE_OF):
+        return _signal(name, *_POSE, f"where the body {name.removeprefix(POSE_OF)} is, in W, at t")
+    signal = SIGNALS[name]
+    if size == len(signal.components):
+        return signal
+    if name in _OF_JOINTS:
+        return _signal(name, _joints(size), signal.units[0], signal.description)
+    if name in ("slave_state", "master_state"):
+        return _signal(name, *_state(size // 2), signal.description)
+    return signal

@@ -1,0 +1,190 @@
+"""A serial arm of revolute and prismatic joints, read out of a finalized MultibodyPlant."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    BodyIndex,
+    Frame,
+    Joint,
+    JointActuator,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+    SpatialInertia,
+    WeldJoint,
+)
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.slave.arm import (
+    DAMPING,
+    GRAVITY,
+    PHI,
+    ROTATION,
+    ROTOR,
+    SLIDES,
+    TRANSLATION,
+    WIDTH,
+    ArmModel,
+    Array,
+)
+
+
+def ArmModelFromPlant(
+    plant: MultibodyPlant,
+    model_instance: ModelInstanceIndex,
+    sensor_frame_name: str = "sensor",
+) -> ArmModel:
+    """Reads the chain from the world to a sensor frame out of a finalized plant.
+
+    Joints beyond the sensor frame (a gripper's fingers) count as held at their default positions.
+
+    Args:
+        plant: a finalized plant; other models in it do not matter, whatever is attached to the arm
+            counts, whichever model instance it belongs to.
+        model_instance: the arm's.
+        sensor_frame_name: a frame of that model instance, on the last link or welded to it.
+
+    Raises:
+        DrakeTeleopError: there is no such frame, or what leads to it from the world is not a chain
+            of welds, revolute and prismatic joints, or a link carries a further moving joint.
+    """
+    if not plant.HasFrameNamed(sensor_frame_name, model_instance):
+        raise DrakeTeleopError(
+            f"the arm has no frame named {sensor_frame_name!r}",
+            where=plant.GetModelInstanceName(model_instance),
+            remedy="name the frame or link at which the sensor measures",
+        )
+    frame_S = plant.GetFrameByName(sensor_frame_name, model_instance)
+    inboard = {
+        joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
+    }
+    joints = _chain(inboard, frame_S)
+    n = len(joints)
+    table = np.zeros((n + 1, WIDTH))
+    for row, joint in enumerate(joints):
+        table[row, ROTOR] = _reflected_inertia(plant, joint)
+        table[row, DAMPING] = joint.default_damping()
+        table[row, SLIDES] = isinstance(joint, PrismaticJoint)
+    gravity = plant.gravity_field()
+    table[n, GRAVITY:SLIDES] = gravity.gravity_vector() * gravity.is_enabled(model_instance)
+
+    context = plant.CreateDefaultContext()
+    # C turns the joint's axis into z.
+    C = [RigidTransform(RotationMatrix.MakeFromOneVector(_axis(j), 2)) for j in joints]
+    X_WS = frame_S.CalcPoseInWorld(context)
+    X_WJ = [
+        j.frame_on_parent().CalcPoseInWorld(context) @ X for j, X in zip(joints, C, strict=True)
+    ]
+    X_WL = [j.frame_on_child().CalcPoseInWorld(context) @ X for j, X in zip(joints, C, strict=True)]
+    X_WJ.append(X_WS)
+    X_WL.append(X_WS)
+    for row, X_WP in enumerate([RigidTransform(), *X_WL[:-1]]):
+        X_PJ = X_WP.InvertAndCompose(X_WJ[row])
+        table[row, ROTATION:TRANSLATION] = X_PJ.rotation().matrix().ravel()
+        table[row, TRANSLATION:PHI] = X_PJ.translation()
+    rows = {joint.child_body().index(): row for row, joint in enumerate(joints)}
+    for index in inboard:
+        body = plant.get_body(index)
+        found = _row_of(body, inboard, rows, frame_S.body())
+        if found is not None:
+            X_LB = X_WL[found].InvertAndCompose(body.EvalPoseInWorld(context))
+            M_B = body.CalcSpatialInertiaInBodyFrame(context)
+            table[found, PHI:ROTOR] += _phi(M_B, X_LB)
+    return ArmModel(
+        joint_names=tuple(joint.name() for joint in joints),
+        table=table,
+        lower=_per_joint([j.position_lower_limits()[0] for j in joints]),
+        upper=_per_joint([j.position_upper_limits()[0] for j in joints]),
+        velocity_limit=_per_joint([j.velocity_upper_limits()[0] for j in joints]),
+        acceleration_limit=_per_joint([j.acceleration_upper_limits()[0] for j in joints]),
+        effort_limit=_per_joint([_effort_limit(plant, j) for j in joints]),
+        position_index=np.array([j.position_start() for j in joints], dtype=np.intp),
+        velocity_index=np.array([j.velocity_start() for j in joints], dtype=np.intp),
+    )
+
+
+def _per_joint(values: list[float]) -> Array:
+    return np.array(values, dtype=np.float64)
+
+
+def _axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
+    slides = isinstance(joint, PrismaticJoint)
+    axis: Array = joint.translation_axis() if slides else joint.revolute_axis()
+    return axis
+
+
+def _chain(inboard: dict[BodyIndex, Joint], frame_S: Frame) -> list[RevoluteJoint | PrismaticJoint]:
+    """The moving joints from the world to S, from the base outwards."""
+    body, joints = frame_S.body(), list[RevoluteJoint | PrismaticJoint]()
+    while body.index() in inboard:
+        joint = inboard[body.index()]
+        if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
+            joints.append(joint)
+        elif not isinstance(joint, WeldJoint):
+            raise DrakeTeleopError(
+                f"the arm hangs on a {joint.type_name()} joint",
+                where=joint.name(),
+                remedy="weld the arm's base to the world; up to the sensor, use joints of one axis",
+            )
+        body = joint.parent_body()
+    if not joints:
+        raise DrakeTeleopError(
+            f"no moving joint between the world and {frame_S.name()}",
+            where="sensor_frame",
+            remedy="name a frame or link that the arm moves",
+        )
+    return joints[::-1]
+
+
+def _row_of(
+    body: RigidBody,
+    inboard: dict[BodyIndex, Joint],
+    rows: dict[BodyIndex, int],
+    sensor_body: RigidBody,
+) -> int | None:
+    """The row of the table that carries the body's inertia; None if the arm does not carry it."""
+    moving = None
+    outermost = body
+    while True:
+        if body.index() == sensor_body.index() and outermost.index() != body.index():
+            return len(rows)
+        if body.index() in rows:
+            break
+        if body.index() not in inboard:
+            return None
+        joint = inboard[body.index()]
+        if not isinstance(joint, WeldJoint):
+            moving = joint
+        body = joint.parent_body()
+    if moving is not None:
+        raise DrakeTeleopError(
+            f"link {body.name()} carries a moving part beside the chain to the sensor",
+            where=moving.name(),
+            remedy="weld that joint",
+        )
+    return rows[body.index()]
+
+
+def _phi(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
+    """(10,) phi of a body about the origin of L, in L."""
+    M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
+    M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
+    I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()
+    return np.array([M_BLo_L.get_mass(), *M_BLo_L.CalcComMoment(), *I_BLo_L[np.triu_indices(3)]])
+
+
+def _actuators(plant: MultibodyPlant, joint: Joint) -> list[JointActuator]:
+    actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
+    return [a for a in actuators if a.joint().index() == joint.index()]
+
+
+def _reflected_inertia(plant: MultibodyPlant, joint: Joint) -> float:
+    return sum(a.default_reflected_inertia() for a in _actuators(plant, joint))
+
+
+def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
+    return min((a.effort_limit() for a in _actuators(plant, joint)), default=np.inf)

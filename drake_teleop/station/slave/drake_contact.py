@@ -1,0 +1,76 @@
+"""Contact as Drake computes it, for what the wrist sensor's own law does not know.
+
+Meshes, cylinders, boxes on boxes, pressures over an area. Drake tells the forces of the state that
+the plant is in, so the plant stops at each of the sensor's samples: the wrench is as exact as by
+the compiled law, and takes longer to simulate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import Value
+from pydrake.multibody.plant import ContactResults
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.station.slave.tool_contact import add_force
+
+
+def contact_wrench_W(
+    results: ContactResults, bodies: Container[int], shapes: Container[int]
+) -> NDArray[np.float64]:
+    """(6,) what all contacts exert on the tool, [f; tau] about the world's origin, in W [N, N m].
+
+    Args:
+        results: of the plant.
+        bodies: the tool's, as numbers.
+        shapes: the identifiers of their collision shapes, as numbers.
+    """
+    wrench_W = np.zeros(6)
+    for k in range(results.num_point_pair_contacts()):
+        contact = results.point_pair_contact_info(k)
+        if int(contact.bodyB_index()) in bodies:  # which the force is on
+            add_force(wrench_W, contact.contact_point(), contact.contact_force())
+        elif int(contact.bodyA_index()) in bodies:
+            add_force(wrench_W, contact.contact_point(), -contact.contact_force())
+    for k in range(results.num_hydroelastic_contacts()):
+        area = results.hydroelastic_contact_info(k)
+        surface, F_Ac_W = area.contact_surface(), area.F_Ac_W()  # on the body of M
+        first, second = surface.id_M().get_value(), surface.id_N().get_value()
+        sign = float(first in shapes) - float(second in shapes)
+        if sign != 0.0:
+            add_force(wrench_W, surface.centroid(), sign * F_Ac_W.translational())
+            wrench_W[3:] += sign * F_Ac_W.rotational()
+    return wrench_W
+
+
+class DrakeContact(LeafSystem):
+    """The true contact wrench for the log, of Drake's contact results; no controller sees it.
+
+    .. pydrake_system::
+
+        name: DrakeContact
+        input_ports:
+        - contact_results: the plant's
+        output_ports:
+        - true_contact_wrench_W: on the tool, [f; tau] about the world's origin, in W
+
+    Args:
+        bodies: the tool's, as numbers.
+        shapes: the identifiers of their collision shapes, as numbers.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, bodies: Container[int], shapes: Container[int]) -> None:
+        super().__init__()
+        self._of = bodies, shapes
+        results = Value[ContactResults]()
+        self._contacts = self.DeclareAbstractInputPort("contact_results", results)
+        self.DeclareVectorOutputPort("true_contact_wrench_W", 6, weak_callback(self._calc))
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(contact_wrench_W(self._contacts.Eval(context), *self._of))

@@ -1,0 +1,331 @@
+"""Closed-form inverse kinematics of the Staubli RX90: all eight branches, and the nearest one.
+
+The wrist is spherical, so position and orientation come apart (Pieper 1968): the first three joints
+put the wrist's centre, the last three turn the sensor frame. Lengths are those of models/rx90.sdf.
+
+At q = 0 the arm points straight up and S has the world's axes; then with the wrist centre at
+(x, y, z) above the shoulder and rho its signed distance from the first axis
+
+    rho = -(l2 sin q2 + l3 sin(q2 + q3)),   z = l2 cos q2 + l3 cos(q2 + q3),
+    R_WS = Rz(q1) Ry(-q2 - q3) Rz(q4) Ry(-q5) Rz(q6).
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.fault import sound
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.vectors import put
+from drake_teleop.station.slave.arm import SLIDES, ArmModel, forward_kinematics
+
+Array = NDArray[np.float64]
+
+SHOULDER_HEIGHT = 0.420
+"""Base to shoulder [m]."""
+UPPER_ARM = 0.450
+"""Shoulder to elbow [m]."""
+FOREARM = 0.450
+"""Elbow to wrist centre [m]."""
+FLANGE = 0.085
+"""Wrist centre to the origin of S, along z_S [m]."""
+
+# Below this a direction says nothing any more: distance from the first axis [m] and sin q5.
+_SINGULAR = 1e-9
+# A limit may be passed by this much [rad]; the angle is put onto it.
+_ROUNDING = 1e-9
+
+
+class IkStatus(IntEnum):
+    """How the inverse kinematics came by its answer; here in the words of the closed form.
+
+    The numeric one (`numeric_inverse_kinematics`) comes as near to the pose as it can, whatever
+    keeps it from it. By WRIST_SINGULAR it means that the last three axes nearly lie in a plane, by
+    SHOULDER_SINGULAR any other singularity; past either a part of the pose is met late.
+    """
+
+    OK = 0
+    """The pose is met."""
+    WRIST_SINGULAR = 1
+    """The pose is met; axes 4 and 6 are aligned, q4 was kept and q6 took the rest."""
+    SHOULDER_SINGULAR = 2
+    """The pose is met; the wrist's centre is on the first axis and q1 was kept."""
+    OUT_OF_REACH = 3
+    """The orientation is met; the wrist's centre was drawn towards the shoulder into reach."""
+    JOINT_LIMIT = 4
+    """Each branch breaks a joint limit: the reference is held, put within the limits."""
+    BAD_POSE = 5
+    """The pose is not finite, beyond 1e6 m, or its quaternion is zero: the reference is held,
+    within limits. Or the reference is not finite: the answer is not either."""
+    SPEED_LIMIT = 6
+    """The pose is not met yet: a joint moves as fast as it may."""
+
+
+# Compiled code knows plain integers only.
+_OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE, _ = map(
+    int, IkStatus
+)
+
+
+@njit(cache=True)
+def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q: Array) -> int:
+    """Fills q (8, 6); rows are nan if out of reach and not ``clamp``. Returns an `IkStatus`.
+
+    Row 4 a + 2 b + c: shoulder a (0: rho >= 0, 1: reaching backwards over the first axis), elbow b
+    (0: q3 >= 0), wrist c (0: q5 >= 0).
+    """
+    status = _OK
+    x = p[0] - FLANGE * R[0, 2]
+    y = p[1] - FLANGE * R[1, 2]
+    z = p[2] - FLANGE * R[2, 2] - SHOULDER_HEIGHT
+    reach = UPPER_ARM + FOREARM
+    hole = abs(UPPER_ARM - FOREARM)
+    distance = np.sqrt(x * x + y * y + z * z)
+    if distance > reach or distance < hole:
+        if not clamp:
+            q[:] = np.nan
+            return _OUT_OF_REACH
+        scale = (reach if distance > reach else hole) / distance
+        x, y, z = scale * x, scale * y, scale * z
+        distance *= scale
+        status = _OUT_OF_REACH
+    rho = np.sqrt(x * x + y * y)
+    if rho < _SINGULAR:
+        q1_front = q1_kept
+        status = max(status, _SHOULDER_SINGULAR)
+    else:
+        q1_front = np.arctan2(y, x)
+    # Half-angle form: keeps its digits where the arm is nearly stretched.
+    stretched = max((reach - distance) * (reach + distance), 0.0)
+    folded = max((distance - hole) * (distance + hole), 0.0)
+    q3_up = 2.0 * np.arctan2(np.sqrt(stretched), np.sqrt(folded))
+    for a in range(2):
+        q1 = q1_front + a * np.pi
+        c1, s1 = np.cos(q1), np.sin(q1)
+        for b in range(2):
+            q3 = q3_up if b == 0 else -q3_up
+            to_wrist = np.arctan2(-rho if a == 0 else rho, z)
+            q2 = to_wrist - np.arctan2(FOREARM * np.sin(q3), UPPER_ARM + FOREARM * np.cos(q3))
+            c, s = np.cos(q2 + q3), np.sin(q2 + q3)
+            # M = Ry(q2 + q3) Rz(-q1) R = Rz(q4) Ry(-q5) Rz(q6)
+            u = c1 * R[0, 2] + s1 * R[1, 2]
+            m02 = c * u + s * R[2, 2]
+            m12 = c1 * R[1, 2] - s1 * R[0, 2]
+            m22 = c * R[2, 2] - s * u
+            m10 = c1 * R[1, 0] - s1 * R[0, 0]
+            m11 = c1 * R[1, 1] - s1 * R[0, 1]
+            m00 = c * (c1 * R[0, 0] + s1 * R[1, 0]) + s * R[2, 0]
+            m01 = c * (c1 * R[0, 1] + s1 * R[1, 1]) + s * R[2, 1]
+            sin_q5 = np.sqrt(m02 * m02 + m12 * m12)
+            q4_up = q4_kept if sin_q5 < _SINGULAR else np.arctan2(-m12, -m02)
+            q5_up = np.arctan2(sin_q5, m22)
+            # q6 from what q4 leaves over, so that an inexact q4 near the singularity costs nothing.
+            c4, s4 = np.cos(q4_up), np.sin(q4_up)
+            q6_up = np.arctan2(c4 * m10 - s4 * m00, c4 * m11 - s4 * m01)
+            for w in range(2):
+                row = 4 * a + 2 * b + w
+                q[row, 0], q[row, 1], q[row, 2] = q1, q2, q3
+                q[row, 3] = q4_up + w * np.pi
+                q[row, 4] = q5_up if w == 0 else -q5_up
+                q[row, 5] = q6_up + w * np.pi
+    return status
+
+
+@njit(cache=True)
+def _turned(angle: float, near: float, lower: float, upper: float) -> float:
+    """angle + 2 pi k within the limits and there nearest to ``near``; nan if there is none."""
+    turn = 2.0 * np.pi
+    angle += turn * np.round((near - angle) / turn)
+    if angle > upper + _ROUNDING:
+        angle -= turn * np.ceil((angle - upper - _ROUNDING) / turn)
+    if angle < lower - _ROUNDING:
+        angle += turn * np.ceil((lower - _ROUNDING - angle) / turn)
+    if angle > upper + _ROUNDING:
+        return np.nan
+    return min(max(angle, lower), upper)
+
+
+@njit(cache=True)
+def _nearest_branch(
+    R: Array, p: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
+) -> int:
+    """`nearest_branch` into q (6,)."""
+    if not np.isfinite(reference.sum()):
+        q[:] = np.nan
+        return _BAD_POSE
+    for i in range(6):
+        q[i] = min(max(reference[i], lower[i]), upper[i])
+    if not (np.isfinite(R.sum()) and sound(p)):
+        return _BAD_POSE
+    branches = np.empty((8, 6))
+    status = _branches(R, p, reference[0], reference[3], True, branches)
+    best = -1
+    best_distance = np.inf
+    for row in range(8):
+        distance = 0.0
+        for i in range(6):
+            angle = _turned(branches[row, i], reference[i], lower[i], upper[i])
+            step = abs(angle - reference[i])
+            # Also where angle is nan, outside the limits.
+            distance += step * step if step <= max_step else np.inf
+            branches[row, i] = angle
+        if distance < best_distance:
+            best, best_distance = row, distance
+    if best < 0:
+        return _JOINT_LIMIT
+    put(q, 0, branches[best], 0, 6)
+    if abs(np.sin(q[4])) < _SINGULAR:
+        status = max(status, _WRIST_SINGULAR)
+    return status
+
+
+@njit(cache=True)
+def solve_pose_command(
+    pose: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
+) -> int:
+    """`nearest_branch` for a pose of seven numbers, without making arrays for its result.
+
+    Args:
+        pose: (7,) X_WS as ``[qw, qx, qy, qz, px, py, pz]``, the quaternion of any length but zero.
+        reference: (6,) [rad].
+        lower: (6,) [rad].
+        upper: (6,) [rad].
+        max_step: [rad].
+        q: (6,) filled [rad].
+
+    Returns:
+        The `IkStatus` as a plain integer.
+    """
+    w, x, y, z = pose[0], pose[1], pose[2], pose[3]
+    norm = w * w + x * x + y * y + z * z
+    k = 2.0 / norm if norm > 0.0 else np.nan
+    R = np.empty((3, 3))
+    R[0, 0], R[0, 1], R[0, 2] = 1 - k * (y * y + z * z), k * (x * y - w * z), k * (x * z + w * y)
+    R[1, 0], R[1, 1], R[1, 2] = k * (x * y + w * z), 1 - k * (x * x + z * z), k * (y * z - w * x)
+    R[2, 0], R[2, 1], R[2, 2] = k * (x * z - w * y), k * (y * z + w * x), 1 - k * (x * x + y * y)
+    return _nearest_branch(R, pose[4:7], reference, lower, upper, max_step, q)
+
+
+def inverse_kinematics(R_WS: Array, p_WS: Array) -> Array:
+    """All solutions, without regard to joint limits.
+
+    Where a joint is undetermined (q1 with the wrist's centre on the first axis, q4 with axes 4 and
+    6 aligned) it is 0.
+
+    Args:
+        R_WS: (3, 3) rotation of the sensor frame in the world.
+        p_WS: (3,) its origin [m].
+
+    Returns:
+        (8, 6) joint positions in (-pi, pi] [rad], nan if out of reach. Row ``4 a + 2 b + c``:
+        a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has q5 <= 0.
+    """
+    q = np.empty((8, 6))
+    _branches(np.ascontiguousarray(R_WS), p_WS, 0.0, 0.0, False, q)
+    return q - 2.0 * np.pi * np.ceil(q / (2.0 * np.pi) - 0.5)
+
+
+def nearest_branch(
+    R_WS: Array,
+    p_WS: Array,
+    q_reference: Array,
+    lower: Array,
+    upper: Array,
+    max_step: float = np.inf,
+) -> tuple[Array, IkStatus]:
+    """The solution within the joint limits that is nearest to a reference (Euclidean, in rad).
+
+    Joints that may turn by more than 360 degrees take the turn nearest to the reference. Of a
+    finite reference the result is always finite and within the limits, see `IkStatus`: out of
+    reach, the wrist's centre is drawn towards the shoulder onto the boundary (the arm stretches,
+    the orientation stays); singular, the undetermined joint keeps its reference; without an
+    admissible branch the reference itself is held.
+
+    Args:
+        R_WS: (3, 3) rotation of the sensor frame in the world.
+        p_WS: (3,) its origin [m].
+        q_reference: (6,) [rad], normally where the arm is.
+        lower: (6,) joint limits [rad].
+        upper: (6,) joint limits [rad].
+        max_step: branches with any joint further than this from the reference are not admitted
+            [rad].
+
+    Returns:
+        (6,) joint positions [rad], and how they were found.
+    """
+    q = np.empty(6)
+    # Drake's matrices run by columns: one layout, one compilation.
+    R = np.ascontiguousarray(R_WS)
+    status = _nearest_branch(R, p_WS, q_reference, lower, upper, max_step, q)
+    return q, IkStatus(status)
+
+
+def has_closed_form(arm: ArmModel) -> bool:
+    """Whether this closed form is that of an arm: it leads back to joint angles of its poses."""
+    if arm.num_joints != 6 or arm.table[:, SLIDES].any():
+        return False
+    R_WS, p_WS, endless = np.empty((3, 3)), np.empty(3), np.full(6, np.inf)
+    for q in ([0.3, -0.5, -1.1, 0.7, 0.9, -0.4], [-1.0, 0.6, 1.3, -0.8, 0.5, 1.2]):
+        forward_kinematics(arm.table, np.array(q), R_WS, p_WS)
+        found, _ = nearest_branch(R_WS, p_WS, np.array(q), -endless, endless)
+        if not np.allclose(found, q, rtol=0.0, atol=1e-9):
+            return False
+    return True
+
+
+class InverseKinematics(LeafSystem):
+    """Turns a commanded pose of the sensor frame into joint positions. Stateless.
+
+    A branch that is more than `MAX_STEP` away in any joint is not taken: at a joint limit the arm
+    waits for the command to come back instead of swinging into another configuration.
+
+    .. pydrake_system::
+
+        name: InverseKinematics
+        input_ports:
+        - pose_command: X_WS as [qw, qx, qy, qz, px, py, pz] [-, m]
+        - joint_position: (6,) where the arm is [rad]
+        output_ports:
+        - joint_command: (6,) the nearest branch [rad]
+        - ik_status: an `IkStatus`
+
+    Args:
+        lower: (6,) joint limits [rad].
+        upper: (6,) joint limits [rad].
+    """
+
+    __slots__ = ONE_DICT
+
+    MAX_STEP = 2.0
+    """[rad]. More than the quarter turn by which joints 4 and 6 may have to move past q5 = 0."""
+
+    def __init__(self, lower: Array, upper: Array) -> None:
+        super().__init__()
+        self._lower = np.array(lower, dtype=np.float64)
+        self._upper = np.array(upper, dtype=np.float64)
+        self._pose = self.DeclareVectorInputPort("pose_command", 7)
+        self._position = self.DeclareVectorInputPort("joint_position", 6)
+        inputs = {self.all_input_ports_ticket()}
+        self.DeclareVectorOutputPort("joint_command", 6, weak_callback(self._calc_command), inputs)
+        self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status), inputs)
+
+    def _solve(self, context: Context, q: np.ndarray) -> int:
+        return solve_pose_command(
+            self._pose.Eval(context),
+            self._position.Eval(context),
+            self._lower,
+            self._upper,
+            self.MAX_STEP,
+            q,
+        )
+
+    def _calc_command(self, context: Context, output: BasicVector) -> None:
+        self._solve(context, output.get_mutable_value())
+
+    def _calc_status(self, context: Context, output: BasicVector) -> None:
+        output[0] = self._solve(context, np.empty(6))

@@ -1,0 +1,200 @@
+"""Joint position control of the slave: position loop around a velocity loop, as in the paper.
+
+VI-A: the joint controllers turn joint angle setpoints into joint velocities for the inverters.
+Here the velocity loop acts through the arm's computed torque, so that the joints are decoupled.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fault import sound
+from drake_teleop.common.fields import settings
+from drake_teleop.common.lifetime import ONE_DICT
+from drake_teleop.common.quantities import choice, quantity
+from drake_teleop.common.vectors import put
+from drake_teleop.station.slave.arm import ArmModel, inverse_dynamics
+from drake_teleop.station.slave.position_servo import INTERFACES, PositionInterface, PositionServo
+
+COMPUTED_TORQUE = "computed_torque"
+
+
+@settings
+@dataclass
+class JointControlConfig:
+    """How the joints follow; of computed torque the loop is about as fast as the position loop."""
+
+    position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "of the position loop (E)")
+    velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "of the velocity loop (E)")
+    servo: str = choice(
+        COMPUTED_TORQUE,
+        (COMPUTED_TORQUE, *INTERFACES, "position"),
+        "computed_torque has the bandwidths above; the others are arms that take positions, by"
+        " name or, position, by `interface` alone",
+    )
+    interface: PositionInterface | None = None
+
+    @property
+    def position_interface(self) -> PositionInterface | None:
+        """That of the servo; None of computed torque."""
+        if self.servo == COMPUTED_TORQUE:
+            return None
+        return self.interface or INTERFACES.get(self.servo, PositionInterface())
+
+    @property
+    def lag(self) -> float:
+        """By how much it is behind a steady motion, about [s]."""
+        interface = self.position_interface
+        if interface is not None:
+            return interface.lookahead + interface.dead_time + 1 / interface.command_hz
+        return 1 / (2 * np.pi * min(self.position_bandwidth_hz, self.velocity_bandwidth_hz))
+
+    @property
+    def speed_gain(self) -> float:
+        """The speed that is asked of a joint, over its error [1/s]."""
+        interface = self.position_interface
+        return 2 * np.pi * self.position_bandwidth_hz if interface is None else 1 / self.lag
+
+    def check(self, where: str, rate: float) -> None:
+        """Checks what ranges cannot, against the rate of the joint control [Hz].
+
+        Raises:
+            DrakeTeleopError: naming `where` and the field.
+        """
+        if self.servo == COMPUTED_TORQUE and self.interface is not None:
+            raise DrakeTeleopError(
+                "computed torque takes the bandwidths, not an interface",
+                where=f"{where}.interface",
+                remedy="leave it out, or choose another servo, such as position",
+            )
+        interface = self.position_interface
+        if interface is not None:
+            interface.check(f"{where}.interface", rate)
+
+    def check_is_torque(self, what: str) -> None:
+        """For what knows computed torque alone.
+
+        Raises:
+            DrakeTeleopError: for another servo, saying what does not know it.
+        """
+        if self.servo != COMPUTED_TORQUE:
+            raise DrakeTeleopError(
+                f"{what} does not know the servo {self.servo}",
+                where="joint_control.servo",
+                remedy=f"choose {COMPUTED_TORQUE}, with a position_bandwidth_hz of"
+                f" {1 / (2 * np.pi * self.lag):.2g} for the same lag; `run` has them all",
+            )
+
+
+@njit(cache=True, borrows=True)
+def joint_control_torque(
+    arm, command, state, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
+):  # fmt: skip
+    """tau = ID(q, v, kv (clip(kp (q_command - q)) - v)), within the motors' torque.
+
+    `state` is [q; v], `scratch` (3 n,), all other arrays (n,), rad, rad/s, N m; gains in 1/s.
+    `torque` is written: while the encoders give no numbers, what carries the arm at rest at the
+    command. If that gives none it stays as it is.
+    """
+    if not sound(command):
+        return
+    n = torque.shape[0]
+    q, v, wanted = scratch[:n], scratch[n : 2 * n], scratch[2 * n :]
+    put(scratch, 0, state, 0, 2 * n)
+    if not sound(state):
+        put(q, 0, command, 0, n)
+        v[:] = 0.0
+    for i in range(n):
+        setpoint = position_gain * (command[i] - q[i])
+        setpoint = min(max(setpoint, -velocity_limit[i]), velocity_limit[i])
+        wanted[i] = velocity_gain * (setpoint - v[i])
+    inverse_dynamics(arm, q, v, wanted, torque)
+    for i in range(n):
+        torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
+
+
+def servo_numbers(
+    arm: ArmModel, config: JointControlConfig
+) -> tuple[float, float, NDArray[np.float64], NDArray[np.float64]]:
+    """Gains and limits for `joint_control_torque`."""
+    return (
+        2 * np.pi * config.position_bandwidth_hz,
+        2 * np.pi * config.velocity_bandwidth_hz,
+        arm.velocity_limit,
+        arm.effort_limit,
+    )
+
+
+class JointControl(LeafSystem):
+    """Sampled joint position controller.
+
+    While the encoders give no numbers the motors carry the arm's weight, and it drifts on, for it
+    has no brakes.
+
+    .. pydrake_system::
+
+        name: JointControl
+        input_ports:
+        - joint_command: (n,) [rad]
+        - slave_state: [q; v] of the arm [rad, rad/s]
+        output_ports:
+        - joint_torque: (n,) [N m], held between samples
+
+    Args:
+        arm: the arm with its tool (the controller knows its own nominal load).
+        config: the bandwidths.
+        period: sampling period [s].
+        q_start: (n,) where it holds the arm before the first sample [rad].
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        config: JointControlConfig,
+        period: float,
+        q_start: NDArray[np.float64],
+    ) -> None:
+        super().__init__()
+        n = arm.num_joints
+        self._arm = arm.table
+        self._constants = (*servo_numbers(arm, config), np.zeros(3 * n))
+        self._command = self.DeclareVectorInputPort("joint_command", n)
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
+        still, holding = np.zeros(n), np.zeros(n)
+        inverse_dynamics(arm.table, q_start, still, still, holding)
+        self.DeclareStateOutputPort("joint_torque", self.DeclareDiscreteState(holding))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        joint_control_torque(
+            self._arm,
+            self._command.Eval(context),
+            self._state.Eval(context),
+            *self._constants,
+            discrete_state.get_mutable_value(0),
+        )
+
+
+def MakeJointControl(
+    arm: ArmModel, config: JointControlConfig, period: float, q_start: NDArray[np.float64]
+) -> LeafSystem:
+    """The block that a scenario asks for; arguments as of `JointControl`."""
+    interface = config.position_interface
+    if interface is None:
+        return JointControl(arm, config, period, q_start)
+    return PositionServo(arm, interface, period, q_start)
+
+
+def interface_of(block: Mapping[str, Any] | None) -> PositionInterface | None:
+    """The defaults for a scenario's `joint_control.interface`: those of the servo that it names."""
+    return copy.deepcopy(INTERFACES.get(str((block or {}).get("servo"))))

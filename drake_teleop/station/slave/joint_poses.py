@@ -1,0 +1,56 @@
+"""Pose of the wrist sensor from the joint positions of an arm that a model file describes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_teleop.common.arrays import Array
+from drake_teleop.logs.read.rotations import quaternions
+from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
+from drake_teleop.station.slave.plant import finalize
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """The kinematics of an arm.
+
+    Args:
+        joint_names: from the base outwards.
+        table: `ArmModel.table`.
+    """
+
+    joint_names: tuple[str, ...]
+    table: Array
+
+    def pose(self, q: Array) -> Array:
+        """(7,) quaternion w x y z, and position [m], of S in the world at q (n,) [rad, m]."""
+        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+        forward_kinematics(self.table, q, R_WS, p_WS)
+        return np.concatenate([quaternions(R_WS[None])[0], p_WS])
+
+
+def arm_of(model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()) -> Arm:
+    """Return the kinematics of the arm in a model file.
+
+    Args:
+        model: URDF, SDF, MJCF or .dmd.yaml.
+        sensor_frame: name of the frame or link at which the sensor measures.
+        package_paths: folders in which `package://` addresses are looked up.
+
+    Raises:
+        DrakeTeleopError: if the model cannot be read or is no serial arm.
+    """
+    plant = MultibodyPlant(0.0)
+    with drakes_errors_said(model):
+        parsed = ParseModel(plant, model, sensor_frame, package_paths)
+        finalize(plant)
+        found = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
+    arm = Arm(found.joint_names, found.table)
+    arm.pose(np.zeros(found.num_joints))  # Load the compiled function before the first reading.
+    return arm

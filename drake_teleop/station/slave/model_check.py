@@ -1,0 +1,316 @@
+"""What cannot be true of a robot model, said before Drake reads it.
+
+Drake follows a link with two parents or a circle of joints into an abort or for ever, and replaces
+an inertia that no body has by another one without telling, even if only the last digit is wrong.
+Here each is one error with the name of joint or link; what is merely missing is an assumption, and
+what the file's rounding made wrong is made right. So is an inertia of what no joint of the arm
+moves, such as its base, on which nothing depends.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.slave.arm import PHI, TRANSLATION, ArmModel
+
+_INERTIAS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+# What places, shapes and masses are said with, in URDF and SDF.
+_MEASURES = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
+_MEASURES |= {"radius", "radii", "length", "scale", "mass", "inertia", *_INERTIAS}
+_MEASURES |= {"drake:rotor_inertia", "drake:gear_ratio"}
+WORLD = "world"  # as URDF and SDF call it
+_JOINTS = ("joint", "drake:joint")
+_SMALLEST, _LONGEST = 0.01, 50.0  # of an arm [m]
+_LARGEST = 1e6  # of these in SI; limits may be larger, where there is none
+# How far principal moments may be from those of a body, for rounding in the file.
+_ROUNDING = 1e-3
+_NONE = 1e-15  # kg m^2: a grain of dust has more
+
+
+def check_model(root: Element, where: str, sensor: str = "") -> list[str]:
+    """Checks tree, limits and masses of a URDF or SDF.
+
+    Args:
+        root: of the file, in which inertias may be made right.
+        where: for messages.
+        sensor: the arm's last link, or a link fixed to it, if that is what the file is read for.
+
+    Returns:
+        Assumptions: which links have no mass or no inertia, and what Drake leaves out.
+
+    Raises:
+        DrakeTeleopError: for a link with two parents, a second root in a URDF, joints that form a
+            circle, names that stand twice, limits that are no numbers or the wrong way round, a
+            negative mass, an inertia that no body has where something moves it, a length or a mass
+            that no arm has.
+    """
+    for scope in root.iter():
+        _check_scope(scope, where)
+    for element in root.iter():
+        if element.tag in _MEASURES:
+            _check_measure(element, where)
+    for joint in root.iter("joint"):
+        for limit in joint.iter("limit"):
+            _check_limit(limit, f"{where}: joint {joint.get('name', '')}")
+    moved = {
+        _end(joint, "child")
+        for joint in (each for tag in _JOINTS for each in root.iter(tag))
+        if joint.get("type") != "fixed"
+    }
+    unmoved = _unmoved(root, sensor)
+    without, rounded, one_kg, wrong = list[str](), list[str](), list[str](), list[str]()
+    for link in root.iter("link"):
+        name = link.get("name", "")
+        if root.tag == "sdf" and link.find("inertial") is None:
+            one_kg.append(name)
+        elif _is_massless(link, where, name in moved):
+            without.append(name)
+        if _made_right(link, f"{where}: link {name}", refused=name not in unmoved):
+            (wrong if name in unmoved else rounded).append(name)
+    rough = [
+        joint.get("name", "")
+        for joint in root.iter("joint")
+        for dynamics in joint.iter("dynamics")
+        if float(dynamics.get("friction") or dynamics.findtext("friction") or 0.0) != 0.0
+    ]
+    return [
+        f"{what} {', '.join(names)}"
+        for what, names in (
+            ("no inertia of", without),
+            ("1 kg, as SDF has it, for", one_kg),
+            ("an inertia of rounded numbers made a body's for", rounded),
+            ("a body's inertia, which no joint of the arm moves, for", wrong),
+            ("not the model's own dry friction of", rough),
+        )
+        if names
+    ]
+
+
+def check_tree(joints: Iterable[tuple[str, str, str]], where: str) -> dict[str, tuple[str, str]]:
+    """Checks that joints make a tree, or several.
+
+    Args:
+        joints: name, parent and child of each.
+        where: for the message.
+
+    Returns:
+        Of each link that hangs on a joint, its parent and the joint's name.
+
+    Raises:
+        DrakeTeleopError: for a link with two parents, a world that hangs on something, a circle.
+    """
+    parents: dict[str, tuple[str, str]] = {}
+    for name, parent, child in joints:
+        if child in parents or child == WORLD:
+            on = f"two joints, {parents[child][1]} and {name}" if child in parents else name
+            raise DrakeTeleopError(
+                f"{child} hangs on {on}",
+                where=where,
+                remedy="an arm is a tree: each link is the child of one joint, the world of none",
+            )
+        parents[child] = parent, name
+    for start in parents:
+        link, passed = start, {start}
+        while link in parents:
+            link = parents[link][0]
+            if link in passed:
+                raise DrakeTeleopError(
+                    f"its joints form a circle through {link}",
+                    where=where,
+                    remedy="an arm is a tree: cut the loop, or model the chain to the sensor alone",
+                )
+            passed.add(link)
+    return parents
+
+
+def _check_scope(scope: Element, where: str) -> None:
+    """Checks the tree of a robot or a model; models inside it have names of their own."""
+    joints = [
+        (joint.get("name", ""), parent, child)
+        for joint in (each for tag in _JOINTS for each in scope.findall(tag))
+        for parent, child in [(_end(joint, "parent"), _end(joint, "child"))]
+        if parent and child  # or Drake says what lacks
+    ]
+    links = [link.get("name", "") for link in scope.findall("link")]
+    for kind, names in (("links", links), ("joints", [name for name, _, _ in joints])):
+        for name in names:
+            if name and names.count(name) > 1:
+                raise DrakeTeleopError(f"two {kind} are named {name}", where=where)
+    parents = check_tree(joints, where)
+    loose = [name or "a link without name" for name in links if name not in parents]
+    if scope.tag == "robot" and len(loose) > 1:
+        raise DrakeTeleopError(
+            f"{loose[0]} and {loose[1]} are both the child of no joint",
+            where=where,
+            remedy="a URDF has one root: fasten the rest to it by joints, or take it out",
+        )
+
+
+def _end(joint: Element, name: str) -> str:
+    element = joint.find(name)
+    return "" if element is None else (element.get("link") or element.text or "").strip()
+
+
+def _check_measure(element: Element, where: str) -> None:
+    for text in (element.text or "", *element.attrib.values()):
+        for word in text.split():
+            try:
+                value = float(word)
+            except ValueError:  # a name; or Drake says that it wants a number
+                continue
+            if not abs(value) <= _LARGEST:
+                raise DrakeTeleopError(
+                    f"{element.tag} {word} is no finite number up to {_LARGEST:g}", where=where
+                )
+            if element.tag == "drake:rotor_inertia" and value < 0.0:
+                raise DrakeTeleopError(f"a rotor inertia of {word} kg m^2", where=where)
+
+
+def _check_limit(limit: Element, where: str) -> None:
+    def number(name: str) -> float | None:
+        text = limit.get(name) or limit.findtext(name)
+        return None if text is None else _number(text, name, where)
+
+    lower, upper = number("lower"), number("upper")
+    if lower is not None and upper is not None and lower > upper:
+        raise DrakeTeleopError(f"lower limit {lower:g} is above upper limit {upper:g}", where=where)
+    for name in ("velocity", "effort"):
+        value = number(name)
+        # Of SDF, -1 says that there is no limit.
+        if value is not None and value < 0 and not (value == -1 and limit.get(name) is None):
+            raise DrakeTeleopError(f"{name} limit {value:g} is negative", where=where)
+    for name, text in limit.attrib.items():  # of a URDF
+        if math.isinf(_number(text, name, where)):
+            raise DrakeTeleopError(
+                f"{name} {text} is not finite",
+                where=where,
+                remedy="leave out what has no limit: what is assumed will be said",
+            )
+
+
+def _is_massless(link: Element, where: str, moves: bool) -> bool:
+    """Whether a link that has shapes, or that a joint moves, has no inertia.
+
+    Without either it is a frame, such as tool0.
+
+    Raises:
+        DrakeTeleopError: for a mass or an inertia that cannot be.
+    """
+    place = f"{where}: link {link.get('name', '')}"
+    inertial = link.find("inertial")
+    mass_element = None if inertial is None else inertial.find("mass")
+    counts = moves or link.find("collision") is not None or link.find("visual") is not None
+    if inertial is None or mass_element is None:
+        return counts
+    mass = _number(mass_element.get("value") or mass_element.text or "", "mass", place)
+    if mass < 0:
+        raise DrakeTeleopError(f"mass {mass:g} kg is negative", where=place)
+    element = inertial.find("inertia")
+    if element is None:
+        turns = mass_element.get("value") is None  # of SDF it is 1 kg m^2 then
+    else:
+        turns = bool(_moments(element, place)[2] > 0.0)
+    if mass == 0.0 and turns:
+        raise DrakeTeleopError("an inertia, but no mass", where=place, remedy="give both or none")
+    return counts and not turns
+
+
+def _unmoved(root: Element, sensor: str) -> set[str]:
+    """The links of a URDF or of an SDF's only model that no joint up to the sensor moves."""
+    joints = {
+        _end(joint, "child"): (_end(joint, "parent"), joint.get("type") != "fixed")
+        for joint in (each for tag in _JOINTS for each in root.iter(tag))
+    }
+    links = [link.get("name", "") for link in root.iter("link")]
+    if sensor not in links or len(set(links)) < len(links):
+        return set()
+
+    def way(link: str) -> list[str]:
+        passed = [link]
+        while passed[-1] in joints and joints[passed[-1]][0] not in passed:  # a loop has no end
+            passed.append(joints[passed[-1]][0])
+        return passed
+
+    moved = [link for link in way(sensor) if joints.get(link, ("", False))[1]]
+    return {link for link in links if moved and moved[-1] not in way(link)}
+
+
+def _made_right(link: Element, where: str, *, refused: bool) -> bool:
+    """Makes a body's inertia of one that no body has, by the same addition to each of its moments.
+
+    Args:
+        link: of which it is.
+        where: for the message.
+        refused: whether more than rounding is an error: `_ROUNDING` of the largest moment, `_NONE`.
+
+    Raises:
+        DrakeTeleopError: if it is one.
+    """
+    element = link.find("inertial/inertia")
+    if element is None:
+        return False
+    moments = _moments(element, where)
+    lacking = max(-moments[0], moments[2] - moments[1] - moments[0])
+    if lacking <= 0.0:
+        return False
+    if refused and lacking > max(_ROUNDING * abs(moments[2]), _NONE):
+        raise DrakeTeleopError(
+            "no body has this inertia: its principal moments are "
+            f"{moments[0]:.3g}, {moments[1]:.3g}, {moments[2]:.3g} kg m^2",
+            where=where,
+            remedy="all are positive, and none is more than the sum of the other two",
+        )
+    for name in ("ixx", "iyy", "izz"):
+        value = f"{float(_entry(element, name)) + 1.001 * lacking:.17g}"
+        child = element.find(name)
+        if child is None:
+            element.set(name, value)
+        else:
+            child.text = value
+    return True
+
+
+def _entry(inertia: Element, name: str) -> str:
+    return inertia.get(name) or inertia.findtext(name) or "0"
+
+
+def _moments(inertia: Element, where: str) -> NDArray[np.float64]:
+    """(3,) principal moments, the smallest first."""
+    xx, xy, xz, yy, yz, zz = (_number(_entry(inertia, name), name, where) for name in _INERTIAS)
+    tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return np.asarray(np.linalg.eigvalsh(tensor), dtype=np.float64)
+
+
+def _number(text: str, name: str, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if math.isnan(value):
+        raise DrakeTeleopError(f"{name} {text.strip()!r} is not a number", where=where)
+    return value
+
+
+def check_size(arm: ArmModel, where: str) -> None:
+    """Refuses an arm that is too large or too small for its lengths to be metres.
+
+    Raises:
+        DrakeTeleopError: for its length, or a link whose mass is far from its joint.
+    """
+    length = float(np.linalg.norm(arm.table[1:, TRANSLATION:PHI], axis=1).sum())
+    remedy = "give lengths in m, and inertias in kg m^2"
+    if 0.0 < length < _SMALLEST or length > _LONGEST:
+        what = f"from its first joint to the sensor it is {length:.3g} m long"
+        raise DrakeTeleopError(what, where=where, remedy=remedy)
+    for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI:], strict=True):
+        # The root mean square of the distance of its mass from the joint's origin.
+        away = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
+        if away > _LONGEST:
+            what = f"what {name} moves is {away:.3g} m away from it"
+            raise DrakeTeleopError(what, where=where, remedy=remedy)

@@ -1,0 +1,247 @@
+"""The files that a robot model names, and those that these name: where they are, which may be read.
+
+A model may come from anybody, and what it names goes into pages and films. So only files inside its
+folder and its packages are read, after symbolic links are resolved: packages are `package_paths`,
+and ROS packages (package.xml) around the model. Includes form no cycle; number and size of all
+files are bounded.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+from urllib.parse import unquote
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+
+from pydrake.multibody.parsing import PackageMap
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.texts import read_yaml
+
+# Of all files, each counted as often as it is included; and bytes of each text.
+_MAX_FILES, _MAX_BYTES, _MAX_TEXT = 2000, 500_000_000, 50_000_000
+_LONGEST_NAME = 4096
+_MAX_DEPTH = 20  # of files that include each other
+_BINARY = (".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2", ".dae")
+_PACKAGE = "package.xml"
+_ATTRIBUTE = re.compile(r"(file|filename|uri|url|file(right|left|up|down|front|back))\Z")
+_ELEMENT = re.compile(r"(\{.*\}|drake:)?(file|filename|uri|url|\w*_map|sdf)\Z")
+_FOLDERS = ("meshdir", "texturedir", "assetdir")  # of MJCF, in which files are looked for
+_MTL = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+(.*)$", re.M)
+_OBJ = re.compile(rb"^[ \t]*mtllib[ \t]+(.*)$", re.M)
+
+
+class ModelFiles:
+    """What a model may read.
+
+    Args:
+        model: its file.
+        package_paths: folders that are packages, or contain some.
+
+    Attributes:
+        packages: folders by the name of the package.
+    """
+
+    def __init__(self, model: Path, package_paths: tuple[Path, ...]) -> None:
+        self._model, self._folder = model, model.resolve().parent
+        self._total = 0, 0
+        _check_size(1, model.stat().st_size, model)
+        self.packages: dict[str, Path] = {}
+        inner = [each for folder in package_paths for each in sorted(folder.glob("*"))]
+        for folder in (*package_paths, *inner):
+            if folder.is_dir():
+                self.packages.setdefault(folder.name, folder.resolve())
+        around = [self._folder, *self._folder.parents]
+        own = [folder for folder in around if os.path.isfile(folder / _PACKAGE)]
+        text = model.read_bytes().decode("utf-8", errors="replace")
+        for name in set(re.findall(r"(?:package|model)://([^/\s\"'<]+)", text)):
+            beside = [each for each in around if os.path.isfile(each / name / _PACKAGE)]
+            inside = [self._folder] if os.path.isdir(self._folder / name) else []
+            named = [each for each in own if each.name == name]
+            for folder in (*(each / name for each in inside), *named, *(e / name for e in beside)):
+                if folder.resolve() == folder:  # no link, and not ".."
+                    self.packages.setdefault(name, folder)
+        self._roots = {self._folder, *own, *(folder.resolve() for folder in package_paths)}
+        self._sizes: dict[Path, tuple[int, int]] = {}
+        self._bases = {""}
+
+    def share_packages(self, known: PackageMap) -> None:
+        """Merge the packages with Drake's; the one that Drake would download is removed."""
+        known.Remove("drake_models")
+        for name, folder in self.packages.items():
+            if known.Contains(name):  # Drake's own, which theirs takes the place of
+                known.Remove(name)
+            known.Add(name, str(folder))
+        self.packages = {n: Path(known.GetPath(n)).resolve() for n in known.GetPackageNames()}
+
+    def file(self, address: str, folder: Path | None = None) -> Path | None:
+        """Return the file or folder at an address; None if there is none.
+
+        Args:
+            address: package://, model://, file:// or a path.
+            folder: that the path is relative to; None: the model's.
+        """
+        match = re.match(r"(?:package|model)://([^/]+)/?(.*)", address, re.S)
+        if match:
+            base = self.packages.get(match[1])
+            path = None if base is None else base / match[2]
+        else:
+            path = (folder or self._folder) / address.removeprefix("file://")
+        return next(iter(_existing(path)), None)
+
+    def check(self, path: Path) -> None:
+        """Check the model, or a file that it names, with all that is named in there.
+
+        Of a model in URDF or SDF the meshes of its own links are left out.
+
+        Raises:
+            DrakeTeleopError: for a file outside, a cycle, or too many or too large files.
+        """
+        folders = 0
+        while folders < len(self._bases):  # those of MJCF hold for files that were seen before
+            folders = len(self._bases)
+            self._sizes.clear()
+            files, size = self._size(path, ())
+        self._total = self._total[0] + files, self._total[1] + size
+        _check_size(*self._total, self._model)
+
+    def _size(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
+        """The number of files and bytes that reading a file takes."""
+        real, where = path.resolve(), str(including[-1] if including else self._model)
+        roots = (*self._roots, *self.packages.values())
+        if not any(real.is_relative_to(root) for root in roots):
+            raise DrakeTeleopError(
+                f"names {real}, which is outside the model's folder and its packages",
+                where=where,
+                remedy="move it there, or name its folder: --package-path, slave.package_paths",
+            )
+        if real in including or len(including) > _MAX_DEPTH:
+            what = "names itself" if real in including else "is nested too deeply"
+            raise DrakeTeleopError(f"{what} by {path.name}", where=where, remedy="cut the circle")
+        if real not in self._sizes:
+            if not (real.is_file() or real.is_dir()):
+                raise DrakeTeleopError(f"names {path}, which is no file", where=where)
+            files, size = 1, real.stat().st_size
+            _check_size(files, size, path)
+            for named in list(self._named(real)):
+                more = self._size(named, (*including, real))
+                files, size = files + more[0], size + more[1]
+                _check_size(files, size, path)
+            self._sizes[real] = files, size
+        return self._sizes[real]
+
+    def _named(self, path: Path) -> Iterator[Path]:
+        """The files and folders that a file names, as far as they exist."""
+        tops = [path.parent, self._folder]
+        if path.suffix.lower() == ".sdf" and path != self._model.resolve():
+            tops.append(Path.cwd())  # from where Drake takes includes of includes
+        folders = {top / base for top in tops for base in self._bases}
+        try:
+            for address in self._addresses(path):
+                if len(address) > _LONGEST_NAME and path.suffix.lower() not in (".obj", ".mtl"):
+                    what = f"names a file by {len(address)} characters"  # which ends Drake
+                    raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
+                named = {self.file(address, folder) for folder in folders}
+                found = {file for each in named for file in _existing(each)}
+                yield from (each for each in found if each != path.parent)
+        except OSError as error:
+            raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
+
+    def _addresses(self, path: Path) -> Iterator[str]:
+        kind = path.suffix.lower()
+        if path.is_dir():  # of a model in Gazebo's form
+            yield from (
+                name for name in ("model.config", "manifest.xml") if (path / name).is_file()
+            )
+        elif kind in (".urdf", ".sdf", ".xml", ".config"):
+            root = read_xml(path)
+            self._bases |= {e.get(n, "") for e in root.iter("compiler") for n in _FOLDERS}
+            yield from _of_xml(root, meshes=path != self._model.resolve() or kind == ".xml")
+        elif kind in (".yaml", ".yml"):
+            yield from added_models(read_yaml(path, tagged=True))
+        elif kind in (".gltf", ".glb"):
+            yield from _of_gltf(path)
+        elif kind in (".obj", ".mtl"):
+            for line in (_OBJ if kind == ".obj" else _MTL).findall(path.read_bytes()):
+                words = line.decode("utf-8", errors="surrogateescape").split()
+                yield from {*words, *(" ".join(words[k:]) for k in range(len(words)))}
+
+
+def _existing(path: Path | None) -> list[Path]:
+    """The path if it exists, and what it is to Drake, to which a/../b is b whatever a is."""
+    try:
+        both = [] if path is None else [path, Path(os.path.normpath(path))]
+        return [each for each in dict.fromkeys(both) if os.path.exists(each)]
+    except ValueError:  # no name that a file can have
+        return []
+
+
+def _check_size(files: int, size: int, path: Path) -> None:
+    most = _MAX_BYTES if files > 1 or path.suffix.lower() in _BINARY else _MAX_TEXT
+    if files > _MAX_FILES or size > most:
+        what = f"{_MAX_FILES} files" if files > _MAX_FILES else f"{most // 10**6} MB"
+        raise DrakeTeleopError(f"takes more than {what} to read", where=str(path))
+
+
+def read_xml(path: Path) -> Element:
+    """Return the root of an XML file, with names as they are: Drake's own begin with `drake:`.
+
+    Drake's parser reads what is no XML too. That would be checked by nobody, so it is an error.
+    """
+    builder, parser = TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.CharacterDataHandler = builder.data
+
+    def unread(name: str | None, *_: object) -> NoReturn:
+        raise ValueError(f"the entity {name} is not in this file")
+
+    parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = unread
+    try:
+        parser.Parse(path.read_bytes(), True)
+        return builder.close()
+    except (expat.ExpatError, ValueError, LookupError) as error:  # the last two of its encoding
+        remedy = "give a URDF or SDF that other readers of XML take too"
+        raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
+
+
+def _of_xml(root: Element, *, meshes: bool) -> Iterator[str]:
+    for element in root.iter():
+        if element.tag in ("plugin", "script"):
+            continue
+        if element.tag != "mesh" or meshes:
+            yield from (x for name, x in element.items() if _ATTRIBUTE.match(name) and x)
+            texts = (e.text for e in element if _ELEMENT.match(e.tag))
+            yield from (text.strip() for text in texts if text and text.strip())
+
+
+def added_models(data: Any) -> Iterator[str]:
+    """Return the addresses of the files that model directives add."""
+    directives = data.get("directives") if isinstance(data, dict) else None
+    for each in directives if isinstance(directives, list) else []:
+        for kind in ("add_model", "add_directives"):
+            added = each.get(kind) if isinstance(each, dict) else None
+            if isinstance(added, dict) and isinstance(added.get("file"), str):
+                yield added["file"]
+
+
+def _of_gltf(path: Path) -> list[str]:
+    found: list[str] = []
+
+    def keep(fields: list[tuple[str, Any]]) -> None:
+        for name, value in fields:  # each of a name that is there twice
+            if name == "uri" and isinstance(value, str) and not value.startswith("data:"):
+                found.extend({value, unquote(value)})
+
+    data = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        data = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+    try:
+        json.loads(data, object_pairs_hook=keep)
+    except (ValueError, RecursionError) as error:
+        raise DrakeTeleopError(f"is no glTF file ({error})", where=str(path)) from None
+    return found

@@ -1,0 +1,448 @@
+"""Reading robot models as they are found: meshes missing, base hanging free, packages elsewhere."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple, TypeAlias, TypeVar
+from xml.etree import ElementTree
+
+import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    Frame,
+    Joint,
+    JointIndex,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+    WeldJoint,
+)
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.silence import silent_stderr
+from drake_teleop.common.texts import read_text
+from drake_teleop.station.slave.meshes import without_lost_meshes
+from drake_teleop.station.slave.model_check import WORLD, check_model, check_tree
+from drake_teleop.station.slave.model_files import (
+    XACRO,
+    efforts,
+    floating_links,
+    peculiar_joints,
+    read_roots,
+    without_idle,
+)
+from drake_teleop.station.slave.model_references import ModelFiles
+
+# What ties links to each other besides joints: Drake's tags in URDF and SDF, MJCF's.
+_LOOP = re.compile(rb"<(drake:ball_constraint|drake:linear_bushing_rpy|connect|weld|distance)\b")
+# How what is said of lost meshes begins.
+_MISSING = "shapes are missing of"
+# What a file should be, and where its packages are looked for.
+_Said: TypeAlias = tuple[str, str]
+_Found = TypeVar("_Found")
+_ROBOT = ("robot", "with --package-path for package://")
+_SCENE = ("scene", "its package:// addresses in folders around it")
+
+
+@dataclass(frozen=True)
+class ParsedModel:
+    """What `ParseModel` found.
+
+    Attributes:
+        instance: the arm's, of the joints from the world to S.
+        sensor_frame: S.
+        assumptions: on what is missing, and what is held.
+        folder: of converted meshes; Drake reads them when it needs them.
+    """
+
+    instance: ModelInstanceIndex
+    sensor_frame: Frame
+    assumptions: list[str]
+    folder: TemporaryDirectory[str]
+
+
+@dataclass(frozen=True)
+class ParsedTool:
+    """What `ParseTool` found: as of `ParsedModel`, and the body on the sensor frame."""
+
+    body: RigidBody
+    assumptions: list[str]
+    folder: TemporaryDirectory[str] | None = None
+
+
+def ParseModel(
+    plant: MultibodyPlant,
+    path: Path,
+    sensor_frame: str,
+    package_paths: tuple[Path, ...] = (),
+    X_WBase: RigidTransform | None = None,
+) -> ParsedModel:
+    """Parses the model of an arm, so that nothing of it moves but the joints that lead to S.
+
+    A base that hangs on nothing is welded to the world, and joints beside the way from there to S,
+    such as a gripper's, where they are by default. Each joint on the way has one actuator.
+
+    Args:
+        plant: not finalized.
+        path: a URDF or SDF, or anything else that Drake reads by its suffix.
+        sensor_frame: name of the frame or link at which the sensor measures.
+        package_paths: folders in which `package://` addresses are looked up.
+        X_WBase: where the base is welded to the world.
+
+    Raises:
+        DrakeTeleopError: if the file cannot be read, has no such frame, says what cannot be true of
+            an arm, see `check_model`, or fastens the base elsewhere than at `X_WBase`.
+    """
+    before = set(plant.GetJointIndices())
+    read = _read(plant, path, package_paths, sensor=sensor_frame)
+    having = [i for i in read.instances if plant.HasFrameNamed(sensor_frame, i)]
+    if len(having) != 1:
+        frames = [
+            plant.get_frame(index).name()
+            for instance in read.instances
+            for index in plant.GetFrameIndices(instance)
+        ]
+        # Drake's own, of joints.
+        frames = [name for name in frames if not name.endswith(("_parent", "_child", "__model__"))]
+        known = ", ".join(sorted(set(frames)))
+        raise DrakeTeleopError(
+            f"{len(having) or 'no'} frames are named {sensor_frame!r}",
+            where=str(path),
+            remedy=f"name one of {known}" if known else "give a model that has links",
+        )
+    frame = plant.GetFrameByName(sensor_frame, having[0])
+    chain = _weld_base(plant, frame, read.of_all(peculiar_joints), X_WBase, str(path))
+    _check_loose(plant, read.instances, str(path))
+    _check_chain(plant, chain, str(path))
+    with drakes_errors_said(path):
+        held = _hold_others(plant, before, chain)
+        _actuate(plant, chain, read.of_all(efforts))
+    instances = {plant.get_joint(k).model_instance() for k in chain if _moves(plant, k)}
+    if len(instances) > 1:
+        names = sorted(map(plant.GetModelInstanceName, instances))
+        raise DrakeTeleopError(
+            f"its joints belong to several models, {', '.join(names)}",
+            where=str(path),
+            remedy="write the chain up to the sensor as one model",
+        )
+    instance = next(iter(instances), having[0])
+    afloat = [name for root in read.roots for name in floating_links(root)]
+    welded = [f"welded to the world, where it may float: {', '.join(afloat)}"] if afloat else []
+    return ParsedModel(instance, frame, [*read.assumptions, *welded, *held], read.folder)
+
+
+def ParseTool(
+    plant: MultibodyPlant, path: Path, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
+) -> ParsedTool:
+    """Parses what hangs on the sensor: its root is welded to S by the joint "sensor_weld".
+
+    Joints inside it are held where they are by default.
+
+    Args:
+        plant: not finalized, with the arm.
+        path: as for `ParseModel`.
+        sensor_frame: S.
+        package_paths: as for `ParseModel`.
+
+    Raises:
+        DrakeTeleopError: if the file cannot be read, or holds several things that do not hang on
+            each other.
+    """
+    before = set(plant.GetJointIndices())
+    read = _read(plant, path, package_paths)
+    held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
+    bodies = [index for instance in read.instances for index in plant.GetBodyIndices(instance)]
+    roots = [plant.get_body(index) for index in bodies if index not in held]
+    if len(roots) != 1:
+        names = ", ".join(body.name() for body in roots)
+        raise DrakeTeleopError(
+            f"{names or 'nothing'} can be put on the sensor",
+            where=str(path),
+            remedy="a tool is one tree of links, whose root is put on the sensor frame",
+        )
+    with drakes_errors_said(path):
+        assumptions = [*read.assumptions, *_hold_others(plant, before, [])]
+    weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
+    plant.AddJoint(weld)
+    return ParsedTool(roots[0], assumptions, read.folder)
+
+
+def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
+    """Parses what stands around an arm: nothing of it is held, and nothing assumed.
+
+    Args:
+        plant: not finalized.
+        path: as for `ParseModel`.
+
+    Returns:
+        The folder of converted meshes, to be kept as long as shapes are looked at.
+
+    Raises:
+        DrakeTeleopError: if the file cannot be read, or has what Drake would leave out.
+    """
+    read = _read(plant, path, (), _SCENE)
+    missing = [text for text in read.assumptions if text.startswith(_MISSING)]
+    missing += [f"{name} {what}" for name, what in read.of_all(peculiar_joints).items()]
+    if missing:
+        raise DrakeTeleopError(
+            missing[0], where=str(path), remedy="nothing may be left out that the tool could touch"
+        )
+    return read.folder
+
+
+class _Read(NamedTuple):
+    """What stands in a file; the roots of the XML that it is made of."""
+
+    instances: list[ModelInstanceIndex]
+    roots: list[ElementTree.Element]
+    assumptions: list[str]
+    folder: TemporaryDirectory[str]
+
+    def of_all(self, find: Callable[[ElementTree.Element], dict[str, _Found]]) -> dict[str, _Found]:
+        """What `find` finds in any of the roots."""
+        return {name: what for root in self.roots for name, what in find(root).items()}
+
+
+def _read(
+    plant: MultibodyPlant,
+    path: Path,
+    package_paths: tuple[Path, ...],
+    said: _Said = _ROBOT,
+    sensor: str = "",
+) -> _Read:
+    if not os.path.isfile(path):
+        raise DrakeTeleopError("there is no such file", where=str(path))
+    if path.suffix.lower() == ".xacro":
+        raise DrakeTeleopError("is a macro", where=str(path), remedy=XACRO)
+    kind = path.suffix.lower().removeprefix(".")
+    if kind == "xml":
+        read_text(path)  # or names cannot be said
+    files = ModelFiles(path, package_paths)
+    parser = Parser(plant)
+    parser.SetAutoRenaming(True)
+    files.share_packages(parser.package_map())
+    files.check(path)
+    assumptions: list[str] = []
+    converted = TemporaryDirectory(prefix="drake_teleop_")
+    forces = plant.num_force_elements()
+    roots = read_roots(path, files)
+    _check_no_loop(path, kind)
+    with drakes_errors_said(path, said):
+        for file, root in roots.items():
+            assumptions += check_model(root, str(file), sensor)
+        if kind in ("urdf", "sdf"):
+            root = roots[path]
+            assumptions += without_idle(root)
+            lost = without_lost_meshes(root, files, Path(converted.name))
+            assumptions += [f"{_MISSING} {', '.join(ls)}: {what}" for what, ls in lost.items()]
+            for uri in root.iterfind(".//include/uri"):  # relative to the file, not to the process
+                if (included := files.file((uri.text or "").strip())) is not None:
+                    uri.text = f"file://{included.resolve()}"
+            text = ElementTree.tostring(root, encoding="unicode")
+            with _drakes_errors_raised():
+                instances = parser.AddModelsFromString(text, kind)
+        else:
+            with _drakes_errors_raised():
+                instances = parser.AddModels(str(path))
+    if said is _ROBOT and plant.num_force_elements() > forces:
+        raise DrakeTeleopError(
+            "has springs, or other forces of its own",
+            where=str(path),
+            remedy="take them out: what moves the arm are its motors, gravity and what it touches",
+        )
+    return _Read(instances, list(roots.values()), assumptions, converted)
+
+
+def _check_chain(plant: MultibodyPlant, chain: list[JointIndex], where: str) -> None:
+    """Refuses what moves otherwise than about or along one axis."""
+    for joint in (plant.get_joint(index) for index in chain if _moves(plant, index)):
+        if not isinstance(joint, (RevoluteJoint, PrismaticJoint)):
+            raise DrakeTeleopError(
+                f"{joint.name()} is a {joint.type_name()} joint",
+                where=where,
+                remedy="up to the sensor, use joints that turn about one axis or slide along it",
+            )
+
+
+def _check_loose(plant: MultibodyPlant, instances: list[ModelInstanceIndex], where: str) -> None:
+    held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
+    for index in (k for instance in instances for k in plant.GetBodyIndices(instance)):
+        if index not in held:
+            raise DrakeTeleopError(
+                f"{plant.get_body(index).name()} hangs on nothing, beside the arm",
+                where=where,
+                remedy="take it out, and put what there is to touch into the environment",
+            )
+
+
+def _check_no_loop(path: Path, kind: str) -> None:
+    """Refuses what closes loops in a tree of links: Drake would drop it, or the chain be another.
+
+    Of joints that move together, `peculiar_joints` tells.
+    """
+    found = None if kind == "yaml" else _LOOP.search(path.read_bytes())
+    if found:
+        raise DrakeTeleopError(
+            f"its links form a loop, by {found[1].decode()}",
+            where=str(path),
+            remedy="cut the loop, or model the chain to the sensor alone",
+        )
+
+
+def _moves(plant: MultibodyPlant, index: JointIndex) -> bool:
+    return plant.get_joint(index).num_velocities() > 0
+
+
+def _hold_others(
+    plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
+) -> list[str]:
+    """Welds what moves and is not on the chain, where it is by default; says so."""
+    for constraint in plant.GetConstraintIds():  # such as of fingers that move together
+        plant.RemoveConstraint(constraint)
+    names = []
+    for index in set(plant.GetJointIndices()) - before - set(chain):
+        if not _moves(plant, index):
+            continue
+        joint = plant.get_joint(index)
+        name, ends = joint.name(), (joint.frame_on_parent(), joint.frame_on_child())
+        X_FM = _default_pose(joint)
+        for k in plant.GetJointActuatorIndices():
+            if plant.get_joint_actuator(k).joint().index() == index:
+                plant.RemoveJointActuator(plant.get_joint_actuator(k))
+        plant.RemoveJoint(joint)
+        plant.AddJoint(WeldJoint(f"{name}_held", *ends, X_FM))
+        names.append(name)
+    return [f"held: {', '.join(sorted(names))}"] if names else []
+
+
+def _default_pose(joint: Joint) -> RigidTransform:
+    """X_FM where the joint is by default; Drake has it for few kinds."""
+    q = joint.default_positions()
+    if isinstance(joint, RevoluteJoint):
+        return RigidTransform(AngleAxis(q[0], joint.revolute_axis()), np.zeros(3))
+    if isinstance(joint, PrismaticJoint):
+        return RigidTransform(q[0] * joint.translation_axis())
+    return joint.GetDefaultPose() if np.any(q) else RigidTransform()
+
+
+def _actuate(plant: MultibodyPlant, chain: list[JointIndex], efforts: dict[str, float]) -> None:
+    """One actuator for each moving joint of the chain, in its order, as a state has them."""
+    moving = [index for index in chain if _moves(plant, index)]
+    actuators = [plant.get_joint_actuator(k) for k in plant.GetJointActuatorIndices()]
+    own = [each for each in actuators if each.joint().index() in chain]
+    if [each.joint().index() for each in own] == moving:
+        return
+    known = {
+        each.joint().index(): (
+            each.effort_limit(),
+            each.default_rotor_inertia(),
+            each.default_gear_ratio(),
+        )
+        for each in own
+    }
+    for each in own:
+        plant.RemoveJointActuator(each)
+    for index in moving:
+        joint = plant.get_joint(index)
+        effort, rotor, gear = known.get(index, (efforts.get(joint.name(), 0.0), 0.0, 1.0))
+        effort = effort if effort > 0.0 else np.inf
+        actuator = plant.AddJointActuator(joint.name(), joint, effort)
+        actuator.set_default_rotor_inertia(rotor)
+        actuator.set_default_gear_ratio(gear)
+
+
+@contextmanager
+def drakes_errors_said(path: Path, said: _Said = _ROBOT) -> Iterator[None]:
+    """Makes one error, with the file, of what Drake raises over a model: at parsing or later."""
+    try:
+        yield
+    except DrakeTeleopError:
+        raise
+    # SystemExit: a condition of Drake's; LookupError: of the containers of C++.
+    except (RuntimeError, SystemExit, ValueError, LookupError) as error:
+        reason = str(error).replace("<literal-string>", "").replace(f"{path.parent}/", "")
+        raise DrakeTeleopError(
+            f"cannot be read as a {said[0]} ({reason.strip()})",
+            where=str(path),
+            remedy=f"give a URDF, SDF, MJCF or .dmd.yaml model, {said[1]}",
+        ) from None
+
+
+@contextmanager
+def _drakes_errors_raised() -> Iterator[None]:
+    """Raises RuntimeError for an error that Drake only logs, going on without what it cannot read.
+
+    And for an inertia in whose place it takes another one. Its other warnings are of elements that
+    it does not know; they are not said.
+    """
+    errors: list[str] = []
+
+    def keep(record: logging.LogRecord) -> bool:
+        message = record.getMessage()
+        if record.levelno >= logging.ERROR or "inertia" in message:
+            errors.append(" ".join(message.split()))
+        return False
+
+    log = logging.getLogger("drake")
+    log.addFilter(keep)
+    try:
+        with silent_stderr():  # where the parsers below it write some more
+            yield
+    finally:
+        log.removeFilter(keep)
+    if errors:
+        raise RuntimeError(errors[0])
+
+
+def _weld_base(
+    plant: MultibodyPlant,
+    frame: Frame,
+    peculiar: dict[str, str],
+    X_WBase: RigidTransform | None,
+    where: str,
+) -> list[JointIndex]:
+    """Welds the base to the world if it hangs on nothing; returns the joints to S, outwards."""
+
+    def name_of(body: RigidBody) -> str:
+        is_world = body.index() == plant.world_body().index()
+        return WORLD if is_world else body.scoped_name().get_full()
+
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    # Once more, because `check_model` looks neither into other files nor beyond URDF and SDF.
+    check_tree(
+        ((each.name(), name_of(each.parent_body()), name_of(each.child_body())) for each in joints),
+        where,
+    )
+    inboard = {joint.child_body().index(): joint for joint in joints}
+    body, chain = frame.body(), list[Joint]()
+    while body.index() in inboard:
+        chain.append(inboard[body.index()])
+        body = inboard[body.index()].parent_body()
+    for name in (*(joint.name() for joint in chain), body.name()):
+        if name in peculiar:
+            raise DrakeTeleopError(
+                f"{name} {peculiar[name]}",
+                where=where,
+                remedy="the arm up to the sensor has to be a chain of independent joints",
+            )
+    if body.index() != plant.world_body().index():
+        X_WB = RigidTransform() if X_WBase is None else X_WBase
+        plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WB)
+    elif X_WBase is not None and not X_WBase.IsExactlyIdentity():
+        raise DrakeTeleopError(
+            f"the model fastens {chain[-1].child_body().name()} to the world itself",
+            where=where,
+            remedy="leave the base pose out, or take that joint out of the model",
+        )
+    return [joint.index() for joint in reversed(chain)]

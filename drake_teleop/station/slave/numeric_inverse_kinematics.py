@@ -1,0 +1,447 @@
+"""Inverse kinematics of any serial arm: damped least squares within limits of position and speed.
+
+Each call makes the pose's error ``e = [p_WS* - p_WS; L log(R_WS* R_SW)]`` small, with a length L
+of the arm, in Levenberg and Marquardt's steps. A joint that the error pushes against a limit stays
+there, and the others do what they can without it (active set). Two uses of the same steps:
+
+`follow_pose` goes on from the last command, as a station does sample by sample, and moves no joint
+further than its speed allows. Where the smallest singular value sigma of the Jacobian (turns times
+L) is below ``s = SINGULAR``, the motion is damped with ``lambda^2 = s^2 - sigma^2`` (Chiaverini,
+Siciliano, Egeland 1994): past a singularity there is an error for a moment, and no leap. Elsewhere
+the pose is met to rounding. What a redundant arm has left over takes it towards a posture.
+
+`find_posture` finds joint positions from afar: undamped, from one start after the other.
+
+The last command is what a station goes on from, not where the arm is: else nothing would hold what
+the pose leaves open of a redundant arm. Drake's `DifferentialInverseKinematicsIntegrator` warns of
+the same with its port `robot_state`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.fault import sound
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.quaternions import (
+    conjugate,
+    logarithm,
+    multiply,
+    normalized,
+    quaternion_of,
+)
+from drake_teleop.common.vectors import cross, dot, put, three
+from drake_teleop.station.slave.arm import (
+    PHI,
+    SLIDES,
+    TRANSLATION,
+    ArmModel,
+    jacobian_and_pose,
+    solve_spd,
+)
+from drake_teleop.station.slave.inverse_kinematics import IkStatus
+
+Array = NDArray[np.float64]
+
+MET = 1e-8
+"""A pose is met if neither its origin [m] nor its turn [rad] is further off than this."""
+
+# The error at which there is nothing left but rounding [m].
+_EXACT = 1e-14
+SINGULAR = 5e-3
+"""Singular value of the Jacobian below which a station's motion is damped [m]."""
+STEPS = 10
+"""How many a station takes for each command, at most; two or three are the rule."""
+# Least damping of a step [m^2]: what the pose leaves open stays where it is.
+_LEAST = 1e-14
+# Damping of a step for the error squared, at first; from afar, steps of a start and starts.
+_CAUTION, _STEPS_FROM_AFAR, _STARTS = 1e-3, 100, 100
+# What the error pulls along J^T, of itself, below which it pulls at nothing [m].
+_STUCK = 1e-3
+# An error that nobody can tell out of reach from singular by [m].
+_NEAR = 5e-6
+# The same from afar, where the search comes to an end early.
+_NEARLY = 1e-3
+# How far a joint is moved to find a way out of a singularity, at most [rad, m].
+_NUDGE, _NUDGE_FROM_AFAR = 0.05, 0.3
+# Triple product of the last three axes below which it is the wrist that is singular.
+_ALIGNED = 0.1
+
+_OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = (
+    map(int, IkStatus)
+)
+
+
+@njit(cache=True)
+def _look(table, L, pose, q, x, J, e):
+    """The Jacobian J (6, n) and the error e (6,) at q, turns times L; returns e^2."""
+    jacobian_and_pose(table, q, J, x)
+    a = normalized((pose[0], pose[1], pose[2], pose[3]))
+    R = np.empty((3, 3))
+    for i in range(3):
+        for k in range(3):
+            R[i, k] = x[12 + 3 * i + k]
+    turn = logarithm(multiply(a, conjugate(quaternion_of(R))))
+    squared = 0.0
+    for i in range(3):
+        e[i] = pose[4 + i] - x[9 + i]
+        e[3 + i] = L * turn[i]
+        squared += e[i] * e[i] + e[3 + i] * e[3 + i]
+        for k in range(q.shape[0]):
+            J[3 + i, k] *= L
+    return squared
+
+
+@njit(cache=True)
+def _normal(J, H):
+    """H := J^T J, or J J^T if H is too small for that."""
+    n = H.shape[0]
+    rows = n == J.shape[1]
+    for i in range(n):
+        for k in range(i + 1):
+            value = 0.0
+            if rows:
+                for m in range(6):
+                    value += J[m, i] * J[m, k]
+            else:
+                for m in range(J.shape[1]):
+                    value += J[i, m] * J[k, m]
+            H[i, k] = H[k, i] = value
+
+
+@njit(cache=True)
+def _weakest(H, u):
+    """The least eigenvalue of H (m, m) and its vector u (m,), by inverse iteration."""
+    m = H.shape[0]
+    M = np.empty((m, m))
+    for i in range(m):
+        u[i] = 0.5 + (0.618 * (i + 1)) % 1.0
+    growth = 1.0
+    for _ in range(3):
+        for i in range(m):
+            for k in range(m):
+                M[i, k] = H[i, k]
+            M[i, i] += _LEAST
+        solve_spd(M, u)
+        growth = 0.0
+        for i in range(m):
+            growth += u[i] * u[i]
+        growth = np.sqrt(growth)
+        for i in range(m):
+            u[i] /= growth
+    return max(1.0 / growth - _LEAST, 0.0)
+
+
+@njit(cache=True)
+def _is_held(q, lower, upper, i, push):
+    return (push > 0.0 and q[i] >= upper[i]) or (push < 0.0 and q[i] <= lower[i])
+
+
+@njit(cache=True)
+def _step(H, g, damping, q, lower, upper, trial):
+    """The damped step from q, within the box, to trial (n,); returns its largest part.
+
+    Of the joints, those that g pushes out of the box stay, and those that the step would take
+    there go as far as they may: what the others do is solved again without them.
+    """
+    n = q.shape[0]
+    M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
+    for i in range(n):
+        held[i] = _is_held(q, lower, upper, i, g[i])
+    outside = True
+    while outside:
+        for i in range(n):
+            d[i] = fixed[i] if held[i] else g[i]
+            for k in range(n):
+                M[i, k] = 0.0 if held[i] or held[k] else H[i, k]
+                if held[k] and not held[i]:
+                    d[i] -= H[i, k] * fixed[k]
+            M[i, i] = 1.0 if held[i] else H[i, i] + damping
+        solve_spd(M, d)
+        outside = False
+        for i in range(n):
+            if not (held[i] or lower[i] <= q[i] + d[i] <= upper[i]):
+                fixed[i] = (upper[i] if d[i] > 0.0 else lower[i]) - q[i]
+                held[i] = outside = True
+    largest = 0.0
+    for i in range(n):
+        trial[i] = min(max(q[i] + d[i], lower[i]), upper[i])
+        largest = max(largest, abs(d[i]))
+    return largest
+
+
+@njit(cache=True)
+def _singular_part(L, J):
+    """Whether the last three axes are nearly in a plane, or what is before them is singular."""
+    n = J.shape[1]
+    a, b, c = three(J[3:, n - 3], 0), three(J[3:, n - 2], 0), three(J[3:, n - 1], 0)
+    return _WRIST_SINGULAR if abs(dot(a, cross(b, c))) < _ALIGNED * L**3 else _SHOULDER_SINGULAR
+
+
+@njit(cache=True)
+def follow_pose(
+    table, L, pose, reference, lower, upper, max_step, posture, pull, singular, steps, q
+):
+    """The joint positions next to a reference that meet a pose, or come near it without a leap.
+
+    Args:
+        table: `ArmModel.table`.
+        L: of `turn_length` [m].
+        pose: (7,) X_WS as ``[qw, qx, qy, qz, px, py, pz]``, the quaternion of any length but zero.
+        reference: (n,) normally the last command [rad, or m of a joint that slides].
+        lower: (n,) limits.
+        upper: (n,) limits.
+        max_step: (n,) how far a joint may go from the reference, its speed limit times the time
+            since then; inf for any distance.
+        posture: (n,) that an arm of more than six joints is drawn towards.
+        pull: by which part of the way, from 0 to 1.
+        singular: singular value below which the motion is damped [m].
+        steps: of the search, at most.
+        q: (n,) filled.
+
+    Returns:
+        The `IkStatus` as a plain integer.
+    """
+    n = q.shape[0]
+    low, high = np.empty(n), np.empty(n)
+    for i in range(n):
+        q[i] = min(max(reference[i], lower[i]), upper[i])
+        low[i], high[i] = max(q[i] - max_step[i], lower[i]), min(q[i] + max_step[i], upper[i])
+    length = pose[0] * pose[0] + pose[1] * pose[1] + pose[2] * pose[2] + pose[3] * pose[3]
+    if not (sound(reference) and sound(pose) and length > 0.0):
+        for i in range(n):
+            q[i] = q[i] if sound(reference) else np.nan
+        return _BAD_POSE
+    start, drawn = q.copy(), n > 6 and pull > 0.0
+    if drawn:
+        for i in range(n):
+            q[i] = min(max(q[i] + pull * (posture[i] - q[i]), low[i]), high[i])
+    x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
+    g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
+    squared = _look(table, L, pose, q, x, J, e)
+    _normal(J, B)
+    damping = max(singular * singular - _weakest(B, u), 0.0)
+    before, still_to_win = np.inf, 0.0
+    while True:
+        put(anchor, 0, q, 0, n)
+        cost, caution, idle, better = squared, _CAUTION, 0, True
+        for _ in range(steps):
+            if squared < _EXACT * _EXACT or idle > 3 or caution > 1e9:
+                break
+            if better:
+                _normal(J, H)
+                for i in range(n):
+                    g[i] = damping * (anchor[i] - q[i])
+                    for k in range(6):
+                        g[i] += J[k, i] * e[k]
+            stiff = damping + max(_LEAST, caution * squared)
+            if _step(H, g, stiff, q, low, high, trial) < _EXACT:
+                break
+            found = _look(table, L, pose, trial, x, J, e)
+            total = found
+            for i in range(n):
+                total += damping * (trial[i] - anchor[i]) ** 2
+            better = total < cost
+            if better:
+                idle = idle + 1 if total > 0.99 * cost else 0
+                squared, cost, caution = found, total, 0.2 * caution
+                put(q, 0, trial, 0, n)
+            else:
+                caution = 10.0 * max(caution, _CAUTION)
+        _look(table, L, pose, q, x, J, e)
+        p, turned = three(e, 0), three(e, 3)
+        if dot(p, p) <= MET * MET and dot(turned, turned) <= L * L * MET * MET:
+            return _OK
+        if drawn:
+            # The pose comes first: once more, without the posture.
+            drawn = False
+            put(q, 0, start, 0, n)
+            squared = _look(table, L, pose, q, x, J, e)
+            continue
+        if before < np.inf:
+            if squared < (1.0 - 1e-7) * before - still_to_win:
+                return _singular_part(L, J)
+            put(q, 0, kept, 0, n)
+            far = before > _NEAR * _NEAR and still_to_win < 1e-3 * before
+            return _OUT_OF_REACH if far else _singular_part(L, J)
+        held, free = -1, 0.0
+        for i in range(n):
+            push = 0.0
+            for k in range(6):
+                push += J[k, i] * e[k]
+            if not _is_held(q, low, high, i, push):
+                free += push * push
+            elif held < 0 or lower[i] < q[i] < upper[i]:
+                held = i
+        if held >= 0:
+            return _SPEED_LIMIT if lower[held] < q[held] < upper[held] else _JOINT_LIMIT
+        if singular > 0.0 and free > _STUCK * _STUCK * squared:
+            return _singular_part(L, J) if damping > 0.0 else _SPEED_LIMIT
+        before = squared
+        # What the next samples would win without being moved, or nothing would be out of reach.
+        still_to_win = 4.0 * free / max(damping, _LEAST)
+        put(kept, 0, q, 0, n)
+        # A little along what the pose does not notice. No further than the error is worth, or noise
+        # would set the arm in motion.
+        _weakest(H, g)
+        size = min(_NUDGE, 10.0 * np.sqrt(squared) / L) if singular > 0.0 else _NUDGE_FROM_AFAR
+        way = 0.0
+        for i in range(n):
+            for k in range(6):
+                way += g[i] * J[k, i] * e[k]
+        for i in range(n):
+            q[i] = min(max(q[i] + (size if way >= 0.0 else -size) * g[i], low[i]), high[i])
+        squared = _look(table, L, pose, q, x, J, e)
+
+
+def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, IkStatus]:
+    """Joint positions that meet a pose, from a reference or, if that fails, from elsewhere.
+
+    The first that is found, which need not be the one nearest to the reference. A joint that turns
+    by more than 360 degrees takes the turn nearest to it.
+
+    Args:
+        arm: the arm; a joint without limits counts as one of half a turn, or pi metres, either way.
+        pose: (7,) X_WS as ``[qw, qx, qy, qz, px, py, pz]``.
+        reference: (n,) where to begin [rad, or m of a joint that slides].
+
+    Returns:
+        (n,) joint positions, and how they were found. If none meet the pose: the nearest to it that
+        were found, and JOINT_LIMIT if a joint cannot go on from there, WRIST_SINGULAR or
+        SHOULDER_SINGULAR if they are within 1 mm and nearly singular, else OUT_OF_REACH.
+    """
+    n = arm.num_joints
+    lower = np.where(np.isfinite(arm.lower), arm.lower, reference - np.pi)
+    upper = np.where(np.isfinite(arm.upper), arm.upper, reference + np.pi)
+    far, q, nearest = np.full(n, np.inf), np.empty(n), np.empty(n)
+    # Starts as even as they can be, each irrational in each joint (Roberts's R sequence).
+    ratio = 2.0
+    for _ in range(30):
+        ratio = (1.0 + ratio) ** (1.0 / (n + 1))
+    start, status, L, least = reference, _OUT_OF_REACH, turn_length(arm), np.inf
+    x, e, J = np.empty(21), np.empty(6), np.empty((6, n))
+    for k in range(_STARTS):
+        found = follow_pose(
+            arm.table, L, pose, start, lower, upper, far, start, 0.0, 0.0,
+            _STEPS_FROM_AFAR, q,
+        )  # fmt: skip
+        if found in (_OK, _BAD_POSE):
+            turns = 2 * np.pi * np.round((reference - q) / (2 * np.pi))
+            nearer = q + np.where(arm.table[:-1, SLIDES] == 0, turns, 0.0)
+            return np.where((lower <= nearer) & (nearer <= upper), nearer, q), IkStatus(found)
+        squared = _look(arm.table, L, pose, q, x, J, e)
+        if squared < least:
+            least, nearest = squared, q.copy()
+            status = _JOINT_LIMIT if found == _JOINT_LIMIT else _OUT_OF_REACH
+            if squared < _NEARLY**2 and np.linalg.svd(J)[1][-1] < SINGULAR:
+                status = _singular_part(L, J)
+        part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
+        start = lower + part * (upper - lower)
+    return nearest, IkStatus(status)
+
+
+def turn_length(arm: ArmModel) -> float:
+    """By what a turn [rad] is multiplied to count as a way [m]: a fifth of the stretched arm."""
+    return float(np.linalg.norm(arm.table[:, TRANSLATION:PHI], axis=1).sum()) / 5.0
+
+
+@njit(cache=True)
+def _follow_command(
+    table, L, lower, upper, speed, posture, pull, pose, position, last, time, q
+):  # fmt: skip
+    """`follow_pose` from the last command, as far as the time since then allows.
+
+    Args:
+        table, L, lower, upper, posture, pose: as of `follow_pose`.
+        speed: (n,) of the joints, at most [rad/s, m/s]; inf for any.
+        pull: `NumericInverseKinematics.PULL` [1/s].
+        position: (n,) of the encoders; only whether it is one counts.
+        last: (n + 1,) the last command [rad, m], and when it was [s].
+        time: now [s].
+        q: (n,) filled; the last command if `position` is none.
+
+    Returns:
+        The `IkStatus` as a plain integer.
+    """
+    n = q.shape[0]
+    put(q, 0, last, 0, n)
+    if not sound(position):
+        return _BAD_POSE
+    reference, max_step, since = q.copy(), np.zeros(n), max(time - last[n], 0.0)
+    if since > 0.0:  # nothing moves in no time, not even a joint without a limit
+        for i in range(n):
+            max_step[i] = speed[i] * since
+    steps = np.int64(STEPS)  # for the constant itself `follow_pose` would be compiled once more
+    return follow_pose(
+        table, L, pose, reference, lower, upper, max_step, posture, min(pull * since, 1.0),
+        SINGULAR, steps, q,
+    )  # fmt: skip
+
+
+class NumericInverseKinematics(LeafSystem):
+    """Turns a commanded pose of the sensor frame into joint positions, for any serial arm.
+
+    The joints go on from the last command, no faster than they may; without numbers from the
+    encoders the command is held.
+
+    .. pydrake_system::
+
+        name: NumericInverseKinematics
+        input_ports:
+        - pose_command: X_WS as [qw, qx, qy, qz, px, py, pz] [-, m]
+        - joint_position: (n,) where the arm is [rad]
+        output_ports:
+        - joint_command: (n,) [rad]
+        - ik_status: an `IkStatus`
+
+    Args:
+        arm: kinematics and limits.
+        q_start: (n,) the command before the first one, and the posture that an arm of more than
+            six joints is drawn towards [rad].
+        period: in which commands are taken [s].
+    """
+
+    __slots__ = ONE_DICT
+
+    PULL = 1.0
+    """By what a redundant arm nears its posture in a second, of the way left over [1/s]."""
+
+    def __init__(self, arm: ArmModel, q_start: Array, period: float) -> None:
+        super().__init__()
+        n = arm.num_joints
+        self._joints, posture = n, np.array(q_start, dtype=np.float64)
+        #: (n,) of the joints; its numbers may be changed [rad/s, m/s].
+        self.speed_limit = arm.velocity_limit.copy()
+        limits = arm.lower, arm.upper, self.speed_limit
+        self._fixed = (arm.table, turn_length(arm), *limits, posture)
+        self._pose = self.DeclareVectorInputPort("pose_command", 7)
+        self._position = self.DeclareVectorInputPort("joint_position", n)
+        self.DeclareDiscreteState(np.append(posture, 0.0))  # and of when it is
+        self._command = self.DeclareVectorOutputPort(
+            "joint_command", n, weak_callback(self._calc_command)
+        )
+        self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _solve(self, context: Context, q: Array) -> int:
+        last = context.get_discrete_state_vector().value()
+        time, pose, position = context.get_time(), self._pose, self._position
+        status: int = _follow_command(
+            *self._fixed, self.PULL, pose.Eval(context), position.Eval(context), last, time, q
+        )
+        return status
+
+    def _calc_command(self, context: Context, output: BasicVector) -> None:
+        self._solve(context, output.get_mutable_value())
+
+    def _calc_status(self, context: Context, output: BasicVector) -> None:
+        output[0] = self._solve(context, np.empty(self._joints))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        next_state = discrete_state.get_mutable_value(0)
+        next_state[:-1] = self._command.Eval(context)  # which the joint control has asked for too
+        next_state[-1] = context.get_time()

@@ -1,0 +1,404 @@
+"""The slave's rigid bodies: arm, tool and what the scenario has to touch."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import product
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.geometry import Role, SceneGraph
+from pydrake.math import RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.environment.environment import Environment
+from drake_teleop.station.slave.arm import FRICTION, ArmModel
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.assumed_limits import with_all_limits
+from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.slave.home import R_WS_HOME, check_strength, start_posture
+from drake_teleop.station.slave.joint_friction import AddJointFriction, friction_of_joints
+from drake_teleop.station.slave.model_check import check_size
+from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
+from drake_teleop.station.slave.payload import AddPayload
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.surroundings import AddEnvironment, Contact, ContactWith, no_contact
+from drake_teleop.station.slave.tool import AddTool, shapes_reach
+
+# Shapes that reach as far as others to so much make contact with them, as two fingers do [m].
+_ABREAST = 1e-3
+#: What the arm's model instance is called in a plant, whatever its file says.
+ARM = "arm"
+
+
+@dataclass(frozen=True)
+class SlavePlant:
+    """The plant and what the blocks around it need to know.
+
+    Args:
+        plant: continuous MultibodyPlant, finalized.
+        instance: the arm's joints.
+        sensor_frame: S.
+        tool: the body on the sensor.
+        arm: kinematics and dynamics up to S, with all that hangs there as its load.
+        start: (n,) joint positions at the start [rad].
+        X_WS_start: (7,) see `start_pose`.
+        tip: (3,) p_STip, where the tool makes contact [m].
+        contact: with what there is to touch.
+        assumptions: what the models do not say.
+        config: what was asked for.
+        environment: what there is to touch, or None.
+    """
+
+    plant: MultibodyPlant
+    instance: ModelInstanceIndex
+    sensor_frame: Frame
+    tool: BodyIndex
+    arm: ArmModel
+    start: NDArray[np.float64]
+    X_WS_start: NDArray[np.float64]
+    tip: NDArray[np.float64]
+    contact: Contact
+    assumptions: tuple[str, ...]
+    config: Slave
+    environment: Environment | None
+
+    @property
+    def contact_pairs(self) -> NDArray[np.float64]:
+        """(k, 28) what may touch by the compiled contact law, see `Pairs`."""
+        return self.contact.pairs
+
+    @cached_property
+    def physics(self) -> tuple[NDArray[np.float64], ...]:
+        """For `plant_rates`: the arm's table, phi in it, pairs, leaf, joints; nothing is told.
+
+        A copy, because of what the joint control does not know: something may be grasped, and dry
+        friction.
+        """
+        carried = self.arm.with_load(self.arm.phi_load)
+        carried.table[:-1, FRICTION] = self.friction
+        contact = self.contact.pairs, self.contact.leaf, self.contact.joints
+        return carried.table, carried.load, *contact, np.zeros((0, 0))
+
+    @property
+    def friction(self) -> NDArray[np.float64]:
+        """(n,) of the joints, dry [N m]."""
+        return friction_of_joints(self.config.friction, self.arm.joint_names)
+
+    @property
+    def sheet(self) -> ModelInstanceIndex | None:
+        """Model instance of the leaf, or another `moving_part`, if there is one."""
+        return self.contact.sheet
+
+    @property
+    def can_touch(self) -> bool:
+        """Whether there is something to touch."""
+        return len(self.contact_pairs) > 0 or bool(self.contact.beyond)
+
+    @property
+    def sensed_sheet(self) -> ModelInstanceIndex | None:
+        """The sheet, if the compiled contact law moves it."""
+        return None if self.contact.beyond else self.sheet
+
+    @property
+    def start_tip(self) -> NDArray[np.float64]:
+        """(3,) p_WTip at the start [m]."""
+        start = self.X_WS_start
+        R_WS = RotationMatrix(Quaternion(start[:4] / np.linalg.norm(start[:4])))
+        return start[4:] + R_WS.matrix() @ self.tip
+
+
+def start_pose(slave: Slave) -> NDArray[np.float64]:
+    """(7,) X_WS [qw qx qy qz px py pz] at the start; without `home` as it was asked for.
+
+    Raises:
+        DrakeTeleopError: as `NominalSlave`, if `home` is given.
+    """
+    if slave.home:
+        return NominalSlave(slave).X_WS_start
+    return np.array([*R_WS_HOME.ToQuaternion().wxyz(), *slave.position])
+
+
+def NominalSlave(slave: Slave) -> SlavePlant:
+    """The slave by itself, with nothing to touch, for its numbers: arm, start and tip.
+
+    Raises:
+        DrakeTeleopError: as `AddSlavePlant`.
+    """
+    written = tuple(path.stat().st_mtime_ns for path in slave.files())
+    return _nominal_slave(_Known(slave), written)
+
+
+class _Known:
+    """A slave that can be looked up: by all of its values."""
+
+    def __init__(self, slave: Slave) -> None:
+        self.slave, self._values = copy.deepcopy(slave), repr(slave)
+
+    def __hash__(self) -> int:
+        return hash(self._values)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Known) and self._values == other._values
+
+
+@lru_cache(maxsize=4)  # to parse the models takes longer than to build a station of them
+def _nominal_slave(known: _Known, _: tuple[int, ...]) -> SlavePlant:
+    return AddSlavePlant(DiagramBuilder(), known.slave, None)
+
+
+def AddSlavePlant(
+    builder: DiagramBuilder,
+    slave: Slave,
+    environment: Environment | None,
+    q_start: NDArray[np.float64] | None = None,
+) -> SlavePlant:
+    """Adds the slave's plant, at rest.
+
+    A scene graph, which costs time at every step, comes only with something to touch. Of the slave
+    itself only the tool touches, not the arm.
+
+    Args:
+        builder: the diagram.
+        slave: arm, tool, payload and where they start.
+        environment: what there is to touch, or None.
+        q_start: (n,) joint positions to start at instead [rad].
+
+    Raises:
+        DrakeTeleopError: if a model cannot be read, the arm cannot reach the start or not hold the
+            tool there.
+    """
+    if environment is None:
+        plant = builder.AddNamedSystem("slave_plant", MultibodyPlant(time_step=0.0))
+    else:
+        plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
+        plant.set_name("slave_plant")
+        areas = ContactModel.kHydroelasticWithFallback
+        plant.set_contact_model(areas if environment.hydroelastic else ContactModel.kPoint)
+        plant.set_stiction_tolerance(environment.slip)
+    parsed = ParseSlave(plant, slave)
+    instance, tool = parsed.instance, parsed.tool
+    touched = None if environment is None else AddEnvironment(plant, environment)
+    with drakes_errors_said(slave.path):
+        finalize(plant)
+    contact = no_contact()
+    if environment is not None and touched is not None:
+        _remove_visuals(plant, scene_graph)
+        frame = parsed.sensor_frame
+        _remove_shapes(plant, scene_graph, instance, bodies_beyond(plant, frame.body()))
+        contact = ContactWith(plant, scene_graph, frame, tool, environment, touched)
+    arm, assumptions = parsed.arm()
+    start = start_posture(slave, arm) if q_start is None else q_start
+    if q_start is None:
+        check_strength(arm, start)
+    friction = friction_of_joints(slave.friction, arm.joint_names)
+    if friction.any():
+        AddJointFriction(builder, plant, instance, friction, arm.velocity_index)
+    plant.SetDefaultPositions(instance, start)
+    X_WS_start = np.empty(7) if slave.home else start_pose(slave)
+    if slave.home:
+        pose_into(arm.table, start, X_WS_start)
+    return SlavePlant(
+        plant,
+        instance,
+        parsed.sensor_frame,
+        tool,
+        arm,
+        start,
+        X_WS_start,
+        _tip(plant, slave, parsed, arm),
+        contact,
+        (*parsed.assumptions, *assumptions),
+        slave,
+        environment,
+    )
+
+
+@dataclass(frozen=True)
+class ParsedSlave:
+    """Arm and tool in a plant that is not finalized.
+
+    Attributes:
+        slave: what was asked for.
+        plant: where they are.
+        instance: the arm's joints.
+        sensor_frame: S.
+        tool: the body on the sensor.
+        assumptions: what the models do not say, but for limits.
+        folders: of converted meshes, to be kept as long as shapes are looked at.
+    """
+
+    slave: Slave
+    plant: MultibodyPlant
+    instance: ModelInstanceIndex
+    sensor_frame: Frame
+    tool: BodyIndex
+    assumptions: tuple[str, ...]
+    folders: list[TemporaryDirectory[str]]
+
+    def arm(self) -> tuple[ArmModel, list[str]]:
+        """Its numbers once the plant is finalized, and what is assumed of its limits.
+
+        Raises:
+            DrakeTeleopError: if it is no arm, or nothing hangs on its sensor.
+        """
+        frame = self.sensor_frame
+        arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
+        if not arm.phi_load[0] > 0.0:
+            raise DrakeTeleopError(
+                f"nothing with a mass hangs on {frame.name()}",
+                where="slave.tool",
+                remedy="give the tool, or a sensor_frame before the model's own",
+            )
+        check_size(arm, str(self.slave.path))
+        arm, assumed = with_all_limits(arm, str(self.slave.path))
+        if arm.num_joints < 6:
+            assumed.append(f"with {arm.num_joints} joints the tool follows as far as it can")
+        return arm, assumed
+
+
+def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave:
+    """Parses arm and tool and adds the payload; the tool hangs on S by the joint "sensor_weld".
+
+    Whatever its file says, the arm's model instance is called "arm".
+
+    Args:
+        plant: not finalized.
+        slave: which; by default the paper's.
+
+    Raises:
+        DrakeTeleopError: as `ParseModel` and `AddTool`.
+    """
+    slave = Slave() if slave is None else slave
+    model = ParseModel(plant, slave.path, slave.sensor_frame, slave.packages, slave.X_WBase)
+    if plant.HasModelInstanceNamed(ARM):
+        plant.RenameModelInstance(plant.GetModelInstanceByName(ARM), f"{ARM}_of_model")
+    plant.RenameModelInstance(model.instance, ARM)
+    frame, own = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
+    assumptions, folders = [*model.assumptions], [model.folder]
+    if slave.tool is not None:
+        tool = AddTool(plant, slave.tool, frame, slave.packages)
+        assumptions += tool.assumptions
+        folders += [tool.folder] if tool.folder is not None else []
+        if own:
+            names = ", ".join(body.name() for body in own)
+            assumptions.append(f"{names} of the model on the sensor beside the tool")
+        on_sensor, holder = tool.body, tool.body.body_frame()
+    else:
+        on_sensor, holder = own[0] if own else frame.body(), frame
+    AddPayload(plant, holder, slave.payload)
+    return ParsedSlave(
+        slave, plant, model.instance, frame, on_sensor.index(), tuple(assumptions), folders
+    )
+
+
+def bodies_beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
+    """What hangs on a body, from the nearest outwards."""
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
+    return near + [far for each in near for far in bodies_beyond(plant, each)]
+
+
+def finalize(plant: MultibodyPlant) -> None:
+    """Finalizes a continuous plant whose joint limits somebody else watches.
+
+    Continuous plants ignore limits, and Drake warns of it, even in the middle of a run. It does
+    not for limits that are given after finalizing; the station's monitor and the inverse
+    kinematics keep them.
+    """
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    limits = [(joint.position_lower_limits(), joint.position_upper_limits()) for joint in joints]
+    for joint, (lower, upper) in zip(joints, limits, strict=True):
+        joint.set_position_limits(np.full_like(lower, -np.inf), np.full_like(upper, np.inf))
+    plant.Finalize()
+    for joint, (lower, upper) in zip(joints, limits, strict=True):
+        joint.set_position_limits(lower, upper)
+
+
+def _remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Every shape costs time at every step, and nobody looks at these: a replay has its own."""
+    for index in range(plant.num_bodies()):
+        for shape in plant.GetVisualGeometriesForBody(plant.get_body(BodyIndex(index))):
+            scene_graph.RemoveGeometry(plant.get_source_id(), shape)
+
+
+def _remove_shapes(
+    plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, load: list[RigidBody]
+) -> None:
+    """Of the arm itself nothing touches: a model's hulls overlap, and would push it about."""
+    carried = {body.index() for body in load}
+    for index in plant.GetBodyIndices(arm):
+        for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
+            if index not in carried:
+                scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
+
+
+def lowest_point(slave: Slave) -> NDArray[np.float64]:
+    """p_W (3,) of the lowest point of what hangs on the sensor, at the start [m].
+
+    By the hulls of its meshes and boxes around other shapes; without shapes, of its tip.
+    """
+    nominal = NominalSlave(slave)
+    X_WS = nominal.X_WS_start
+    R_WS = RotationMatrix(Quaternion(X_WS[:4] / np.linalg.norm(X_WS[:4]))).matrix()
+    corners = [X_WS[4:] + hull @ R_WS.T for hull in _hulls_on_sensor(slave)]
+    points = np.vstack([nominal.start_tip, *corners])
+    return np.array(points[np.argmin(points[:, 2])])
+
+
+def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
+    """(k, 3) corners in S of each shape that hangs on the sensor, or of a box around it [m]."""
+    plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
+    parsed = ParseSlave(plant, slave)
+    finalize(plant)
+    context, inspector = plant.CreateDefaultContext(), scene_graph.model_inspector()
+    hulls, signs = [], np.array(list(product((-1.0, 1.0), repeat=3)))
+    for body in bodies_beyond(plant, parsed.sensor_frame.body()):
+        X_SBody = plant.CalcRelativeTransform(context, parsed.sensor_frame, body.body_frame())
+        for shape in plant.GetCollisionGeometriesForBody(body):
+            X_SShape = X_SBody @ inspector.GetPoseInFrame(shape)
+            mesh, box = inspector.GetConvexHull(shape), inspector.GetObbInGeometryFrame(shape)
+            if mesh is not None:
+                corners = np.array([mesh.vertex(k) for k in range(mesh.num_vertices())])
+            elif box is not None:  # as of a half space
+                corners = (box.pose() @ (signs * box.half_width()).T).T
+            else:
+                continue
+            hulls.append((X_SShape @ corners.T).T)
+    return hulls
+
+
+def _farthest(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """p_S (3,) in the middle of the shapes that reach farthest along z_S, as far as they reach."""
+    reach = max(float(hull[:, 2].max()) for hull in hulls)
+    abreast = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _ABREAST]
+    middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in abreast]
+    return np.array([*np.mean(middles, axis=0), reach])
+
+
+def _tip(
+    plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel
+) -> NDArray[np.float64]:
+    if slave.tip:
+        return np.array(slave.tip, dtype=np.float64)
+    instance = plant.get_body(parsed.tool).model_instance()
+    if plant.HasFrameNamed("tip", instance):
+        tip = plant.GetFrameByName("tip", instance)
+        if slave.tool is not None and tip.body().index() == parsed.tool:  # whose frame is S
+            return tip.GetFixedPoseInBodyFrame().translation()
+        X_WS, X_WTip = (
+            frame.CalcPoseInWorld(plant.CreateDefaultContext())
+            for frame in (parsed.sensor_frame, tip)
+        )
+        return X_WS.InvertAndCompose(X_WTip).translation()
+    reach = None if slave.tool is None else shapes_reach(slave.tool)
+    if slave.tool is None and (hulls := _hulls_on_sensor(slave)):
+        return _farthest(hulls)
+    return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)

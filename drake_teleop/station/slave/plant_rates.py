@@ -1,0 +1,88 @@
+"""The plant's motion in compiled code, for who looks into one of its steps: sensor and servo.
+
+Of arm, tool, balls on boxes and one leaf; `Contact.beyond` says if there is more to touch. A state
+is x = [q, the leaf's deflection, v, its rate]; behind it, if anything else moves, stands the state
+[q; v] of the whole plant.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.vectors import put
+from drake_teleop.station.slave.arm import forward_dynamics
+from drake_teleop.station.slave.tool_contact import environment_wrench
+
+
+@njit(cache=True)
+def joined(state, around, x):
+    """x, see the module, of [q; v] and [deflection, rate, the plant's state]."""
+    n = state.shape[0] // 2
+    put(x, 0, state, 0, n)
+    put(x, n + 1, state, n, n)
+    x[n], x[2 * n + 1] = around[0], around[1]
+    put(x, 2 * n + 2, around, 2, around.shape[0] - 2)
+
+
+@njit(cache=True)
+def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
+    """Time derivative of the first 2 n + 2 of x, and the environment's wrench.
+
+    Args:
+        physics: `SlavePlant.physics`.
+        x: see the module.
+        tau: (n,) of the motors [N m].
+        applied_W, wrench_W: as for `environment_wrench`.
+        xdot: (2 n + 2,) filled.
+    """
+    arm, _, pairs, _, joints, told = physics
+    half = tau.shape[0] + 1
+    q, v, sheet, plant = (
+        x[: half - 1],
+        x[half : 2 * half - 1],
+        x[half - 1 : 2 * half : half],
+        x[2 * half :],
+    )
+    if not _is_told(told, x, wrench_W):
+        environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W)
+    else:
+        applied = np.empty(6)
+        environment_wrench(arm, pairs[:0], joints, applied_W, q, v, sheet, plant, applied)
+        wrench_W += applied
+    rates_under(physics, x, tau, applied_W, wrench_W, xdot)
+
+
+@njit(cache=True)
+def _is_told(told, x, wrench_W):
+    """Whether the wrench of contact has been told, into `wrench_W`; if not, it is asked for.
+
+    Args:
+        told: (k, ...) [how many are told, how many were needed, the first x that was not], then a
+            wrench (6) each; or nothing, if nobody is asked.
+    """
+    if told.shape[0] == 0:
+        return False
+    number = int(told[0, 1])
+    told[0, 1] += 1.0
+    if number < told[0, 0]:
+        put(wrench_W, 0, told[1 + number], 0, 6)
+        return True
+    if number == told[0, 0]:
+        put(told[0], 2, x, 0, x.shape[0])
+    return False
+
+
+@njit(cache=True)
+def rates_under(physics, x, tau, applied_W, wrench_W, xdot):
+    """Time derivative of x, see `plant_rates`, under the environment's wrench."""
+    arm, _, pairs, leaf, _, _ = physics
+    half = tau.shape[0] + 1
+    q, v = x[: half - 1], x[half : 2 * half - 1]
+    forward_dynamics(arm, q, v, tau, wrench_W, xdot[half:-1])
+    put(xdot, 0, x, half, half)
+    push = 0.0
+    if pairs.shape[0] > 0:  # which all are of one body, the leaf, or of none
+        for i in range(3):
+            push -= pairs[0, 19 + i] * (wrench_W[i] - applied_W[i])
+    xdot[-1] = (push - leaf[1] * x[half - 1] - leaf[2] * x[2 * half - 1]) / leaf[0] + leaf[3]

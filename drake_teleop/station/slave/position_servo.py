@@ -1,0 +1,239 @@
+"""An arm as it is sold: it takes joint positions at its own rate, and follows them in its own way.
+
+    command --[dead time, held]--> target --[generator]--> r, dr/dt --[drives]--> torque
+
+The generator is what the makers call gain and lookahead, within the joints' limits, and the drives
+follow it by computed torque, critically damped:
+
+    d2r/dt2 = gain (target - (r + lookahead dr/dt))
+    d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz
+
+So a steady motion is followed by `lookahead` and the dead time later. Towards a target that is far
+away it goes no faster than it can still brake. How sure each number is: D from the manufacturer's
+documents, E an engineering estimate.
+
+- `ur_servoj`: the URScript manual on servoj has 500 Hz, lookahead_time 0.1 s and gain 300 by
+  default, a P gain on the target against the position projected ahead by lookahead_time (D), and
+  the e-Series 180 degrees/s (D). That the gain is one of acceleration, dead time, acceleration and
+  drives are E.
+- `franka_position`: joint positions of libfranka have 1 kHz, a low-pass of 100 Hz (here a
+  critically damped one), 2.175 rad/s and 7.5 rad/s^2, the least of the seven joints (D). Dead time
+  and drives are E.
+
+Left out: gears' friction and elasticity, limits of jerk, and the stops by which such arms protect
+themselves. The drives have no integral: in contact a joint gives way by torque / (inertia w^2).
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fault import sound
+from drake_teleop.common.fields import settings
+from drake_teleop.common.lifetime import ONE_DICT
+from drake_teleop.common.quantities import quantity
+from drake_teleop.common.vectors import put
+from drake_teleop.station.slave.arm import ArmModel, inverse_dynamics
+
+# In memory: periods since the target was taken, where in the queue of commands is the oldest; then
+# the target, r and dr/dt (n each), and the queue.
+_COUNT, _OLDEST = 0, 1
+# Twice the share of the largest acceleration with which it means to brake.
+_BRAKES = 2 * 0.8
+
+
+@settings
+@dataclass
+class PositionInterface:
+    """What an arm makes of joint positions, see `position_servo`; speeds in m/s where it slides."""
+
+    command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "how often it takes a command")
+    dead_time: float = quantity(
+        0.004, "s", 0.0, 1.0, "until it acts on one; whole periods of command_hz"
+    )
+    gain: float = quantity(300.0, "1/s^2", 1.0, 1e7, "from an error to acceleration")
+    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "by which it lags behind a steady motion")
+    max_speed: float = quantity(math.pi, "rad/s", 1e-3, 100.0, "of a joint, or its own limit")
+    max_acceleration: float = quantity(40.0, "rad/s^2", 1e-2, 1e4, "of a joint")
+    drive_bandwidth_hz: float = quantity(
+        30.0, "Hz", 0.1, 1e3, "of the drives, which follow what is generated: how stiff it is"
+    )
+
+    def check(self, where: str, rate: float) -> None:
+        """Checks it against the rate of the joint control [Hz].
+
+        Raises:
+            DrakeTeleopError: naming `where` and the field.
+        """
+        periods = rate / self.command_hz
+        if periods < 1.0 or abs(periods - round(periods)) > 1e-6 * periods:
+            raise DrakeTeleopError(
+                f"{self.command_hz:g} Hz do not divide rates.joint_control_hz, {rate:g} Hz",
+                where=f"{where}.command_hz",
+                remedy="choose a rate of the joint control that is a multiple of it",
+            )
+        damping = self.gain * self.lookahead / rate
+        if damping + 0.5 * self.gain / rate**2 > 1.5:  # from 2 on it is unstable
+            raise DrakeTeleopError(
+                f"a gain of {self.gain:g} 1/s^2 is too fast for steps of {1e3 / rate:g} ms",
+                where=f"{where}.gain",
+                remedy="lower gain or lookahead, or raise rates.joint_control_hz",
+            )
+        if self.drive_bandwidth_hz > 0.1 * rate:
+            raise DrakeTeleopError(
+                f"drives of {self.drive_bandwidth_hz:g} Hz are too fast for {rate:g} Hz",
+                where=f"{where}.drive_bandwidth_hz",
+                remedy="choose at most a tenth of rates.joint_control_hz",
+            )
+
+
+#: Arms by the name of their interface.
+INTERFACES: dict[str, PositionInterface] = {
+    "ur_servoj": PositionInterface(),
+    "franka_position": PositionInterface(
+        command_hz=1000.0,
+        dead_time=0.002,
+        gain=(200 * math.pi) ** 2,
+        lookahead=1 / (100 * math.pi),
+        max_speed=2.175,
+        max_acceleration=7.5,
+        drive_bandwidth_hz=20.0,
+    ),
+}
+
+
+@njit(cache=True)
+def _generate(command, interface, limits, memory, reference):
+    """Takes the command if it is time, and moves r on by a period.
+
+    Args:
+        command: (n,) [rad].
+        interface: (6,) period [s], gain, lookahead, w, periods of a command, length of the queue.
+        limits: (2, n) of speed and acceleration.
+        memory: see the module; changed.
+        reference: (3, n) filled with r and its two derivatives.
+    """
+    period, gain, lookahead, _, every, queued = interface
+    n = command.shape[0]
+    target, r, speed = memory[2 : 2 + n], memory[2 + n : 2 + 2 * n], memory[2 + 2 * n : 2 + 3 * n]
+    if memory[_COUNT] == 0.0 and sound(command):
+        if queued > 0.0:
+            place = 2 + 3 * n + int(memory[_OLDEST]) * n
+            put(target, 0, memory, place, n)
+            put(memory, place, command, 0, n)
+            memory[_OLDEST] = (memory[_OLDEST] + 1.0) % queued
+        else:
+            put(target, 0, command, 0, n)
+    memory[_COUNT] = (memory[_COUNT] + 1.0) % every
+    for i in range(n):
+        away = target[i] - r[i]
+        fastest = min(limits[0, i], math.sqrt(_BRAKES * limits[1, i] * abs(away)))
+        towards = min(max(away / lookahead, -fastest), fastest)
+        wanted = gain * lookahead * (towards - speed[i])
+        wanted = min(max(wanted, -limits[1, i]), limits[1, i])
+        faster = min(max(speed[i] + period * wanted, -limits[0, i]), limits[0, i])
+        reference[0, i], reference[1, i] = r[i], speed[i]
+        reference[2, i] = (faster - speed[i]) / period
+        speed[i] = faster
+        r[i] += period * faster
+
+
+@njit(cache=True)
+def position_servo_torque(
+    arm, command, state, interface, limits, effort_limit, scratch, memory, torque
+):  # fmt: skip
+    """The motors' torque (n,) for the coming period, within `effort_limit` (n,) [N m].
+
+    `state` is [q; v], `scratch` (6, n), the others as of `_generate`; rad, rad/s. While a command
+    is none the last one holds, and while the encoders give no numbers the arm is carried.
+    """
+    n = torque.shape[0]
+    _generate(command, interface, limits, memory, scratch)
+    q, v, wanted, w = scratch[3], scratch[4], scratch[5], interface[3]
+    if sound(state):
+        put(q, 0, state, 0, n)
+        put(v, 0, state, n, n)
+        for i in range(n):
+            wanted[i] = scratch[2, i]
+            wanted[i] += 2.0 * w * (scratch[1, i] - v[i]) + w * w * (scratch[0, i] - q[i])
+    else:
+        put(q, 0, scratch[0], 0, n)
+        v[:] = 0.0
+        wanted[:] = 0.0
+    inverse_dynamics(arm, q, v, wanted, torque)
+    for i in range(n):
+        torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
+
+
+class PositionServo(LeafSystem):
+    """The position interface of an arm, in the place of `JointControl`.
+
+    .. pydrake_system::
+
+        name: PositionServo
+        input_ports:
+        - joint_command: (n,) [rad]
+        - slave_state: [q; v] of the arm [rad, rad/s]
+        output_ports:
+        - joint_torque: (n,) [N m], held between samples
+
+    Args:
+        arm: the arm with its tool (the drives know its nominal load).
+        interface: its numbers.
+        period: of the drives [s]; `PositionInterface.check` says which fit.
+        q_start: (n,) where it holds the arm before the first command [rad].
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        interface: PositionInterface,
+        period: float,
+        q_start: NDArray[np.float64],
+    ) -> None:
+        super().__init__()
+        n = arm.num_joints
+        self._arm = arm.table
+        queued = round(interface.dead_time * interface.command_hz)
+        numbers = [
+            period,
+            interface.gain,
+            interface.lookahead,
+            2 * np.pi * interface.drive_bandwidth_hz,
+            round(1 / (interface.command_hz * period)),
+            queued,
+        ]
+        speed = np.minimum(arm.velocity_limit, interface.max_speed)
+        acceleration = np.minimum(arm.acceleration_limit, interface.max_acceleration)
+        self._constants = (
+            np.array(numbers),
+            np.array([speed, acceleration]),
+            arm.effort_limit,
+            np.zeros((6, n)),
+        )
+        self._command = self.DeclareVectorInputPort("joint_command", n)
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
+        still, holding = np.zeros(n), np.zeros(n)
+        inverse_dynamics(arm.table, q_start, still, still, holding)
+        self.DeclareStateOutputPort("joint_torque", self.DeclareDiscreteState(holding))
+        memory = np.concatenate([[0.0, 0.0], q_start, q_start, still, *(queued * [q_start])])
+        self.DeclareDiscreteState(memory)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        position_servo_torque(
+            self._arm,
+            self._command.Eval(context),
+            self._state.Eval(context),
+            *self._constants,
+            discrete_state.get_mutable_value(1),
+            discrete_state.get_mutable_value(0),
+        )

@@ -1,0 +1,145 @@
+"""Something to touch out of a file: SDF, URDF or Drake's model directives, as Drake reads them.
+
+Its bodies may hang on joints, with springs and damping of the file, and have any shape. What an SDF
+or URDF hangs on nothing is welded to the world, or left to fall and to be pushed.
+"""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    ProximityProperties,
+    Role,
+    RoleAssign,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import choice, plain, quantity
+from drake_teleop.common.resources import models_dir
+from drake_teleop.station.environment.environment import Environment, LetFloat, ToolShapes
+from drake_teleop.station.slave.models import ParseScene
+from drake_teleop.station.slave.moving_pose import can_be_told
+
+#: Meshes that were converted, for as long as this process looks at them.
+_CONVERTED: list[TemporaryDirectory[str]] = []
+_OWN = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
+_RESOLUTION = 0.005  # m, of the mesh that the tool's ball becomes
+
+
+@settings
+@dataclass
+class Scene(Environment):
+    """Of which file, where it stands, and whether contacts have points or areas."""
+
+    file: str = plain(
+        "door.sdf",
+        ".sdf, .urdf or .dmd.yaml, from the scenario's folder; door.sdf comes with this",
+    )
+    position: list[float] = quantity(
+        [0.0, 0.0, 0.0], "m", -3.0, 3.0, "of what hangs on nothing in the file, in W"
+    )
+    rotation: list[float] = quantity(
+        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch and yaw of it"
+    )
+    fixed: bool = plain(True, "what hangs on nothing is welded there; false: it can be pushed")
+    contact: str = choice(
+        "point", ("point", "hydroelastic"), "Drake's model; what cannot be hydroelastic has points"
+    )
+    tool_modulus: float = quantity(
+        1e7, "Pa", 1e4, 1e11, "hydroelastic modulus of the tool's shapes (E)"
+    )
+    slip: float = quantity(1e-3, "m/s", 1e-6, 1.0, "at which friction is complete (E)")
+
+    @property
+    def path(self) -> Path:
+        """The file, or the model of that name that comes with the package."""
+        given, shipped = Path(self.file), models_dir() / self.file
+        return shipped if not given.is_file() and shipped.is_file() else given
+
+    @property
+    def hydroelastic(self) -> bool:
+        """Whether the file's and the tool's shapes may have a pressure over an area."""
+        return self.contact == "hydroelastic"
+
+    def found_from(self, folder: Path) -> "Scene":
+        """The same with its file found from a folder, if it is there."""
+        path = (folder / self.file).resolve()
+        return dataclasses.replace(self, file=str(path)) if path.is_file() else self
+
+    def AddTo(self, plant: MultibodyPlant) -> None:
+        """Parses the file and puts what hangs on nothing where it shall be.
+
+        Raises:
+            DrakeTeleopError: if there is no such file, or Drake cannot read it.
+        """
+        before, path = plant.num_bodies(), self.path
+        folder = ParseScene(plant, path)
+        if any(Path(folder.name).iterdir()):
+            _CONVERTED.append(folder)
+        added = range(before, plant.num_bodies())
+        for body in map(plant.get_body, map(BodyIndex, added)):
+            if body.name() in _OWN:
+                raise DrakeTeleopError(
+                    f"a body is called {body.name()}, as one of the station's frames",
+                    where=str(path),
+                    remedy="give it another name in the file",
+                )
+        joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+        for joint in joints:
+            if not can_be_told(joint):
+                raise DrakeTeleopError(
+                    f"{joint.name()} is of the kind {joint.type_name()}",
+                    where=str(path),
+                    remedy="let it turn about an axis (several, for more), slide along one, or be"
+                    " free",
+                )
+        hung = {joint.child_body().index() for joint in joints}
+        bases = [index for index in map(BodyIndex, added) if index not in hung]
+        X_WBase = RigidTransform(RollPitchYaw(self.rotation), self.position)
+        for body in map(plant.get_body, bases):
+            if self.fixed:
+                plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBase)
+            else:
+                LetFloat(plant, body, X_WBase)
+
+    def PrepareContact(
+        self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
+    ) -> None:
+        """Gives the tool's shapes a pressure, if that is wanted.
+
+        Raises:
+            DrakeTeleopError: if no shape of the file could have one.
+        """
+        if not self.hydroelastic:
+            return
+        inspector = scene_graph.model_inspector()
+        own = [shape for each in ToolShapes(plant, scene_graph, tool).values() for shape in each]
+        others = set(inspector.GetAllGeometryIds(Role.kProximity)) - set(own)
+        if not any(is_hydroelastic(inspector.GetProximityProperties(shape)) for shape in others):
+            raise DrakeTeleopError(
+                "no shape in it is hydroelastic",
+                where=str(self.path),
+                remedy="give one drake:compliant_hydroelastic or drake:rigid_hydroelastic in its"
+                " drake:proximity_properties, or set contact: point",
+            )
+        for shape in own:
+            properties = ProximityProperties(inspector.GetProximityProperties(shape))
+            if not is_hydroelastic(properties):
+                AddCompliantHydroelasticProperties(_RESOLUTION, self.tool_modulus, properties)
+                scene_graph.AssignRole(
+                    plant.get_source_id(), shape, properties, RoleAssign.kReplace
+                )
+
+
+def is_hydroelastic(properties: ProximityProperties) -> bool:
+    """Whether a shape may have a pressure over an area of contact."""
+    return bool(properties.HasProperty("hydroelastic", "compliance_type"))

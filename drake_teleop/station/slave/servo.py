@@ -1,0 +1,90 @@
+"""Arm and joint control as one servo at the tool, as the passivity methods take them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.station.slave.arm import ArmModel, forward_dynamics, inverse_dynamics, jacobian
+from drake_teleop.station.slave.joint_control import JointControlConfig
+
+Array = NDArray[np.float64]
+
+
+def mass_matrix(arm: ArmModel, q: Array) -> Array:
+    """(n, n) M(q), with rotors and tool: inverse dynamics of unit accelerations.
+
+    Args:
+        arm: the arm with its tool.
+        q: (n,) where it is [rad].
+    """
+    still, weight = np.zeros(len(q)), np.empty(len(q))
+    inverse_dynamics(arm.table, q, still, still, weight)
+    columns = np.empty((len(q), len(q)))
+    for unit, column in zip(np.eye(len(q)), columns, strict=True):
+        inverse_dynamics(arm.table, q, still, unit, column)
+        column -= weight
+    return columns.T
+
+
+def operational_inertia(arm: ArmModel, q: Array) -> Array:
+    """(6, 6) (J M^-1 J^T)^-1 at So, translation first, in W: the arm that a wrench there moves.
+
+    Khatib, A unified approach for motion and force control of robot manipulators (1987).
+
+    Args:
+        arm: the arm with its tool.
+        q: (n,) where it is, not singular [rad].
+    """
+    n = arm.num_joints
+    still, J = np.zeros(n), np.empty((6, n))
+    mobility, rates = np.empty((n, n)), np.empty(n)
+    forward_dynamics(arm.table, q, still, still, np.zeros(6), rates)
+    falling = rates.copy()
+    for i, torque in enumerate(np.eye(n)):
+        forward_dynamics(arm.table, q, still, torque, np.zeros(6), rates)
+        mobility[i] = rates - falling
+    jacobian(arm.table, q, J)
+    return np.linalg.inv(J @ mobility @ J.T)
+
+
+class ServoAtTool(NamedTuple):
+    """It pulls with K (x_command - x) - D v; for translation and rotation, lists of 2.
+
+    Attributes:
+        stiffness: K [N/m, N m/rad].
+        damping: D [N s/m, N m s/rad].
+        mass: of arm and tool [kg, kg m^2].
+    """
+
+    stiffness: list[float]
+    damping: list[float]
+    mass: list[float]
+
+
+def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoAtTool:
+    """Stiffness, damping and mass of the slave as a method is told of them.
+
+    One mass for translation and one inertia for rotation, with which nothing moves with more energy
+    than they say, whatever moves at the same time in whichever direction: the least multiple of the
+    largest eigenvalues of either's block for which diag(m, m, m, J, J, J) - Lambda has none below
+    zero. The joints' loops accelerate with kv (kp (x_command - x) - v), hence K and D.
+
+    Args:
+        arm, q: as for `operational_inertia`.
+        config: of the joint control.
+
+    Raises:
+        DrakeTeleopError: for a servo other than computed torque.
+    """
+    config.check_is_torque("what a method is told of the arm")
+    inertia = operational_inertia(arm, q)
+    blocks = [np.linalg.eigvalsh(inertia[i : i + 3, i : i + 3])[-1] for i in (0, 3)]
+    unit = 1 / np.sqrt(np.repeat(blocks, 3))
+    mass = np.linalg.eigvalsh(unit[:, np.newaxis] * inertia * unit)[-1] * np.array(blocks)
+    kp, kv = (
+        2 * np.pi * hertz for hertz in (config.position_bandwidth_hz, config.velocity_bandwidth_hz)
+    )
+    return ServoAtTool((kp * kv * mass).tolist(), (kv * mass).tolist(), mass.tolist())

@@ -1,0 +1,120 @@
+"""What a scenario says of the slave: which arm, where it stands and starts, what it carries."""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import choice, plain, quantity
+from drake_teleop.common.resources import models_dir
+from drake_teleop.station.slave.ik_methods import AUTOMATIC, METHODS
+from drake_teleop.station.slave.payload import Payload
+from drake_teleop.station.slave.tool import Tool
+
+
+@settings
+@dataclass
+class Slave:
+    """The arm, by default the paper's, with its tool."""
+
+    position: list[float] = quantity(
+        [0.55, 0.0, 0.45], "m", -5.0, 5.0, "p_WS at the start, with z_S down; unless home is given"
+    )
+    payload: Payload = field(default_factory=Payload)
+    inverse_kinematics: str = choice(
+        AUTOMATIC,
+        (AUTOMATIC, *METHODS),
+        "how a pose becomes joint angles: closed_form is that of arms like the RX90; numeric, for"
+        " any arm, keeps their speeds; automatic takes the first where it can",
+    )
+    model: str = plain(
+        "", "file of an arm: URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; else an RX90"
+    )
+    package_paths: list[str] = plain(
+        [], "folders for package:// addresses in model and tool, from the scenario's folder"
+    )
+    base_pose: list[float] = quantity(
+        [0.0] * 6, "m, rad", -10.0, 10.0, "X_WBase of the arm: its place; roll, pitch, yaw"
+    )
+    sensor_frame: str = plain(
+        "sensor", "frame or link of the model at which the sensor measures: S; z_S towards the tool"
+    )
+    home: list[float] = plain(
+        [], "joint positions to start at [rad, m]; by default found for position"
+    )
+    friction: list[float] = plain(
+        [],
+        "dry friction of the joints [N m, N], one for all or each, which joint control does not"
+        " know; by default none",
+    )
+    tool: Tool | None = field(
+        default_factory=Tool,
+        metadata={"doc": "what hangs on the sensor; null: what the model has beyond its frame"},
+    )
+
+    tip: list[float] = plain(
+        [],
+        "p_STip [m], where contact is made; by default the tool's frame of that name, or how far"
+        " its shapes reach along z_S",
+    )
+
+    @property
+    def path(self) -> Path:
+        """The file of the arm."""
+        return Path(self.model) if self.model else models_dir() / "rx90.sdf"
+
+    @property
+    def packages(self) -> tuple[Path, ...]:
+        """Where package:// addresses are looked up."""
+        return tuple(Path(folder) for folder in self.package_paths)
+
+    @property
+    def X_WBase(self) -> RigidTransform:
+        """Where the arm stands."""
+        return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
+
+    def files(self) -> list[Path]:
+        """What its models are read from, as far as it is there."""
+        paths = [self.path] if self.tool is None else [self.path, self.tool.path]
+        return [path for path in paths if path.is_file()]
+
+    def check(self, where: str) -> None:
+        """Checks what ranges cannot.
+
+        Raises:
+            DrakeTeleopError: for numbers that are none, or a tool that cannot be.
+        """
+        if not np.isfinite(self.friction).all() or min(self.friction, default=0.0) < 0.0:
+            raise DrakeTeleopError(
+                "has to be a list of finite numbers from 0 on", where=f"{where}.friction"
+            )
+        for name, length in (("home", len(self.home)), ("tip", 3)):
+            values = getattr(self, name)
+            if values and (len(values) != length or not all(np.isfinite(values))):
+                raise DrakeTeleopError(
+                    "has to be a list of finite numbers" + (", 3 of them" if name == "tip" else ""),
+                    where=f"{where}.{name}",
+                )
+        if self.tool is not None:
+            self.tool.check(f"{where}.tool")
+
+    def found_from(self, folder: Path) -> "Slave":
+        """The same with its files found from a folder, wherever the program runs."""
+
+        def found(name: str) -> str:
+            return str((folder / name).resolve()) if name else ""
+
+        tool = self.tool
+        if tool is not None and tool.model:
+            tool = dataclasses.replace(tool, model=found(tool.model))
+        return dataclasses.replace(
+            self,
+            model=found(self.model),
+            package_paths=[found(path) for path in self.package_paths],
+            tool=tool,
+        )

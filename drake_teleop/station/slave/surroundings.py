@@ -1,0 +1,202 @@
+"""What there is to touch in the slave's plant: what of it moves, which law tells its contact."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex
+from pydrake.systems.framework import Context
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.environment.environment import Environment, ToolShapes
+from drake_teleop.station.environment.moving_bodies import JOINT_WIDTH, JointTable
+from drake_teleop.station.environment.point_contact import WATCHED_WIDTH, WIDTH, ContactPairs
+
+_SAME = 1e-12  # of frames: rounding
+_NO_INERTIA = 1e-12  # kg or kg m^2: nothing that is moved has less
+
+
+class Touched(NamedTuple):
+    """What there is to touch in a plant: model instances, and that of the leaf, if there is one."""
+
+    instances: Collection[ModelInstanceIndex]
+    sheet: ModelInstanceIndex | None
+
+
+class Contact(NamedTuple):
+    """What may touch the tool, and how it is told.
+
+    Attributes:
+        pairs: (k, 28) `Pairs.known`; none if `beyond` says something.
+        watched: (l, 40) `Pairs.watched`: what is left to Drake where it comes near.
+        joints: (m, 21) of `JointTable`, by which the boxes of `pairs` move.
+        plant_size: of the plant's state, if there are joints, or 0.
+        beyond: what the compiled contact law does not know, so that Drake's contact results are
+            used; empty if it knows enough.
+        bodies: the tool's, and what is welded to it, as numbers.
+        shapes: identifiers of their shapes, as numbers.
+        leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] of the leaf, and its acceleration by
+            gravity [m/s^2]; without one, a mass that nothing moves.
+        sheet: model instance of the leaf, or another `moving_part`, if there is one.
+        moving: everything else that moves, by name.
+    """
+
+    pairs: NDArray[np.float64]
+    watched: NDArray[np.float64]
+    joints: NDArray[np.float64]
+    plant_size: int
+    beyond: str
+    bodies: frozenset[int]
+    shapes: frozenset[int]
+    leaf: NDArray[np.float64]
+    sheet: ModelInstanceIndex | None
+    moving: dict[str, BodyIndex]
+
+    @property
+    def law(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pairs and joints, as `environment_wrench` takes them."""
+        return self.pairs, self.joints
+
+
+def no_contact() -> Contact:
+    """With nothing to touch."""
+    leaf = np.array([1.0, 0.0, 0.0, 0.0])
+    pairs, joints = np.zeros((0, WIDTH)), np.zeros((0, JOINT_WIDTH))
+    watched = np.zeros((0, WATCHED_WIDTH))
+    return Contact(pairs, watched, joints, 0, "", frozenset(), frozenset(), leaf, None, {})
+
+
+def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> Touched:
+    """Adds what there is to touch to a plant that has the tool and is not finalized.
+
+    Raises:
+        DrakeTeleopError: if a file of it cannot be read.
+    """
+    before, sheet = plant.num_model_instances(), None
+    for part in environment.parts:
+        if part.moving_part is not None:
+            sheet = ModelInstanceIndex(plant.num_model_instances())
+        part.AddTo(plant)
+    added = range(before, plant.num_model_instances())
+    return Touched([ModelInstanceIndex(index) for index in added], sheet)
+
+
+def ContactWith(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    sensor_frame: Frame,
+    tool: BodyIndex,
+    environment: Environment,
+    touched: Touched,
+) -> Contact:
+    """Prepares the contact of the tool with what was added, once the plant is finalized.
+
+    Args:
+        plant: finalized.
+        scene_graph: with the shapes of tool and environment, and of nothing else.
+        sensor_frame: S.
+        tool: the body on it.
+        environment: what there is to touch.
+        touched: the same, as `AddEnvironment` returned it.
+
+    Raises:
+        DrakeTeleopError: if a scene's contact is not what was asked for, or what moves has no mass.
+    """
+    environment.PrepareContact(plant, scene_graph, tool)
+    shapes = ToolShapes(plant, scene_graph, tool)
+    contact = no_contact()._replace(
+        # Numbers: the identifiers themselves would hold the plant.
+        bodies=frozenset(int(index) for index in shapes),
+        shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
+        sheet=touched.sheet,
+        moving=MovingBodies(plant, touched),
+    )
+    for part in environment.parts:
+        if part.moving_part is not None:
+            gravity = plant.gravity_field().gravity_vector()[2]
+            contact = contact._replace(leaf=np.array([*part.moving_part, gravity]))
+    context = plant.CreateDefaultContext()
+    _check_masses(plant, context, contact)
+    if beyond := _beyond(environment, contact):
+        return contact._replace(beyond=beyond)
+    joints, order = contact.joints, list[int]()
+    if contact.moving:
+        joints, order = JointTable(plant, contact.moving.values())
+    from_S = {
+        shape: _X_SBody(plant, context, sensor_frame, index)
+        for index, own in shapes.items()
+        for shape in own
+    }
+    inspector, slip = scene_graph.model_inspector(), environment.slip
+    try:
+        found = ContactPairs(plant, inspector, from_S, touched.instances, slip, order)
+    except DrakeTeleopError as endless:
+        return contact._replace(beyond=str(endless))
+    known, watched, unknown = found
+    if not len(known):
+        return contact._replace(beyond=unknown or "nothing has a shape")
+    size = plant.num_multibody_states() if len(joints) else 0
+    return contact._replace(pairs=known, watched=watched, joints=joints, plant_size=size)
+
+
+def _X_SBody(
+    plant: MultibodyPlant, context: Context, sensor_frame: Frame, index: BodyIndex
+) -> RigidTransform:
+    frame = plant.get_body(index).body_frame()
+    X_SBody = plant.CalcRelativeTransform(context, sensor_frame, frame)
+    return RigidTransform() if X_SBody.IsNearlyIdentity(_SAME) else X_SBody
+
+
+def _check_masses(plant: MultibodyPlant, context: Context, contact: Contact) -> None:
+    if not contact.moving:
+        return
+    inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
+    if not inertia.min() > _NO_INERTIA:
+        bodies = {name: plant.get_body(index) for name, index in contact.moving.items()}
+        names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
+        raise DrakeTeleopError(
+            f"{' and '.join(names or bodies)} can move, and has no mass or no inertia",
+            where="environment",
+            remedy="give it both, or fix it",
+        )
+
+
+def _beyond(environment: Environment, contact: Contact) -> str:
+    if environment.hydroelastic:
+        return "contacts have areas"
+    if contact.sheet is not None and len(environment.parts) > 1:
+        return "the leaf is not alone"
+    return ""
+
+
+def MovingBodies(plant: MultibodyPlant, touched: Touched) -> dict[str, BodyIndex]:
+    """What moves of it, besides the leaf, in a finalized plant, by the names of the bodies.
+
+    Of several of one name each has that of its model instance before its own.
+    """
+    bodies = [
+        plant.get_body(index)
+        for instance in touched.instances
+        if instance != touched.sheet
+        for index in plant.GetBodyIndices(instance)
+    ]
+    moving = [body for body in bodies if not plant.IsAnchored(body)]
+    names = [body.name() for body in moving]
+    return {
+        _plain(body.name() if names.count(body.name()) == 1 else body.scoped_name().get_full()): (
+            body.index()
+        )
+        for body in moving
+    }
+
+
+def _plain(name: str) -> str:
+    """For the name of a signal: a full stop would end it."""
+    return re.sub(r"\W+", "_", name)

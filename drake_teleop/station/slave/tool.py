@@ -1,0 +1,176 @@
+"""What hangs on the wrist sensor: the paper's tool, one of a file, or one of a few numbers."""
+
+# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, Shape, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import Frame, RigidBody, SpatialInertia, UnitInertia, WeldJoint
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fields import settings
+from drake_teleop.common.quantities import plain, quantity
+from drake_teleop.common.resources import models_dir
+from drake_teleop.station.slave.models import ParsedTool, ParseTool
+
+_STEEL = 7850.0  # kg/m^3
+# Of the shapes' surface, as of the ball of tool.sdf.
+_STIFFNESS, _DISSIPATION, _FRICTION = 4e5, 1.0, 0.2
+_COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
+
+
+@settings
+@dataclass
+class Ball:
+    """A ball that may touch."""
+
+    radius: float = quantity(0.012, "m", 1e-4, 1.0, "of the ball")
+    position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
+
+    @property
+    def shape(self) -> Shape:
+        """For Drake."""
+        return Sphere(self.radius)
+
+    @property
+    def pose(self) -> RigidTransform:
+        """X_SShape."""
+        return RigidTransform(self.position)
+
+
+@settings
+@dataclass
+class Block:
+    """A box that may touch."""
+
+    edges: list[float] = quantity([0.04, 0.04, 0.04], "m", 1e-4, 2.0, "lengths along x, y, z")
+    position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
+    rpy: list[float] = quantity([0.0, 0.0, 0.0], "rad", -6.3, 6.3, "roll, pitch, yaw in S")
+
+    @property
+    def shape(self) -> Shape:
+        """For Drake."""
+        return Box(*self.edges)
+
+    @property
+    def half_height(self) -> float:
+        """From its centre to its farthest corner along z_S [m]."""
+        return float(np.abs(self.pose.rotation().matrix()[2]) @ self.edges) / 2
+
+    @property
+    def pose(self) -> RigidTransform:
+        """X_SShape."""
+        return RigidTransform(RollPitchYaw(self.rpy), self.position)
+
+
+@settings
+@dataclass
+class Tool:
+    """By default the paper's. A file, or a mass, is another one in its place."""
+
+    model: str = plain("", "file of a tool: its root link is put on S")
+    mass: float = quantity(0.0, "kg", 0.0, 100.0, "of a tool without a file")
+    com: list[float] = quantity([0.0, 0.0, 0.05], "m", -1.0, 1.0, "its centre, p_SoBcm_S")
+    inertia: list[float] = quantity(
+        [0.0] * 6,
+        "kg m^2",
+        -10.0,
+        10.0,
+        "about it: Ixx, Ixy, Ixz, Iyy, Iyz, Izz; zeros: a ball of steel's",
+    )
+    shapes: list[Ball | Block] = plain([], "what of it may touch: !Ball, !Block")
+
+    @property
+    def path(self) -> Path:
+        """The file, of the paper's tool if no other is named."""
+        return Path(self.model) if self.model else models_dir() / "tool.sdf"
+
+    def check(self, where: str) -> None:
+        """Checks what ranges cannot.
+
+        Raises:
+            DrakeTeleopError: if file and mass are both given, or there are shapes without either,
+                or no body has this inertia.
+        """
+        if self.model and self.mass:
+            raise DrakeTeleopError(
+                "both a file and a mass say what the tool is",
+                where=f"{where}.mass",
+                remedy="leave one of them out",
+            )
+        if self.mass == 0.0 and (self.shapes or any(self.inertia)):
+            raise DrakeTeleopError(
+                "a tool of its own shapes or inertia needs a mass", where=f"{where}.mass"
+            )
+        if not _inertia(self).IsPhysicallyValid():
+            raise DrakeTeleopError(
+                "no body has this inertia",
+                where=f"{where}.inertia",
+                remedy="give entries of the tensor about the centre of mass, or leave it out",
+            )
+
+
+def shapes_reach(tool: Tool) -> list[float] | None:
+    """p_STip (3,) of the shape that reaches farthest along z_S [m]; None if there is none."""
+    ends = [
+        np.array(each.position) + np.array([0.0, 0.0, half])
+        for each in tool.shapes
+        for half in [each.radius if isinstance(each, Ball) else each.half_height]
+    ]
+    return max(ends, key=lambda end: float(end[2])).tolist() if ends else None
+
+
+def AddTool(
+    plant: MultibodyPlant, tool: Tool, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
+) -> ParsedTool:
+    """Puts the tool on the sensor frame, through the joint "sensor_weld".
+
+    Args:
+        plant: with the arm, not finalized.
+        tool: which.
+        sensor_frame: S.
+        package_paths: as for `ParseModel`.
+
+    Raises:
+        DrakeTeleopError: as `ParseTool`.
+    """
+    if tool.mass == 0.0:
+        return ParseTool(plant, tool.path, sensor_frame, package_paths)
+    body = plant.AddRigidBody("tool", plant.AddModelInstance("tool"), _inertia(tool))
+    weld = WeldJoint("sensor_weld", sensor_frame, body.body_frame(), RigidTransform.Identity())
+    plant.AddJoint(weld)
+    if plant.geometry_source_is_registered():
+        _add_shapes(plant, body, tool)
+    return ParsedTool(body, [])
+
+
+def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
+    surface = ProximityProperties()
+    friction = CoulombFriction(_FRICTION, _FRICTION)
+    AddContactMaterial(surface, _DISSIPATION, _STIFFNESS, friction)
+    if not tool.shapes:  # or nothing would be seen of it
+        seen = RigidTransform(tool.com), Sphere(_radius(tool))
+        plant.RegisterVisualGeometry(body, *seen, "tool", _COLOUR)
+    for k, each in enumerate(tool.shapes):
+        name = f"tool_{k}"
+        plant.RegisterCollisionGeometry(body, each.pose, each.shape, name, surface)
+        plant.RegisterVisualGeometry(body, each.pose, each.shape, name, _COLOUR)
+
+
+def _inertia(tool: Tool) -> SpatialInertia:
+    if tool.mass == 0.0:
+        return SpatialInertia.Zero()
+    if not any(tool.inertia):
+        about_com = SpatialInertia.SolidSphereWithMass(tool.mass, _radius(tool))
+        return about_com.Shift(np.negative(tool.com))
+    xx, xy, xz, yy, yz, zz = np.array(tool.inertia) / tool.mass
+    about_S = UnitInertia(xx, yy, zz, xy, xz, yz).ShiftFromCenterOfMass(np.negative(tool.com))
+    return SpatialInertia(tool.mass, tool.com, about_S, skip_validity_check=True)
+
+
+def _radius(tool: Tool) -> float:
+    """Of a ball of steel of its mass [m]."""
+    return float((tool.mass / _STEEL * 3 / (4 * np.pi)) ** (1 / 3))

@@ -1,0 +1,167 @@
+"""What the environment exerts on the tool: contacts of balls with boxes, and what is applied."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.quaternions import rotate
+from drake_teleop.common.vectors import add_into, cross, minus, plus, put, three
+from drake_teleop.station.environment.moving_bodies import POSE_AND_TWIST, bodies_into
+from drake_teleop.station.environment.point_contact import (
+    BODY,
+    WIDTH,
+    apart,
+    contact_force,
+    indentation,
+)
+from drake_teleop.station.slave.arm import ArmModel, forward_kinematics, jacobian
+from drake_teleop.station.slave.surroundings import Contact
+
+#: Of the tool: nothing touches it, what the compiled law knows may, what it does not know may.
+FAR, TOUCHING, WATCHED = range(3)
+_WATCHED_FROM = 0.02  # m, farther than anything moves between two looks
+_ROUNDING = 1e-9  # m
+
+
+@njit(cache=True)
+def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench_W):
+    """What acts on the tool besides the sensor and gravity, about the world's origin, in W.
+
+    Args:
+        arm: `ArmModel.table`.
+        pairs: (k, 28) `Pairs.known`.
+        joints: (m, 21) of `JointTable`.
+        applied_W: (6,) [f; tau] about So, in W, on top of the contacts [N, N m].
+        q, v: (n,) of the arm.
+        sheet: (2,) deflection and its rate [m, m/s], of a leaf.
+        state: [q; v] of the whole plant, for `joints`; not read if there are none.
+        wrench_W: (6,) filled [N, N m].
+    """
+    acts = pairs.shape[0] > 0
+    for i in range(6):
+        wrench_W[i] = applied_W[i]
+        acts = acts or applied_W[i] != 0.0
+    if not acts:
+        return
+    R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
+    twist, velocity, has_twist = np.empty(6), np.empty(3), False
+    bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)
+    bodies_into(joints, state, bodies)
+    forward_kinematics(arm, q, R_WS, p_WS)
+    add_into(wrench_W, 3, cross(p_WS, applied_W))
+    for pair in pairs:
+        box = _place(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
+        depth = indentation(box, p_WS, R_WS, sheet[0], normal)
+        if depth <= 0.0:
+            continue
+        if not has_twist:
+            J = np.empty((6, q.shape[0]))
+            jacobian(arm, q, J)
+            put(twist, 0, J @ v, 0, 6)
+            has_twist = True
+        lever = minus(three(normal, 3), p_WS)
+        moving = plus(three(twist, 0), cross(three(twist, 3), lever))
+        for i in range(3):
+            velocity[i] = moving[i] - pair[19 + i] * sheet[1]
+        if pair[BODY] >= 0.0:
+            body = bodies[int(pair[BODY])]
+            lever = minus(three(normal, 3), three(body, 4))
+            moving = plus(three(body, 10), cross(three(body, 7), lever))
+            for i in range(3):
+                velocity[i] -= moving[i]
+        contact_force(pair, depth, normal[:3], velocity, force)
+        add_force(wrench_W, normal[3:], force)
+
+
+@njit(cache=True)
+def _place(pair, bodies, placed):
+    """The pair with its box where its body has it, in `placed` (28,)."""
+    body = bodies[int(pair[BODY])]
+    put(placed, 0, pair, 0, WIDTH)
+    turn = (body[0], body[1], body[2], body[3])
+    for i in range(3):
+        column = rotate(turn, (pair[4 + i], pair[7 + i], pair[10 + i]))
+        placed[4 + i], placed[7 + i], placed[10 + i] = column
+    placed[13], placed[14], placed[15] = plus(three(body, 4), rotate(turn, three(pair, 13)))
+    return placed
+
+
+@njit(cache=True)
+def nearness(arm, pairs, watched, joints, q, sheet, state):
+    """How near the tool is to anything: `FAR`, `TOUCHING` or `WATCHED`.
+
+    Args:
+        arm, pairs, joints, q, sheet, state: as above.
+        watched: (l, 40) `Pairs.watched`.
+    """
+    R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
+    bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)
+    bodies_into(joints, state, bodies)
+    forward_kinematics(arm, q, R_WS, p_WS)
+    for pair in watched:
+        if pair[BODY] >= 0.0:
+            _place(pair, bodies, placed)
+        else:
+            put(placed, 0, pair, 0, WIDTH)
+        if apart(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_FROM:
+            return WATCHED
+    for pair in pairs:
+        box = _place(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
+        if indentation(box, p_WS, R_WS, sheet[0], normal) > -_ROUNDING:
+            return TOUCHING
+    return FAR
+
+
+@njit(cache=True)
+def add_force(wrench_W, p_WC, force_W):
+    """Adds a force (3,) at C [N] to a wrench (6,) about the world's origin, all in W."""
+    add_into(wrench_W, 0, force_W)
+    add_into(wrench_W, 3, cross(p_WC, force_W))
+
+
+class ToolContact(LeafSystem):
+    """The true contact wrench for the log; no controller sees it.
+
+    .. pydrake_system::
+
+        name: ToolContact
+        input_ports:
+        - slave_state: [q; v] of the arm
+        - sheet_state: [z; v_z] of the sheet spring (only if there is one)
+        - plant_state: [q; v] of the whole plant (only if other bodies move)
+        output_ports:
+        - true_contact_wrench_W: on the tool, [f; tau] about the world's origin, in W
+
+    Args:
+        arm: kinematics up to the tool.
+        contact: what it may touch.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, arm: ArmModel, contact: Contact) -> None:
+        super().__init__()
+        n = self._n = arm.num_joints
+        self._contact = arm.table, contact.pairs, contact.joints, np.zeros(6)
+        self._nothing = np.zeros(2)
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
+        self._sheet = self._plant = None
+        if contact.sheet is not None:
+            self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
+        if contact.plant_size:
+            self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_size)
+        self.DeclareVectorOutputPort("true_contact_wrench_W", 6, weak_callback(self._calc))
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        state = self._state.Eval(context)
+        environment_wrench(
+            *self._contact,
+            state[: self._n],
+            state[self._n :],
+            self._nothing if self._sheet is None else self._sheet.Eval(context),
+            self._nothing if self._plant is None else self._plant.Eval(context),
+            output.get_mutable_value(),
+        )

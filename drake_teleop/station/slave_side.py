@@ -1,0 +1,350 @@
+"""The slave side: the arm follows a pose, and its wrist sensor tells contact from the tool."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RollPitchYaw
+from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
+
+from drake_teleop.common.arrays import checked, learnt
+from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.load.contact.noise_floor import NoiseFloor
+from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.station.estimation.contact_detection import ContactDetection
+from drake_teleop.station.estimation.load_estimator import LoadEstimator
+from drake_teleop.station.scaling.force_scaling import OLDEST, ForceScaling
+from drake_teleop.station.scenario import Scenario, check_scenario
+from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
+from drake_teleop.station.sensor.wrist_sensor import AddWristSensor
+from drake_teleop.station.signals import POSE_OF
+from drake_teleop.station.slave.drake_contact import DrakeContact
+from drake_teleop.station.slave.forward_kinematics import ForwardKinematics
+from drake_teleop.station.slave.ik_methods import METHODS, method_of
+from drake_teleop.station.slave.joint_control import MakeJointControl
+from drake_teleop.station.slave.joint_follower import JointFollower
+from drake_teleop.station.slave.joint_friction import FRICTION_SPEED
+from drake_teleop.station.slave.joint_trajectory import JointTrajectory
+from drake_teleop.station.slave.monitor import SlaveMonitor
+from drake_teleop.station.slave.moving_pose import MovingPose
+from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
+from drake_teleop.station.slave.sampled_servo import SampledServo, samples_within
+from drake_teleop.station.slave.servo import mass_matrix
+from drake_teleop.station.slave.tool_contact import ToolContact
+from drake_teleop.station.wiring import export
+
+Array = NDArray[np.float64]
+
+#: How often the monitor looks [s]; an event at 2 kHz would cost time.
+MONITOR_PERIOD = 0.01
+# See `_check_friction`.
+_LARGEST_FRICTION_STEP = 2.0
+
+
+def MakeSlaveSide(
+    scenario: Scenario,
+    *,
+    load_estimate: Array | None = None,
+    load_covariance: Array | None = None,
+    noise_floor: NoiseFloor | None = None,
+) -> Diagram:
+    """Inverse kinematics, joint control, arm, wrist sensor, load estimator, elimination.
+
+    .. pydrake_system::
+
+        name: slave_side
+        input_ports:
+        - pose_command: (7,) X_WS that it shall follow; or leader_joints: (n,) [rad], if a leader
+          leads joint by joint
+        output_ports:
+        - wrench_B: (6,) F_E_B, what the hand should feel, in the master's base [N, N m]; not a
+          number while there is a fault
+        - load_wrench_B: (6,) what of that is the load's weight and inertia
+        - pose_slave: (7,) X_WS, actual, of the joint angles now (over a network)
+        - saturated: (1,) 1 while the wrench is not to be trusted; a signal too
+        - contact: (1,) 1 in contact; a signal too (with contact detection)
+        - the parts of a sample (`sample_parts`), slave_state, joint_torque, joint_command,
+          ik_status, scaled_wrench_S, fault: signals
+        - load_estimate, contact_wrench_S (if the load is known or learnt): signals
+        - load_state (if the load is watched), true_contact_wrench_W (with something to touch),
+          sheet_state (with a sheet spring), pose_of_NAME (of each other body of the surroundings
+          that moves): signals
+        - sample, scaled_contact_and_fault: several of these side by side, for the log
+
+    Args:
+        scenario, load_estimate, load_covariance, noise_floor: as for `MakeTeleopStation`.
+
+    Raises:
+        DrakeTeleopError: for a value that cannot be right, a start out of reach, scales that mean
+            something only if the load is known while it is not, or detection without its floor.
+    """
+    check_scenario(scenario)
+    _check_load_is_known(scenario, load_estimate)
+    if load_covariance is not None:
+        checked("load_covariance", load_covariance, 16, 16)
+    builder = DiagramBuilder()
+    body = _add_body(builder, scenario, load_estimate, load_covariance)
+    arm = body.slave.arm
+
+    start, led = body.slave.start, scenario.master.leads_joints
+    make_ik = METHODS[method_of(scenario.slave.inverse_kinematics, arm)]
+    make_ik = JointFollower if led else make_ik
+    ik = builder.AddNamedSystem("inverse_kinematics", make_ik(arm, start, body.command_period))
+    if not led:
+        builder.Connect(body.sample["joint_position"], ik.GetInputPort("joint_position"))
+    builder.Connect(
+        ik.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
+    )
+    builder.Connect(ik.GetOutputPort("ik_status"), body.monitor.GetInputPort("ik_status"))
+    setpoint = "leader_joints" if led else "pose_command"
+    builder.ExportInput(ik.GetInputPort(setpoint), setpoint)
+    export(builder, ik, "joint_command")
+    export(builder, body.monitor, "ik_status")
+
+    R_WB = RollPitchYaw(scenario.kinematic_scaling.alignment).ToRotationMatrix().matrix()
+    force_scaling = builder.AddNamedSystem(
+        "force_scaling",
+        ForceScaling(
+            scenario.force_scaling,
+            arm,
+            R_WB,
+            scenario.wrist_sensor.largest_wrench(),
+            max(OLDEST, 2 / scenario.rates.sensor_hz),
+        ),
+    )
+    estimate = body.load_estimator.GetOutputPort("load_estimate")
+    builder.Connect(body.sample["sample"], force_scaling.GetInputPort("sample"))
+    builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
+    export(builder, force_scaling, "wrench_B", "load_wrench_B", "scaled_wrench_S", "fault")
+    if _is_known(scenario, load_estimate):
+        export(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
+
+    if not scenario.is_direct:
+        kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))
+        state = body.slave.plant.get_state_output_port(body.slave.instance)
+        builder.Connect(state, kinematics.GetInputPort("slave_state"))
+        export(builder, kinematics, "pose_slave")
+
+    if scenario.contact_detection is not None:
+        if noise_floor is None:
+            raise DrakeTeleopError(
+                "nobody knows how large the contact wrench is in free motion",
+                where="contact_detection",
+                remedy="pass the noise_floor of identify_load, as load_estimate",
+            )
+        expect(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
+        detection = builder.AddNamedSystem(
+            "contact_detection",
+            ContactDetection(
+                scenario.contact_detection, noise_floor, arm, 1 / scenario.rates.estimator_hz
+            ),
+        )
+        builder.Connect(body.sample["sample"], detection.GetInputPort("sample"))
+        builder.Connect(estimate, detection.GetInputPort("load_estimate"))
+        export(builder, detection, "contact")
+    return builder.Build()
+
+
+def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
+    """The slave without a master: its joints run through an excitation trajectory (section IV).
+
+    It starts at the trajectory's start; `trajectory` runs once, after the settling time. Its ports
+    are those signals of `MakeSlaveSide` that need no command and no elimination.
+    """
+    builder = DiagramBuilder()
+    start, _, _ = trajectory.evaluate(0.0)
+    body = _add_body(builder, scenario, q_start=start)
+    command = builder.AddNamedSystem(
+        "joint_trajectory", JointTrajectory(trajectory, scenario.simulation.settle)
+    )
+    builder.Connect(
+        command.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
+    )
+    export(builder, command, "joint_command")
+    return builder.Build()
+
+
+@dataclass(frozen=True)
+class _Body:
+    """Plant, joint control, wrist sensor, load estimator and monitor, wired to each other."""
+
+    slave: SlavePlant
+    joint_control: LeafSystem
+    monitor: LeafSystem
+    load_estimator: LeafSystem
+    sample: dict[str, OutputPort]
+    command_period: float  # in which it takes joint commands [s]
+
+
+def _add_body(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    load_estimate: Array | None = None,
+    load_covariance: Array | None = None,
+    q_start: Array | None = None,
+) -> _Body:
+    """Adds what every slave has; the joint command is left open."""
+    rates, sensor = scenario.rates, scenario.wrist_sensor
+    slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
+    arm, plant, start = slave.arm, slave.plant, slave.start
+    state = plant.get_state_output_port(slave.instance)
+    builder.ExportOutput(state, "slave_state")
+
+    samples = 1 if q_start is not None else _samples_within(scenario, slave)
+    ramps = samples > 1
+    control = builder.AddNamedSystem(
+        "joint_control",
+        SampledServo(slave, scenario.joint_control, 1 / rates.joint_control_hz, samples, start)
+        if ramps
+        else MakeJointControl(arm, scenario.joint_control, 1 / rates.joint_control_hz, start),
+    )
+    held = samples / rates.joint_control_hz
+    _check_friction(slave, min(held, scenario.simulation.max_step))
+    torque = control.GetOutputPort("joint_torque")
+    builder.Connect(state, control.GetInputPort("slave_state"))
+    builder.Connect(torque, plant.get_actuation_input_port(slave.instance))
+    export(builder, control, "joint_torque")
+
+    monitor = builder.AddNamedSystem("monitor", SlaveMonitor(arm, MONITOR_PERIOD))
+    builder.Connect(state, monitor.GetInputPort("slave_state"))
+
+    sample = AddWristSensor(
+        builder,
+        slave,
+        sensor,
+        scenario.motion_estimation,
+        1 / rates.sensor_hz,
+        held,
+        start,
+        ramps=ramps,
+    )
+    wrist = builder.GetSubsystemByName("wrist_sensor")
+    acceleration = plant.get_generalized_acceleration_output_port(slave.instance)
+    builder.Connect(state, wrist.GetInputPort("slave_state"))
+    builder.Connect(acceleration, wrist.GetInputPort("slave_acceleration"))
+    builder.Connect(torque, wrist.GetInputPort("joint_torque"))
+    if ramps:
+        rate = control.GetOutputPort("torque_rate")
+        builder.Connect(rate, wrist.GetInputPort("torque_rate"))
+        if slave.sensed_sheet is not None:
+            sheet = plant.get_state_output_port(slave.sensed_sheet)
+            builder.Connect(sheet, control.GetInputPort("sheet_state"))
+    for name, port in sample.items():
+        builder.ExportOutput(port, name)
+
+    estimator = builder.AddNamedSystem(
+        "load_estimator",
+        LoadEstimator(
+            scenario.load_estimator,
+            sensor.wrench_std(),
+            estimated_motion_std(
+                scenario.motion_estimation, sensor, arm.num_joints, 1 / rates.sensor_hz
+            ),
+            1 / rates.estimator_hz,
+            sample["sample"].size(),
+            np.zeros(16) if load_estimate is None else load_estimate,
+            load_covariance,
+            scenario.force_scaling.gripper_phi,
+        ),
+    )
+    # Only when it learns or watches: at 8 kHz even a wire that nobody reads costs time.
+    if scenario.load_estimator.enabled or scenario.load_estimator.watch:
+        builder.Connect(sample["sample"], estimator.GetInputPort("sample"))
+    if _is_known(scenario, load_estimate):
+        export(builder, estimator, "load_estimate")
+    if scenario.load_estimator.watch:
+        export(builder, estimator, "load_state")
+
+    if slave.can_touch:
+        _add_tool_contact(builder, slave, state)
+    return _Body(slave, control, monitor, estimator, sample, held)
+
+
+def _samples_within(scenario: Scenario, slave: SlavePlant) -> int:
+    """Of the servo for one event; 1 where nothing but the plant itself can foresee its motion."""
+    contact, interface = slave.contact, scenario.joint_control.position_interface
+    if contact.beyond or contact.plant_size or interface is not None:
+        return 1
+    return samples_within(scenario.rates.joint_control_hz, scenario.rates.hand_hz)
+
+
+def _check_friction(slave: SlavePlant, step: float) -> None:
+    """Refuses friction that stops a joint within less than a step [s] of the plant: it would shake.
+
+    A step of Runge and Kutta is stable up to 2.5 for (friction's slope / inertia) * step.
+
+    Raises:
+        DrakeTeleopError: if it does, about where the arm starts.
+    """
+    if not slave.friction.any():
+        return
+    mass = mass_matrix(slave.arm, slave.start)
+    slope = np.diag(slave.friction / FRICTION_SPEED)
+    rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
+    if rate * step > _LARGEST_FRICTION_STEP:
+        shorter = 0.9 * _LARGEST_FRICTION_STEP / rate
+        raise DrakeTeleopError(
+            f"the friction stops a joint within {1e3 / rate:.2g} ms, too fast for steps of "
+            f"{1e3 * step:g} ms",
+            where="slave.friction",
+            remedy=f"choose less, or a simulation.max_step of {shorter:.2g} s",
+        )
+
+
+def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputPort) -> None:
+    plant = slave.plant
+    if slave.contact.beyond:
+        contact = builder.AddNamedSystem(
+            "tool_contact", DrakeContact(slave.contact.bodies, slave.contact.shapes)
+        )
+        results = plant.get_contact_results_output_port()
+        builder.Connect(results, contact.GetInputPort("contact_results"))
+    else:
+        contact = builder.AddNamedSystem("tool_contact", ToolContact(slave.arm, slave.contact))
+        builder.Connect(state, contact.GetInputPort("slave_state"))
+        if slave.contact.plant_size:
+            builder.Connect(plant.get_state_output_port(), contact.GetInputPort("plant_state"))
+    export(builder, contact, "true_contact_wrench_W")
+    if slave.sheet is not None:
+        sheet = plant.get_state_output_port(slave.sheet)
+        builder.ExportOutput(sheet, "sheet_state")
+        if slave.sensed_sheet is not None:
+            builder.Connect(sheet, contact.GetInputPort("sheet_state"))
+    for name, body in slave.contact.moving.items():
+        pose = builder.AddNamedSystem(POSE_OF + name, MovingPose(plant, body))
+        builder.Connect(plant.get_state_output_port(), pose.GetInputPort("plant_state"))
+        export(builder, pose, **{POSE_OF + name: "pose"})
+
+
+def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
+    if hasattr(estimate, "estimate"):
+        raise DrakeTeleopError(
+            f"expected 16 numbers, found {type(estimate).__name__}",
+            where="load_estimate",
+            remedy="pass its .estimate",
+        )
+    if estimate is not None:
+        estimate = checked("load_estimate", estimate, 16)
+        if not scenario.load_estimator.enabled:
+            learnt("load_estimate", estimate[6:])
+    sigma_gripper, sigma_object, gamma = scenario.force_scaling.scales()
+    needed = not sigma_gripper == sigma_object == gamma
+    if needed and not _is_known(scenario, estimate):
+        raise DrakeTeleopError(
+            "sigma and gamma differ, but the load is not known",
+            where="load_estimate",
+            remedy="pass the estimate of identify_load, or set load_estimator.enabled",
+        )
+    if scenario.contact_detection is not None and not _is_known(scenario, estimate):
+        raise DrakeTeleopError(
+            "contact is to be detected, but the load is not known",
+            where="load_estimate",
+            remedy="pass the estimate of identify_load, as its noise_floor",
+        )
+
+
+def _is_known(scenario: Scenario, estimate: Array | None) -> bool:
+    """Whether there is a load estimate, or will be one; without it nobody can tell contact."""
+    return estimate is not None or scenario.load_estimator.enabled

@@ -1,0 +1,83 @@
+"""How ports of blocks and sides are exported, wired and recorded; what is missing is one error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from pydrake.systems.framework import Diagram, DiagramBuilder, System
+from pydrake.systems.primitives import LogVectorOutput, Multiplexer
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.load.sample import sample_parts
+from drake_teleop.station.signals import LOG, POSE_OF, SIGNALS
+
+#: Ports that hold several signals side by side, in the order of `SIGNALS`: to read one port takes
+#: less time than to read its parts.
+TOGETHER = {
+    "sample": (*sample_parts(0), "sample_time"),
+    "scaled_contact_and_fault": ("scaled_wrench_S", "contact_wrench_S", "fault"),
+    "displayed_and_fault": ("force_to_master", "fault_at_hand"),
+}
+
+
+def export(builder: DiagramBuilder, block: System, *names: str, **renamed: str) -> None:
+    """Exports output ports of a block: under their own names, or as `exported="its port"`."""
+    for name, port in (dict(zip(names, names, strict=True)) | renamed).items():
+        builder.ExportOutput(block.GetOutputPort(port), name)
+
+
+def wire(builder: DiagramBuilder, source: System, name: str, target: System, entry: str) -> None:
+    """Connects the output port `name` of one side to the input port `entry` of another.
+
+    Raises:
+        DrakeTeleopError: if a side, which may be somebody's own, lacks it or has another size.
+    """
+    output = source.HasOutputPort(name) and source.GetOutputPort(name)
+    port = target.HasInputPort(entry) and target.GetInputPort(entry)
+    _check(output, source, f"output port '{name}'")
+    _check(port, target, f"input port '{entry}'")
+    if output.size() != port.size():
+        raise DrakeTeleopError(
+            f"its output port '{name}' has {output.size()} numbers, {target.get_name()} expects "
+            f"{port.size()}",
+            where=source.get_name(),
+            remedy="docs/station.md lists the ports that each side has",
+        )
+    builder.Connect(output, port)
+
+
+def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float) -> Diagram:
+    """Exports and records every port that is a signal, in the order of `SIGNALS`, then poses.
+
+    What lies side by side in one port of a side (`TOGETHER`) is recorded from there.
+    """
+    outputs = {
+        port.get_name(): port
+        for side in sides
+        for port in (side.get_output_port(i) for i in range(side.num_output_ports()))
+    }
+    signals = [name for name in SIGNALS if name in outputs]
+    signals += [name for name in outputs if name.startswith(POSE_OF)]
+    for name in signals:
+        builder.ExportOutput(outputs[name], name)
+    wide = {part: port for port, parts in TOGETHER.items() if port in outputs for part in parts}
+    ports = [outputs[name] for name in dict.fromkeys(wide.get(name, name) for name in signals)]
+    # One wide log: at 8 kHz each further system with events of its own costs time at every step.
+    row = builder.AddNamedSystem("log_input", Multiplexer([port.size() for port in ports]))
+    for index, port in enumerate(ports):
+        builder.Connect(port, row.get_input_port(index))
+    log = LogVectorOutput(row.get_output_port(), builder, 1 / log_hz)
+    log.set_name(LOG)
+    diagram = builder.Build()
+    diagram.set_name(title)
+    return diagram
+
+
+def _check(port: Any, side: System, what: str) -> None:
+    if not port:
+        raise DrakeTeleopError(
+            f"there is no {what}",
+            where=side.get_name(),
+            remedy="docs/station.md lists the ports that each side has",
+        )
