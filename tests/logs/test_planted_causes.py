@@ -78,3 +78,10 @@ def test_a_slow_record_of_an_imu_gives_mass_and_centre(tmp_path: Path) -> None:
     assert found.identifiable.tolist() == [True] * 10 + [False] * 6
     assert found.standard_deviations[6] < 0.005
     assert found.mass == pytest.approx(record.truth.loads[0][0][0], abs=0.015)
+
+
+def test_a_factor_that_slow_motion_does_not_determine_leaves_the_load_uncertain() -> None:
+    found = judged("torque factor", "pick", "poses", 25)
+    assert [name for name, *_ in found["named"]] == ["torque factor"]
+    assert "or 0.112985" in found["messages"][0]  # the true one: pound-force inches
+    assert found["false"] == []

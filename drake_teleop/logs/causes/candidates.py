@@ -48,6 +48,8 @@ _DRIFT_LEVELS = 3.0
 _NEGATIVE_DEVIATIONS, _NEGATIVE_SHARE = 8.0, 0.1
 _FACTOR_SHARE, _FACTOR_MOST, _FACTOR_MOST_FAR = 0.02, 0.06, 0.2
 _SIMILAR, _AS_LIKELY, _FACTOR_STEPS = 0.2, 1.0, 4
+_QUIETER = 0.2
+_INDISTINCT = 8.0  # difference of the log likelihood, four standard deviations
 _DOUBTFUL = 30.0  # a score that widens intervals and names nothing
 
 
@@ -242,10 +244,15 @@ def _factor(state: State) -> Iterator[Candidate]:
         fits.append(state.extended(model, state.x, steps=_FACTOR_STEPS))
     most = max(x.likelihood for x in fits)
     best = next(x for x in fits if x.likelihood > most - _AS_LIKELY)
+    # Coloured noise predicts a large and smooth misfit as well: the residual decides there.
+    least = min(x.loudness for x in fits)
+    quiet = least < _QUIETER * min(best.loudness, state.loudness)
+    if quiet:
+        best = max((x for x in fits if x.loudness < 2.0 * least), key=lambda x: x.likelihood)
     if best is fits[0]:
         return
-    best = state.extended(best.model, best.x)
-    if 2.0 * (best.likelihood - state.likelihood) < 20.0:
+    best = state.extended(best.model, best.x, **({"steps": _FACTOR_STEPS} if quiet else {}))
+    if not quiet and 2.0 * (best.likelihood - state.likelihood) < 20.0:
         return
     free = best.extended(best.model.extended("torque factor"))
     value, covariance = part(free, "torque factor")
@@ -256,6 +263,20 @@ def _factor(state: State) -> Iterator[Candidate]:
     found = _candidate("torque factor", state, best, more=1)
     # A factor that is not quite a known one is no cause, but makes the load doubtful.
     yield found if abs(value[0]) < limit else replace(found, score=min(found.score, _DOUBTFUL))
+
+
+def similar_factors(state: State) -> list[State]:
+    """Return fits with other known factors of the torque that the record does not exclude.
+
+    A record of slow motion may not distinguish 0.1 from 0.113 (pound-force inches).
+    """
+    factor, found = state.model.factor, []
+    for other in FACTORS if factor != 1.0 else ():
+        if other != factor and 0.5 < other / factor < 2.0:
+            fitted = state.extended(replace(state.model, factor=other), state.x)
+            if fitted.likelihood > state.likelihood - _INDISTINCT:
+                found.append(fitted)
+    return found
 
 
 def _axes(state: State) -> Iterator[Candidate]:

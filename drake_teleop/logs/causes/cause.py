@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.arrays import Array
 from drake_teleop.load.identification import worth_stating
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.logs.causes.candidates import part
+from drake_teleop.logs.causes.candidates import part, similar_factors
 from drake_teleop.logs.causes.state import State
 
 _NEAR_S, _SHORT_S = 0.8, 1.2
@@ -169,6 +169,9 @@ def _factor(state: State) -> Cause:
         what = "the torque has the opposite sign"
     else:
         what = f"the torque is {factor:.6g} times that which belongs to the force"
+        if others := [other.model.factor for other in similar_factors(state)]:
+            listed = " or ".join(f"{x:.6g}" for x in others)
+            what += f" (or {listed} times, which the record does not exclude)"
     return Cause(
         "torque factor",
         f"{what}: unit or sign is wrong",

@@ -13,6 +13,7 @@ from drake_teleop.logs.causes.instants import Instants
 from drake_teleop.logs.causes.intervals import (
     block_deviations,
     covariance_of,
+    factor_covariance,
     gain_covariance,
     misfit_deviations,
 )
@@ -74,7 +75,8 @@ def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] =
     """
     with one_blas_thread():
         state, late, rejected = search(data, later, given)
-        blocks, gains = block_deviations(state), gain_covariance(state)
+        blocks = block_deviations(state)
+        gains = gain_covariance(state) + factor_covariance(state)
         covariance = covariance_of(state, rejected, blocks, gains)
         causes = causes_of(state, given)
         noise = explained(state)

@@ -17,7 +17,7 @@ import numpy as np
 from drake_teleop.common.arrays import Array
 from drake_teleop.load.batch.covariance import ARM
 from drake_teleop.load.identification import natural_scale
-from drake_teleop.logs.causes.candidates import Candidate
+from drake_teleop.logs.causes.candidates import Candidate, similar_factors
 from drake_teleop.logs.causes.fit import inverted
 from drake_teleop.logs.causes.instants import FORCES
 from drake_teleop.logs.causes.model import LOAD
@@ -116,6 +116,15 @@ def gain_covariance(state: State) -> Array:
     largest = _GAINS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
     effects = largest * (inverse @ mixed)[LOAD]
     return np.asarray(effects @ effects.T)
+
+
+def factor_covariance(state: State) -> Array:
+    """Return (16, 16) of [offsets; phi] by other known factors of the torque that fit as well."""
+    out = np.zeros((16, 16))
+    for other in similar_factors(state):
+        distance = other.x[LOAD] - state.x[LOAD]
+        out += np.outer(distance, distance)
+    return out
 
 
 def misfit_factor(state: State, blocks: Array) -> float:

@@ -74,6 +74,7 @@ def search(data: Instants, later: Later | None = None, given: tuple[str, ...] = 
         return found
     other = _search(_begun(later(late), given), late, later)
     better = explained(other[0]) or other[0].likelihood > found[0].likelihood + _NAMED
+    better = better or other[0].loudness < _FIFTH * found[0].loudness
     return other if better else found
 
 
@@ -103,7 +104,9 @@ def _search(state: State, late: float, later: Later | None) -> Found:
         found = _without_attenuation(list(candidates(state, first=number == 0)))
         last = [x for x in found if plausible(x.state)]
         effective = [x for x in last if _effective(x, state)]
-        winner = _winner(effective) or _of_smallest_residual(state, last)
+        winner, calm = _winner(effective), _of_smallest_residual(state, last)
+        if winner is None or _much_calmer(calm, winner):
+            winner = calm
         if winner is None:
             other = _phases(state, last)
             if other is None:
@@ -155,6 +158,13 @@ def _of_smallest_residual(state: State, found: list[Candidate]) -> Candidate | N
     least = min([x.state.loudness for x in calm], default=0.0)
     near = [x for x in calm if x.state.loudness < 2.0 * least]
     return min(near, key=lambda x: ORDER.index(x.name), default=None)
+
+
+def _much_calmer(calm: Candidate | None, winner: Candidate) -> bool:
+    """Whether a candidate other than a contact leaves a fifth of what the most likely one leaves."""
+    if calm is None or calm.name == "contact":
+        return False
+    return calm.state.loudness < _FIFTH * winner.state.loudness
 
 
 def _phases(state: State, found: list[Candidate]) -> State | None:
