@@ -161,7 +161,7 @@ def _of_smallest_residual(state: State, found: list[Candidate]) -> Candidate | N
 
 
 def _much_calmer(calm: Candidate | None, winner: Candidate) -> bool:
-    """Whether a candidate other than a contact leaves a fifth of what the most likely one leaves."""
+    """Return whether a candidate other than a contact leaves a fifth of the winner's residual."""
     if calm is None or calm.name == "contact":
         return False
     return calm.state.loudness < _FIFTH * winner.state.loudness
