@@ -15,6 +15,7 @@ import numpy as np
 
 from drake_teleop.common.arrays import numbers
 from drake_teleop.common.errors import DrakeTeleopError, expect, install_extra, reading, refuse_fork
+from drake_teleop.common.parquet_sizes import check_parquet
 from drake_teleop.common.writing import PARTS_OF_LOG, make_folder, part_of_log, write_table
 
 if TYPE_CHECKING:
@@ -274,9 +275,12 @@ class SimulationResult:
         expect((str, Path), path, "result")
         path = Path(path)
         remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
+        parts = _parts(path)
+        for part in parts:
+            with reading(part, remedy, "is not a simulation result"):
+                check_parquet(part)
         with reading(path, remedy, "is not a simulation result"):
-            part = min(path.glob(PARTS_OF_LOG), default=path)
-            text = pl.read_parquet_metadata(part)[_METADATA_KEY]
+            text = pl.read_parquet_metadata(parts[0])[_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]
             t = _columns_of_numbers(path, ["t"])[:, 0]
         return cls(t, _SignalsOnDisk(path, specs), specs)
@@ -395,12 +399,17 @@ def _describe(spec: Signal) -> str:
     return f"{text}  {spec.description}" if spec.description else text
 
 
+def _parts(path: Path) -> list[Path]:
+    """The parts of a log in order; of a log in one file that file."""
+    return sorted(path.glob(PARTS_OF_LOG)) or [path]
+
+
 def _columns_of_numbers(path: Path, columns: list[str]) -> NDArray[np.float64]:
     """(N, k) the columns of a Parquet file; whatever goes wrong is for `reading`."""
     import polars as pl
 
     refuse_fork()
-    table = pl.read_parquet(sorted(path.glob(PARTS_OF_LOG)) or path, columns=columns)
+    table = pl.read_parquet(_parts(path), columns=columns)
     if not all(dtype.is_numeric() for dtype in table.dtypes):
         raise ValueError(f"{', '.join(columns)} hold no numbers")
     return table.to_numpy()

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drake_teleop.common.errors import DrakeTeleopError, reading
+from drake_teleop.common.parquet_sizes import check_parquet
 from drake_teleop.common.writing import make_folder, naming, write_table, write_text
 
 if TYPE_CHECKING:
@@ -80,8 +81,12 @@ class Store:
         import polars as pl
 
         remedy = "remove the part that is damaged; the same command makes it anew"
+        parts = self._parts()
+        for part in parts:
+            with reading(part, remedy):
+                check_parquet(part)
         with reading(self.folder, remedy):
-            return pl.read_parquet(self._parts()).sort("run")
+            return pl.read_parquet(parts).sort("run")
 
 
 def _first_run(part: Path) -> int:
@@ -94,6 +99,8 @@ def _runs_in(parts: list[Path]) -> set[int]:
 
     if parts:
         with suppress(DrakeTeleopError), reading(parts[0], ""):
+            for part in parts:
+                check_parquet(part)
             return set(pl.read_parquet(parts, columns=["run"])["run"])
     return set()
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, reading, refuse_fork
+from drake_teleop.common.parquet_sizes import check_parquet
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.mat_file import read_mat
 
@@ -261,6 +262,7 @@ def _read_frame(path: Path, header: bool) -> Table:
     import polars as pl
 
     if path.suffix.lower() == ".parquet":
+        check_parquet(path)
         names = list(pl.read_parquet_schema(path))
         lazy = _ParquetColumns(
             path, _with_canonical(dict(zip(_stripped(names), names, strict=True)))
