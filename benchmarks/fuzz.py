@@ -112,7 +112,7 @@ class State:
     target: Target
     folder: Path
     seconds: float
-    counts: Any  # shared by the processes: cases, and those that were refused
+    counts: Any  # shared by the processes: cases, those that were refused, is one being made
     kept: list[bytes] = field(default_factory=list)
     lines: set[tuple[str, int]] = field(default_factory=set)
     findings: dict[str, Finding] = field(default_factory=dict)
@@ -155,10 +155,15 @@ def work(state: State, seed: int, most: float, pipe: Connection) -> None:
     while state.counts[0] < most and time.monotonic() < end:
         rng = random.Random(f"{seed} {target.name} {state.counts[0]}")
         pool = state.kept if state.kept and rng.random() < 0.5 else good
-        content = target.mutate(rng, rng.choice(pool), rng.choice(good))
+        origin = rng.choice(pool)
+        # A process that dies while it makes a case leaves what it made it of, and goes on after it.
+        case.write_bytes(origin)
+        state.counts[0] += 1
+        state.counts[2] = 1
+        content = target.mutate(rng, origin, rng.choice(good))
+        state.counts[2] = 0
         os.ftruncate(errors, 0)  # what libraries say while a case is made
         case.write_bytes(content)
-        state.counts[0] += 1
         lines: set[tuple[str, int]] = set()
         with _traced(lines) if state.counts[0] % _TRACED == 0 else nullcontext():
             kind, *finding = _outcome(target, case, errors)
@@ -251,7 +256,7 @@ def fuzzed(targets: list[Target], arguments: argparse.Namespace, folder: Path) -
     second = arguments.seconds * arguments.jobs / sum(target.share for target in targets)
     states = []
     for target in sorted(targets, key=lambda target: -target.share):
-        counts = context.Array("q", 2, lock=False)
+        counts = context.Array("q", 3, lock=False)
         seconds = math.inf if arguments.cases else second * target.share
         states.append(State(target, folder / target.name, seconds, counts))
     most = arguments.cases or math.inf
@@ -295,6 +300,8 @@ def _died(state: State, status: int) -> None:
         name = _DEATHS.get(signal.Signals(-status), signal.Signals(-status).name)
     else:  # a good input is refused, or the fuzzer has a mistake
         name, state.seconds = "the fuzzer", 0.0
+    if state.counts[2]:
+        name, state.counts[2] = f"{name} while a case was made of this one", 0
     case = state.folder / f"case{state.target.suffix}"
     state.find(case.read_bytes(), f"{name} at {_place(said)}", f"{name}\n{said}")
 
@@ -303,7 +310,7 @@ def report(states: list[State], folder: Path) -> dict[str, Any]:
     """Prints counts and findings, and writes the latter."""
     print(f"{'':14}{'cases':>8}{'results':>9}{'one line':>9}{'lines':>7}{'findings':>9}")
     for state in states:
-        cases, refused = state.counts
+        cases, refused, _ = state.counts
         wrong = sum(finding.times for finding in state.findings.values())
         figures = (cases, cases - refused - wrong, refused, len(state.lines), wrong)
         print("{:14}{:8}{:9}{:9}{:7}{:9}".format(state.target.name, *figures))

@@ -25,6 +25,7 @@ import yaml
 from scipy.io import savemat
 
 from drake_teleop.logs.read.mat_file import read_mat
+from drake_teleop.parquet_sizes import check_parquet_content
 
 Mutation = Callable[[random.Random, bytes, bytes], bytes]
 
@@ -351,8 +352,14 @@ def decoded(suffix: str, content: bytes) -> dict[str, np.ndarray]:
         with tempfile.TemporaryDirectory() as folder:
             (path := Path(folder) / "x.mat").write_bytes(content)
             return read_mat(path)
-    read = polars.read_csv if suffix == ".csv" else polars.read_parquet
+    read = polars.read_csv if suffix == ".csv" else read_parquet
     return {series.name: series.to_numpy() for series in read(io.BytesIO(content))}
+
+
+def read_parquet(content: io.BytesIO) -> polars.DataFrame:
+    """A table, or an exception: damaged content would end the process in polars."""
+    check_parquet_content(content.getvalue())
+    return polars.read_parquet(content)
 
 
 def encoded(suffix: str, columns: dict[str, np.ndarray]) -> bytes:

@@ -45,6 +45,13 @@ from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.bags import read_topic, topics_of
 from drake_teleop.logs.read.reading import read_log
+<<<<<<< HEAD
+=======
+from drake_teleop.parquet_sizes import check_parquet_content
+from drake_teleop.passivity.packet import PACKET_SIZE
+from drake_teleop.resources import models_dir, scenarios_dir, studies_dir
+from drake_teleop.result import Signal, SimulationResult
+>>>>>>> fb126d7 (benchmarks: count a fuzzed case before it is made, and check Parquet in mutations)
 from drake_teleop.robots import udp
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.lines import read_line
@@ -335,6 +342,7 @@ def _result_mutation(rng: random.Random, content: bytes, other: bytes) -> bytes:
     if rng.random() < 0.4:
         return mutations.damaged(rng, content, other)
     try:
+        check_parquet_content(content)
         found = dict(pl.read_parquet_metadata(io.BytesIO(content)))
         key = next(name for name in found if name != "ARROW:schema")
         if rng.random() < 0.5:
@@ -342,7 +350,9 @@ def _result_mutation(rng: random.Random, content: bytes, other: bytes) -> bytes:
         else:
             content = mutations.table(".parquet")(rng, content, other)
         stream = io.BytesIO()
-        pl.read_parquet(io.BytesIO(content)).write_parquet(stream, metadata={key: found[key]})
+        mutations.read_parquet(io.BytesIO(content)).write_parquet(
+            stream, metadata={key: found[key]}
+        )
         return stream.getvalue()
     # What polars does not write is damaged as bytes.
     except (Exception, pl.exceptions.PanicException):

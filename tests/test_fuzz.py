@@ -138,3 +138,21 @@ def test_errors_warnings_hangs_and_deaths_are_found(
     figures = fuzz.report([state], tmp_path / "out")
     assert figures == {"letters.cases": 25, "cases": 25, "findings": 4}
     assert len(list((tmp_path / "out").iterdir())) == 4
+
+
+@pytest.mark.slow
+def test_a_death_while_a_case_is_made_is_told_apart_and_not_repeated(
+    fuzz: ModuleType, tmp_path: Path
+) -> None:
+    def mutate(draws: random.Random, content: bytes, other: bytes) -> bytes:
+        if draws.randrange(4) == 0:
+            os.abort()
+        return b"refuse"
+
+    target = fuzz.Target("letters", ".txt", 1.0, lambda _: [b"good"], mutate, _read)
+    options = Namespace(seconds=60.0, seed=1, jobs=2, cases=12)
+    (state,) = fuzz.fuzzed([target], options, tmp_path)
+    ((place, finding),) = state.findings.items()
+    assert place.startswith("SIGABRT while a case was made of this one")
+    assert finding.content == b"good"
+    assert state.counts[0] == 12 and state.counts[1] + finding.times == 12
