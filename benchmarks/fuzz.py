@@ -326,6 +326,8 @@ def report(states: list[State], folder: Path) -> dict[str, Any]:
     figures |= {"cases": sum(figures.values())}
     figures |= {"findings": sum(len(state.findings) for state in states)}
     print(f"\n{figures['cases']} cases, {figures['findings']} findings")
+    if untested := [state.target.name for state in states if not state.counts[0]]:
+        print(f"no time for a case, nothing is known of: {', '.join(untested)}")
     return figures
 
 

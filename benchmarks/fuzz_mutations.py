@@ -24,8 +24,8 @@ import polars
 import yaml
 from scipy.io import savemat
 
+from drake_teleop.common.parquet_sizes import check_parquet_content
 from drake_teleop.logs.read.mat_file import read_mat
-from drake_teleop.parquet_sizes import check_parquet_content
 
 Mutation = Callable[[random.Random, bytes, bytes], bytes]
 

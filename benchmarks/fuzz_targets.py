@@ -45,13 +45,6 @@ from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.bags import read_topic, topics_of
 from drake_teleop.logs.read.reading import read_log
-<<<<<<< HEAD
-=======
-from drake_teleop.parquet_sizes import check_parquet_content
-from drake_teleop.passivity.packet import PACKET_SIZE
-from drake_teleop.resources import models_dir, scenarios_dir, studies_dir
-from drake_teleop.result import Signal, SimulationResult
->>>>>>> fb126d7 (benchmarks: count a fuzzed case before it is made, and check Parquet in mutations)
 from drake_teleop.robots import udp
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.lines import read_line
