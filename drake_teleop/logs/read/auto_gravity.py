@@ -1,4 +1,4 @@
-"""What `gravity: auto` stands for: the direction of gravity, from the weight in all poses."""
+"""Direction of gravity for `gravity: auto`, from the weight in all orientations."""
 
 from __future__ import annotations
 
@@ -20,18 +20,9 @@ _LEAST_KNOWN_DEG = 2.0
 def describe_gravity(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
-    """Replace `gravity: auto` by a vector of standard magnitude.
+    """Replace `gravity: auto` by a vector of standard magnitude; return notes.
 
-    Args:
-        description: with `gravity: auto`.
-        source: its file, for messages.
-        read: reads a log as it is described.
-
-    Returns:
-        the description, and a note with the line to write.
-
-    Raises:
-        DrakeTeleopError: if the data do not determine the direction.
+    `read` returns the log of a description. Raises an error if the direction is undetermined.
     """
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf

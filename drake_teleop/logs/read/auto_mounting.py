@@ -1,4 +1,4 @@
-"""What `imu.frame: auto` and `imu.position: auto` of a description stand for, from the data."""
+"""Estimates for `imu.frame: auto` and `imu.position: auto`."""
 
 from __future__ import annotations
 
@@ -15,24 +15,15 @@ from drake_teleop.logs.read.lever_arm import LeverArm, lever_arm_from_wrench
 from drake_teleop.logs.read.mounting import Mounting, find_mounting
 
 CLOCK = 0.05
-"""Clocks of IMU and pose that disagree by more are worth a note [s]."""
+"""Lag between the clocks of IMU and pose that causes a warning [s]."""
 
 
 def describe_mounting(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
-    """The description with what `imu.frame: auto` and `imu.position: auto` leave to the data.
+    """Replace `auto` in the IMU's frame and position by estimates; return notes.
 
-    Args:
-        description: with an IMU that has `auto`.
-        source: its file, for messages.
-        read: reads a log as it is described.
-
-    Returns:
-        the description, and notes that say what was found and how to write it down.
-
-    Raises:
-        DrakeTeleopError: if the data do not determine it.
+    `read` returns the log of a description. Raises an error if the data do not determine a value.
     """
     imu = description.imu
     assert imu is not None
@@ -65,7 +56,7 @@ def describe_mounting(
 
 
 def _believed(mounting: Mounting | None, where: str) -> Mounting:
-    """The mounting, if the data determine its rotation."""
+    """Return the mounting, or raise an error if its rotation is undetermined."""
     if mounting is None:
         what = "the specific force hardly changes, or gaps leave too little of it"
         remedy = "turn the sensor about two axes"
@@ -112,7 +103,7 @@ def _rotation_notes(found: Mounting) -> list[str]:
 
 
 def _lever(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
-    """The lever arm from the pose, or else from the wrench."""
+    """Return the lever arm from the pose, or else from the wrench."""
     lever = None
     if mounting is not None and mounting.fits:
         lever = mounting.lever
@@ -139,7 +130,6 @@ def _lever(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
 
 
 def _written(x: NDArray[np.float64]) -> list:
-    """To four digits, without -0.0."""
     return list((np.round(x, 4) + 0.0).tolist())
 
 

@@ -1,4 +1,4 @@
-"""What `pose.position_in_sensor: auto` and `pose.rotation_in_sensor: auto` stand for."""
+"""Estimates for `pose.position_in_sensor: auto` and `pose.rotation_in_sensor: auto`."""
 
 from __future__ import annotations
 
@@ -15,21 +15,9 @@ from drake_teleop.logs.read.description import Description
 def describe_pose_frame(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
-    """The description with what the wrench says of the frame of the poses.
+    """Replace `auto` in the pose frame by estimates from the wrench; return notes.
 
-    The load is fitted together with the transform between pose and sensor, see
-    `drake_teleop.logs.pose_motion`; an IMU is not asked.
-
-    Args:
-        description: with a pose that has `auto`.
-        source: its file, for messages.
-        read: reads a log as it is described.
-
-    Returns:
-        the description, and notes that say what was found and how to write it down.
-
-    Raises:
-        DrakeTeleopError: if the data do not determine it.
+    An IMU is not used. Raises an error if the data do not determine a value.
     """
     from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 

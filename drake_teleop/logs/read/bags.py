@@ -1,25 +1,9 @@
-"""ROS bags and MCAP files: a topic becomes a table whose columns are the messages' fields.
+"""ROS bags and MCAP files: each topic becomes a table whose columns are message fields.
 
-A bag is a folder with metadata.yaml (sqlite3 or mcap storage), a lone .mcap or .db3 file, or a .bag
-of ROS 1. Message types are read from the bag itself, so that anybody's own will do; only bags
-without definitions (sqlite3 before ROS 2 Iron) have to do with the standard types. It takes the
-library rosbags, extra `ros`, but no ROS.
-
-Columns of a topic's table:
-
-==================== =============================================================================
-wrench.force.x       a number, by the path of its field
-covariance, data.0   an array of up to 64 numbers as a whole, and each of them
-force.x              short for a path that ends so, if only one does; of the standard groups force,
-                     torque, linear_acceleration, angular_velocity, orientation (also for a
-                     transform's rotation) and position (also for its translation)
-received             s, when the recorder received the message
-header.stamp         s, the stamp of its sender, unless all are zero; so any other time
-stamp                header.stamp, or received where there is none
-==================== =============================================================================
-
-Fields whose covariance begins with -1 in every message are not there: that is how ROS says that
-a sensor does not have them. Messages that hold `transforms` (TF) are taken apart.
+The library rosbags (extra `ros`) reads them. Columns: numbers and arrays (up to 64) by path
+(`wrench.force.x`, `data.0`); unique short names of standard groups (`force.x`); `received` and
+`header.stamp` [s]; `stamp`, the latter if present. A group with covariance -1 is absent, as in
+ROS. TF messages are split into transforms.
 """
 
 from __future__ import annotations
@@ -49,7 +33,7 @@ if TYPE_CHECKING:
 SUFFIXES = (".mcap", ".db3", ".bag")
 _LONGEST_ARRAY = 64
 _BLOCK, _RECEIVED = 10_000, "received at"
-# Of MCAP: what a chunk is, and how much larger than the file all of them may be [bytes].
+# MCAP: opcode of a chunk; limits of the total uncompressed size: ratio to the file, bytes.
 _CHUNK, _MOST_RATIO, _MOST_UNPACKED = 6, 200, 100_000_000
 _MOST_MEMORY = 1_500_000_000  # bytes
 _TOO_LARGE, _CUT = "unpacks to more than can be read", "cut it, or write the topics one by one"
@@ -75,18 +59,18 @@ _TYPES = {
         "TFMessage",
     ),
 }
-"""The types that a stream may be, the likeliest first."""
+"""Message types for each stream, the most likely first."""
 
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of a bag.
+    """Topic of a bag.
 
-    Args:
+    Attributes:
         name: such as "/ft/wrench".
-        type: of its messages, such as "geometry_msgs/msg/WrenchStamped".
-        messages: how many there are.
-        rate_hz: messages over the duration of the bag; 0 for an empty one.
+        type: such as "geometry_msgs/msg/WrenchStamped".
+        messages: their number.
+        rate_hz: mean rate; 0 for an empty bag.
     """
 
     name: str
@@ -96,16 +80,12 @@ class Topic:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether the path looks like a bag: a folder with metadata.yaml, or one of `SUFFIXES`."""
+    """Return whether the path is a folder with metadata.yaml or ends in one of `SUFFIXES`."""
     return os.path.isfile(path / "metadata.yaml") or path.suffix.lower() in SUFFIXES
 
 
 def topics_of(path: Path) -> list[Topic]:
-    """The topics of a bag by name.
-
-    Raises:
-        DrakeTeleopError: if there is no such bag, it cannot be read, or rosbags is missing.
-    """
+    """Return the topics of a bag by name; raise an error if it cannot be read."""
     with _opened(path) as reader:
         seconds = reader.duration * 1e-9
         return [
@@ -117,17 +97,10 @@ def topics_of(path: Path) -> list[Topic]:
 
 
 def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
-    """The messages of a topic as a table, see the top of this module.
+    """Return the messages of a topic as a table.
 
-    Args:
-        path: the bag.
-        topic: its name.
-        child_frame: of transforms and odometry, only those whose child_frame_id this is; may be
-            left out if there is one only.
-
-    Raises:
-        DrakeTeleopError: if the bag cannot be read, rosbags is missing, the topic is none of its or
-            empty, or the child frame is not or not clearly one of its.
+    `child_frame` selects transforms or odometry by child_frame_id. Raises an error if bag, topic
+    or child frame are missing, or the child frame is ambiguous.
     """
     with _opened(path) as reader:
         connections = [entry for entry in reader.connections if entry.topic == topic]
@@ -158,14 +131,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
 
 
 def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
-    """The table behind a stream of a description: its file, or a topic of the bag.
-
-    Args:
-        stream: with an absolute path.
-
-    Raises:
-        DrakeTeleopError: if it cannot be read, or is a bag without a topic.
-    """
+    """Return the table of a stream: its file or topic. Raises an error without a topic."""
     if not isinstance(stream, Static) and stream.topic is not None:
         return read_topic(stream.file, stream.topic, stream.child_frame)
     if is_bag(stream.file):
@@ -174,16 +140,7 @@ def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
 
 
 def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
-    """A draft of a log description: the topics whose types suit the streams.
-
-    Args:
-        path: the bag.
-        topics: what is in it.
-        folder: where the draft will be, which its path to the bag starts from.
-
-    Returns:
-        YAML text whose first lines say that it is a draft, and which other topics would do.
-    """
+    """Return a draft description as YAML with suitable topics and paths relative to `folder`."""
     draft: dict[str, Any] = {}
     others: list[str] = []
     file = os.path.relpath(path, folder)
@@ -206,7 +163,7 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
 
 
 def topic_missing(path: Path) -> DrakeTeleopError:
-    """The error for a bag of which no topic is named."""
+    """Return the error for a bag without a named topic."""
     return DrakeTeleopError(
         "is a bag, which does not say what its topics are",
         where=str(path),
@@ -244,7 +201,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         raise
     except MemoryError:
         raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT) from None
-    # A damaged file fails somewhere in rosbags, or in the libraries below it, in many ways.
+    # Damaged files cause many kinds of exceptions in rosbags and its libraries.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
         raise DrakeTeleopError(
@@ -253,11 +210,11 @@ def _opened(path: Path) -> Iterator[AnyReader]:
 
 
 def _check_unpacked(path: Path) -> None:
-    """Refuse an MCAP file whose chunks say that they are far larger than measured data get."""
+    """Reject an MCAP file whose chunks declare an implausible uncompressed size."""
     total, most = 0, path.stat().st_size * _MOST_RATIO + _MOST_UNPACKED
     with path.open("rb") as file:
         file.seek(8)
-        while len(head := file.read(33)) == 33:  # of a record; of a chunk with times and size
+        while len(head := file.read(33)) == 33:  # head of a record
             length = int.from_bytes(head[1:9], "little")
             total += int.from_bytes(head[25:33], "little") if head[0] == _CHUNK else 0
             file.seek(min(length - 24, most), 1)
@@ -267,11 +224,11 @@ def _check_unpacked(path: Path) -> None:
 
 @contextmanager
 def _little_memory() -> Iterator[None]:
-    """MemoryError for more than `_MOST_MEMORY` more, whatever a compressed block unpacks to."""
+    """Raise MemoryError for more than `_MOST_MEMORY` additional bytes (Linux only)."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
-    except OSError:  # not on Linux, which alone keeps such a limit
+    except OSError:  # only Linux enforces this limit
         yield
         return
     most = pages * resource.getpagesize() + _MOST_MEMORY
@@ -289,7 +246,7 @@ def _parts(message: Any) -> list[Any]:
 def _blocks(
     pairs: Iterator[tuple[int, Any]], child_frame: str | None, where: str
 ) -> list[dict[str, NDArray]]:
-    """The columns of every so many messages, which take a tenth of the memory of the messages."""
+    """Return the columns of each `_BLOCK` messages, to limit memory."""
     children: set[str] = set()
     blocks: list[dict[str, NDArray]] = []
 
@@ -315,7 +272,6 @@ def _blocks(
 
 
 def _joined(blocks: list[dict[str, NDArray]]) -> dict[str, NDArray]:
-    """The columns that all blocks have, with as many numbers in a row."""
     return {
         name: np.concatenate([block[name] for block in blocks])
         for name, values in blocks[0].items()
@@ -324,7 +280,6 @@ def _joined(blocks: list[dict[str, NDArray]]) -> dict[str, NDArray]:
 
 
 def _columns(messages: list[Any]) -> dict[str, NDArray]:
-    """Every number, time and short array of the messages by its path."""
     columns: dict[str, NDArray] = {}
     for path, sample in _leaves(messages[0], ""):
         get = attrgetter(path)
@@ -354,7 +309,7 @@ def _leaves(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 def _take_absent(columns: dict[str, NDArray]) -> tuple[str, ...]:
-    """The groups that their covariance calls not provided; they are taken out of `columns`."""
+    """Remove groups whose covariance begins with -1; return their names."""
     absent = tuple(
         name.removesuffix("_covariance")
         for name, values in columns.items()
@@ -366,7 +321,7 @@ def _take_absent(columns: dict[str, NDArray]) -> tuple[str, ...]:
 
 
 def _short(columns: dict[str, NDArray]) -> dict[str, NDArray]:
-    """The standard groups by their short names, where only one path ends so."""
+    """Return columns of the standard groups by unique short name."""
     found: dict[str, list[str]] = {}
     for path in columns:
         *_, group, axis = ["", *path.split(".")]

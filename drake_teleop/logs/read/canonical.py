@@ -1,4 +1,4 @@
-"""The canonical log: wrench and motion of the sensor frame S at common instants."""
+"""Canonical log: wrench and motion of the sensor frame S at common instants."""
 
 from __future__ import annotations
 
@@ -55,34 +55,30 @@ _ARRAYS = (
 
 @dataclass(frozen=True)
 class Log:
-    """What identification and elimination need: N samples on one clock, frame S, SI units.
+    """Wrench and motion of the sensor frame S: N samples on one clock, SI units.
 
-    Args:
-        t: (N,) time, uniformly spaced [s]; for static poses merely their number.
-        wrench: (N, 6) [f; tau] with the sign of Eq. (1): what the sensor exerts on the load, about
-            the origin of S [N, N m].
-        specific_force: (N, 3) s = a - g of the origin of S, in S [m/s^2].
+    Attributes:
+        t: (N,) uniform time [s]; row numbers for static poses.
+        wrench: (N, 6) [f; tau] that the sensor exerts on the load, about So, Eq. (1) [N, N m].
+        specific_force: (N, 3) s = a - g of So, in S [m/s^2].
         angular_velocity: (N, 3) omega_WS_S [rad/s].
         angular_acceleration: (N, 3) alpha_WS_S [rad/s^2].
-        gravity: (N, 3) g_S, gravity in S [m/s^2], if the orientation is known.
-        static: the samples are separate poses at rest; there is nothing to filter or to shift.
-        bridged: (N,) where a straight line stands in for samples that a stream does not have; None
-            if there are no gaps.
-        notes: what the reader had to assume, in words.
-        source: the file, for messages.
-        posed: the poses themselves, on the clock of `t`, where they have positions.
-        gain_std: standard deviation of the sensor's gains, as stated.
-        R_WS: (N, 3, 3) orientation of S, where `gravity` is from it.
-        gravity_W: (3,) gravity in the world [m/s^2], likewise.
-        one_sided_s: length of either end in which derivatives have samples on one side only [s].
-        described: the description, with what was found in the place of `auto`.
-        free: parts of `drake_teleop.logs.causes.model.Model` that the description leaves to the
-            data: "gravity" for `gravity: auto`, "weight" for `wrench.weight: removed`.
-        resolution: step of the file's numbers of force and torque [N, N m], of static poses.
+        gravity: (N, 3) in S [m/s^2], or None.
+        static: the samples are separate poses at rest.
+        bridged: (N,) samples interpolated over gaps, or None.
+        notes: assumptions of the reader.
+        source: file name for messages.
+        posed: recorded poses, if they have positions.
+        gain_std: stated standard deviation of the sensor gains.
+        R_WS: (N, 3, 3) orientation, or None.
+        gravity_W: (3,) in the world [m/s^2], or None.
+        one_sided_s: length of each end with one-sided derivatives [s].
+        described: the description, with estimates for `auto`.
+        free: causes left to the data: "gravity" and "weight".
+        resolution: step of force and torque of static poses [N, N m].
 
     Raises:
-        DrakeTeleopError: if the arrays do not fit each other, hold NaN or infinity, or `t` does not
-            increase.
+        DrakeTeleopError: for wrong shapes, values that are not finite, or decreasing `t`.
     """
 
     t: NDArray[np.float64]
@@ -138,21 +134,17 @@ class Log:
 
     @cached_property
     def dt(self) -> float:
-        """Time between samples [s]; where samples in gaps were taken out, between the others."""
+        """Sample spacing [s], without steps across removed gaps."""
         steps = np.diff(self.t)
         return float(steps[steps < 1.5 * np.median(steps)].mean())
 
     def earlier(self, start: float) -> Log:
-        """The same with the times since `start` [s]."""
+        """Return the log with times relative to `start` [s]."""
         posed = None if self.posed is None else self.posed.earlier(start)
         return replace(self, t=self.t - start, posed=posed)
 
     def only(self, rows: slice | NDArray[np.bool_]) -> Log:
-        """These samples of the log.
-
-        Args:
-            rows: which.
-        """
+        """Return the log with the selected rows."""
         if not isinstance(rows, slice) and rows.all():
             return self
         arrays = {name: getattr(self, name) for name in _ARRAYS}
@@ -161,20 +153,12 @@ class Log:
 
     @property
     def motion(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """(specific_force, angular_velocity, angular_acceleration), the order of every function."""
+        """Specific force, angular velocity and angular acceleration."""
         return self.specific_force, self.angular_velocity, self.angular_acceleration
 
 
 def write_log(log: Log, path: str | Path) -> None:
-    """Writes a log as a canonical table: columns t, f_x ... alpha_z.
-
-    Args:
-        log: the log.
-        path: where to; ends in .csv or .parquet.
-
-    Raises:
-        DrakeTeleopError: for another suffix.
-    """
+    """Write a log as a canonical table; raise an error unless it is .csv or .parquet."""
     import polars as pl
 
     path = Path(path)
@@ -191,17 +175,10 @@ def write_log(log: Log, path: str | Path) -> None:
 
 
 def describe_canonical(path: Path, table: Table) -> Description:
-    """The description of a canonical table, so that there is one way of reading.
+    """Return the description of a canonical table.
 
-    Rows at rest are understood as static poses: those without `t`, or slower than any log of motion
-    and with gravity in S turned by more than 10 deg from row to row, at least once in five rows.
-
-    Args:
-        path: the table's file.
-        table: what is in it.
-
-    Raises:
-        DrakeTeleopError: if the wrench, or the kinematics and the pose in their place, are absent.
+    Rows without `t` are static poses. So are rows slower than 5 Hz, if gravity turns by more than
+    10 deg in a fifth of the steps. Raises an error if wrench or kinematics are absent.
     """
 
     def present(names: Sequence[str]) -> bool:
@@ -265,7 +242,6 @@ def describe_canonical(path: Path, table: Table) -> Description:
 
 
 def _at_rest(table: Table, s: bool, omega: bool, q: bool) -> bool:
-    """Whether the rows of a canonical table are poses at rest, see `describe_canonical`."""
     where = str(table.path)
     if not (s or q):
         return False
@@ -277,7 +253,7 @@ def _at_rest(table: Table, s: bool, omega: bool, q: bool) -> bool:
         return True
     t = table.single("t", where)
     if not np.isfinite(t).all():
-        return False  # the reader names the row
+        return False  # the reader raises an error that names the row
     steps = np.diff(t)
     if not len(steps) or not np.median(steps) > 1 / SLOWEST:
         return False

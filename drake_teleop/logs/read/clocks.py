@@ -1,15 +1,14 @@
-"""The clock of one stream: what becomes of its time stamps, and where nothing was recorded.
+"""Clock of one stream: checks and corrections of its time stamps.
 
 =========================== ======================================================================
-time stamps                 outcome
+time stamps                 result
 =========================== ======================================================================
-missing (NaN)               the rows are left out, with a note
-repeated, rows identical    the repetitions are left out, with a note
-repeated, rows differ       bursts or coarse stamps: rows are spread evenly, see `spread`, with a
-                            note
-going back, or too uneven   an error that names the row
-of an absurd rate           an error that names the unit which would do
-gaps                        see `gaps`; what lies in them is not used
+missing (NaN)               rows are removed, with a note
+repeated, rows identical    repetitions are removed, with a note
+repeated, rows differ       rows are spaced evenly, see `spread`, with a note
+decreasing or too uneven    error that names the row
+implausible rate            error that proposes a unit
+gaps                        samples in them are not used, see `gaps`
 =========================== ======================================================================
 """
 
@@ -27,9 +26,9 @@ from drake_teleop.logs.read.description import UNITS, Time
 from drake_teleop.logs.read.tables import Table
 
 GAP = 4.0
-"""Steps longer than this many median steps may be gaps."""
+"""Least length of a gap in median steps."""
 SLOWEST, FASTEST = 5.0, 1e5
-"""Rates outside are taken for a wrong unit [Hz]."""
+"""Range of plausible rates [Hz]; other rates indicate a wrong unit."""
 _SPARSE = 4.0
 _WINDOW = 50
 
@@ -38,11 +37,11 @@ _WINDOW = 50
 class Clock:
     """Times of the rows of a stream.
 
-    Args:
-        t: (N,) strictly increasing, on the common clock [s].
-        rows: (N,) the rows of the table that they belong to.
-        total: number of time stamps, those left out included.
-        notes: what was done to the stamps, in words.
+    Attributes:
+        t: (N,) increasing, on the common clock [s].
+        rows: (N,) their rows of the table.
+        total: number of stamps before removal.
+        notes: corrections.
     """
 
     t: NDArray[np.float64]
@@ -51,22 +50,14 @@ class Clock:
     notes: tuple[str, ...] = ()
 
     def taken(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, ...) those rows of (total, ...)."""
+        """Return the rows of (total, ...) values that have a time."""
         return x if len(self.rows) == self.total else x[self.rows]
 
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
-    """The times of a stream's rows, see the top of this module.
+    """Return the times of a stream's rows; raise an error by the table of this module.
 
-    Args:
-        time: the stream's field.
-        table: its table.
-        columns: of its signals: repeated rows are those that agree in all of them.
-        where: that field, for messages.
-
-    Raises:
-        DrakeTeleopError: if the stamps go back, stand still, or are too uneven, or if their rate is
-            absurd.
+    A repeated row equals the previous one in all `columns`. `where` names the field.
     """
     if time.column is None:
         assert time.rate is not None
@@ -111,21 +102,14 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
 
 
 def _common(t: NDArray[np.float64], time: Time) -> NDArray[np.float64]:
-    """Times of the stream's clock on the common one."""
     return t[0] + time.scale * (t - t[0]) + time.offset
 
 
 def spread(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Times of rows of which several share a stamp, because it is coarse or given to a burst.
+    """Return times of rows with shared stamps: means over 50 distinct stamps, straight at the ends.
 
-    A row's time is the mean of the stamps around it, over as many rows as 50 distinct stamps have
-    on average: within such a window rows count as evenly spaced. At the ends the outermost windows'
-    straight lines are continued. Windows do not reach over steps of more than three median ones.
-    The mean of the stamps is kept; if they are all early or late, by half a burst for instance, the
-    times are so too, which is a delay like any other.
-
-    Args:
-        t: (N,) stamps [s] that do not go back, at least two of them distinct.
+    Windows end at steps of more than three median steps. The mean of the stamps is kept. `t` (N,)
+    must not decrease.
     """
     distinct = np.unique(t)
     step = float(np.median(np.diff(distinct)))
@@ -136,14 +120,9 @@ def spread(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def gaps(t: NDArray[np.float64], bandwidth_hz: float | None) -> NDArray[np.float64]:
-    """(G, 2) start and end of the steps over which the signal is not known.
+    """Return (G, 2) start and end of the gaps in increasing times `t` (N,) [s].
 
-    Those are longer than four median steps and, as shorter ones hide nothing that the low-pass
-    would let through, than half a period of its cut-off.
-
-    Args:
-        t: (N,) increasing times [s].
-        bandwidth_hz: the cut-off; None for none.
+    A gap is longer than four median steps and half a period of the low-pass.
     """
     steps = np.diff(t)
     at = np.flatnonzero(steps > shortest_gap(float(np.median(steps)), bandwidth_hz))
@@ -151,18 +130,18 @@ def gaps(t: NDArray[np.float64], bandwidth_hz: float | None) -> NDArray[np.float
 
 
 def shortest_gap(step: float, bandwidth_hz: float | None) -> float:
-    """Above which steps are gaps [s], see `gaps`; `step` is the median one [s]."""
+    """Return the shortest gap [s] for a median `step` [s]."""
     return max(GAP * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
 
 
 def _evened(t: NDArray[np.float64], half: int, dt: float) -> NDArray[np.float64]:
-    """Moving average of the stamps over 2 half + 1 rows, with straight ends."""
+    """Return the moving average of the stamps over 2 half + 1 rows, with straight ends."""
     n = len(t)
     if t[0] == t[-1]:
         return t[0] + dt * (np.arange(n) - (n - 1) / 2)
     half = min(half, (n - 1) // 2)
     width = 2 * half + 1
-    # What is averaged are small deviations: stamps may count from 1970.
+    # Small deviations keep the precision: stamps can count from 1970.
     line = np.linspace(t[0], t[-1], n)
     deviation = t - line
     sums = np.concatenate([[0.0], np.cumsum(deviation)])
@@ -185,7 +164,7 @@ def _distinct(
     columns: Sequence[str | int],
     where: str,
 ) -> NDArray[np.intp]:
-    """`rows` without those that are the same as the one before, time stamp included."""
+    """Return `rows` without repetitions of the previous row."""
     values = [table.raw(column, where) for column in columns]
     values = [x[rows] for x in values if len(x) == len(t)]
     same = np.diff(t[rows]) == 0
@@ -232,7 +211,7 @@ def _check_rate(t: NDArray[np.float64], time: Time, where: str) -> None:
     if 1 / FASTEST <= step <= 1 / SLOWEST:
         return
     counts = step / UNITS[time.unit]
-    # Rates of a sensor that are most likely: 20 Hz to 10 kHz.
+    # Typical sensor rates are 20 Hz to 10 kHz.
     likely = [unit for unit in ("s", "ms", "us", "ns") if 1e-4 <= counts * UNITS[unit] <= 0.05]
     remedy = f"probably `unit: {likely[0]}`" if likely else "check the unit, or give time.rate"
     if step > 1 / SLOWEST:

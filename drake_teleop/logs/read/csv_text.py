@@ -1,17 +1,8 @@
-"""CSV files as recorders and spreadsheets write them: which separator, decimal sign, header.
+"""CSV files of recorders and spreadsheets: separator, decimal sign, header and encoding.
 
-======================================== =========================================================
-in the file                              taken as
-======================================== =========================================================
-`;`, tab, or spaces                      the separator, where a line has no other; with the first
-                                         two, or in quotes, a number may have a decimal comma
-lines at the end without a cell          not there
-lines that end in CR alone               lines
-lines before the header that begin       comments, but for one right before the numbers that has
-with `#`                                 as many names: the header, as `numpy.savetxt` writes it
-UTF-16 with its mark, UTF-8 with one     text, as spreadsheets save it
-dates and times of ISO 8601              numpy's datetime64 (a time of day: timedelta64)
-======================================== =========================================================
+Separators are `;`, tab, comma or spaces. With `;` or tab, or in quotes, a comma can be the decimal
+sign. Lines with `#` before the header are comments, except names directly before the numbers
+(`numpy.savetxt`). UTF-8 and UTF-16 are accepted. ISO 8601 dates become datetime64.
 """
 
 from __future__ import annotations
@@ -27,11 +18,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import polars as pl
 
-_LOOKED_AT = 2**16  # bytes that tell all this
-_TELLING = 1000  # rows that tell what is in a column, if it is numbers
+_LOOKED_AT = 2**16  # bytes from which the format is detected
+_TELLING = 1000  # rows from which column types are inferred
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _RETURN = re.compile(rb"\r(?!\n)")
-_EMPTY = b' \t,;\r\n\x00\x1a"'  # of which lines without a cell are made
+_EMPTY = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
 _QUOTED_NUMBER = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
 _THOUSANDS = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
 _QUOTED = re.compile('"[^"]*"')
@@ -39,15 +30,7 @@ _DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 
 
 def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
-    """The table in a CSV file, and the number of its first data row as a reader counts.
-
-    Args:
-        path: the file.
-        header: whether there are names.
-
-    Raises:
-        Exception: whatever polars says of what is no such file.
-    """
+    """Return the table of a CSV file and its first data line; errors are those of polars."""
     import polars as pl
 
     with path.open("rb") as file:
@@ -85,12 +68,12 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
 
 
 def _repaired(path: Path, source: Path | bytes, head: bytes) -> bytes | None:
-    """The text with line feeds and decimal points and no empty end; None if it has them already."""
+    """Return the text with LF, decimal points and no empty end; None if it is unchanged."""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - _LOOKED_AT))
         tail = file.read() if isinstance(source, Path) else source
     returns, commas = bool(_RETURN.search(head)), _QUOTED_NUMBER.findall(head)
-    # "1,500" alone may be 1500.
+    # "1,500" can be 1500.
     commas = [found for found in commas if not _THOUSANDS.fullmatch(b",".join(found))]
     if not (returns or commas or _end(tail) < len(tail)):
         return None
@@ -101,16 +84,12 @@ def _repaired(path: Path, source: Path | bytes, head: bytes) -> bytes | None:
 
 
 def _end(text: bytes) -> int:
-    """The number of bytes before the lines without a cell at the end."""
     line = text.find(b"\n", len(text.rstrip(_EMPTY)))
     return len(text) if line < 0 else line + 1
 
 
 def _parsed(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
-    """Of the types of its first rows if they are numbers, and all is; else of those of all rows.
-
-    To look at all of them takes six times as long as to read them.
-    """
+    """Parse with types of the first rows if all are numeric; otherwise of all rows (slow)."""
     import polars as pl
 
     with suppress(pl.exceptions.ComputeError):
@@ -121,7 +100,6 @@ def _parsed(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
 
 
 def _comments(lines: list[str]) -> int:
-    """How many lines stand before the table."""
     table = (i for i, line in enumerate(lines) if line.strip() and not line.startswith("#"))
     return next(table, 0)
 
@@ -134,7 +112,7 @@ def _separator(line: str) -> str:
 
 
 def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
-    """Of the last comment, if numbers follow it, one for each name."""
+    """Return names from the last comment if numbers follow, one for each name."""
     told = [line for line in comments if line.startswith("#")]
     if not told or not all(_is_number(cell) for cell in rest[0].split(separator)):
         return None

@@ -1,4 +1,4 @@
-"""The delay between motion and wrench, from the log itself."""
+"""Delay between motion and wrench, estimated from the log."""
 
 from __future__ import annotations
 
@@ -23,22 +23,15 @@ _FEWEST = 32
 def estimate_delay(
     log: Log, cutoff_hz: float | None, phi: NDArray[np.float64] | None = None
 ) -> float | None:
-    """How far the motion lags behind the wrench: the shift with the smallest residual.
+    """Return the delay of the motion behind the wrench [s], or None if undetermined.
 
-    Minimises sum_c log var(w_c - o_c - (V(t + delay) phi)_c) over the six channels c, the
-    likelihood of a Gaussian residual with unknown variance in each channel; offsets o, and phi if
-    it is not given, are fitted anew at every shift. First on a grid over +-0.25 s (at most a tenth
-    of the record), then refined to 10 us.
+    It minimizes sum_c log var(w_c - o_c - (V(t + delay) phi)_c) over the channels c, within
+    +-0.25 s or a tenth of the record. Offsets o, and phi if not given, are fitted at each shift.
 
     Args:
         log: the log.
-        cutoff_hz: zero-phase low-pass before the comparison; None for 30 Hz.
-        phi: (10,) known load, or None.
-
-    Returns:
-        the delay [s], or None if the record does not determine it: the residual hardly depends on
-        the shift (twice a log likelihood ratio of 50, and 5 % in one channel, are asked for), or it
-        is smallest at the end of the range.
+        cutoff_hz: of the low-pass; None for 30 Hz.
+        phi: (10,) identified load, or None.
     """
     cutoff = min(cutoff_hz or 30.0, 0.2 / log.dt)
     smooth = low_passed(log, cutoff)
@@ -62,14 +55,9 @@ def estimate_delay(
 def delay_of(
     log: Log, cutoff_hz: float | None, delay: str | float, phi: NDArray[np.float64] | None = None
 ) -> tuple[float, str]:
-    """The delay to take out of the motion, and where it is from, as the summary has it.
+    """Return the delay to remove [s] and its source; estimate it if `delay` is "auto".
 
-    Args:
-        log, cutoff_hz, phi: as of `estimate_delay`.
-        delay: seconds, or "auto" to estimate it.
-
-    Raises:
-        DrakeTeleopError: for another text, or no number.
+    Raises an error for another text.
     """
     if log.static:
         return 0.0, "static"
@@ -84,7 +72,6 @@ def delay_of(
 
 
 def _known(log: Log, cutoff: float, reach: float) -> NDArray[np.bool_]:
-    """(N,) samples that have no gap within reach of any shift."""
     gap = ~measured(log, cutoff)
     return ~widened(gap, math.ceil(reach / log.dt)) if gap.any() else ~gap
 
@@ -101,22 +88,22 @@ def _cost(
     log: Log, rows: NDArray[np.intp], phi: NDArray[np.float64] | None
 ) -> Callable[[float], float]:
     t, wrench = log.t[rows], log.wrench[rows]
-    # Of all forces, and of all torques: a channel with nothing in it must not weigh most, and the
-    # rounding of a wrench that does not change is nothing.
+    # Common scales of forces and torques prevent large weights of channels without a signal; the
+    # floor excludes rounding of a constant wrench.
     rounding = (1e-9 * np.abs(wrench).max()) ** 2 + 1e-30
     variance = np.repeat(wrench.var(axis=0).reshape(2, 3).sum(axis=1), 3) + rounding
     scale, floor = np.sqrt(variance), 1e-9 * variance
-    motion = np.hstack(log.motion)  # one search for the times serves all
+    motion = np.hstack(log.motion)  # one interpolation for all signals
 
     def residual(shift: float) -> NDArray[np.float64]:
         s, omega, alpha = np.split(resample(t + shift, log.t, motion), 3, axis=1)
         if phi is not None:
             return contact_wrench(wrench, np.zeros(6), s, omega, alpha, phi)
         V = regressor(s, omega, alpha)
-        # Taking the means away fits the offsets; scaling weighs force and torque alike.
+        # Subtracting the means fits the offsets; the scale weights force and torque equally.
         V = ((V - V.mean(axis=0)) / scale[:, None]).reshape(-1, 10)
         w = ((wrench - wrench.mean(axis=0)) / scale).ravel()
-        # The normal equations take a tenth of the time of a decomposition of V.
+        # Normal equations are ten times faster than a decomposition of V.
         theta = np.linalg.lstsq(V.T @ V, V.T @ w, rcond=1e-12)[0]
         return (w - V @ theta).reshape(-1, 6) * scale
 

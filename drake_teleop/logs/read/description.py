@@ -1,12 +1,8 @@
-"""Log descriptions: where a foreign log keeps what (long: all classes of one file's format).
+"""Log descriptions: YAML files that specify files, columns, units and frames (docs/logs.md).
 
-YAML files that say it, with units and frames.
-
-Every field is documented in docs/logs.md. A number x of a file becomes a quantity in S by
+A number x of a file becomes a quantity in S by
 
     x_S = sign * R_S,stream * scale * (x - bias) * unit
-
-so a bias is in the unit and the axes of the file.
 """
 
 from __future__ import annotations
@@ -73,7 +69,7 @@ UNITS = {
     "mm": 1e-3,
     "mm/s^2": 1e-3,
 }
-"""SI value of each unit; "g" is the magnitude of the description's gravity."""
+"""SI value of each unit, except "g", the magnitude of the described gravity."""
 
 
 class _Strict(BaseModel):
@@ -89,7 +85,7 @@ class _Strict(BaseModel):
 
 
 class Time(_Strict):
-    """When the rows of a stream were taken: a column of time stamps, or a nominal rate."""
+    """Time of the rows of a stream: a column of stamps or a nominal rate."""
 
     column: Column | None = None
     unit: Literal["s", "ms", "us", "ns"] = "s"
@@ -129,28 +125,28 @@ class Torque(_Quantity):
 
 
 class Acceleration(_Quantity):
-    """Columns of a linear acceleration, their unit, and what it reads of none."""
+    """Columns of a linear acceleration, their unit and bias."""
 
     unit: Literal["m/s^2", "g", "mm/s^2"] = "m/s^2"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
 class AngularVelocity(_Quantity):
-    """Columns of an angular velocity, their unit, and what it reads of none."""
+    """Columns of an angular velocity, their unit and bias."""
 
     unit: Literal["rad/s", "deg/s"] = "rad/s"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
 class AngularAcceleration(_Quantity):
-    """Columns of an angular acceleration, their unit, and what it reads of none."""
+    """Columns of an angular acceleration, their unit and bias."""
 
     unit: Literal["rad/s^2", "deg/s^2"] = "rad/s^2"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
 class Orientation(_Strict):
-    """R_WS, or of the stream's frame if `frame` is a rotation."""
+    """Orientation R_WS of S, or of the stream's frame if `frame` is a rotation."""
 
     columns: tuple[Column, ...]
     form: Literal["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector"]
@@ -184,12 +180,12 @@ class _Stream(_Strict):
 
     @property
     def source(self) -> Path:
-        """The file, or, in a bag, the file and the topic behind it."""
+        """File and, in a bag, topic."""
         return self.file
 
 
 class _Recorded(_Stream):
-    """A stream with a clock: a table, or a topic of a bag, for which much has defaults."""
+    """Stream with a clock: a table, or a topic with default columns."""
 
     topic: str | None = Field(default=None, description="of a ROS bag or MCAP file")
     child_frame: str | None = Field(default=None, description="which transform of the topic")
@@ -220,7 +216,7 @@ class _Recorded(_Stream):
 
 
 class Wrench(_Recorded):
-    """The force-torque sensor's file and columns."""
+    """File and columns of the force-torque sensor."""
 
     _defaults = ("force", "torque")
 
@@ -233,7 +229,7 @@ class Wrench(_Recorded):
 
 
 class Imu(_Recorded):
-    """The file and columns of an IMU."""
+    """File and columns of an IMU."""
 
     _defaults = ("specific_force", "angular_velocity")
 
@@ -259,12 +255,12 @@ class Imu(_Recorded):
 
     @property
     def automatic(self) -> bool:
-        """Whether the data shall tell the frame or the position."""
+        """Whether frame or position is `auto`."""
         return self.frame == "auto" or self.position == "auto"
 
 
 class Pose(_Recorded):
-    """The file and columns of a pose of sensor, flange or TCP."""
+    """File and columns of a pose of sensor, flange or TCP."""
 
     _defaults = ("orientation", "position")
 
@@ -295,12 +291,12 @@ class Pose(_Recorded):
 
     @property
     def automatic(self) -> bool:
-        """Whether the data shall tell where the posed frame is."""
+        """Whether position or rotation of the posed frame is `auto`."""
         return self.position_in_sensor == "auto" or self.rotation_in_sensor == "auto"
 
     @property
     def R_SP(self) -> NDArray[np.float64] | None:
-        """(3, 3) from the posed frame to S, where it is given; None for the axes of S."""
+        """(3, 3) rotation from the posed frame to S; None for the axes of S."""
         for rotation in (self.rotation_in_sensor, self.frame):
             if isinstance(rotation, tuple):
                 return np.array(rotation)
@@ -308,7 +304,7 @@ class Pose(_Recorded):
 
 
 class Static(_Stream):
-    """Averages over separate poses at rest, one a row."""
+    """Averages over separate poses at rest, one per row."""
 
     force: Force
     torque: Torque
@@ -335,7 +331,7 @@ class Static(_Stream):
 
 
 class Description(_Strict):
-    """A whole log: a wrench stream with imu, pose, or both; or static poses."""
+    """Description of a log: a wrench with imu, pose or both; or static poses."""
 
     gravity: Gravity = (
         0.0,
@@ -388,26 +384,26 @@ class Description(_Strict):
 
     @property
     def gravity_W(self) -> NDArray[np.float64]:
-        """(3,) gravity in W [m/s^2]; straight down for `auto`."""
+        """(3,) gravity in W [m/s^2]; along -z for `auto`."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
     def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
-        """Poses of S with what else is described of them, and what an IMU tells of S."""
+        """Return poses of S with gravity, the pose frame and IMU data."""
         assert self.pose is not None
         place, turn = self.pose.position_in_sensor, self.pose.R_SP
         turn = np.eye(3) if turn is None else turn
         return Posed(poses, self.gravity_W, np.array(place), turn, imu)
 
     def scale(self, unit: str) -> float:
-        """SI value of a unit; "g" is the magnitude of this description's gravity."""
+        """Return the SI value of a unit; "g" is the described gravity."""
         return float(np.linalg.norm(self.gravity_W)) if unit == "g" else UNITS[unit]
 
 
 def json_schema() -> str:
-    """The JSON schema of a description, as text: what docs/log-description.schema.json holds."""
+    """Return the JSON schema of a description (docs/log-description.schema.json)."""
     schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     schema |= Description.model_json_schema()
-    # With a topic a stream needs its file and nothing else.
+    # With a topic, only the file is required.
     for name in ("Wrench", "Imu", "Pose"):
         stream = schema["$defs"][name]
         without = [field for field in stream["required"] if field != "file"]
@@ -418,13 +414,9 @@ def json_schema() -> str:
 
 
 def load_description(path: str | Path) -> Description:
-    """Reads a log description.
+    """Read a description from a YAML file; its paths are relative to the folder.
 
-    Args:
-        path: the YAML file. Relative paths in it are relative to its folder.
-
-    Raises:
-        DrakeTeleopError: naming file and field, if it is absent, no YAML, or does not fit.
+    Raises an error that names file and field.
     """
     path = Path(path)
     if not os.path.exists(path):
@@ -451,7 +443,7 @@ def _resolved(description: Description, folder: Path) -> Description:
 
 
 def _explained(error: ValidationError, path: Path) -> DrakeTeleopError:
-    # A misspelt field is also a missing one: name what stands there first.
+    # A misspelt field also causes "missing"; report the misspelling first.
     first = min(error.errors(), key=lambda entry: entry["type"] == "missing")
     *outer, last = first["loc"] or ("",)
     unknown = first["type"] == "extra_forbidden"

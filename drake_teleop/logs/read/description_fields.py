@@ -1,4 +1,4 @@
-"""Kinds of fields of a log description: numbers, vectors, frames and places."""
+"""Field types of a log description."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, WithJsonSchema
 from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
 
 ROTATION_TOLERANCE = 0.01
-"""Entries of R^T R may be off those of the identity by this."""
+"""Largest deviation of entries of R^T R from the identity."""
 _LEAST_SCALE = 1e-12
 
 
@@ -70,7 +70,7 @@ def _weight(value: Any) -> Any:
 Column = str | int
 
 
-Number = Annotated[float, Field(strict=True)]  # neither true nor "1"
+Number = Annotated[float, Field(strict=True)]  # rejects true and "1"
 Vector = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 Rotation = tuple[Vector, Vector, Vector]
 GainStd = Annotated[

@@ -1,4 +1,4 @@
-"""How far the clock of an IMU is behind that of the pose, whatever the axes of either."""
+"""Lag and drift of an IMU's clock behind the pose's clock, for any axes."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from numpy.typing import NDArray
 from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 
-# A drift is believed from this likelihood ratio (twice its logarithm), and if it amounts to this.
+# Least log likelihood ratio (times 2) and total lag [s] of a significant drift.
 _LIKELIHOOD, _DRIFTED = 50.0, 0.01
 
 
 Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""Of each sensor, the pose's signal and the IMU's, see `signal_pairs`."""
+"""Signal of the pose and of the IMU, for each sensor, see `signal_pairs`."""
 
 
 def signal_pairs(t: NDArray[np.float64], imu: Log, pose: Log, gyroscope: bool) -> Pairs:
-    """Of each sensor, the signal (N, 3) of the pose at `t`, and that of the IMU on its clock."""
+    """Return (N, 3) signals of the pose at `t` with those of the IMU on its clock."""
     pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
     if gyroscope:
         pairs.append((resample(t, pose.t, pose.angular_velocity), imu.angular_velocity))
@@ -31,7 +31,7 @@ def best_shift(
     reach: float,
     arm: NDArray[np.float64],
 ) -> float:
-    """The shift at which free maps leave least, beyond what is linear in `arm` (N, k)."""
+    """Return the shift [s] of the best affine maps, without effects linear in `arm` (N, k)."""
     U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
 
@@ -62,18 +62,10 @@ def clock_drift(
     lag: float,
     independent: float,
 ) -> tuple[float, float]:
-    """Lag in the middle and its growth, by Gauss-Newton steps from a constant lag.
+    """Return lag at mid-record [s] and drift [s/s], by Gauss-Newton from a constant lag [s].
 
-    Args:
-        t: (N,) times on the clock of the pose.
-        pairs: of signals at `t` and signals of the IMU at `t_imu`, each mapped freely.
-        t_imu: times on the clock of the IMU.
-        lag: the best constant lag [s].
-        independent: how many samples of such signals say something new.
-
-    Returns:
-        the lag in the middle [s] and its growth [s/s]; `lag` and 0 if the likelihood of a constant
-        lag is not exceeded decisively, or the lag changes by less than 10 ms.
+    `pairs` are signals at `t` (N,) and IMU signals at `t_imu`. `independent` is the number of
+    independent samples. A drift that is insignificant or below 10 ms is 0.
     """
     tau = t - t.mean()
     found = np.array([lag, 0.0])
@@ -87,7 +79,7 @@ def clock_drift(
             basis = np.column_stack([np.ones(len(t)), moved])
             Q = np.linalg.qr(basis)[0]
             mapped = np.linalg.lstsq(basis, y, rcond=1e-6)[0][1:]
-            # What a small shift does, beyond what another map could do as well.
+            # Effects of a small shift that a change of the map cannot reproduce.
             effects = [rate @ mapped, tau[:, None] * (rate @ mapped)]
             size = np.sqrt(y.var(axis=0).sum() + 1e-12)
             rows.append(np.stack([(e - Q @ (Q.T @ e)).ravel() / size for e in effects], axis=1))
@@ -105,7 +97,7 @@ def clock_drift(
 
 
 def _unmapped(y: NDArray[np.float64], x: NDArray[np.float64]) -> float:
-    """Share of the variance of y (N, 3) that no affine map of x (N, 3) explains."""
+    """Return the share of the variance of y (N, 3) that no affine map of x explains."""
     y, x = y - y.mean(axis=0), x - x.mean(axis=0)
     both, total = x.T @ y, float((y * y).sum()) + 1e-12 * len(y)
     explained = (both * (np.linalg.pinv(x.T @ x, rcond=1e-12, hermitian=True) @ both)).sum()

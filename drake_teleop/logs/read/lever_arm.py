@@ -1,12 +1,6 @@
-"""Where an accelerometer sits on the sensor, from the wrench of a rigid load.
+"""Position of an accelerometer on the sensor, from the wrench of a rigid load, Eqs. (T20), (T21).
 
-An accelerometer at Io, a point of the body of S, measures in the axes of S, up to a bias,
-
-    s_I = s + alpha x p + omega x (omega x p) = s + K p,    p = p_SoIo_S
-
-with the specific force s of So and the motion of S. Force and torque, Eqs. (1)-(2), are linear in
-s, and while a shift of the accelerometer looks like a shift of the centre of mass in the force
-alone, the torque knows the centre of mass from the weight. So the wrench tells p.
+The force determines m c - m p, the torque determines m c.
 """
 
 from __future__ import annotations
@@ -26,25 +20,25 @@ from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.jackknife import RANK, solve
 
 LEVER_KNOWN = 0.005
-"""A coordinate of the accelerometer is determined if its standard deviation is below this [m]."""
+"""Largest standard deviation of a determined coordinate [m]."""
 BELIEVABLE = 0.05
-"""A fit that leaves more of the variance than this tells nothing."""
+"""Largest unexplained share of the variance of a valid fit."""
 CUTOFF = 8.0
-"""Of the low-pass on everything [Hz]."""
+"""Cut-off of the low-pass on all signals [Hz]."""
 SAMPLES = 1500
-"""As many are compared."""
-# Least ratio of a motion's power to that of its noise, for a lever arm 5 % too short at worst.
+"""Number of compared samples."""
+# Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
 _SIGNAL = 20.0
 
 
 @dataclass(frozen=True)
 class LeverArm:
-    """Where the accelerometer is.
+    """Estimated position of the accelerometer.
 
-    Args:
-        p_SoIo_S: (3,) its position in S, on top of what the description says already [m].
-        deviations: (3,) standard deviations [m]; inf along an axis that the motion says nothing of.
-        source: "pose" or "wrench", which told it.
+    Attributes:
+        p_SoIo_S: (3,) relative to the described position, in S [m].
+        deviations: (3,) standard deviations [m]; inf if undetermined.
+        source: "pose" or "wrench".
     """
 
     p_SoIo_S: NDArray[np.float64]
@@ -53,23 +47,15 @@ class LeverArm:
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """(3,) the verdict on each axis."""
+        """(3,) whether each coordinate is determined."""
         return self.deviations < LEVER_KNOWN
 
 
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
-    """The lever arm of an accelerometer from the wrench of a rigid load that touches nothing.
+    """Fit offsets, load, delay and lever arm to the wrench of a rigid load, Eq. (T21).
 
-    Least squares of the wrench over offsets, load, delay and lever arm together: the wrench of
-    Eqs. (1)-(2) with s = s_measured - K p. Forces and torques are weighted by their own residuals.
-    All signals are low-passed at 8 Hz.
-
-    Args:
-        log: its specific force is that of the accelerometer, in the axes of S.
-
-    Returns:
-        None if the load leaves more than 5 % of the wrench's variance: then something is touched;
-        or if gaps leave less than a tenth of the record.
+    The log contains the accelerometer's specific force, in the axes of S. Returns None if more than
+    5 % of the variance remains (contact), or a tenth of the record is not available.
     """
     cutoff = min(CUTOFF, 0.2 / log.dt)
     delay = estimate_delay(log, None) or 0.0
@@ -102,24 +88,24 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
 def common_times(
     start: float, stop: float, logs: Sequence[Log], cutoff: float
 ) -> NDArray[np.float64]:
-    """Evenly spaced times at which all logs have samples, and not bridges over gaps."""
+    """Return evenly spaced times at which all logs have samples."""
     t = np.linspace(start, stop, SAMPLES)
     known = [np.interp(t, log.t, measured(log, cutoff).astype(float)) > 0.99 for log in logs]
     return t[np.all(known, axis=0)]
 
 
 def lever_matrix(omega: NDArray[np.float64], alpha: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 3, 3) K = [alpha x] + [omega x]^2: K p is what p adds to the specific force."""
+    """Return (N, 3, 3) K of Eq. (T20)."""
     W = cross_matrix(omega)
     return cross_matrix(alpha) + W @ W
 
 
 def shown_axes(K: NDArray[np.float64], log: Log, cutoff: float) -> NDArray[np.bool_]:
-    """(3,) lever arms that the motion shows, and not only its noise.
+    """Return (3,) axes along which the motion exceeds its noise.
 
-    Noise in K is not seen in residuals: it draws the lever arm to zero, with confidence. The power
-    per Hz of white noise that was differentiated grows with the square of the frequency at least,
-    so below the cut-off there is at most a seventh of what is in the octave above it.
+    Noise in K biases the lever arm to zero and is not visible in residuals. The power density of
+    differentiated white noise grows at least with f^2, so the noise below the cut-off is at most a
+    seventh of that in the next octave.
     """
     alpha = log.angular_acceleration
     above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)

@@ -1,4 +1,4 @@
-"""The block means of a log with the motion that it has."""
+"""Block means of a log."""
 
 from __future__ import annotations
 
@@ -8,11 +8,7 @@ from drake_teleop.logs.read.canonical import Log
 
 
 def log_instants(log: Log) -> Instants:
-    """Return the block means of wrench and motion.
-
-    Args:
-        log: with its motion.
-    """
+    """Return block means of wrench and motion."""
     gravity = None
     motion: tuple[Array, ...] = log.motion
     if log.R_WS is not None and log.gravity_W is not None:

@@ -1,9 +1,7 @@
-"""MATLAB's files up to version 7: variables, and fields of structures, that are arrays of numbers.
+"""Numeric arrays of MATLAB files up to version 7, with fields of structures.
 
-Files of version 5 to 7 are taken apart here (MathWorks, MAT-File Format, chapter 1), because what a
-broken or planted file says leads SciPy's reader out of its memory, which ends the process; those of
-version 4, one array after the other, are SciPy's. All else (texts, cells, sparse and complex
-matrices, objects) is passed over.
+Versions 5 to 7 are parsed here (MathWorks, MAT-File Format), because invalid files can crash
+SciPy's reader. Other types are ignored.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _HEADER, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _DEEPEST = 128, 14, 15, 2, 1 << 11, 20
-_NUMBERS = range(6, 16)  # classes
+_NUMBERS = range(6, 16)  # numeric classes
 _TYPES = {
     1: "i1",
     2: "u1",
@@ -36,10 +34,10 @@ _BROKEN = "it is broken, or not all of it is there"
 
 
 def read_mat(path: Path) -> dict[str, NDArray]:
-    """Arrays by name; those in structures as `structure.field`.
+    """Return arrays by name; fields are named `structure.field`.
 
     Raises:
-        ValueError: if it is no such file, not all of one, or has no arrays.
+        ValueError: if the file is invalid or has no arrays.
     """
     from scipy.io import loadmat
     from scipy.io.matlab import matfile_version
@@ -63,7 +61,7 @@ def read_mat(path: Path) -> dict[str, NDArray]:
 
 
 def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """The kind of each element, and what is in it."""
+    """Yield type and content of each element."""
     start = 0
     while start < len(data):
         if len(data) - start < 8:
@@ -84,7 +82,7 @@ def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
 def _take(
     kind: int, content: memoryview, order: str, name: str | None, depth: int, found: dict
 ) -> None:
-    """Puts the arrays of one variable, or of a field by its name, with those that were found."""
+    """Add the arrays of a variable or named field to `found`."""
     parts = list(_elements(content, order)) if kind == _MATRIX else []
     if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _FLAGS_AND_SIZE:  # objects have no size
         return
@@ -112,7 +110,7 @@ def _numbers(part: tuple[int, memoryview], order: str) -> NDArray:
 
 
 def _put(name: str, array: NDArray, found: dict[str, NDArray]) -> None:
-    """A row or a column is a list, and a single number nothing. MATLAB counts matrices last."""
+    """Add an array: vectors as 1-D, matrix stacks with the stack axis first."""
     if array.size < 2 or not name:
         return
     if array.ndim == 2 and 1 in array.shape:

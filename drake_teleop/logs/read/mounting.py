@@ -1,16 +1,7 @@
-"""How an IMU sits on the sensor: its rotation, its place and its clock, from the data.
+"""Rotation, position and clock of an IMU on the sensor, by comparison with the pose, Eq. (T20).
 
-An accelerometer at Io, a point of the body of S, measures in its own axes I, up to a bias,
-
-    R_SI s_I = s + alpha x p + omega x (omega x p) = s + K p,    p = p_SoIo_S
-
-with the specific force s of So and the motion of S. A pose with position gives s, omega and alpha,
-hence R_SI and p. A pose without position gives s only as far as So does not accelerate: R_SI is
-found, and p would be the distance from the centre of the rotation, so it is not told. The wrench
-may tell it then (`lever_arm`).
-
-Standard deviations are those of a `jackknife`. They contain noise, but not what interpolation
-between the samples of a pose does (about 0.1 % of p) nor the errors of scale of an accelerometer.
+Without positions only the rotation is found. Standard deviations are those of `jackknife`; they
+exclude interpolation (about 0.1 % of p) and scale errors.
 """
 
 from __future__ import annotations
@@ -36,33 +27,30 @@ from drake_teleop.logs.read.lever_arm import (
 from drake_teleop.logs.read.rotations import right_angled_rotations, rotation_matrices
 
 RIGHT_ANGLED_DEG = 5.0
-"""A mounting within this angle of one that only exchanges axes counts as right-angled."""
+"""Largest angle from an exchange of axes of a right-angled mounting."""
 ROTATION_KNOWN_DEG = 1.0
-"""A rotation is determined if its standard deviation about every axis is below this."""
+"""Largest standard deviation of a determined rotation."""
 BELIEVABLE_GRAVITY = 0.005
-"""The same of specific forces that are compared with gravity alone, as accelerations may look like
-a rotation."""
+"""As `BELIEVABLE`, without positions: unmodelled accelerations resemble a rotation."""
 _REACH = 1.0
 
 
 @dataclass(frozen=True)
 class Mounting:
-    """The IMU against the pose.
+    """Mounting of the IMU relative to the pose.
 
-    Args:
-        R_SI: (3, 3) rotation from the axes of the IMU's stream to S: `imu.frame` on top of what the
-            description says already.
-        lag_s: how far the IMU's clock is behind that of the pose: the best single shift [s].
-        lag_middle_s: the same in the middle of the record, if the clocks drift; else `lag_s`.
-        middle_s: that instant, on the clock of the pose [s].
-        drift: growth of the lag [s/s]; 0 if the record does not show one.
-        unexplained: share of the variance of the specific force that this leaves.
+    Attributes:
+        R_SI: (3, 3) rotation from the described IMU axes to S.
+        lag_s: constant lag of the IMU's clock behind the pose's clock [s].
+        lag_middle_s: lag at mid-record [s].
+        middle_s: mid-record on the pose's clock [s].
+        drift: growth of the lag [s/s]; 0 if insignificant.
+        unexplained: share of the specific force's variance.
         unexplained_turning: the same of the angular velocity; None without a gyroscope.
-        mirrored: a reflection fits decisively better, so R_SI means nothing.
-        speed_ratio: rms angular speed of the gyroscope over that of the pose; None without one.
-        deviations_deg: (3,) standard deviations of R_SI about the axes of S [deg]; inf about an
-            axis that the motion says nothing of.
-        lever: of the accelerometer; None if the pose has no position.
+        mirrored: a reflection fits clearly better, so R_SI is invalid.
+        speed_ratio: angular speed of gyroscope over pose (rms), or None.
+        deviations_deg: (3,) standard deviations about the axes of S [deg].
+        lever: lever arm; None without positions.
     """
 
     R_SI: NDArray[np.float64]
@@ -84,7 +72,7 @@ class Mounting:
 
     @property
     def right_angled(self) -> NDArray[np.float64]:
-        """(3, 3) the nearest of the 24 rotations that only exchange and turn axes."""
+        """(3, 3) nearest of the 24 rotations that map axes to axes."""
         return max(right_angled_rotations(), key=lambda R: float(np.trace(R.T @ self.R_SI)))
 
     @property
@@ -94,44 +82,39 @@ class Mounting:
 
     @property
     def is_right_angled(self) -> bool:
-        """Whether axes only change places and signs."""
+        """Whether R_SI maps axes to axes."""
         return self.oblique_deg < RIGHT_ANGLED_DEG
 
     @property
     def fits(self) -> bool:
-        """Whether IMU and pose agree, so that the rest means something."""
+        """Whether IMU and pose agree."""
         turning = self.unexplained_turning is None or self.unexplained_turning < BELIEVABLE
         if self.lever is not None:
             return not self.mirrored and turning and self.unexplained < BELIEVABLE
-        # Without a position the pose knows the angular velocity, but not the acceleration.
+        # Without positions the pose determines the angular velocity, but not the acceleration.
         known = self.unexplained_turning is not None or self.unexplained < BELIEVABLE_GRAVITY
         return not self.mirrored and turning and known
 
     @property
     def determined(self) -> bool:
-        """Whether the motion shows the rotation about every axis."""
+        """Whether the rotation about every axis is determined."""
         return self.fits and bool((self.deviations_deg < ROTATION_KNOWN_DEG).all())
 
 
 def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | None:
-    """Rotation, place and clock of an IMU, from two readings of the same log.
+    """Estimate rotation, position and clock of an IMU from two readings of a log.
 
-    First the clock, to about 10 ms within +-1 s: at every shift, free linear maps of specific force
-    and, with a gyroscope, angular velocity are fitted, which do not depend on the axes; a drift of
-    the clocks is fitted on top, see `clock_drift`. Then
-    R s_imu + b = s_pose + K p, and R omega_imu + b = omega_pose, by nonlinear least squares over
-    the rotation R, constants b, the lever arm p and the clock, from the rotation of Kabsch (1976);
-    the two sensors are weighted by their own residuals. All signals are low-passed at 8 Hz.
+    First the clock is found within +-1 s by free linear maps. Then least squares refine rotation,
+    biases, lever arm and lag, from the rotation of Kabsch (1976). Each sensor is weighted by its
+    residual, and all signals are low-passed at 8 Hz.
 
     Args:
         imu: specific force and angular velocity from the IMU.
         pose: the same from the pose alone.
-        position: whether the pose has positions. If not, its specific force is minus gravity, p is
-            the place of the accelerometer from the centre of the rotation, and it is not told.
+        position: whether the pose has positions.
 
     Returns:
-        None if the specific force changes by less than 0.5 m/s^2 (rms), or gaps leave less than a
-        tenth of the record, so that nothing can be said.
+        None if the specific force changes by less than 0.5 m/s^2 (rms), or gaps leave too little.
     """
     start, stop = max(imu.t[0], pose.t[0]), min(imu.t[-1], pose.t[-1])
     reach = min(_REACH, 0.2 * float(stop - start))
@@ -140,14 +123,14 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     t = common_times(start + reach, stop - reach, (imu, pose), cutoff)
     if len(t) < SAMPLES // 10:
         return None
-    # Without a gyroscope both readings have the angular velocity of the pose.
+    # Without a gyroscope both readings contain the angular velocity of the pose.
     omega_imu, omega = (resample(t, log.t, log.angular_velocity) for log in (imu, pose))
     gyroscope = not np.allclose(omega_imu, omega, atol=1e-9)
     pairs = signal_pairs(t, sensed, smooth, gyroscope)
     expected = pairs[0][0]
     if expected.var(axis=0).sum() < 0.25:
         return None
-    # A gyroscope tells the clock. Without one, a long lever arm must not be taken for a late clock.
+    # Without a gyroscope, a long lever arm resembles a lag, so its effects are removed.
     arm = np.zeros((len(t), 1))
     if not gyroscope:
         omega, alpha = (resample(t, pose.t, x) for x in smooth.motion[1:])
@@ -157,7 +140,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     middle, drift = clock_drift(t, pairs, imu.t, lag, 2 * cutoff * float(t[-1] - t[0]))
     R, mirrored = _kabsch(resample(t + middle + drift * (t - centre), imu.t, pairs[0][1]), expected)
 
-    # With the clock known, more of the record can be used.
+    # The estimated lag allows the use of more samples.
     margin = min(reach, abs(middle) + 0.5 * abs(drift) * float(stop - start) + 0.1)
     t = common_times(start + margin, stop - margin, (imu, pose), cutoff)
     pairs = signal_pairs(t, sensed, smooth, gyroscope)
@@ -197,20 +180,19 @@ def _refined(
     R: NDArray[np.float64],
     lag: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """The least squares of `find_mounting`.
+    """Solve the least squares of `find_mounting`.
 
     Args:
-        t: (N,) times on the clock of the pose [s].
-        later: (N,) what a drift of the clocks adds to the lag by then [s].
-        t_imu: (M,) times of the IMU's samples, on its own clock [s].
-        pairs: specific force [m/s^2] and, with a gyroscope, angular velocity [rad/s]: (N, 3) of the
-            pose and (M, 3) of the IMU.
-        K: (N, 3, 3) of the module docstring.
-        R, lag: R_SI and the lag [s] to begin with.
+        t: (N,) on the pose's clock [s].
+        later: (N,) lag by drift [s].
+        t_imu: (M,) on the IMU's clock [s].
+        pairs: k signals, (N, 3) of the pose and (M, 3) of the IMU.
+        K: (N, 3, 3) of Eq. (T20).
+        R, lag: start.
 
     Returns:
-        (7 + 3 k,) rotation vector on top of R in S [rad], lag [s], p [m] and the k constants b;
-        their standard deviations; (N, 3 k) what is left. k is the number of pairs.
+        (7 + 3 k,) rotation vector [rad], lag [s], p [m] and biases; their standard deviations;
+        (N, 3 k) residuals.
     """
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
 
@@ -231,7 +213,7 @@ def _refined(
 
 
 def _kabsch(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
-    """The rotation R of the smallest |y - R x - b|, and whether a reflection fits far better."""
+    """Return R of least |y - R x - b|, and whether a reflection fits clearly better."""
     x, y = x - x.mean(axis=0), y - y.mean(axis=0)
     U, _, Vt = np.linalg.svd(y.T @ x)
     side = np.linalg.det(U @ Vt)
@@ -241,7 +223,7 @@ def _kabsch(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.
 
 
 def _turned(R: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """R turned by a rotation vector (3,) in S [rad]."""
+    """Return R rotated by a rotation vector (3,) in S [rad]."""
     return rotation_matrices(vector[None], "rotation_vector")[0] @ R
 
 

@@ -1,4 +1,4 @@
-"""The orientations of a stream: its columns, made rotations some rows at a time."""
+"""Orientations of a stream, converted in blocks of rows."""
 
 from __future__ import annotations
 
@@ -19,15 +19,7 @@ from drake_teleop.logs.read.tables import Table
 
 
 class Orientations:
-    """What a table says of the orientations R_WS, or of their inverses.
-
-    Args:
-        description: which has the unit of angles.
-        orientation: which columns, and in which form.
-        table: the stream's file.
-        rows: how many rows of it are read.
-        where: of the description's field, for messages.
-    """
+    """Orientations R_WS, or their inverses, of `rows` rows of a table."""
 
     def __init__(
         self,
@@ -44,27 +36,19 @@ class Orientations:
             self._columns *= description.scale(orientation.unit)
 
     def rotations(self, rows: NDArray[np.intp]) -> NDArray[np.float64]:
-        """(n, 3, 3) R_WS of n rows.
-
-        Raises:
-            DrakeTeleopError: if one is farther from a rotation than rounding makes it.
-        """
+        """Return (n, 3, 3) R_WS of n rows; raise an error for other matrices."""
         R = rotation_matrices(self._columns[rows], self._orientation.form)
         self._check(rotation_error(R), rows)
         return nearest_rotation(np.swapaxes(R, 1, 2) if self._orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> NDArray[np.float64]:
-        """(n, 4) [w, x, y, z] of `rotations`, without matrices where the log has none.
-
-        Raises:
-            DrakeTeleopError: as there.
-        """
+        """Return (n, 4) [w, x, y, z] of `rotations`, without matrices where possible."""
         if not self._orientation.form.startswith("quaternion"):
             return quaternions(self.rotations(rows))
         q = self._columns[rows]
         if self._orientation.form == "quaternion_xyzw":
             q = np.roll(q, 1, axis=1)
-        squared = np.einsum("ij,ij->i", q, q)  # q stands for the matrix of this, times a rotation
+        squared = np.einsum("ij,ij->i", q, q)  # the matrix of q is this, times a rotation
         self._check(np.abs(squared**2 - 1.0), rows)
         q /= np.sqrt(squared)[:, None]
         if self._orientation.inverse:
@@ -72,7 +56,6 @@ class Orientations:
         return q
 
     def _check(self, errors: NDArray[np.float64], rows: NDArray[np.intp]) -> None:
-        """Refuses errors of `rotation_error` that are not of rounding."""
         worst = int(np.argmax(errors))
         if errors[worst] > ROTATION_TOLERANCE:
             row = rows[worst] + self._table.first_row

@@ -1,4 +1,4 @@
-"""From a file to a `Log`: canonical tables and descriptions alike (long: stream by stream)."""
+"""Conversion of a canonical table or a described recording into a `Log`."""
 
 from __future__ import annotations
 
@@ -54,25 +54,21 @@ _BRIDGED = 4.0
 def read_log(
     path: str | Path, *, bandwidth_hz: float | None = 30.0, differentiate: bool = True
 ) -> Log:
-    """Reads a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
+    """Read a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
 
-    Streams are brought to the wrench's clock and its median rate by linear interpolation, over the
-    time that all of them cover; faster streams pass a zero-phase low-pass first, so that nothing is
-    folded down. What becomes of doubtful time stamps, and what a gap is, stands in
-    `drake_teleop.logs.read.clocks`; gaps are marked in `Log.bridged`. Angular velocity is taken
-    from the gyroscope if there is one, else from the orientation; angular acceleration from the
-    file, else by differentiating the angular velocity, else the orientation; the specific force
-    from the accelerometer (moved to the origin of S by its lever arm), else from the position, else
-    it is minus gravity, and a note says so.
+    Streams are interpolated on the wrench's clock at its median rate; faster streams are low-passed
+    first. For time stamps and gaps see `drake_teleop.logs.read.clocks`. Angular velocity comes from
+    the gyroscope, else the orientation; angular acceleration from the file, else by
+    differentiation; specific force from the accelerometer, else the position, else it is -gravity.
 
     Args:
         path: the file.
-        bandwidth_hz: of the smoother that differentiates; see `smooth_derivatives`.
-        differentiate: whether poses are differentiated that alone tell the motion; if not, the
-            motion is zero, and `Log.posed` is there for those who have a better way.
+        bandwidth_hz: see `smooth_derivatives`.
+        differentiate: False leaves the motion zero where poses are its only source, for users of
+            `Log.posed`.
 
     Raises:
-        DrakeTeleopError: naming file and field and what to do, if the log cannot be used.
+        DrakeTeleopError: naming file, field and remedy.
     """
     expect((str, Path), path, "log", "give the file's name")
     if bandwidth_hz is not None and not number("bandwidth_hz", bandwidth_hz) >= _LEAST_HZ:
@@ -103,21 +99,12 @@ def read_description(
     *,
     tables: dict[Path, Table] | None = None,
 ) -> Log:
-    """The log of a description in memory, as of `read_log`.
-
-    Args:
-        description: with absolute paths.
-        source: the file, for messages.
-        tables: files that are read already.
-
-    Raises:
-        DrakeTeleopError: if the log cannot be used.
-    """
+    """Return the log of a description with absolute paths, as `read_log`."""
     return _Reader(description, source, 30.0, tables).log()
 
 
 class _Reader:
-    """Reads the streams of one description; holds what they have in common."""
+    """Reader of the streams of one description."""
 
     def __init__(
         self,
@@ -176,7 +163,7 @@ class _Reader:
         *,
         differentiate: bool = True,
     ) -> None:
-        """Puts what the data say in the place of `auto`."""
+        """Replace `auto` by the estimates of `describe`."""
         self._description, notes = describe(
             self._description,
             self._source,
@@ -185,7 +172,7 @@ class _Reader:
         self._notes += notes
 
     def _another(self, description: Description, *, differentiate: bool = True) -> Log:
-        """The log with another description of the same files."""
+        """Return the log of another description of the same files."""
         for name in ("wrench", "imu", "pose"):
             if (stream := getattr(self._description, name)) is not None:
                 self._table(stream)
@@ -217,7 +204,7 @@ class _Reader:
     def _vectors(
         self, name: str, field: str, quantity: Any, table: Table, rows: int, sign: float = 1.0
     ) -> NDArray[np.float64]:
-        """(rows, 3) of a stream's field in SI, in the axes of the file, of a size that can be."""
+        """Return (rows, 3) values of a field in SI units, in the axes of the file."""
         where = f"{self._source}:{name}.{field}.columns"
         values = table.numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
@@ -231,10 +218,7 @@ class _Reader:
         return values
 
     def _pose(self, stream: Pose, *, differentiate: bool) -> Stream:
-        """The motion by differentiation, unless it is not wanted and the poses are enough.
-
-        Of an hour at 1 kHz the poses fit into memory, their rotations and derivatives do not.
-        """
+        """Return the differentiated motion, or only the poses to save memory."""
         table = self._table(stream)
         clock = self._clock("pose", stream, table)
         t, raw = uniform_times(clock.t), None
@@ -264,7 +248,7 @@ class _Reader:
     def _poses_of_S(
         self, stream: Pose, table: Table, clock: Clock
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-        """(N, 4) quaternions [w, x, y, z] of R_WS, and (N, 3) p_WoSo_W if there are positions."""
+        """Return (N, 4) quaternions [w, x, y, z] of R_WS, and (N, 3) p_WoSo_W or None."""
         position = None
         if stream.position is not None:
             position = self._vectors("pose", "position", stream.position, table, clock.total)
@@ -280,7 +264,7 @@ class _Reader:
                 if stream.R_SP is not None:
                     R_WS = R_WS @ stream.R_SP.T
                     q = quaternions(R_WS)
-                if position is not None:  # from the posed origin to that of S
+                if position is not None:  # from Po to So
                     position[part] -= R_WS @ origin
             quaternion[part] = q
         return quaternion, position
@@ -308,7 +292,7 @@ class _Reader:
         if s is not None and any(stream.position):
             s = at_S(s, np.array(stream.position), t, omega, alpha, pose)
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
-        kept = raw_t[at] - raw_t[at - 1] < _BRIDGED * dt  # not within a gap
+        kept = raw_t[at] - raw_t[at - 1] < _BRIDGED * dt  # outside of gaps
         both = (None if x is None else x[kept] for x in (s, omega))
         return Stream("imu", t, s, omega, alpha, told=Inertial(t[kept], *both))
 
@@ -374,7 +358,7 @@ class _Reader:
         return replace(log, gain_std=stream.gain_std, described=described, resolution=resolution)
 
     def _resolution(self, stream: Static, table: Table) -> tuple[float, float]:
-        """Step of the numbers of force and torque [N, N m]."""
+        """Return the steps of force and torque [N, N m]."""
         force, torque = (
             decimal_step(table.numbers(quantity.columns, 3, f"static.{field}", table.rows))
             * (self._description.scale(quantity.unit) * np.abs(quantity.scale).max())
@@ -383,7 +367,7 @@ class _Reader:
         return force, torque
 
     def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
-        """Strictly increasing times of a stream, and the rows of the table that they belong to."""
+        """Return the times of a stream; record its notes and gaps."""
         columns = [
             column
             for field in type(stream).model_fields
@@ -414,7 +398,7 @@ class _Reader:
         return clock
 
     def _half_window(self, dt: float) -> float:
-        """How far to either side a derivative has seen [s]."""
+        """Return half the window of a derivative [s]."""
         window = SMOOTHER_WINDOW / self._bandwidth_hz if self._bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 
@@ -430,7 +414,7 @@ class _Reader:
     def _common_time(
         self, wrench_t: NDArray[np.float64], streams: Sequence[Stream]
     ) -> NDArray[np.float64]:
-        """Uniform times at the wrench's rate, over the time that all streams cover."""
+        """Return uniform times at the wrench's rate that all streams cover."""
         start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
         stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])
         spans = "; ".join(
@@ -445,7 +429,7 @@ class _Reader:
             )
         uniform = uniform_times(wrench_t)
         dt = spacing(uniform)
-        # A rounding error of the clocks must not cost the first and the last sample.
+        # Rounding of the clocks must not exclude the first and last sample.
         inside = (uniform >= start - 1e-6 * dt) & (uniform <= stop + 1e-6 * dt)
         t = uniform[inside]
         if len(t) < MINIMUM_SAMPLES:
@@ -492,7 +476,7 @@ class _Reader:
         )
 
     def _bridged(self, t: NDArray[np.float64]) -> NDArray[np.bool_] | None:
-        """(N,) samples that a gap of any stream has touched; None without gaps."""
+        """Return (N,) flags of samples that a gap affects, or None."""
         if not self._gaps:
             return None
         flags = np.zeros(len(t), bool)

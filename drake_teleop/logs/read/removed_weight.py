@@ -1,4 +1,4 @@
-"""The weight of a payload that the robot has subtracted from the wrench, added back."""
+"""Weight of a payload that the robot has subtracted from the wrench."""
 
 from __future__ import annotations
 
@@ -14,20 +14,15 @@ from drake_teleop.logs.read.log_instants import log_instants
 
 
 def weight_of(weight: NDArray[np.float64], gravity: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 6) wrench of [m, m c] (4,) at rest in gravity (N, 3) in S, sign of Eq. (1)."""
+    """Return the (N, 6) wrench of [m, m c] at rest in gravity (N, 3) in S, Eq. (1)."""
     return np.hstack([-weight[0] * gravity, np.cross(weight[1:], -gravity)])
 
 
 def restored(log: Log, weight: NDArray[np.float64], moved: Log) -> Log:
-    """Add a weight back to the wrench.
+    """Return the log with the weight of [m, m c] (4,) in S [kg, kg m] added to its wrench.
 
-    The robot's own pose, from which it has calculated the weight, belongs to the wrench's clock:
-    the recorded orientation is taken at the delay of the motion behind the wrench.
-
-    Args:
-        log: the log.
-        weight: (4,) [m, m c] in S [kg, kg m].
-        moved: the same log with its motion and gravity.
+    The robot's own pose has the wrench's clock, so the orientation in `moved`, the same log with
+    motion, is evaluated at the delay.
     """
     assert moved.gravity is not None
     at = np.clip(log.t + free_delay(log_instants(moved)), moved.t[0], moved.t[-1])

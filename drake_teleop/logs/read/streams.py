@@ -1,4 +1,4 @@
-"""Signals on a clock of their own, brought to another, and vectors turned to the axes of S."""
+"""Signals of one stream on its clock: resampling and transformation to S."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ LARGEST = {
     "angular_acceleration": (1e9, "rad/s^2"),
     "position": (1e9, "m"),
 }
-"""What no log holds, not even in wrong units within reach: those are told by what they explain."""
+"""Largest plausible value of each signal and its unit, also for wrong units."""
 
 
 @dataclass(frozen=True)
 class Stream:
-    """Signals on one clock. Arrays (N, ...) or None; `t` is [s] on the common clock.
+    """Signals (N, ...) on one clock `t` [s], or None.
 
-    `raw` are the poses of S as they were recorded, `told` what an IMU tells of S.
+    `raw` are the recorded poses of S, `told` the IMU data in S.
     """
 
     name: str
@@ -40,26 +40,26 @@ class Stream:
 
     @property
     def dt(self) -> float:
-        """Usual time from one sample to the next [s]."""
+        """Mean sample spacing [s]."""
         return spacing(self.t)
 
 
 def on_clock(
     t: NDArray[np.float64], stream: Stream, values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """`values` of a stream at times `t`, without what is too fast for their spacing."""
+    """Return `values` of a stream at times `t`, low-passed if the stream is faster."""
     rate = 1 / spacing(t)
     faster = stream.dt * rate < 0.9
     return resample(t, stream.t, low_pass(values, stream.dt, 0.4 * rate if faster else None))
 
 
 def in_S(R_WS: NDArray[np.float64], vectors_W: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 3) vectors in S, of such in W."""
+    """Return (N, 3) vectors in S of vectors in W."""
     return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
 
 
 def turned_wrench(R_SW: NDArray[np.float64], wrench_W: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 6) wrenches in S, of such in W."""
+    """Return (N, 6) wrenches in S of wrenches in W."""
     both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
     return both.reshape(-1, 6)
 
@@ -72,7 +72,7 @@ def at_S(
     alpha: NDArray[np.float64] | None,
     pose: Stream | None,
 ) -> NDArray[np.float64]:
-    """Specific force of So from the one measured at Io, a point of the same rigid body."""
+    """Return the specific force of So from that of Io on the same rigid body."""
     if omega is None or alpha is None:
         assert pose is not None and pose.angular_velocity is not None
         assert pose.angular_acceleration is not None

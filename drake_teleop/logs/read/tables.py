@@ -1,7 +1,4 @@
-"""Tables of numbers from files of text, Parquet, NPZ, MAT; messages name file, column, row.
-
-Topics of bags become the same kind of table in `drake_teleop.logs.read.bags`.
-"""
+"""Tables of numbers from text, Parquet, NPZ and MAT files; errors name file, column and row."""
 
 from __future__ import annotations
 
@@ -28,25 +25,24 @@ if TYPE_CHECKING:
 _TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
 FORMATS = (*_TEXT, ".parquet", ".npz", ".mat")
 LARGEST = 1e25
-"""Numbers beyond are none that were measured, in whatever unit: nanoseconds since 1970 are 2e18."""
+"""Largest plausible number in any unit; nanoseconds since 1970 are 2e18."""
 _CANONICAL = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
 _Column = TypeVar("_Column")
-_PARTS = 16  # numbers of an array that are columns of their own: up to a homogeneous matrix
+_PARTS = 16  # elements of an array with their own columns: up to a homogeneous matrix
 _MOST_DECIMALS = 12
 _LARGE = 2**24
-"""Numbers in a table that are more than is kept in memory, where the file's format allows it."""
+"""Number of cells above which columns of a Parquet file are read on access."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """The columns of one file.
+    """Columns of one file.
 
-    Args:
-        path: the file, for messages.
-        columns: name to array (N,) or, from NPZ and MAT files, (N, ...), whose numbers are columns
-            of their own as well, `name[0]` and so on in row-major order; of any type as yet.
-        first_row: number of the first data row in the file as a reader counts, for messages.
-        absent: groups of columns, such as "orientation", that the file says it does not have.
+    Attributes:
+        path: file name for messages.
+        columns: arrays (N,) of any type by name; also (N, ...) with columns `name[0]`, row-major.
+        first_row: number of the first data row in the file.
+        absent: groups that the file marks as not provided.
     """
 
     path: Path
@@ -62,19 +58,10 @@ class Table:
     def numbers(
         self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
     ) -> NDArray[np.float64]:
-        """(N, width) finite numbers from the named columns side by side.
+        """Return (N, width) finite numbers of the named columns, side by side.
 
-        An array with several columns counts as that many, row-major.
-
-        Args:
-            names: of the columns.
-            width: how many they have to be.
-            where: the field that names them, for messages.
-            rows: how many rows they have to have; None for the same number in all of them.
-
-        Raises:
-            DrakeTeleopError: if a column is absent, a cell is no finite number, or the numbers of
-                columns and rows are not these.
+        `where` is the field for messages. Raises an error if a column is absent, a cell is not
+        finite, or `width` or `rows` differ.
         """
         columns = [self._column(str(name), where) for name in names]
         self._check_rows(names, columns, where, rows)
@@ -90,7 +77,6 @@ class Table:
     def _check_rows(
         self, names: Sequence[str | int], columns: list[NDArray], where: str, rows: int | None
     ) -> None:
-        """Raises an error if not all have so many rows, or None: as many as the first."""
         rows = len(columns[0]) if columns and rows is None else rows
         for name, column in zip(names, columns, strict=True):
             if len(column) != rows:
@@ -101,25 +87,13 @@ class Table:
                 )
 
     def all_raw(self, names: Sequence[str | int], where: str) -> NDArray[np.float64]:
-        """`raw` of several columns, side by side.
-
-        Raises:
-            DrakeTeleopError: as `raw`, and if they have different numbers of rows.
-        """
+        """Return `raw` of several columns with equal numbers of rows, side by side."""
         columns = [self.raw(name, where) for name in names]
         self._check_rows(names, columns, where, None)
         return np.hstack(columns)
 
     def raw(self, name: str | int, where: str) -> NDArray[np.float64]:
-        """(N, k) numbers of one column, whatever they are: NaN and infinity included.
-
-        Args:
-            name: of the column.
-            where: the field that names it, for messages.
-
-        Raises:
-            DrakeTeleopError: if the column is absent or a cell is no number.
-        """
+        """Return (N, k) numbers of a column, NaN and infinity included; raise an error if absent."""
         name = str(name)
         if name not in self.columns:
             return self._column(name, where)
@@ -128,15 +102,7 @@ class Table:
         return numbers
 
     def single(self, name: str | int, where: str) -> NDArray[np.float64]:
-        """(N,) numbers of a column that is one wide, whatever they are: NaN and infinity included.
-
-        Args:
-            name: of the column.
-            where: the field that names it, for messages.
-
-        Raises:
-            DrakeTeleopError: if the column is absent, wider, or a cell is no number.
-        """
+        """Return (N,) numbers of a column as `raw`; raise an error if it is wider."""
         numbers = self.raw(name, where)
         if numbers.shape[1] != 1:
             raise DrakeTeleopError(
@@ -154,18 +120,7 @@ class Table:
         where: str,
         remedy: str = "check the column and its unit, or delete the row",
     ) -> None:
-        """Refuses what cannot have been measured, and would be beyond all floats when squared.
-
-        Args:
-            values: (N, k), a row for each of the table's.
-            largest: size of a value, in the unit.
-            unit: for the message.
-            where: the field, for the message.
-            remedy: for the message.
-
-        Raises:
-            DrakeTeleopError: naming the first row with a number that is larger, but not infinite.
-        """
+        """Raise an error for the first row with a finite value beyond `largest`."""
         if not values.size or (values.min() >= -largest and values.max() <= largest):
             return
         bad = ((np.abs(values) > largest) & np.isfinite(values)).any(axis=1)
@@ -221,7 +176,7 @@ class Table:
 
 
 def decimal_step(values: NDArray[np.float64]) -> float:
-    """Largest power of ten, 1 at most, of which all values are multiples; 0 if there is none."""
+    """Return the largest power of ten <= 1 that divides all values, or 0."""
     for decimals in range(_MOST_DECIMALS if values.any() else 0):
         error = np.abs(values - np.round(values, decimals))
         if (error <= 4.0 * np.finfo(float).eps * np.abs(values)).all():
@@ -230,15 +185,9 @@ def decimal_step(values: NDArray[np.float64]) -> float:
 
 
 def read_table(path: Path, *, header: bool = True) -> Table:
-    """Reads a file of one of the `FORMATS`, told apart by its suffix.
+    """Read a file with one of the suffixes `FORMATS`; raise an error if it is invalid.
 
-    Args:
-        path: the file.
-        header: whether the first line of a file of text holds names; if not, the columns are named
-            by their numbers, from "0".
-
-    Raises:
-        DrakeTeleopError: if the file is absent, of another kind, or cannot be parsed.
+    Without a header the columns of a text file are named from "0".
     """
     if path.suffix.lower() not in FORMATS:
         raise DrakeTeleopError(
@@ -282,14 +231,14 @@ def _stripped(names: list[str]) -> list[str]:
 
 
 def _with_canonical(columns: dict[str, _Column]) -> dict[str, _Column]:
-    """The columns, and under their canonical names those of a canonical log in other letters."""
+    """Add lower-case column names if the table is a canonical log."""
     small = {name.lower(): column for name, column in columns.items()}
     canonical = len(small) == len(columns) and _CANONICAL.issubset(small)
     return small | columns if canonical and not _CANONICAL.issubset(columns) else columns
 
 
 class _ParquetColumns(UserDict[str, Any]):
-    """The columns of a file, each read when it is asked for: all of an hour's fill the memory."""
+    """Columns of a Parquet file, each read on access to limit memory."""
 
     def __init__(self, path: Path, names: dict[str, str]) -> None:
         super().__init__(names)
@@ -309,9 +258,9 @@ def _frame_column(series: pl.Series) -> NDArray:
         series = series.cast(pl.Duration("ns"))
     if series.dtype in (pl.Datetime, pl.Duration):
         return series.to_numpy()
-    if series.dtype == pl.Int128:  # which numpy has not
+    if series.dtype == pl.Int128:  # not supported by NumPy
         series = series.cast(pl.Float64)
-    # Floats keep their empty cells as NaN, which is reported with its row later on.
+    # Empty cells become NaN, which is reported with its row later.
     return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
 
 
@@ -342,7 +291,7 @@ def _as_numbers(
     if column.dtype.kind in "mM":  # seconds, since 1970 or midnight
         count = column.astype(f"{column.dtype.kind}8[ns]").astype(np.int64)
         return np.where(np.isnat(column), np.nan, count * 1e-9)
-    if column.dtype.kind == "c" and len(column):  # float() would drop half of it
+    if column.dtype.kind == "c" and len(column):  # float() would drop the imaginary part
         raise bad(0, column[0])
     numbers = np.empty(len(column))
     for row, cell in enumerate(column):
@@ -350,7 +299,7 @@ def _as_numbers(
             numbers[row] = np.nan if cell is None else float(cell)
         except (TypeError, ValueError) as error:
             raise bad(row, cell) from error
-        if isinstance(cell, str) and "_" in cell:  # which Python reads over
+        if isinstance(cell, str) and "_" in cell:  # which Python ignores
             raise bad(row, cell)
     return numbers
 
