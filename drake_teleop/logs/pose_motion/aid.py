@@ -1,19 +1,6 @@
-"""An IMU beside the poses: rows of acceleration and of turning for the same splines.
+"""Comparison of an IMU with splines of poses, Eqs. (T82), (T83).
 
-Below the frequencies that splines of the poses pass, the IMU is compared with them,
-
-    y(t) = b + (1 + D) x(t + tau) + noise,
-
-y its specific force or angular velocity and x that of the splines: least squares over frequencies,
-weighted by the noise of both, for the constants b, the small matrix D (gains and mounting; 0.1 is
-its prior deviation, for motions that do not show it) and the time tau. What is left, less what the
-poses' own noise makes, is the IMU's noise. So the poses tell its bias, axes and clock, and it tells
-what they see too coarsely: with powers S_p and S_s of white noise (variance over rate) of position
-and specific force, and S_r and S_w of turn and angular velocity, least squares over both leaves
-
-    1 / (1 / S_p + w^4 / S_s)   and   1 / (1 / S_r + w^2 / S_w)
-
-of noise in position and turn at the frequency w.
+The poses determine the IMU's bias, axes and clock. The corrected IMU then refines the splines.
 """
 
 from __future__ import annotations
@@ -30,16 +17,16 @@ from drake_teleop.logs.pose_motion.splines import Aid, PoseSplines
 
 _PRIOR = 0.1
 _STEPS, _FARTHEST, _ROUNDS, _ENOUGH = 4, 0.1, 10, 40
-_LARGEST = 0.2  # of the entries of D
-# Share of 1 / h up to which splines pass the motion, and of the motion that may stay unexplained.
+_LARGEST = 0.2  # largest entry of D
+# Share of 1 / h that splines pass, and largest unexplained share of the motion.
 _PASSED, _BELIEVABLE = 0.25, 0.05
-# Rates [Hz] that are enough to compare and to add, and what a comparison needs at least [s].
+# Rates of comparison and of added rows [Hz], and least length of a comparison [s].
 _COMPARED, _ADDED, _SHORTEST = 125.0, 500.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Sensor:
-    """How a sensor of the IMU differs from the poses: y = b + (1 + D) x(t + tau), and its noise."""
+    """Model y = b + (1 + D) x(t + tau) of one sensor, and its noise power density."""
 
     D: Array
     b: Array
@@ -47,18 +34,11 @@ class _Sensor:
     power: float
 
     def corrected(self, y: Array) -> Array:
-        """(K, 3) x of y."""
         return np.asarray(np.linalg.solve(np.eye(3) + self.D, (y - self.b).T).T)
 
 
 def aid_of(splines: PoseSplines, imu: Inertial, gravity_W: Array) -> Aid | None:
-    """What an IMU adds to splines of poses; None if the two do not agree.
-
-    Args:
-        splines: of the poses alone.
-        imu: on about their clock.
-        gravity_W: (3,) [m/s^2].
-    """
+    """Return the corrected IMU data for splines of poses, or None if the two do not agree."""
     powers = tuple(std**2 / splines.rate for std in splines.noise())
     few, sensors = imu.averaged(_COMPARED), []
     for which, y in enumerate((few.specific_force, few.angular_velocity)):
@@ -73,7 +53,7 @@ def aid_of(splines: PoseSplines, imu: Inertial, gravity_W: Array) -> Aid | None:
     if not known:
         return None
     rows = imu.averaged(_ADDED)
-    t = rows.t + known[-1].tau  # a gyroscope tells the clock best
+    t = rows.t + known[-1].tau  # the gyroscope determines the clock best
     inside = (t > splines.poses.t[0]) & (t < splines.poses.t[-1])
     s, omega = (
         None if sensor is None or y is None else sensor.corrected(y[inside])
@@ -81,7 +61,7 @@ def aid_of(splines: PoseSplines, imu: Inertial, gravity_W: Array) -> Aid | None:
     )
     own = [0.0 if sensor is None else sensor.power for sensor in sensors]
     aid = None
-    for _ in range(2):  # its rows are turned by an orientation: better by that of both
+    for _ in range(2):  # repeat with the orientation of poses and IMU
         aid = Aid.of(
             PoseSplines(splines.poses, splines.spacing, aid),
             t[inside],
@@ -103,11 +83,10 @@ def _compared(
     which: int,
     by_pose: tuple[float, int],
 ) -> _Sensor | None:
-    """A sensor's values y (K, 3) at t (K,) against the splines; None if these do not explain it.
+    """Fit y (K, 3) at t (K,) to the splines; return None if these do not explain it.
 
-    Args:
-        which: 0 for the specific force, 1 for the angular velocity.
-        by_pose: power of the poses' noise, and the power of w with which it comes in.
+    `which` is 0 for the specific force and 1 for the angular velocity. `by_pose` is the power of
+    the poses' noise and its exponent of the angular frequency.
     """
     dt = float(np.median(np.diff(t)))
     place = np.round((t - t[0]) / dt).astype(int)
@@ -126,7 +105,7 @@ def _compared(
     def spectrum(x: Array) -> Complex:
         return np.asarray(np.fft.rfft(x * taper[:, None], axis=0)[used], np.complex128)
 
-    # Of its third differences, which know nothing of the motion; 1, 3, 3, 1 squared are 20.
+    # Third differences remove the motion; the squares of 1, 3, 3, 1 add up to 20.
     least = float(np.mean(np.diff(y, 3, axis=0) ** 2)) * dt / 20.0 + 1e-30
     Y, one, tau, power = spectrum(values), spectrum(np.ones((len(even), 1))), 0.0, least
     for step in range(_STEPS):
@@ -149,7 +128,7 @@ def _compared(
 def _least_squares(
     y: Complex, X: Complex, one: Complex, change: Complex, weight: Array
 ) -> tuple[Array, Array, float]:
-    """D (3, 3), b (3,) and tau of y = X D^T + b + tau change, spectra (K, 3)."""
+    """Return D (3, 3), b (3,) and tau of y = X D^T + b + tau change, from spectra."""
     K = len(y)
     columns = np.zeros((K, 3, 13), complex)
     for i in range(3):
@@ -165,9 +144,9 @@ def _least_squares(
 
 
 def _power(left: NDArray[np.floating], by_pose: NDArray[np.floating], white: float) -> float:
-    """Of noise beside that of the poses, from powers (K,) of both and that of its white part.
+    """Return the IMU's noise power from the residual power and the poses' share, both (K,).
 
-    The latter alone where the poses' noise hides the IMU's at most frequencies that are compared.
+    Return `white` where the poses' noise dominates at most frequencies.
     """
     power = max(float(np.median(left)), white)
     for _ in range(_ROUNDS):

@@ -1,14 +1,4 @@
-"""By how much the clock of the poses runs faster than that of the wrench.
-
-Stamps of the poses that are t + delay + rate (t - middle) at the wrench's time t move the signals
-by
-
-    d zeta / d rate = (t - middle) d zeta / dt,
-
-which with the coefficients of `saturated` moves the wrench that is expected. Gauss-Newton for rate
-and delay, the 16 coefficients of each channel being free, has no opinion on the load. A rate is
-believed if twice the logarithm of the likelihood grows by 25, five standard deviations.
-"""
+"""Relative clock rate of poses and wrench, Eq. (T76)."""
 
 from __future__ import annotations
 
@@ -21,7 +11,7 @@ from drake_teleop.logs.pose_motion.spectra import Grid, signal_spectrum
 from drake_teleop.logs.pose_motion.splines import Choice, PoseSplines
 
 _STEPS, _BELIEVED = 3, 25.0
-# Farther than that from the middle's [s] is no clock's rate, but a motion that does not show it.
+# A larger change of the delay [s] is not caused by a clock.
 _FARTHEST = 0.2
 
 
@@ -34,16 +24,7 @@ def clock_rate(
     top: float,
     spacing: float,
 ) -> float:
-    """The rate, such as 5e-5; 0 if none is believed.
-
-    Args:
-        few: `for_search`.
-        grid, taper: of the wrench.
-        gravity_W: (3,) [m/s^2].
-        delay: in the middle of the grid [s].
-        top: highest frequency [Hz].
-        spacing: of the knots [s].
-    """
+    """Return the relative rate, such as 5e-5, or 0 if insignificant."""
     first = spectra_of(few.at(spacing), grid, taper, gravity_W, delay, top)
     now, best = first, 0.0
     least = start = now.fit().cost
@@ -64,13 +45,13 @@ def clock_rate(
 
 
 def at_rate(poses: Poses, rate: float, grid: Grid, delay: float) -> Poses:
-    """The poses on the clock of the wrench; `delay` [s] is theirs in the middle of the grid."""
+    """Return the poses on the wrench's clock; `delay` [s] holds at mid-record."""
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
     return Poses(middle + (poses.t - middle) / (1.0 + rate), poses.position, poses.quaternion)
 
 
 def _step(spectra: Spectra) -> tuple[float, float]:
-    """Of the rate, and by how much twice the logarithm of the likelihood should grow."""
+    """Return a Gauss-Newton step of the rate and the expected likelihood gain (times 2)."""
     fit, grid = spectra.fit(), spectra.grid
     change = np.gradient(spectra.zeta, grid.dt, axis=0)
     away = (grid.t - 0.5 * (grid.t[0] + grid.t[-1]))[:, None]
@@ -86,7 +67,7 @@ def _step(spectra: Spectra) -> tuple[float, float]:
         y = (np.hstack([columns, left]) * weight).view(np.float64).reshape(count, -1, 2)
         y = y.transpose(0, 2, 1).reshape(2 * count, -1)
         G = y.T @ y
-        # What is left when the coefficients have taken their part.
+        # Eliminate the coefficients.
         rest = G[k:, k:] - G[k:, :k] @ np.linalg.pinv(G[:k, :k], 1e-12, True) @ G[:k, k:]
         gram += rest[:2, :2]
         right += rest[:2, 2]

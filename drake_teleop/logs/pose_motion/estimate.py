@@ -1,15 +1,8 @@
-"""The load, the delay and the pose's frame from a wrench and poses: the whole estimate.
+"""Estimation of load, delay and pose frame from a wrench and poses (docs/theory.md).
 
-1. Splines with knots of a middle distance; a first delay; stretches in which something else acts;
-   the rate of the poses' clock (`clock_rate`).
-2. Distance of the knots, delay, and whether an IMU is asked too (`aid`), by the wrench
-   (`saturated`), then splines of all poses.
-3. What the saturated model says (`read_off`), and a rigid load twice: with the frame as described,
-   and with the transform between pose and sensor free (`rigid`).
-
-A record longer than `SEARCHED` is searched in its liveliest part only, and fitted as a whole.
-Where the load is known (`motion_of_load`) the wrench that it explains best takes the saturated
-model's place: short records and slow motions do, which do not show 16 coefficients.
+1. Initial knots and delay, disturbances and clock rate, from at most `SEARCHED` seconds.
+2. Knot distance, delay and use of an IMU with the least cost.
+3. Rigid load, with the frame as described and with the frame free.
 """
 
 from __future__ import annotations
@@ -54,14 +47,14 @@ from drake_teleop.logs.pose_motion.spectra import TOP, Grid, end_taper, without
 from drake_teleop.logs.pose_motion.splines import Choice, PoseSplines
 
 SEARCHED = 120.0
-"""Longer records are searched in a part of this length [s]."""
+"""Length of the searched part of a record [s]."""
 SHIFT, SHIFT_KNOWN = 0.01, 0.02
-"""A lever arm is told from 10 mm on, and known if its deviation is below 20 mm [m]."""
+"""Least shift that is reported, and largest standard deviation of a known one [m]."""
 TURNED_DEG, TURN_KNOWN_DEG = 5.0, 1.0
-"""The same of a turn [deg]."""
+"""The same of a rotation [deg]."""
 _WALD, _DEVIATIONS = 50.0, 5.0
 _SHARE_OF_RATE = 0.45
-# Gaps of the poses that splines cannot bridge, and how far from them accelerations are wrong [s].
+# Least gap that splines cannot bridge, and excluded margin beside it [s].
 _GAP, _BESIDE = 0.1, 0.4
 _FEWEST, _FEWEST_OF_LOAD = 100, 32
 _NOTHING = 1e-3
@@ -70,16 +63,16 @@ _UNTURNED = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Where the frame P of the poses is, from S, as far as the data tell.
+    """Estimated pose frame P relative to S.
 
     Attributes:
-        p_SoPo_S: (3,) its origin [m].
-        R_SP: (3, 3) its rotation.
-        position_deviations: (3,) standard deviations [m]; inf where nothing tells.
-        turn_deviations_deg: (3,) of a turn about the axes of S [deg].
-        wald: of the shift and turn from what was described; chi-square of 6 if there are none.
-        shifted: whether the origin is elsewhere than described.
-        turned: whether the axes are.
+        p_SoPo_S: (3,) origin [m].
+        R_SP: (3, 3) rotation.
+        position_deviations: (3,) standard deviations [m]; inf if undetermined.
+        turn_deviations_deg: (3,) about the axes of S [deg].
+        wald: statistic of the change; chi-square (6) without one.
+        shifted: whether the origin differs from the description.
+        turned: whether the axes differ.
     """
 
     p_SoPo_S: Array
@@ -92,26 +85,25 @@ class Frame:
 
     @property
     def position_known(self) -> NDArray[np.bool_]:
-        """(3,) whether each coordinate is observable."""
+        """(3,) whether each coordinate is determined."""
         return np.asarray(self.position_deviations < SHIFT_KNOWN)
 
     @property
     def rotation_known(self) -> NDArray[np.bool_]:
-        """(3,) whether the turn about each axis of S is."""
+        """(3,) whether the rotation about each axis of S is determined."""
         return np.asarray(self.turn_deviations_deg < TURN_KNOWN_DEG)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseMotion:
-    """The motion of poses, with the knots and the delay that suit a wrench best.
+    """Motion of poses, with knots and delay fitted to a wrench.
 
     Attributes:
-        splines: of the poses.
+        splines: of the poses, on the wrench's clock.
         delay_s: of the motion behind the wrench [s].
-        delay_deviation: its standard deviation [s]; inf if the record does not determine it.
-        clock_rate: by how much the poses' clock is faster than the wrench's, such as 5e-5, if that
-            shows and the delay was not given; the splines are on the clock of the wrench.
-        imu_agrees: whether an IMU beside the poses tells the same; True without one.
+        delay_deviation: standard deviation [s]; inf if undetermined.
+        clock_rate: relative rate of the poses' clock, such as 5e-5; 0 if insignificant.
+        imu_agrees: whether an IMU agrees; True without one.
     """
 
     splines: PoseSplines
@@ -122,22 +114,21 @@ class PoseMotion:
 
     @property
     def spacing(self) -> float:
-        """Distance of the knots [s]."""
         return self.splines.spacing
 
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate(PoseMotion):
-    """What a wrench and poses say.
+    """Load, delay and frame from a wrench and poses.
 
     Attributes:
-        fit: the load with the frame as described, or as estimated if it was left to the data.
-        frame: of the poses, from the fit in which it is free.
-        free: that fit.
-        seen: what the saturated model says.
-        t: (M,) about 100 Hz [s].
-        rejected: (M,) where something else acts than the load.
-        note: what a user has to know; mostly empty.
+        fit: load with the frame as described or estimated.
+        frame: of `free`.
+        free: fit with a free frame.
+        seen: figures of the linear model.
+        t: (M,) [s].
+        rejected: (M,) disturbed instants.
+        note: for the user; usually empty.
     """
 
     fit: RigidFit
@@ -173,24 +164,23 @@ def estimate_from_poses(
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseEstimate:
-    """Load and offsets, delay, and the frame of the poses.
+    """Estimate load, offsets, delay and pose frame.
 
     Args:
         t: (N,) evenly spaced [s].
-        wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
-        poses: of the frame P, on the same clock but for a delay.
-        gravity_W: (3,) in the world [m/s^2].
-        p_SoPo_S: (3,) where Po is in S [m]; None: the data tell.
-        R_SP: (3, 3) how P is turned; None: the data tell.
-        delay: of the poses behind the wrench, if known [s]; None: found.
-        near: a delay that is found is within 0.25 s of this one, and a tenth of the record [s].
-        gain: standard deviation of the sensor's gains, such as 0.01; it enters the covariance.
-        lost: (N,) samples that do not count, such as bridged gaps.
-        imu: what an IMU beside the poses tells of the frame of S; taken if the wrench likes the
-            motion better with it (`aid`).
+        wrench: (N, 6) [f; tau] in S about So, sign of Eq. (1) [N, N m].
+        poses: of P, on the same clock except for a delay.
+        gravity_W: (3,) [m/s^2].
+        p_SoPo_S: (3,) [m], or None to estimate it.
+        R_SP: (3, 3), or None to estimate it.
+        delay: of the poses behind the wrench [s], or None to estimate it.
+        near: centre of the delays searched [s].
+        gain: standard deviation of the sensor gains, such as 0.01.
+        lost: (N,) excluded samples.
+        imu: IMU data of S, used if they lower the cost.
 
     Raises:
-        DrakeTeleopError: for arrays of another shape, or if fewer than 100 instants remain.
+        DrakeTeleopError: for wrong shapes, or if fewer than 100 instants remain.
     """
     with one_blas_thread():
         grid, poses, gravity, top = _prepared(
@@ -248,14 +238,10 @@ def motion_of_load(
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseMotion:
-    """The motion with which an identified load explains a wrench best, contacts left out.
+    """Return the motion with which a load (6, 16) of `load_coefficients` fits a wrench best.
 
-    Args:
-        t, wrench, poses, gravity_W, delay, lost, imu: as of `estimate_from_poses`, P being S.
-        load: (6, 16) as of `load_coefficients`.
-
-    Raises:
-        DrakeTeleopError: for arrays of another shape, or if fewer than 32 instants remain.
+    Other arguments are those of `estimate_from_poses`, for P = S. Raises an error for wrong shapes,
+    or if fewer than 32 instants remain.
     """
     with one_blas_thread():
         guess = 0.0 if delay is None else delay
@@ -281,7 +267,6 @@ def _prepared(
     fewest: int,
     load: Array | None = None,
 ) -> tuple[Grid, Poses, Array, float]:
-    """The grid, the poses with continuous signs, gravity (3,) and the highest frequency [Hz]."""
     t = checked("t", t, np.size(t))
     wrench = checked("wrench", wrench, len(t), 6)
     gravity = checked("gravity_W", gravity_W, 3)
@@ -297,9 +282,6 @@ def _prepared(
 
 @dataclass(frozen=True, eq=False)
 class _Chosen:
-    """Splines of all poses; spectra of the part that was searched, with the delay; the rate of the
-    poses' clock; and whether an IMU agrees."""
-
     splines: PoseSplines
     last: Spectra
     rate: float
@@ -317,7 +299,6 @@ def _chosen(
     known: bool,
     imu: Inertial | None = None,
 ) -> _Chosen:
-    """Splines with the knots, and spectra with the delay, that are used."""
     part = _liveliest(grid)
     some = replace(grid, t=grid.t[part], wrench=_rows(grid, part))
     near = _within(poses, some)
@@ -356,7 +337,7 @@ def _within(poses: Poses, grid: Grid) -> Poses:
 
 
 def _liveliest(grid: Grid) -> slice:
-    """The part of the record in which the wrench changes most."""
+    """Return the part of the record in which the force changes most."""
     rows, length = len(grid.t), round(SEARCHED / grid.dt)
     if rows <= length:
         return slice(0, rows)
@@ -368,7 +349,7 @@ def _liveliest(grid: Grid) -> slice:
 
 
 def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None, delay: float) -> Array:
-    """(M,) without the ends, gaps of the poses, and what the caller takes away."""
+    """Return the (M,) taper without ends, gaps and `lost` samples."""
     stamps = poses.t - delay
     start, stop = max(grid.t[0], stamps[0]), min(grid.t[-1], stamps[-1])
     if stop - start < 1.0:
@@ -392,7 +373,7 @@ def _start(p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: ReadOff) ->
 
 
 def _freed(fit: RigidFit, start: State, seen: ReadOff) -> State:
-    """Where to start with the transform free: far from the described one, if the data say so."""
+    """Return the described frame, or that of the linear model if it differs."""
     turned = seen.usable and not seen.mirrored and np.trace(seen.R_SP @ start.R) < 2.9
     if not turned:
         return fit.state
@@ -404,7 +385,7 @@ def _frame(free: RigidFit, start: State) -> Frame:
     R_SP, r = free.state.R.T, free.state.r
     place = -R_SP @ r
     covariance = free.covariance[17:, 17:]
-    # p = -R^T r, and R exp(rho x) instead of R makes it p - rho x p.
+    # p = -R^T r, and R exp([rho x]) changes it to p - rho x p.
     jacobian = np.hstack([-R_SP, cross_matrix(place)])
     known = np.isfinite(np.diag(covariance))
     finite = np.where(known[:, None] & known, covariance, 0.0)
@@ -433,7 +414,7 @@ def _frame(free: RigidFit, start: State) -> Frame:
 
 
 def _along(x: Array, covariance: Array) -> float:
-    """Standard deviation of the length of x; inf if a part of it is unknown."""
+    """Return the standard deviation of the length of x; inf if a part is undetermined."""
     if not np.isfinite(np.diag(covariance)).all():
         return np.inf
     direction = x / (np.linalg.norm(x) + 1e-300)

@@ -1,13 +1,4 @@
-"""How the power of the wrench's noise goes with frequency.
-
-Each group of bands and channel has a level of its own, and within the group the power is that level
-times a shape: 1, or for a channel whose offset wanders as a random walk does
-
-    1 + (corner / f)^2,
-
-with the corner of the greatest likelihood (`saturated.wandering`). A group of one level would let
-the lowest frequencies, where such noise is largest and gravity turns, count as much as the others.
-"""
+"""Noise power of the wrench in bands of frequency, Eqs. (T74), (T75)."""
 
 from __future__ import annotations
 
@@ -25,12 +16,12 @@ _LEAST_LEFT = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Bands of frequency, and what the noise is like in them.
+    """Noise with one level for each group of bands and channel.
 
     Attributes:
-        sizes: (bands,) half as many independent numbers as each has.
-        group: (bands,) number of its group.
-        shape: (bands, 6) of the power in each channel.
+        sizes: (bands,) half the number of independent numbers.
+        group: (bands,) number of the group.
+        shape: (bands, 6) relative power.
     """
 
     sizes: Array
@@ -39,15 +30,13 @@ class Levels:
 
     @classmethod
     def flat(cls, of: Bands) -> Levels:
-        """White within each group."""
+        """Return white noise within each group."""
         return cls(of.sizes, of.group, np.ones((of.count, 6)))
 
     def power(self, sums: Array, taken: Array | None = None) -> Array:
-        """(..., bands, 6) mean power of a number.
+        """Return (..., bands, 6) mean power of residual power `sums` (..., bands, 6).
 
-        Args:
-            sums: (..., bands, 6) of the power of the residual's numbers.
-            taken: (bands, 6) numbers that parameters took, of twice `sizes`.
+        `taken` (bands, 6) are degrees of freedom used by parameters.
         """
         left = self._numbers
         if taken is not None:
@@ -56,7 +45,7 @@ class Levels:
         return np.asarray(level[..., self.group, :] * self.shape)
 
     def grouped(self, x: Array) -> Array:
-        """(groups, ...) sums of (bands, ...)."""
+        """Return (groups, ...) sums of (bands, ...)."""
         return np.asarray(np.add.reduceat(x, self._starts, axis=0))
 
     @cached_property
@@ -65,16 +54,14 @@ class Levels:
 
     @cached_property
     def _numbers(self) -> Array:
-        """(groups, 1) half as many as each group has."""
         return self.grouped(self.sizes)[:, None]
 
     def costs(self, power: Array) -> Array:
-        """(..., 6) minus the log likelihood of each channel with powers (..., bands, 6), but for a
-        constant."""
+        """Return (..., 6) costs (T75) of powers (..., bands, 6)."""
         return np.asarray(self.sizes @ np.log(power))
 
 
 def wander(of: Bands, corner: float) -> Array:
-    """(bands,) mean of 1 + (corner / f)^2 in each band; at zero as at the least frequency."""
+    """Return (bands,) means of 1 + (corner / f)^2, Eq. (T74)."""
     f = np.maximum(of.frequency, of.frequency[1])
     return np.asarray(1.0 + of.sums((corner / f) ** 2) / of.sizes)

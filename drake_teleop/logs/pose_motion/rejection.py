@@ -1,12 +1,4 @@
-"""Stretches of a record in which something else than the load acts: contacts, knocks, saturation.
-
-The saturated model (`saturated`) is fitted sample by sample, below the frequencies at which the
-splines begin to miss the motion (a move that starts with a jerk is no knock), first with Huber's
-weights, then without what is more than 4.5 robust standard deviations away in some channel, until
-the same samples are left, as the robust method of `load.batch.methods` does with a load. It has no
-opinion on frames, units or axes: a wrong description is not taken for a contact. What is left out
-is widened to stretches, and the taper falls to zero beside them.
-"""
+"""Detection of disturbances: contacts, impacts and saturation (docs/theory.md)."""
 
 from __future__ import annotations
 
@@ -27,25 +19,17 @@ _NORMAL_MAD = 1.4826
 _MOST_LOSS = 2.5
 _PASSED = 0.3
 _MARGIN = 0.1
-"""On either side of what is rejected, or the knots' distance [s]."""
+"""Least margin of a rejected stretch [s]."""
 
 
 def disturbed(
     spectra: Spectra, grid: Grid, taper: Array, spacing: float
 ) -> tuple[NDArray[np.bool_], str]:
-    """(M,) where something else acts, and what a user has to know of it.
+    """Return (M,) flags of disturbed instants, and a note for the user.
 
-    Nothing is rejected if that raises some standard deviation of the coefficients 2.5 times as much
-    as the loss of as many samples at random would: then it is the motion that is rejected. Of an
-    identified load only the offsets are fitted, and its inertial force takes the coefficients'
-    place in this.
-
-    Args:
-        spectra: of the record with this taper, which knows nothing of disturbances.
-        grid, taper: as in `spectra_of`.
-        spacing: distance of the splines' knots [s].
+    For an identified load only the offsets are fitted.
     """
-    # Half of the amplitude passes at this share of 1 / h; a Gauss curve does not ring.
+    # A Gaussian gain, one half at `_PASSED` / h, does not ring.
     gain = 0.5 ** ((spectra.of.frequency * spacing / _PASSED) ** 2)
     x, y = (_in_time(s * gain[:, None], grid) for s in (spectra.signals, spectra.wrench))
     inside = taper > 0.5
@@ -78,14 +62,13 @@ def disturbed(
 
 
 def _in_time(spectrum: NDArray[np.complex128], grid: Grid) -> Array:
-    """(M, k) of spectra (K, k), what is above them left out."""
     full = np.zeros((grid.length // 2 + 1, spectrum.shape[1]), np.complex128)
     full[: len(spectrum)] = spectrum
     return np.asarray(np.fft.irfft(full, grid.length, axis=0)[: len(grid.t)])
 
 
 def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) -> Array:
-    """(M,) largest residual of a sample's channels over the channel's robust deviation."""
+    """Return (M,) largest ratio of residual to robust deviation over the channels."""
     weighted = x * weights[:, None]
     C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
     residual = np.abs(y - x @ C)
@@ -95,7 +78,7 @@ def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) ->
 
 
 def _loss(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
-    """By how much more the deviation of some coefficient grows than by fewer samples alone."""
+    """Return the largest growth of a deviation, relative to random loss of as many samples."""
     if kept.sum() < 2 * x.shape[1]:
         return np.inf
     every, some = (

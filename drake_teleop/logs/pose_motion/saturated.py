@@ -1,16 +1,4 @@
-"""The wrench as any linear function of the motion: what chooses knots and delay.
-
-The wrench of a rigid load is linear in the 16 signals of `splines`, whatever the frames, units and
-axes of wrench and pose are. So 6 x 16 free coefficients C, F = C zeta, have no hypotheses in them.
-Each channel is fitted with weights of 1 / (power of its noise) in every band, in turn with these
-powers (`levels`). At the end
-
-    L = sum over channels and bands of n log(power)
-
-is minus the log likelihood but for a constant. The knots' distance h and the delay are where it is
-least. Residuals of the poses would not do: noise that is coloured follows the finest knots, and
-then the accelerations are noise.
-"""
+"""Linear model of the wrench with free coefficients, Eqs. (T73) to (T75); choice of knots."""
 
 from __future__ import annotations
 
@@ -44,16 +32,16 @@ from drake_teleop.logs.pose_motion.splines import (
 )
 
 SPACINGS = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
-"""Distances of the knots that are tried [s], and then two beside the best of them."""
+"""Knot distances that are tried before two beside the best [s]."""
 REACH = 0.25
-"""Delays are looked for so far on either side, or a tenth of the record [s]."""
+"""Largest change of the delay in the search, or a tenth of the record [s]."""
 ROUNDING = 1e-7
-"""Least noise of a channel, relative to the wrench."""
+"""Least noise of a channel relative to the wrench."""
 _COARSE, _NEARLY, _FINEST = 0.016, 1e-3, 1e-5
 _ITERATIONS = 4
 _SEARCH_RATE = 125.0
 _RANK, _FULL_RANK = 1e-12, 1e-8
-# Corners of a wandering offset [Hz], and by how much one has to lower a channel's L.
+# Corners of a wandering offset [Hz], and least reduction of a channel's cost.
 _CORNERS = tuple(0.05 * 2.0**k for k in range(9))
 _WORTH = 3.0
 _FINER, _FINER_OF_LOAD, _DETERMINED = 0.84, 0.92, 25.0
@@ -61,13 +49,13 @@ _FINER, _FINER_OF_LOAD, _DETERMINED = 0.84, 0.92, 25.0
 
 @dataclass(frozen=True, eq=False)
 class Saturated:
-    """The fit of C.
+    """Fit of the linear model.
 
     Attributes:
-        coefficients: (6, 16) C; zero for signals that never change.
+        coefficients: (6, 16) C; zero for constant signals.
         covariance: (6, 16, 16) of the rows of C.
-        power: (bands, 6) mean power of the noise, of a number of the spectrum.
-        costs: (6,) what each channel adds to L.
+        power: (bands, 6) mean noise power.
+        costs: (6,) of the channels.
     """
 
     coefficients: Array
@@ -77,30 +65,25 @@ class Saturated:
 
     @property
     def cost(self) -> float:
-        """L."""
+        """Cost (T75)."""
         return float(self.costs.sum())
 
 
 def saturated(Z: Array, levels: Levels) -> Saturated:
-    """The fit to moments (bands, 38, 38) of bands with such noise."""
+    """Fit the model to moments (bands, 38, 38)."""
     return _fitted(Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _powers(Z), levels)
 
 
 def _powers(Z: Array) -> Array:
-    """(bands, 6) of the wrench, summed over each band."""
     return np.diagonal(Z[:, FORCES, FORCES], axis1=1, axis2=2)
 
 
 def _fitted(
     zz: Array, zf: Array, ff: Array, levels: Levels, load: Array | None = None
 ) -> Saturated:
-    """`saturated`, of moments of the signals with themselves and with the wrench, and its powers.
+    """Fit the model to moments zz (..., bands, 16, 16), zf (..., bands, 16, 6) and ff (bands, 6).
 
-    Args:
-        zz, zf, ff: (..., bands, 16, 16), (..., bands, 16, 6) and (bands, 6). What comes back has
-            the dimensions before the bands too: many fits cost little more than one.
-        levels: of the noise.
-        load: (6, 16) coefficients that are fixed but for those of the constant; None: all are free.
+    Leading dimensions are separate fits. With `load` (6, 16) only the constants are free.
     """
     floor = _least(ff, levels.sizes)
     if load is not None:
@@ -133,12 +116,11 @@ def _fitted(
 
 
 def _inverses(gram: Array) -> Array:
-    """(..., 16, 16) pseudo-inverses of symmetric matrices."""
     largest = np.diagonal(gram, axis1=-2, axis2=-1).max(axis=-1, keepdims=True)
     try:
         pivots = np.diagonal(np.linalg.cholesky(gram), axis1=-2, axis2=-1) ** 2
         if (pivots > _FULL_RANK * largest).all():
-            return np.asarray(np.linalg.inv(gram))  # in a third of the time
+            return np.asarray(np.linalg.inv(gram))  # three times faster
     except np.linalg.LinAlgError:
         pass
     values, vectors = np.linalg.eigh(gram)
@@ -148,7 +130,7 @@ def _inverses(gram: Array) -> Array:
 
 
 def least_power(Z: Array, sizes: Array) -> Array:
-    """(6,) below which a residual's power is rounding, not noise."""
+    """Return (6,) power of rounding errors."""
     return _least(_powers(Z), sizes)
 
 
@@ -159,7 +141,7 @@ def _least(ff: Array, sizes: Array) -> Array:
 
 
 def wandering(Z: Array, of: Bands) -> Levels:
-    """The levels of moments (bands, 38, 38), channels rising at low frequencies as they do."""
+    """Return levels with the corner of lowest cost in each channel, Eq. (T74)."""
     levels = Levels.flat(of)
     least, shape = saturated(Z, levels).costs - _WORTH, levels.shape.copy()
     for corner in _CORNERS:
@@ -172,14 +154,14 @@ def wandering(Z: Array, of: Bands) -> Levels:
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """Spectra of a record with one taper, splines and delay.
+    """Spectra of a record for one taper, splines and delay.
 
     Attributes:
-        of: the bands.
+        of: bands.
         wrench: (K, 6).
         signals: (K, 16), of P at t + `delay`.
         delay: [s].
-        grid, taper, zeta: of the record, the latter (M, 16) in time.
+        grid, taper, zeta: of the record; zeta is (M, 16) in time.
     """
 
     of: Bands
@@ -192,18 +174,16 @@ class Spectra:
 
     @cached_property
     def chopped(self) -> bool:
-        """Whether the taper is low between its ends too. Its ends as well would hold a known load's
-        delay, which has nothing else to be told from."""
+        """Whether the taper excludes interior samples, or the load is known.
+
+        Then edges of the taper would bias the delay if they moved with the signals.
+        """
         inside = np.flatnonzero(self.taper > 0.5)
         edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
         return bool(edged or self.grid.load is not None)
 
     def at(self, delay: float) -> Spectra:
-        """The same with the signals, but not `zeta`, moved to another delay.
-
-        The taper's slow ends may move with them, but not the many edges of a chopped one: they
-        would hold the delay where it is.
-        """
+        """Return the spectra with signals at another delay; `zeta` is unchanged."""
         shift, signals = delay - self.delay, self.signals
         if self.chopped:
             before = later(self.grid, self.taper, shift)
@@ -213,7 +193,7 @@ class Spectra:
         return replace(self, signals=late)
 
     def moments(self) -> Array:
-        """(bands, 38, 38); the derivative is that of the signals, without that of the taper."""
+        """Return (bands, 38, 38) moments, with derivatives of the signals alone."""
         rates = 2j * np.pi * self.of.frequency[:, None] * self.signals
         edges = slope(self.grid, self.taper)
         rates -= signal_spectrum(self.grid, edges, self.zeta, len(rates))
@@ -221,10 +201,7 @@ class Spectra:
         return moments(self.signals, self.wrench, self.of, rates)
 
     def fit(self) -> Saturated:
-        """The fit of all coefficients to the wrench, with noise that is level.
-
-        Of those of the constant alone if the load is known.
-        """
+        """Fit all coefficients with flat levels; only the constants if the load is known."""
         Z, load = moments(self.signals, self.wrench, self.of), self.grid.load
         parts = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _powers(Z)
         fit = _fitted(*parts, Levels.flat(self.of), load)
@@ -233,7 +210,7 @@ class Spectra:
         return replace(fit, coefficients=np.hstack([fit.coefficients, load[:, 1:]]))
 
     def costs(self, delays: Array) -> Array:
-        """(D,) L of the fits at these delays (D,)."""
+        """Return (D,) costs at delays (D,)."""
         if self.chopped:
             Z = np.array([moments(x.signals, x.wrench, x.of) for x in map(self.at, delays)])
             zz, zf = Z[..., :SIGNALS, :SIGNALS], Z[..., :SIGNALS, FORCES]
@@ -244,9 +221,9 @@ class Spectra:
         return fits.costs.sum(axis=-1)
 
     def _moved(self, delays: Array) -> tuple[Array, Array]:
-        """(D, bands, 16, 16) and (D, bands, 16, 6) moments at delays (D,), the taper whole.
+        """Return (D, bands, 16, 16) and (D, bands, 16, 6) moments at delays (D,) for a whole taper.
 
-        Phases cancel in products of the signals, but for those with the constant, which stays.
+        Phases cancel in products of signals, except with the constant.
         """
         of, Z = self.of, moments(self.signals, self.wrench, self.of)
         fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * of.weight[:, None]
@@ -266,7 +243,7 @@ class Spectra:
         return zz, zf[..., :6]
 
     def with_motion(self, splines: PoseSplines, gravity_W: Array, delay: float) -> Spectra:
-        """The same wrench and taper with the motion of other splines, `delay` [s] later."""
+        """Return the spectra with other splines and delay [s]."""
         zeta = splines.signals(self.grid.t + delay, gravity_W)
         signals = signal_spectrum(self.grid, self.taper, zeta, len(self.wrench))
         return replace(self, signals=signals, delay=delay, zeta=zeta)
@@ -280,7 +257,7 @@ def spectra_of(
     delay: float,
     top: float,
 ) -> Spectra:
-    """Of the wrench and the motion `delay` [s] later, up to a frequency [Hz]."""
+    """Return spectra of wrench and motion `delay` [s] later, up to `top` [Hz]."""
     of = bands(grid, taper, top)
     count = len(of.frequency)
     zeta = splines.signals(grid.t + delay, gravity_W)
@@ -290,10 +267,7 @@ def spectra_of(
 
 
 def best_delay(spectra: Spectra, reach: float, finest: float = _FINEST) -> tuple[float, float]:
-    """The delay of the least L, within `reach` of the spectra's, and that L.
-
-    To `finest` [s], at the least.
-    """
+    """Return the delay of lowest cost within `reach`, to `finest` [s], and the cost."""
     step = min(_COARSE, reach / 2)
     at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
     costs = spectra.costs(at)
@@ -311,10 +285,7 @@ def best_delay(spectra: Spectra, reach: float, finest: float = _FINEST) -> tuple
 
 
 def delay_deviation(spectra: Spectra) -> float:
-    """Standard deviation of their delay [s]; inf if the record does not determine it.
-
-    It does if L rises on either side of the delay, and by at least 25 within `REACH`.
-    """
+    """Return the standard deviation of the delay [s]; inf if undetermined."""
     reach = min(REACH, 0.1 * float(spectra.grid.t[-1] - spectra.grid.t[0]))
     beside = np.array([-_NEARLY, 0.0, _NEARLY])
     left, least, right = spectra.costs(spectra.delay + beside)
@@ -335,10 +306,7 @@ def first_guess(
     *,
     known: bool = False,
 ) -> tuple[float, float]:
-    """Distance of the knots and delay, of a few distances and within `REACH`, of the least L.
-
-    A delay that is known stays. With knots too fine the motion is noise, and no delay shows.
-    """
+    """Return knot distance and delay of lowest cost on a coarse grid."""
     reach = min(REACH, 0.1 * float(grid.t[-1] - grid.t[0]))
     spacings, found = _allowed(few)[::2], []
     start = spectra_of(few.at(spacings[0]), grid, taper, gravity_W, delay, top)
@@ -359,11 +327,10 @@ def best_spacing(
     *,
     known: bool = False,
 ) -> tuple[Choice, float, float]:
-    """What the splines are fitted to, distance of their knots [s], and delay [s], of the least L.
+    """Return the choice, knot distance [s] and delay [s] of lowest cost.
 
-    Knots are then a little closer than where L is least: a fit of the load takes noise that they
-    pass into account, but not motion that they do not, and of a load that is known that motion
-    looks like contact. The delay is nearly right at first and, unless it is known, found again.
+    Knots are slightly closer than at the minimum, because fits do not compensate for motion that
+    the splines miss.
     """
     start = spectra_of(choices[0].at(SPACINGS[0]), grid, taper, gravity_W, delay, top)
     found = []
@@ -388,7 +355,7 @@ def best_spacing(
 
 
 def for_search(poses: Poses) -> Choice:
-    """Splines of means of poses, if these are faster than the search needs."""
+    """Return splines of averaged poses, at the rate that the search needs."""
     return Choice(poses.averaged(max(1, int(poses.rate / _SEARCH_RATE + 1e-6))))
 
 

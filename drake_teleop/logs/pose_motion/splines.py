@@ -1,17 +1,4 @@
-"""Motion from poses: splines of position and quaternion, and the signals that a wrench hangs on.
-
-Every column of position p and quaternion q is a least-squares spline of degree 5 with uniform
-knots. It takes uneven stamps as they are, and its fifth degree leaves accelerations smooth. With
-n = q . q, which noise and the fit keep from 1, and products of quaternions,
-
-    omega = 2 vec(q* qdot) / n,   alpha = 2 vec(q* qddot) / n - 2 omega (q . qdot) / n,
-
-in the axes of the posed frame P. Of white noise at frequency f the splines pass the share
-
-    g(f) = 1 / (1 + (f h / (1 - f h))^12)   below 1 / h
-
-of the power, h the distance of the knots: nearly all up to 0.3 / h, nearly nothing from 0.7 / h on.
-"""
+"""Motion from poses by splines of position and quaternion, Eqs. (T71), (T72)."""
 
 from __future__ import annotations
 
@@ -29,27 +16,27 @@ from drake_teleop.logs.pose_motion.poses import Poses
 
 DEGREE = 5
 FEWEST_PER_KNOT = 2.0
-"""Poses between two knots, at least, on average."""
+"""Least average number of poses between two knots."""
 SIGNALS = 16
-"""Columns of `PoseSplines.signals`."""
+"""Number of columns of `PoseSplines.signals`."""
 GRAVITY, ACCELERATED = slice(4, 7), [1, 2, 3, *range(7, 16)]
-"""Which of them are gravity, and which are zero at rest."""
-# Frequencies times h between which the residual shows the noise: above what the splines pass.
+"""Columns of gravity, and columns that are zero at rest."""
+# Frequency times h where the residual is noise: just above the passed frequencies.
 _NOISE_BAND = (0.7, 1.5)
 _CHUNK = 2**17
 
 
 @dataclass(frozen=True, eq=False)
 class Aid:
-    """What an IMU adds to the splines (`aid`), its axes, biases and clock being those of the poses.
+    """IMU data that refine the splines, corrected to the axes, clock and zero bias of the poses.
 
     Attributes:
         t: (K,) [s].
-        rate: of them [Hz].
-        acceleration_W: (K, 3) of So in the world [m/s^2], or None.
-        quaternion_rate: (K, 4) derivatives [1/s], or None.
-        pose_powers: of white noise of position [m^2/Hz] and turn [rad^2/Hz].
-        own_powers: likewise of acceleration and angular velocity.
+        rate: [Hz].
+        acceleration_W: (K, 3) of So [m/s^2], or None.
+        quaternion_rate: (K, 4) [1/s], or None.
+        pose_powers: power densities of position [m^2/Hz] and rotation [rad^2/Hz].
+        own_powers: of acceleration and angular velocity.
     """
 
     t: Array
@@ -72,7 +59,7 @@ class Aid:
         pose_powers: tuple[float, float],
         own_powers: tuple[float, float],
     ) -> Aid:
-        """From specific force and angular velocity (K, 3), with the orientation of splines."""
+        """Return the rows of s and omega (K, 3), with the orientation of `splines`."""
         q = splines.quaternion(t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
@@ -85,7 +72,7 @@ class Aid:
         return cls(t, rate, acceleration, rates, pose_powers, own_powers)
 
     def share(self, frequency: Array) -> tuple[Array, Array]:
-        """Of the poses' noise in position and turn that is left at frequencies (K,) [Hz]."""
+        """Return the remaining shares of the poses' noise at frequencies (K,), Eq. (T83)."""
         w = 2.0 * np.pi * frequency
         left = []
         for pose, own, order, rows in zip(
@@ -101,31 +88,30 @@ class Aid:
 
 
 class PoseSplines:
-    """Splines of poses.
+    """Least-squares splines of poses.
 
     Attributes:
-        poses: what they were fitted to, signs continuous.
-        spacing: h of the knots [s].
+        poses: fitted poses with continuous signs.
+        spacing: knot distance [s].
         rate: of the poses [Hz].
-        aid: what else, or None.
+        aid: IMU data, or None.
     """
 
     def __init__(self, poses: Poses, spacing: float, aid: Aid | None = None) -> None:
-        """Fits them; `poses` with continuous signs, see `Poses.continued`."""
         self.poses, self.spacing, self.rate, self.aid = poses, spacing, poses.rate, aid
         self._start = float(poses.t[0])
         t = poses.t - self._start
         self._parts, knots = _parts(len(t)), _knots(t, spacing, aided=aid is not None)
         try:
             self._spline = self._fitted(t, knots)
-        except np.linalg.LinAlgError:  # between gaps one pose to a knot is too little
+        except np.linalg.LinAlgError:  # too few poses per knot between gaps
             self._spline = self._fitted(t, _sparser(knots, t))
 
     def _fitted(self, t: Array, knots: Array) -> BSpline:
-        """By banded normal equations.
+        """Solve banded normal equations.
 
-        `scipy.interpolate.make_lsq_spline` takes QR now, which is five times slower; with two poses
-        to a knot they lose no digit that a pose has.
+        They are five times faster than `scipy.interpolate.make_lsq_spline` and sufficiently
+        accurate.
         """
         poses, aid = self.poses, self.aid
         values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._parts)
@@ -153,11 +139,11 @@ class PoseSplines:
         return BSpline(knots, np.hstack(columns), DEGREE)
 
     def quaternion(self, t: Array) -> Array:
-        """(N, 4) at times t, nearly of unit length."""
+        """Return (N, 4) at times t, nearly of unit length."""
         return np.asarray(self._at(t, 0)[:, 3:])
 
     def position(self, t: Array) -> Array:
-        """(N, 3) at times t [m]."""
+        """Return (N, 3) at times t [m]."""
         return np.asarray(self._at(t, 0)[:, :3])
 
     def _at(self, t: Array, order: int) -> Array:
@@ -165,17 +151,9 @@ class PoseSplines:
         return np.asarray(self._spline(at, order))
 
     def signals(self, t: Array, gravity_W: Array) -> Array:
-        """(N, 16) signals of P at times t, in the axes of P; outside of the poses those of the end.
+        """Return (N, 16) signals zeta of Eq. (T73) at times t (N,) [s], in the axes of P.
 
-        zeta = [1, a (3), -g (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]
-
-        with the acceleration a of Po [m/s^2], gravity g, the angular acceleration alpha and the
-        products of angular velocity. Whatever frame, units and axes the sensor has, the wrench of a
-        rigid load is linear in them.
-
-        Args:
-            t: (N,) [s].
-            gravity_W: (3,) in the world [m/s^2].
+        Outside of the poses, the signals of the ends are held.
         """
         a, minus_g, omega, alpha = self._motion(t, gravity_W)
         zeta = np.empty((len(t), SIGNALS))
@@ -187,12 +165,12 @@ class PoseSplines:
         return zeta
 
     def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array]:
-        """(N, 3) specific force of Po, angular velocity and acceleration of P, in its axes."""
+        """Return (N, 3) specific force of Po, omega and alpha of P, in its axes."""
         a, minus_g, omega, alpha = self._motion(t, gravity_W)
         return a + minus_g, omega, alpha
 
     def gravity(self, t: Array, gravity_W: Array) -> Array:
-        """(N, 3) gravity in the axes of P at times t [m/s^2]."""
+        """Return (N, 3) gravity in the axes of P [m/s^2]."""
         out = np.empty((len(t), 3))
         for part in _parts(len(t)):
             q = self.quaternion(t[part])
@@ -201,7 +179,7 @@ class PoseSplines:
         return out
 
     def _motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
-        """(N, 3) a, -g, omega and alpha."""
+        """Return (N, 3) a, -g, omega and alpha."""
         out = np.empty((4, len(t), 3))
         for part in _parts(len(t)):
             out[:, part] = self._motion_at(t[part], gravity_W)
@@ -217,10 +195,9 @@ class PoseSplines:
         return _in_P(q, n, second[:, :3]), _in_P(q, n, down), omega, alpha
 
     def noise(self) -> tuple[float, float]:
-        """Standard deviations per axis of position [m] and turn [rad], as if they were white.
+        """Return standard deviations per axis of position [m] and rotation [rad].
 
-        From what the splines leave just above the frequencies that they pass: coloured noise has
-        more there than at higher ones. With an aid it is known from splines without.
+        They come from residuals just above the passed frequencies, because noise can be coloured.
         """
         if self.aid is not None:
             place_power, turn_power = self.aid.pose_powers
@@ -236,7 +213,6 @@ class PoseSplines:
         return float(place_std), float(turn_std)
 
     def _powers(self, residual: Array) -> Array:
-        """(3, m) powers of (K, 3) residuals at the frequencies that show the noise."""
         n = len(residual)
         frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
         low, high = (share / self.spacing for share in _NOISE_BAND)
@@ -245,34 +221,33 @@ class PoseSplines:
 
 
 class Choice:
-    """Splines of the same poses with knots of several distances, each fitted once."""
+    """Splines of the same poses with several knot distances, each fitted once."""
 
     def __init__(self, poses: Poses, aid: Aid | None = None) -> None:
-        """`poses` with continuous signs."""
         self.poses, self.aid = poses, aid
         self._fitted: dict[float, PoseSplines] = {}
 
     @property
     def rate(self) -> float:
-        """Of what they are fitted to [Hz]."""
+        """Rate of the fitted rows [Hz]."""
         return self.poses.rate + (0.0 if self.aid is None else self.aid.rate)
 
     def at(self, spacing: float) -> PoseSplines:
-        """Those with knots at this distance [s]."""
+        """Return the splines with this knot distance [s]."""
         if spacing not in self._fitted:
             self._fitted[spacing] = PoseSplines(self.poses, spacing, self.aid)
         return self._fitted[spacing]
 
 
 def passed(frequency: Array, spacing: float) -> Array:
-    """Share of white noise's power that splines pass (module docstring)."""
+    """Return the share of white noise's power that splines pass, Eq. (T72)."""
     x = np.minimum(frequency * spacing, 0.999)
     share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (DEGREE + 1)))
     return np.where(frequency * spacing < 1.0, share, 0.0)
 
 
 def _knots(t: Array, spacing: float, *, aided: bool = False) -> Array:
-    """Uniform ones, without those that no sample stands before: over a gap goes one polynomial."""
+    """Return uniform knots, without those in gaps of the samples."""
     inner = np.arange(t[0] + spacing, t[-1] - 0.5 * spacing, spacing)
     if aided:
         return np.concatenate([np.repeat(t[0], DEGREE + 1), inner, np.repeat(t[-1], DEGREE + 1)])
@@ -284,7 +259,7 @@ def _knots(t: Array, spacing: float, *, aided: bool = False) -> Array:
 
 
 def _sparser(knots: Array, t: Array) -> Array:
-    """Those with `FEWEST_PER_KNOT` samples between any two."""
+    """Return knots with at least `FEWEST_PER_KNOT` samples between them."""
     inner, kept, last = knots[DEGREE + 1 : -DEGREE - 1], [], 0
     for knot, before in zip(inner, np.searchsorted(t, inner), strict=True):
         if min(before - last, len(t) - before) >= FEWEST_PER_KNOT:
@@ -300,16 +275,13 @@ def _parts(count: int) -> list[slice]:
 def _normal(
     parts: Iterable[tuple[Array, Array]], knots: Array, degree: int, width: int
 ) -> tuple[Array, Array]:
-    """Upper band (degree + 1, n) and right-hand side (n, width) of the normal equations.
-
-    Of splines next to values (k, width) at times (k,), part after part.
-    """
+    """Return band (degree + 1, n) and right side (n, width) of the normal equations."""
     size, order = len(knots) - degree - 1, degree + 1
     band, right = np.zeros((order, size)), np.zeros((size, width))
     for t, x in parts:
         A = BSpline.design_matrix(t, knots, degree)
         basis, first = A.data.reshape(-1, order), A.indices[::order]
-        starts = np.flatnonzero(np.diff(first, prepend=-1))  # of the rows between two knots
+        starts = np.flatnonzero(np.diff(first, prepend=-1))  # first row after each knot
         columns = np.hstack([basis, x])
         for i in range(order):
             sums = np.add.reduceat(basis[:, i : i + 1] * columns[:, i:], starts)
@@ -321,9 +293,9 @@ def _normal(
 
 
 def _normal_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Array, Array]:
-    """`_normal` of values x (k, width) that the derivatives of this order are next to."""
+    """Return the same for values of a derivative of the spline."""
     change = eye_array(len(knots) - DEGREE - 1, format="csr")
-    for k in range(order):  # coefficients of a derivative, from those of what it is one of
+    for k in range(order):  # maps coefficients of a spline to those of its derivative
         inner, degree = knots[k : len(knots) - k], DEGREE - k
         span = inner[degree + 1 : -1] - inner[1 : -degree - 1]
         n = len(span)
@@ -343,14 +315,14 @@ def _normal_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Arra
 
 
 def _vector(q: Array, p: Array) -> Array:
-    """(N, 3) vector part of q* p."""
+    """Return (N, 3) vector part of q* p."""
     v, w = q[:, 1:], p[:, 1:]
     out: Array = q[:, :1] * w - p[:, :1] * v - _cross(v, w)
     return out
 
 
 def _in_P(q: Array, n: Array, x: NDArray[np.float64]) -> Array:
-    """(N, 3) vectors in the axes of P, of such in the world."""
+    """Return (N, 3) world vectors in the axes of P."""
     v = -q[:, 1:]
     once = _cross(v, x)
     out: Array = x + 2.0 * (q[:, :1] * once + _cross(v, once)) / n
@@ -358,7 +330,7 @@ def _in_P(q: Array, n: Array, x: NDArray[np.float64]) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """(N, 3) in a fifth of the time that numpy takes."""
+    """Return (N, 3) cross products, five times faster than NumPy."""
     out = np.empty(a.shape)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.subtract(a[:, j] * b[:, k], a[:, k] * b[:, j], out=out[:, i])

@@ -62,8 +62,8 @@ def _interpolated(
 def low_pass(x: NDArray[np.float64], dt: float, cutoff_hz: float | None) -> NDArray[np.float64]:
     """Filter (N, ...) samples of spacing `dt` [s] without phase shift, Eq. (T10).
 
-    The ends are continued by point reflection (2 x_0 - x_k). `scipy.signal.sosfiltfilt` has another
-    gain near the Nyquist rate. A cut-off of None or above that rate changes nothing.
+    The ends are continued by point reflection. A cut-off of None or above the Nyquist rate changes
+    nothing. `scipy.signal.sosfiltfilt` has another gain near that rate.
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return x
@@ -88,15 +88,10 @@ def low_pass(x: NDArray[np.float64], dt: float, cutoff_hz: float | None) -> NDAr
 def smooth_derivatives(
     x: NDArray[np.float64], dt: float, bandwidth_hz: float | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return x, dx/dt and d^2x/dt^2 by sliding polynomials of degree 5 (Savitzky and Golay, 1964).
+    """Return x, dx/dt and d^2x/dt^2 of (N, ...) samples by sliding polynomials of degree 5.
 
-    The window is 1.8 / `bandwidth_hz`, at least 9 samples. At that frequency the gain of the second
-    derivative is 0.43. `scipy.signal.savgol_filter` is inaccurate above 700 samples.
-
-    Args:
-        x: (N, ...) equidistant samples, N >= 9.
-        dt: their spacing [s].
-        bandwidth_hz: None for the shortest window.
+    This is the filter of Savitzky and Golay (1964). The window is 1.8 / `bandwidth_hz` [s], at
+    least 9 samples. `scipy.signal.savgol_filter` is inaccurate above 700 samples.
     """
     n = len(x)
     weights = smoother(n, dt, bandwidth_hz)
@@ -176,7 +171,7 @@ def low_passed(log: Log, cutoff_hz: float | None) -> Log:
 def undelayed(log: Log, delay_s: float) -> Log:
     """Return the log with its motion advanced by its lag `delay_s` behind the wrench.
 
-    Samples without motion are removed. Raises an error if fewer than 8 remain.
+    Samples without motion are removed; an error is raised if fewer than 8 remain.
     """
     if log.static or delay_s == 0:
         return log
@@ -209,10 +204,7 @@ def undelayed(log: Log, delay_s: float) -> Log:
 
 
 def measured(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """Return (N,) flags of samples that no gap affects.
-
-    After two periods of the low-pass, its impulse response is below 1e-4 of the peak.
-    """
+    """Return (N,) flags of samples that no gap affects, even after a low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
     return ~widened(log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt)))

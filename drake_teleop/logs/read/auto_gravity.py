@@ -22,7 +22,7 @@ def describe_gravity(
 ) -> tuple[Description, tuple[str, ...]]:
     """Replace `gravity: auto` by a vector of standard magnitude; return notes.
 
-    `read` returns the log of a description. Raises an error if the direction is undetermined.
+    Raises an error if the direction is undetermined.
     """
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf

@@ -23,7 +23,7 @@ def describe_mounting(
 ) -> tuple[Description, tuple[str, ...]]:
     """Replace `auto` in the IMU's frame and position by estimates; return notes.
 
-    `read` returns the log of a description. Raises an error if the data do not determine a value.
+    Raises an error if the data do not determine a value.
     """
     imu = description.imu
     assert imu is not None
@@ -56,7 +56,6 @@ def describe_mounting(
 
 
 def _believed(mounting: Mounting | None, where: str) -> Mounting:
-    """Return the mounting, or raise an error if its rotation is undetermined."""
     if mounting is None:
         what = "the specific force hardly changes, or gaps leave too little of it"
         remedy = "turn the sensor about two axes"

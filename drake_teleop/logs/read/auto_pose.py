@@ -17,7 +17,7 @@ def describe_pose_frame(
 ) -> tuple[Description, tuple[str, ...]]:
     """Replace `auto` in the pose frame by estimates from the wrench; return notes.
 
-    An IMU is not used. Raises an error if the data do not determine a value.
+    Raises an error if the data do not determine a value.
     """
     from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 

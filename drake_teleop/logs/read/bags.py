@@ -1,9 +1,8 @@
 """ROS bags and MCAP files: each topic becomes a table whose columns are message fields.
 
-The library rosbags (extra `ros`) reads them. Columns: numbers and arrays (up to 64) by path
-(`wrench.force.x`, `data.0`); unique short names of standard groups (`force.x`); `received` and
-`header.stamp` [s]; `stamp`, the latter if present. A group with covariance -1 is absent, as in
-ROS. TF messages are split into transforms.
+Columns are numbers and arrays (up to 64) by path (`wrench.force.x`, `data.0`), unique short names
+(`force.x`), `received`, `header.stamp` [s], and `stamp`, the latter if present. Groups with
+covariance -1 are absent, as in ROS.
 """
 
 from __future__ import annotations
@@ -69,7 +68,7 @@ class Topic:
     Attributes:
         name: such as "/ft/wrench".
         type: such as "geometry_msgs/msg/WrenchStamped".
-        messages: their number.
+        messages: number of messages.
         rate_hz: mean rate; 0 for an empty bag.
     """
 
@@ -99,8 +98,7 @@ def topics_of(path: Path) -> list[Topic]:
 def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
     """Return the messages of a topic as a table.
 
-    `child_frame` selects transforms or odometry by child_frame_id. Raises an error if bag, topic
-    or child frame are missing, or the child frame is ambiguous.
+    Raises an error if bag, topic or child frame are missing, or the child frame is ambiguous.
     """
     with _opened(path) as reader:
         connections = [entry for entry in reader.connections if entry.topic == topic]
@@ -246,7 +244,6 @@ def _parts(message: Any) -> list[Any]:
 def _blocks(
     pairs: Iterator[tuple[int, Any]], child_frame: str | None, where: str
 ) -> list[dict[str, NDArray]]:
-    """Return the columns of each `_BLOCK` messages, to limit memory."""
     children: set[str] = set()
     blocks: list[dict[str, NDArray]] = []
 

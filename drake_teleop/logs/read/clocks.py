@@ -106,10 +106,9 @@ def _common(t: NDArray[np.float64], time: Time) -> NDArray[np.float64]:
 
 
 def spread(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return times of rows with shared stamps: means over 50 distinct stamps, straight at the ends.
+    """Return times of rows with shared stamps: means over 50 distinct stamps.
 
-    Windows end at steps of more than three median steps. The mean of the stamps is kept. `t` (N,)
-    must not decrease.
+    Windows end at steps of more than three median steps. `t` (N,) must not decrease.
     """
     distinct = np.unique(t)
     step = float(np.median(np.diff(distinct)))

@@ -1,8 +1,7 @@
 """CSV files of recorders and spreadsheets: separator, decimal sign, header and encoding.
 
-Separators are `;`, tab, comma or spaces. With `;` or tab, or in quotes, a comma can be the decimal
-sign. Lines with `#` before the header are comments, except names directly before the numbers
-(`numpy.savetxt`). UTF-8 and UTF-16 are accepted. ISO 8601 dates become datetime64.
+With separators `;` and tab, or in quotes, a comma can be the decimal sign. Lines with `#` before
+the header are comments, except names directly before the numbers. UTF-8 and UTF-16 are accepted.
 """
 
 from __future__ import annotations
@@ -112,7 +111,6 @@ def _separator(line: str) -> str:
 
 
 def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
-    """Return names from the last comment if numbers follow, one for each name."""
     told = [line for line in comments if line.startswith("#")]
     if not told or not all(_is_number(cell) for cell in rest[0].split(separator)):
         return None

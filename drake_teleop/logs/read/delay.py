@@ -25,13 +25,9 @@ def estimate_delay(
 ) -> float | None:
     """Return the delay of the motion behind the wrench [s], or None if undetermined.
 
-    It minimizes sum_c log var(w_c - o_c - (V(t + delay) phi)_c) over the channels c, within
-    +-0.25 s or a tenth of the record. Offsets o, and phi if not given, are fitted at each shift.
-
-    Args:
-        log: the log.
-        cutoff_hz: of the low-pass; None for 30 Hz.
-        phi: (10,) identified load, or None.
+    It minimizes sum_c log var(w_c - o_c - (V(t + delay) phi)_c) over the channels c, within +-0.25
+    s or a tenth of the record. Offsets o, and phi if not given, are fitted. The cut-off is 30 Hz by
+    default.
     """
     cutoff = min(cutoff_hz or 30.0, 0.2 / log.dt)
     smooth = low_passed(log, cutoff)

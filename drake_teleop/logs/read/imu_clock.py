@@ -62,10 +62,10 @@ def clock_drift(
     lag: float,
     independent: float,
 ) -> tuple[float, float]:
-    """Return lag at mid-record [s] and drift [s/s], by Gauss-Newton from a constant lag [s].
+    """Return lag at mid-record [s] and drift [s/s], from a constant lag [s].
 
-    `pairs` are signals at `t` (N,) and IMU signals at `t_imu`. `independent` is the number of
-    independent samples. A drift that is insignificant or below 10 ms is 0.
+    `independent` is the number of independent samples. A drift that is insignificant or below 10 ms
+    is 0.
     """
     tau = t - t.mean()
     found = np.array([lag, 0.0])

@@ -54,8 +54,8 @@ class LeverArm:
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     """Fit offsets, load, delay and lever arm to the wrench of a rigid load, Eq. (T21).
 
-    The log contains the accelerometer's specific force, in the axes of S. Returns None if more than
-    5 % of the variance remains (contact), or a tenth of the record is not available.
+    Returns None if more than 5 % of the variance remains (contact), or gaps leave less than a
+    tenth.
     """
     cutoff = min(CUTOFF, 0.2 / log.dt)
     delay = estimate_delay(log, None) or 0.0
@@ -101,11 +101,10 @@ def lever_matrix(omega: NDArray[np.float64], alpha: NDArray[np.float64]) -> NDAr
 
 
 def shown_axes(K: NDArray[np.float64], log: Log, cutoff: float) -> NDArray[np.bool_]:
-    """Return (3,) axes along which the motion exceeds its noise.
+    """Return (3,) axes along which the motion exceeds its noise, which biases the arm to zero.
 
-    Noise in K biases the lever arm to zero and is not visible in residuals. The power density of
-    differentiated white noise grows at least with f^2, so the noise below the cut-off is at most a
-    seventh of that in the next octave.
+    The noise below the cut-off is at most a seventh of that in the next octave, because its power
+    density grows at least with f^2.
     """
     alpha = log.angular_acceleration
     above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)

@@ -1,7 +1,7 @@
 """Rotation, position and clock of an IMU on the sensor, by comparison with the pose, Eq. (T20).
 
-Without positions only the rotation is found. Standard deviations are those of `jackknife`; they
-exclude interpolation (about 0.1 % of p) and scale errors.
+Without positions only the rotation is found. Standard deviations exclude interpolation (about
+0.1 % of p) and scale errors.
 """
 
 from __future__ import annotations
@@ -102,19 +102,13 @@ class Mounting:
 
 
 def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | None:
-    """Estimate rotation, position and clock of an IMU from two readings of a log.
+    """Estimate rotation, position and clock of an IMU; `pose` is the log without it.
 
-    First the clock is found within +-1 s by free linear maps. Then least squares refine rotation,
-    biases, lever arm and lag, from the rotation of Kabsch (1976). Each sensor is weighted by its
-    residual, and all signals are low-passed at 8 Hz.
+    The clock is found within +-1 s by free linear maps. Then least squares refine rotation, biases,
+    lever arm and lag, starting from the rotation of Kabsch (1976), at 8 Hz.
 
-    Args:
-        imu: specific force and angular velocity from the IMU.
-        pose: the same from the pose alone.
-        position: whether the pose has positions.
-
-    Returns:
-        None if the specific force changes by less than 0.5 m/s^2 (rms), or gaps leave too little.
+    Returns None if the specific force changes by less than 0.5 m/s^2 (rms), or gaps leave too
+    little.
     """
     start, stop = max(imu.t[0], pose.t[0]), min(imu.t[-1], pose.t[-1])
     reach = min(_REACH, 0.2 * float(stop - start))
@@ -180,19 +174,11 @@ def _refined(
     R: NDArray[np.float64],
     lag: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Solve the least squares of `find_mounting`.
+    """Solve the least squares of `find_mounting` for k signals `pairs`.
 
-    Args:
-        t: (N,) on the pose's clock [s].
-        later: (N,) lag by drift [s].
-        t_imu: (M,) on the IMU's clock [s].
-        pairs: k signals, (N, 3) of the pose and (M, 3) of the IMU.
-        K: (N, 3, 3) of Eq. (T20).
-        R, lag: start.
-
-    Returns:
-        (7 + 3 k,) rotation vector [rad], lag [s], p [m] and biases; their standard deviations;
-        (N, 3 k) residuals.
+    `t` (N,) are times on the pose's clock, `later` (N,) lags by drift, `t_imu` (M,) times on the
+    IMU's clock [s]; K (N, 3, 3) of Eq. (T20). Returns (7 + 3 k,) rotation vector [rad], lag [s], p
+    [m] and biases, their standard deviations, and (N, 3 k) residuals.
     """
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
 

@@ -57,9 +57,9 @@ def read_log(
     """Read a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
 
     Streams are interpolated on the wrench's clock at its median rate; faster streams are low-passed
-    first. For time stamps and gaps see `drake_teleop.logs.read.clocks`. Angular velocity comes from
-    the gyroscope, else the orientation; angular acceleration from the file, else by
-    differentiation; specific force from the accelerometer, else the position, else it is -gravity.
+    first. Angular velocity comes from the gyroscope, else the orientation; angular acceleration
+    from the file, else by differentiation; specific force from the accelerometer, else the
+    position, else it is -gravity.
 
     Args:
         path: the file.
@@ -398,7 +398,6 @@ class _Reader:
         return clock
 
     def _half_window(self, dt: float) -> float:
-        """Return half the window of a derivative [s]."""
         window = SMOOTHER_WINDOW / self._bandwidth_hz if self._bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 

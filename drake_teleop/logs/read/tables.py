@@ -60,8 +60,7 @@ class Table:
     ) -> NDArray[np.float64]:
         """Return (N, width) finite numbers of the named columns, side by side.
 
-        `where` is the field for messages. Raises an error if a column is absent, a cell is not
-        finite, or `width` or `rows` differ.
+        Raises an error if a column is absent, a cell is not finite, or `width` or `rows` differ.
         """
         columns = [self._column(str(name), where) for name in names]
         self._check_rows(names, columns, where, rows)
@@ -93,7 +92,7 @@ class Table:
         return np.hstack(columns)
 
     def raw(self, name: str | int, where: str) -> NDArray[np.float64]:
-        """Return (N, k) numbers of a column, NaN and infinity included; raise an error if absent."""
+        """Return (N, k) numbers of a column, including NaN and infinity, or raise an error."""
         name = str(name)
         if name not in self.columns:
             return self._column(name, where)
