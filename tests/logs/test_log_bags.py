@@ -368,7 +368,7 @@ def test_without_the_library_the_message_names_it(
         topics_of(tmp_path / "run1")
 
 
-@pytest.mark.parametrize("limit", ["_MOST_UNPACKED", "_MOST_MEMORY"])
+@pytest.mark.parametrize("limit", ["_MAX_UNPACKED_BYTES", "_MAX_MEMORY_BYTES"])
 def test_a_bag_that_unpacks_to_too_much_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str
 ) -> None:
@@ -383,7 +383,7 @@ def test_a_bag_that_unpacks_to_too_much_is_one_line(
         writer.add_message(channel, 0, b"\0\1\0\0" + bytes(size), 0)
         writer.finish()
     assert path.stat().st_size < size / 100
-    monkeypatch.setattr(bags, "_MOST_RATIO", 1 if limit == "_MOST_UNPACKED" else 10**6)
+    monkeypatch.setattr(bags, "_MAX_UNPACK_RATIO", 1 if limit == "_MAX_UNPACKED_BYTES" else 10**6)
     monkeypatch.setattr(bags, limit, 40_000_000)
     with pytest.raises(DrakeTeleopError, match="unpacks to more than can be read; cut it"):
         read_topic(path, "/x")
@@ -395,7 +395,7 @@ def test_many_messages_are_the_same_as_few(tmp_path: Path, monkeypatch: pytest.M
     for topic, child in (("/ft", None), ("/tf", "tool0")):
         whole = read_topic(bag, topic, child).columns
         with monkeypatch.context() as patch:
-            patch.setattr(bags, "_BLOCK", 7)
+            patch.setattr(bags, "_BLOCK_MESSAGES", 7)
             parts = read_topic(bag, topic, child).columns
         assert parts.keys() == whole.keys() and len(whole["received"]) > 7
         for name, values in whole.items():

@@ -201,10 +201,10 @@ def test_the_wrench_is_believed_where_it_tells_more_than_the_pose(
     monkeypatch.setattr(auto_mounting, "lever_arm_from_wrench", lambda _: other)
     of_the_pose: Any = SimpleNamespace(fits=True, lever=of_pose)
     if taken == "wrench":
-        assert auto_mounting._lever(of_the_pose, None, "here") is other
+        assert auto_mounting._choose_lever_arm(of_the_pose, None, "here") is other
         return
     with pytest.raises(DrakeTeleopError, match=r"determine z of .* from the pose\)"):
-        auto_mounting._lever(of_the_pose, None, "here")
+        auto_mounting._choose_lever_arm(of_the_pose, None, "here")
 
 
 def test_a_load_that_touches_something_tells_nothing() -> None:

@@ -128,10 +128,10 @@ def test_what_no_rigid_load_explains_identifies_none_unless_it_is_stated(folder)
 
 
 LIMITS = {
-    "read.tables._LARGE": 100,
-    "read.reading._CHUNK": 300,
-    "read.alignment._CHUNK": 170,
-    "pose_motion.splines._CHUNK": 260,
+    "read.tables._MAX_CELLS_IN_MEMORY": 100,
+    "read.reading._CHUNK_ROWS": 300,
+    "read.alignment._CHUNK_ROWS": 170,
+    "pose_motion.splines._CHUNK_ROWS": 260,
     "posed_fit._SHOWN": 300,
     "posed_fit._CHUNK": 70,
     "posed_fit._BESIDE": 30,

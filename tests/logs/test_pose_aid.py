@@ -12,12 +12,12 @@ import yaml
 from posed_record import GRAVITY_W, LATE, PHI, SECONDS, TRUTH, Kind, motion_at, record
 from scipy.interpolate import BSpline
 
-from drake_teleop.logs.pose_motion.aid import aid_of
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
+from drake_teleop.logs.pose_motion.imu_rows import compare_imu
 from drake_teleop.logs.pose_motion.noise import noise_moments
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.pose_motion.spectra import Grid, bands, end_taper, signal_spectrum
-from drake_teleop.logs.pose_motion.splines import DEGREE, Choice, PoseSplines, _normal_of_rates
+from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, SplineCache, _normal_of_rates
 from drake_teleop.logs.processing import identify_log
 
 RATE, NOISE = 250.0, (0.03, 2e-3)
@@ -46,7 +46,7 @@ def poses_of(kind: Kind) -> tuple[np.ndarray, np.ndarray, Poses]:
 
 def test_poses_tell_bias_axes_clock_and_noise_of_an_imu():
     splines = PoseSplines(poses_of(Kind(seed=4))[2], 0.07)
-    aid = aid_of(splines, sensed(4, later=0.008), GRAVITY_W)
+    aid = compare_imu(splines, sensed(4, later=0.008), GRAVITY_W)
     assert aid is not None
     truth = motion_at(aid.t - LATE)
     acceleration = np.einsum("nij,nj->ni", truth.R_WS, truth.specific_force) + GRAVITY_W
@@ -85,9 +85,9 @@ def test_the_noise_that_splines_of_both_leave_is_as_said():
         # Half an angle in each part of the quaternion.
         q = exact.quaternion + 0.5 * ROUGH.turn * rng.normal(size=exact.quaternion.shape)
         noisy = Poses(exact.t, moved, q / np.linalg.norm(q, axis=1, keepdims=True))
-        aid = aid_of(PoseSplines(noisy, 0.1), sensed(seed), GRAVITY_W)
+        aid = compare_imu(PoseSplines(noisy, 0.1), sensed(seed), GRAVITY_W)
         assert aid is not None
-        splines = Choice(noisy, aid).at(0.05)
+        splines = SplineCache(noisy, aid).at(0.05)
         error = splines.signals(t, GRAVITY_W) - clean
         power = of.sums(np.abs(signal_spectrum(grid, taper, error, len(of.frequency))) ** 2)
         Q = noise_moments(splines, grid, taper, clean, of, splines.noise())
@@ -102,7 +102,7 @@ def test_an_imu_makes_a_load_of_rough_poses_surer():
     t, wrench, poses = poses_of(ROUGH)
     alone = estimate_from_poses(t, wrench, poses, GRAVITY_W)
     both = estimate_from_poses(t, wrench, poses, GRAVITY_W, imu=sensed(4))
-    assert both.splines.aid is not None
+    assert both.splines.imu_rows is not None
     deviations = np.sqrt(np.diag(both.covariance))
     assert np.abs((both.theta - TRUTH) / deviations).max() < 3.5
     inertia = deviations[10:] / np.sqrt(np.diag(alone.covariance))[10:]
@@ -113,7 +113,7 @@ def test_an_imu_of_other_axes_is_not_heard():
     splines, imu = PoseSplines(poses_of(Kind(seed=4))[2], 0.07), sensed(4)
     assert imu.specific_force is not None
     other = replace(imu, specific_force=imu.specific_force[:, [1, 0, 2]])
-    assert aid_of(splines, other, GRAVITY_W) is None
+    assert compare_imu(splines, other, GRAVITY_W) is None
 
 
 @pytest.mark.slow  # two loads from files of 20 s

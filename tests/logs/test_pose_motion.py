@@ -29,6 +29,12 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
 from drake_teleop.logs.pose_motion.levels import Levels
+from drake_teleop.logs.pose_motion.linear_model import (
+    best_delay,
+    fit_levels,
+    fit_linear_model,
+    spectra_of,
+)
 from drake_teleop.logs.pose_motion.noise import noise_moments
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
@@ -42,10 +48,9 @@ from drake_teleop.logs.pose_motion.rigid import (
     fit_rigid,
     motion_map,
 )
-from drake_teleop.logs.pose_motion.saturated import best_delay, saturated, spectra_of, wandering
 from drake_teleop.logs.pose_motion.spectra import Grid, bands, end_taper, moments, signal_spectrum
 from drake_teleop.logs.pose_motion.spectra import without as taper_without
-from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, _knots, _sparser
+from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, _knots, _thin_knots
 from drake_teleop.logs.read.rotations import rotation_matrices
 
 
@@ -82,7 +87,7 @@ def test_signals_are_those_of_the_motion_on_stamps_that_jitter_and_over_a_gap():
 def test_where_one_pose_to_a_knot_is_too_little_there_are_fewer_knots():
     """As a busy machine records: gaps of all lengths. The whole spline would not be determined."""
     t = np.cumsum(np.random.default_rng(1).exponential(0.0125, 200))
-    knots = _sparser(_knots(t, 0.0125), t)
+    knots = _thin_knots(_knots(t, 0.0125), t)
     assert np.diff(np.searchsorted(t, knots[DEGREE:-DEGREE])).min() >= 2 and len(knots) > 80
     assert knots[0] == t[0] and knots[-1] == t[-1]
 
@@ -388,12 +393,12 @@ def test_channels_that_wander_are_told_and_weigh_less_where_they_do():
     grid, taper = Grid.of(t, wrench), end_taper(t[::2], 0.3, SECONDS - 0.3)
     splines = PoseSplines(poses.continued(), 0.1)
     spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
-    levels = wandering(spectra.moments(), spectra.of)
+    levels = fit_levels(spectra.moments(), spectra.of)
     at = spectra.of.sums(spectra.of.frequency) / spectra.of.sizes
     corner = np.sqrt(levels.shape - 1.0)[5] * at[5]
     assert (corner[[2, 3]] > 0.7).all() and (corner[[2, 3]] < 3.3).all()
     np.testing.assert_array_equal(corner[[0, 1, 4, 5]], 0.0)
-    power = saturated(spectra.moments(), levels).power
+    power = fit_linear_model(spectra.moments(), levels).power
     assert (power[0, 2:4] > 30.0 * power[-1, 2:4]).all()
     assert (np.diff(power[levels.group == 0, 2]) < 0.0).all()
 
@@ -407,7 +412,7 @@ def test_deviations_count_that_the_weights_are_estimated():
     for c in range(6):
         Z[:, 16 + c, 16 + c] = n * power
     start = State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
-    best = saturated(Z, levels)
+    best = fit_linear_model(Z, levels)
     fit = fit_rigid(Z, np.zeros_like(Z), levels, start, np.arange(23) == 0, best)
     level = power * n / (n - 0.5 / 4)
     variance = level / (2 * 4 * n) * (1 + 4 * 4 * (1 / 4) * (3 / 4) / (2 * n))
@@ -448,7 +453,7 @@ def test_delays_are_tried_together_as_one_by_one(chopped):
     taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
     taper = taper_without(taper, chopped & (np.abs(grid.t - 5.0) < 0.3), grid.dt)
     spectra = spectra_of(PoseSplines(poses.continued(), 0.07), grid, taper, GRAVITY_W, -0.02, 20.0)
-    assert spectra.chopped is chopped
+    assert spectra.taper_fixed is chopped
     delays = np.array([-0.05, -0.02, LATE])
     alone = [spectra.at(delay).fit().cost for delay in delays]
     np.testing.assert_allclose(spectra.costs(delays), alone, rtol=1e-9)

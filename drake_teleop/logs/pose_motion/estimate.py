@@ -1,6 +1,6 @@
 """Estimation of load, delay and pose frame from a wrench and poses (docs/theory.md).
 
-1. Initial knots and delay, disturbances and clock rate, from at most `SEARCHED` seconds.
+1. Initial knots and delay, disturbances and clock rate, from at most `SEARCHED_S` seconds.
 2. Knot distance, delay and use of an IMU with the least cost.
 3. Rigid load, with the frame as described and with the frame free.
 """
@@ -17,12 +17,23 @@ from drake_teleop.common.arrays import Array, checked
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.logs.pose_motion.aid import aid_of
 from drake_teleop.logs.pose_motion.clock_rate import at_rate, clock_rate
+from drake_teleop.logs.pose_motion.imu_rows import compare_imu
+from drake_teleop.logs.pose_motion.linear_model import (
+    MAX_DELAY_CHANGE_S,
+    Spectra,
+    averaged_splines,
+    choose_spacing,
+    delay_deviation,
+    fit_levels,
+    fit_linear_model,
+    guess_spacing,
+    spectra_of,
+)
 from drake_teleop.logs.pose_motion.noise import noise_moments
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
-from drake_teleop.logs.pose_motion.rejection import disturbed
+from drake_teleop.logs.pose_motion.rejection import find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
     LEVER,
     LOAD,
@@ -32,33 +43,22 @@ from drake_teleop.logs.pose_motion.rigid import (
     State,
     fit_rigid,
 )
-from drake_teleop.logs.pose_motion.saturated import (
-    REACH,
-    Spectra,
-    best_spacing,
-    delay_deviation,
-    first_guess,
-    for_search,
-    saturated,
-    spectra_of,
-    wandering,
-)
-from drake_teleop.logs.pose_motion.spectra import TOP, Grid, end_taper, without
-from drake_teleop.logs.pose_motion.splines import Choice, PoseSplines
+from drake_teleop.logs.pose_motion.spectra import MAX_FREQUENCY_HZ, Grid, end_taper, exclude
+from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
 
-SEARCHED = 120.0
+SEARCHED_S = 120.0
 """Length of the searched part of a record [s]."""
-SHIFT, SHIFT_KNOWN = 0.01, 0.02
+MIN_SHIFT, MAX_SHIFT_DEVIATION = 0.01, 0.02
 """Least shift that is reported, and largest standard deviation of a known one [m]."""
-TURNED_DEG, TURN_KNOWN_DEG = 5.0, 1.0
+MIN_ROTATION_DEG, MAX_ROTATION_DEVIATION_DEG = 5.0, 1.0
 """The same of a rotation [deg]."""
-_WALD, _DEVIATIONS = 50.0, 5.0
+_MIN_WALD, _MIN_DEVIATIONS = 50.0, 5.0
 _SHARE_OF_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
-_GAP, _BESIDE = 0.1, 0.4
-_FEWEST, _FEWEST_OF_LOAD = 100, 32
-_NOTHING = 1e-3
-_UNTURNED = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_MIN_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
+_MIN_INSTANTS, _MIN_INSTANTS_OF_LOAD = 100, 32
+_NEGLIGIBLE = 1e-3
+_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +86,12 @@ class Frame:
     @property
     def position_known(self) -> NDArray[np.bool_]:
         """(3,) whether each coordinate is determined."""
-        return np.asarray(self.position_deviations < SHIFT_KNOWN)
+        return np.asarray(self.position_deviations < MAX_SHIFT_DEVIATION)
 
     @property
     def rotation_known(self) -> NDArray[np.bool_]:
         """(3,) whether the rotation about each axis of S is determined."""
-        return np.asarray(self.turn_deviations_deg < TURN_KNOWN_DEG)
+        return np.asarray(self.turn_deviations_deg < MAX_ROTATION_DEVIATION_DEG)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def estimate_from_poses(
     gravity_W: ArrayLike,
     *,
     p_SoPo_S: ArrayLike | None = (0.0, 0.0, 0.0),
-    R_SP: ArrayLike | None = _UNTURNED,
+    R_SP: ArrayLike | None = _IDENTITY,
     delay: float | None = None,
     near: float = 0.0,
     gain: float = 0.0,
@@ -183,34 +183,36 @@ def estimate_from_poses(
         DrakeTeleopError: for wrong shapes, or if fewer than 100 instants remain.
     """
     with one_blas_thread():
-        grid, poses, gravity, top = _prepared(
-            t, wrench, poses, gravity_W, near if delay is None else delay, lost, _FEWEST
+        grid, poses, gravity, top = _prepare(
+            t, wrench, poses, gravity_W, near if delay is None else delay, lost, _MIN_INSTANTS
         )
         guess = near if delay is None else delay
-        chosen = _chosen(grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu)
+        chosen = _search(grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu)
         splines, late = chosen.splines, chosen.last.delay
         base = _base_taper(grid, splines.poses, lost, late)
         spectra = spectra_of(splines, grid, base, gravity, late, top)
-        rejected, note = disturbed(spectra, grid, base, splines.spacing)
-        taper = without(base, rejected, grid.dt)
+        rejected, note = find_disturbances(spectra, grid, base, splines.spacing)
+        taper = exclude(base, rejected, grid.dt)
         spectra = spectra_of(splines, grid, taper, gravity, late, top)
         Z = spectra.moments()
         Q = noise_moments(splines, grid, spectra.taper, spectra.zeta, spectra.of, splines.noise())
-        levels = wandering(Z, spectra.of)
-        best = saturated(Z, levels)
+        levels = fit_levels(Z, spectra.of)
+        best = fit_linear_model(Z, levels)
 
         def fitted(start: State, free: NDArray[np.bool_]) -> RigidFit:
             return fit_rigid(Z, Q, levels, start, free, best, gain=gain)
 
         seen = read_off(best)
         start = _start(p_SoPo_S, R_SP, seen)
-        fixed = np.ones(PARAMETERS, bool)
-        fixed[16] = delay is None
-        fixed[LEVER], fixed[TURN] = p_SoPo_S is None, R_SP is None
-        fit = fitted(start, fixed)
-        everything = np.ones(PARAMETERS, bool)
-        everything[16] = delay is None
-        free = fit if (fixed == everything).all() else fitted(_freed(fit, start, seen), everything)
+        fit_free = np.ones(PARAMETERS, bool)
+        fit_free[16] = delay is None
+        fit_free[LEVER], fit_free[TURN] = p_SoPo_S is None, R_SP is None
+        fit = fitted(start, fit_free)
+        all_free = np.ones(PARAMETERS, bool)
+        all_free[16] = delay is None
+        free = (
+            fit if (fit_free == all_free).all() else fitted(_free_start(fit, start, seen), all_free)
+        )
         return PoseEstimate(
             splines=splines,
             delay_s=spectra.delay + fit.state.tau,
@@ -218,7 +220,7 @@ def estimate_from_poses(
             clock_rate=chosen.rate,
             imu_agrees=chosen.agrees,
             fit=fit,
-            frame=_frame(free, start),
+            frame=_estimate_frame(free, start),
             free=free,
             seen=seen,
             t=grid.t,
@@ -245,9 +247,9 @@ def motion_of_load(
     """
     with one_blas_thread():
         guess = 0.0 if delay is None else delay
-        prepared = _prepared(t, wrench, poses, gravity_W, guess, lost, _FEWEST_OF_LOAD, load)
+        prepared = _prepare(t, wrench, poses, gravity_W, guess, lost, _MIN_INSTANTS_OF_LOAD, load)
         grid, poses, gravity, top = prepared
-        chosen = _chosen(grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu)
+        chosen = _search(grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu)
         return PoseMotion(
             splines=chosen.splines,
             delay_s=chosen.last.delay,
@@ -257,7 +259,7 @@ def motion_of_load(
         )
 
 
-def _prepared(
+def _prepare(
     t: ArrayLike,
     wrench: ArrayLike,
     poses: Poses,
@@ -276,19 +278,19 @@ def _prepared(
             "wrench and poses have too little in common",
             remedy="record longer, without interruptions",
         )
-    top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
+    top = min(MAX_FREQUENCY_HZ, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
     return grid, poses, gravity, top
 
 
 @dataclass(frozen=True, eq=False)
-class _Chosen:
+class _SearchResult:
     splines: PoseSplines
     last: Spectra
     rate: float
     agrees: bool
 
 
-def _chosen(
+def _search(
     grid: Grid,
     poses: Poses,
     lost: NDArray[np.bool_] | None,
@@ -298,47 +300,55 @@ def _chosen(
     *,
     known: bool,
     imu: Inertial | None = None,
-) -> _Chosen:
-    part = _liveliest(grid)
-    some = replace(grid, t=grid.t[part], wrench=_rows(grid, part))
-    near = _within(poses, some)
-    few = for_search(near)
-    taper = _base_taper(grid, poses, lost, delay)[part] * end_taper(some.t, some.t[0], some.t[-1])
-    spacing, late = first_guess(few, some, taper, gravity, delay, top, known=known)
-    first = spectra_of(PoseSplines(near, spacing), some, taper, gravity, late, top)
-    clear = without(taper, disturbed(first, some, taper, spacing)[0], grid.dt)
+) -> _SearchResult:
+    part = _most_varied_part(grid)
+    part_grid = replace(grid, t=grid.t[part], wrench=_wrench_rows(grid, part))
+    near = _poses_near(poses, part_grid)
+    cache = averaged_splines(near)
+    taper = _base_taper(grid, poses, lost, delay)[part] * end_taper(
+        part_grid.t, part_grid.t[0], part_grid.t[-1]
+    )
+    spacing, late = guess_spacing(cache, part_grid, taper, gravity, delay, top, known=known)
+    first = spectra_of(PoseSplines(near, spacing), part_grid, taper, gravity, late, top)
+    clear_taper = exclude(taper, find_disturbances(first, part_grid, taper, spacing)[0], grid.dt)
     rate = 0.0
     if not known:
-        rate = clock_rate(few, some, clear, gravity, late, top, spacing)
+        rate = clock_rate(cache, part_grid, clear_taper, gravity, late, top, spacing)
     if rate:
-        near, poses = (at_rate(x, rate, some, late) for x in (near, poses))
-        few = for_search(near)
+        near, poses = (at_rate(x, rate, part_grid, late) for x in (near, poses))
+        cache = averaged_splines(near)
     first_spacing, agrees = spacing, True
-    choices = [few]
+    choices = [cache]
     if imu is not None:
-        aid = aid_of(PoseSplines(near, first_spacing), imu, gravity)
-        agrees = aid is not None
-        choices += [] if aid is None else [Choice(few.poses, aid)]
-    chosen, spacing, late = best_spacing(choices, some, clear, gravity, late, top, known=known)
-    aid = chosen.aid
-    if aid is not None and imu is not None and len(near.t) < len(poses.t):
-        aid = aid_of(PoseSplines(poses, first_spacing), imu, gravity)  # of the whole record
-    last = spectra_of(chosen.at(spacing), some, clear, gravity, late, top)
-    return _Chosen(PoseSplines(poses, spacing, aid), last, rate, agrees)
+        imu_rows = compare_imu(PoseSplines(near, first_spacing), imu, gravity)
+        agrees = imu_rows is not None
+        choices += [] if imu_rows is None else [SplineCache(cache.poses, imu_rows)]
+    chosen, spacing, late = choose_spacing(
+        choices, part_grid, clear_taper, gravity, late, top, known=known
+    )
+    imu_rows = chosen.imu_rows
+    if imu_rows is not None and imu is not None and len(near.t) < len(poses.t):
+        imu_rows = compare_imu(
+            PoseSplines(poses, first_spacing), imu, gravity
+        )  # of the whole record
+    last = spectra_of(chosen.at(spacing), part_grid, clear_taper, gravity, late, top)
+    return _SearchResult(PoseSplines(poses, spacing, imu_rows), last, rate, agrees)
 
 
-def _rows(grid: Grid, part: slice) -> Array:
+def _wrench_rows(grid: Grid, part: slice) -> Array:
     return grid.wrench[part.start * grid.stride : part.stop * grid.stride]
 
 
-def _within(poses: Poses, grid: Grid) -> Poses:
-    inside = (poses.t >= grid.t[0] - 2 * REACH) & (poses.t <= grid.t[-1] + 2 * REACH)
+def _poses_near(poses: Poses, grid: Grid) -> Poses:
+    inside = (poses.t >= grid.t[0] - 2 * MAX_DELAY_CHANGE_S) & (
+        poses.t <= grid.t[-1] + 2 * MAX_DELAY_CHANGE_S
+    )
     return Poses(poses.t[inside], poses.position[inside], poses.quaternion[inside])
 
 
-def _liveliest(grid: Grid) -> slice:
+def _most_varied_part(grid: Grid) -> slice:
     """Return the part of the record in which the force changes most."""
-    rows, length = len(grid.t), round(SEARCHED / grid.dt)
+    rows, length = len(grid.t), round(SEARCHED_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
     starts = range(0, rows - length, length // 2)
@@ -359,9 +369,9 @@ def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None, delay:
     if lost is not None:
         rows = len(grid.t) * grid.stride
         bad |= lost[:rows].reshape(-1, grid.stride).any(axis=1)
-    for k in np.flatnonzero(np.diff(stamps) > _GAP):
-        bad |= (grid.t > stamps[k] - _BESIDE) & (grid.t < stamps[k + 1] + _BESIDE)
-    return without(taper, bad, grid.dt, grid.dt)
+    for k in np.flatnonzero(np.diff(stamps) > _MIN_GAP_S):
+        bad |= (grid.t > stamps[k] - _GAP_MARGIN_S) & (grid.t < stamps[k + 1] + _GAP_MARGIN_S)
+    return exclude(taper, bad, grid.dt, grid.dt)
 
 
 def _start(p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: ReadOff) -> State:
@@ -372,7 +382,7 @@ def _start(p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: ReadOff) ->
     return State(np.zeros(16), 0.0, -R @ p, R)
 
 
-def _freed(fit: RigidFit, start: State, seen: ReadOff) -> State:
+def _free_start(fit: RigidFit, start: State, seen: ReadOff) -> State:
     """Return the described frame, or that of the linear model if it differs."""
     turned = seen.usable and not seen.mirrored and np.trace(seen.R_SP @ start.R) < 2.9
     if not turned:
@@ -381,39 +391,48 @@ def _freed(fit: RigidFit, start: State, seen: ReadOff) -> State:
     return State(np.zeros(16), fit.state.tau, R @ start.R.T @ start.r, R)
 
 
-def _frame(free: RigidFit, start: State) -> Frame:
+def _estimate_frame(free: RigidFit, start: State) -> Frame:
     R_SP, r = free.state.R.T, free.state.r
-    place = -R_SP @ r
+    origin = -R_SP @ r
     covariance = free.covariance[17:, 17:]
     # p = -R^T r, and R exp([rho x]) changes it to p - rho x p.
-    jacobian = np.hstack([-R_SP, cross_matrix(place)])
+    jacobian = np.hstack([-R_SP, cross_matrix(origin)])
     known = np.isfinite(np.diag(covariance))
     finite = np.where(known[:, None] & known, covariance, 0.0)
     deviations = np.sqrt(np.diag(jacobian @ finite @ jacobian.T))
     if not known.all():
-        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _NOTHING
+        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _NEGLIGIBLE
         deviations = np.where(lost, np.inf, deviations)
     moved = free.state.r - start.r
     turned = Rotation.from_matrix(start.R.T @ free.state.R).as_rotvec()
     change = np.concatenate([moved, turned])[known]
     wald = float(change @ np.linalg.solve(covariance[np.ix_(known, known)], change))
-    along, about = _along(moved, covariance[:3, :3]), _along(turned, covariance[3:, 3:])
+    shift_deviation, angle_deviation = (
+        _length_deviation(moved, covariance[:3, :3]),
+        _length_deviation(turned, covariance[3:, 3:]),
+    )
     shift, angle = np.linalg.norm(moved), np.linalg.norm(turned)
-    limit, sure = np.radians([TURNED_DEG, TURN_KNOWN_DEG])
-    shifted = shift > max(SHIFT, _DEVIATIONS * along) and along < SHIFT_KNOWN
-    tilted = angle > max(limit, _DEVIATIONS * about) and about < sure
+    limit, largest_deviation = np.radians([MIN_ROTATION_DEG, MAX_ROTATION_DEVIATION_DEG])
+    shifted = (
+        shift > max(MIN_SHIFT, _MIN_DEVIATIONS * shift_deviation)
+        and shift_deviation < MAX_SHIFT_DEVIATION
+    )
+    tilted = (
+        angle > max(limit, _MIN_DEVIATIONS * angle_deviation)
+        and angle_deviation < largest_deviation
+    )
     return Frame(
-        p_SoPo_S=place,
+        p_SoPo_S=origin,
         R_SP=R_SP,
         position_deviations=deviations,
         turn_deviations_deg=np.degrees(np.sqrt(np.diag(covariance)[3:])),
         wald=wald,
-        shifted=bool(wald > _WALD and shifted),
-        turned=bool(wald > _WALD and tilted),
+        shifted=bool(wald > _MIN_WALD and shifted),
+        turned=bool(wald > _MIN_WALD and tilted),
     )
 
 
-def _along(x: Array, covariance: Array) -> float:
+def _length_deviation(x: Array, covariance: Array) -> float:
     """Return the standard deviation of the length of x; inf if a part is undetermined."""
     if not np.isfinite(np.diag(covariance)).all():
         return np.inf

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.arrays import Array
 from drake_teleop.logs.pose_motion.spectra import Bands
 
-_LEAST_LEFT = 0.25
+_MIN_REMAINING_SHARE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,15 +33,17 @@ class Levels:
         """Return white noise within each group."""
         return cls(of.sizes, of.group, np.ones((of.count, 6)))
 
-    def power(self, sums: Array, taken: Array | None = None) -> Array:
+    def power(self, sums: Array, used: Array | None = None) -> Array:
         """Return (..., bands, 6) mean power of residual power `sums` (..., bands, 6).
 
-        `taken` (bands, 6) are degrees of freedom used by parameters.
+        `used` (bands, 6) are degrees of freedom used by parameters.
         """
-        left = self._numbers
-        if taken is not None:
-            left = np.maximum(left - 0.5 * self.grouped(taken), _LEAST_LEFT * left)
-        level = np.add.reduceat(sums / self.shape, self._starts, axis=-2) / left
+        remaining = self._numbers
+        if used is not None:
+            remaining = np.maximum(
+                remaining - 0.5 * self.grouped(used), _MIN_REMAINING_SHARE * remaining
+            )
+        level = np.add.reduceat(sums / self.shape, self._starts, axis=-2) / remaining
         return np.asarray(level[..., self.group, :] * self.shape)
 
     def grouped(self, x: Array) -> Array:
@@ -61,7 +63,7 @@ class Levels:
         return np.asarray(self.sizes @ np.log(power))
 
 
-def wander(of: Bands, corner: float) -> Array:
+def random_walk_shape(of: Bands, corner: float) -> Array:
     """Return (bands,) means of 1 + (corner / f)^2, Eq. (T74)."""
     f = np.maximum(of.frequency, of.frequency[1])
     return np.asarray(1.0 + of.sums((corner / f) ** 2) / of.sizes)

@@ -29,16 +29,20 @@ def noise_moments(
     w2 = (2.0 * np.pi * of.frequency) ** 2
     per_number = np.sum(taper**2) / (grid.dt * splines.rate)
     share = per_number * passed(of.frequency, splines.spacing)
-    place, turn = (std**2 * share for std in noise)
-    if splines.aid is not None:
-        left = splines.aid.share(of.frequency)
-        place, turn = place * left[0], turn * left[1]
+    position_power, rotation_power = (std**2 * share for std in noise)
+    if splines.imu_rows is not None:
+        left = splines.imu_rows.share(of.frequency)
+        position_power, rotation_power = position_power * left[0], rotation_power * left[1]
     weight = taper**2 / np.sum(taper**2)
-    still, first, second, third = _turning(zeta, weight)
+    still, first, second, third = _rotation_covariances(zeta, weight)
     eye = np.zeros((SIGNALS, SIGNALS))
     eye[_A, _A] = np.eye(3)
-    parts = [(place * w2**2, eye), (turn, still), (turn * w2, first + second)]
-    parts.append((turn * w2**2, third))
+    parts = [
+        (position_power * w2**2, eye),
+        (rotation_power, still),
+        (rotation_power * w2, first + second),
+    ]
+    parts.append((rotation_power * w2**2, third))
     Q = np.zeros((of.count, WIDTH, WIDTH))
     for power, shape in parts:
         Q[:, :SIGNALS, :SIGNALS] += of.sums(power)[:, None, None] * shape
@@ -46,7 +50,7 @@ def noise_moments(
     return Q
 
 
-def _turning(zeta: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
+def _rotation_covariances(zeta: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
     """Return covariances (16, 16) for unit rotation noise; factors 1, w^2, w^2, w^4."""
     still, cross, products, alpha = np.zeros((4, SIGNALS, SIGNALS))
     mean = weight @ zeta

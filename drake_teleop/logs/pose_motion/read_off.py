@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_teleop.common.arrays import Array
-from drake_teleop.logs.pose_motion.saturated import Saturated
+from drake_teleop.logs.pose_motion.linear_model import LinearFit
 
-_ROUNDS = 5
+_ITERATIONS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +53,12 @@ class ReadOff:
         return bool(np.linalg.det(self.R_SP) < 0.0)
 
 
-def read_off(fit: Saturated) -> ReadOff:
+def read_off(fit: LinearFit) -> ReadOff:
     """Return the figures of a fit."""
     C, variances = fit.coefficients, np.diagonal(fit.covariance, axis1=1, axis2=2)
     M_a, M_g = C[:3, 1:4], C[:3, 4:7]
     kappa, deviation = _ratio(M_a, M_g, variances[:3, 1:4], variances[:3, 4:7])
-    shown = bool((variances[:3, 4:7] > 0.0).all())
+    determined = bool((variances[:3, 4:7] > 0.0).all())
     U, masses, Vt = np.linalg.svd(M_g)
     R_SP = U @ Vt
     permutation = nearest_permutation(R_SP)
@@ -67,18 +67,21 @@ def read_off(fit: Saturated) -> ReadOff:
         kappa=kappa,
         kappa_deviation=deviation,
         gravity_force=M_g,
-        deviation=float(np.sqrt(variances[:3, 4:7].max())) if shown else np.inf,
+        deviation=float(np.sqrt(variances[:3, 4:7].max())) if determined else np.inf,
         R_SP=R_SP,
         masses=masses,
         permutation=permutation,
         oblique_deg=float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
         gravity_torque=C[3:, 4:7],
         turning_force=-C[:3, 7:10],
-        moment_deviations=(_length(variances[:3, 7:10]), _length(variances[3:, 4:7])),
+        moment_deviations=(
+            _norm_deviation(variances[:3, 7:10]),
+            _norm_deviation(variances[3:, 4:7]),
+        ),
     )
 
 
-def _length(variances: Array) -> float:
+def _norm_deviation(variances: Array) -> float:
     return float(np.sqrt(variances.sum())) if (variances > 0.0).all() else np.inf
 
 
@@ -89,7 +92,7 @@ def _ratio(a: Array, g: Array, variances_a: Array, variances_g: Array) -> tuple[
         return np.nan, np.inf
     a, g, v_a, v_g = (x[known] for x in (a, g, variances_a, variances_g))
     kappa = 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         weight = 1.0 / (v_a + kappa**2 * v_g)
         information = float(weight @ np.maximum(g * g - v_g, 0.0))
         if not information > 0.0:  # gravity is not observable

@@ -16,19 +16,19 @@ from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.batch.covariance import ARM, gain_effects
 from drake_teleop.load.batch.moments import coefficients
 from drake_teleop.logs.pose_motion.levels import Levels
-from drake_teleop.logs.pose_motion.saturated import Saturated, least_power
+from drake_teleop.logs.pose_motion.linear_model import LinearFit, least_power
 from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH
-from drake_teleop.logs.pose_motion.splines import GRAVITY, SIGNALS
+from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, SIGNALS
 
 PARAMETERS = 23
 """[offsets; phi] (16), tau, r (3), rho (3)."""
 LOAD, DELAY, LEVER, TURN = slice(0, 16), slice(16, 17), slice(17, 20), slice(20, 23)
 _STEPS, _CONVERGED = 40, 1e-4
-_RIGID, _BY_GAINS, _NOISE = 4.0, 1.5, 1.5
-_LIMITS = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
-_LEAST_SHARE = 0.1
-_SMALL = 1e-4  # rad, step of a numerical derivative
-_RANK = 1e-12
+_MAX_RIGID_RATIO, _GAIN_ALLOWANCE, _NOISE_RATIO = 4.0, 1.5, 1.5
+_MAX_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
+_MIN_REST_SHARE = 0.1
+_ROTATION_STEP = 1e-4  # rad, step of a numerical derivative
+_RANK_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,18 +65,20 @@ class RigidFit:
     @property
     def rigid(self) -> bool:
         """Whether the misfit is below four times its degrees of freedom."""
-        return self.misfit < _RIGID * self.degrees
+        return self.misfit < _MAX_RIGID_RATIO * self.degrees
 
     @property
     def explained(self) -> bool:
         """Whether a rigid load with the stated gain errors explains the wrench."""
-        return self.misfit < _RIGID * self.degrees + _BY_GAINS * self.misfit_of_gains
+        return (
+            self.misfit < _MAX_RIGID_RATIO * self.degrees + _GAIN_ALLOWANCE * self.misfit_of_gains
+        )
 
     @property
     def inflation(self) -> float:
         """Factor on standard deviations; noise alone causes 1.5 times the degrees."""
-        left = self.misfit - _BY_GAINS * self.misfit_of_gains
-        return float(np.sqrt(max(1.0, left / (_NOISE * self.degrees))))
+        left = self.misfit - _GAIN_ALLOWANCE * self.misfit_of_gains
+        return float(np.sqrt(max(1.0, left / (_NOISE_RATIO * self.degrees))))
 
 
 def motion_map(R: Array, r: Array) -> Array:
@@ -88,7 +90,7 @@ def motion_map(R: Array, r: Array) -> Array:
     M[7:10, 7:10] = -R.T @ cross_matrix(r)
     M[7:10, 10:16] = R.T @ _centripetal(r)
     M[10:13, 7:10] = R.T
-    M[13:19, 10:16] = _turned_products(R)
+    M[13:19, 10:16] = _rotated_products(R)
     return M
 
 
@@ -104,7 +106,7 @@ def _centripetal(r: Array) -> Array:
     )
 
 
-_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
@@ -115,7 +117,7 @@ def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
     C = _coefficients_of(phi)
     if removed_weight is not None:
         weight = _coefficients_of(np.concatenate([removed_weight, np.zeros(6)]))
-        C[:, GRAVITY] -= weight[:, GRAVITY]
+        C[:, GRAVITY_COLUMNS] -= weight[:, GRAVITY_COLUMNS]
     return C
 
 
@@ -125,11 +127,11 @@ def _coefficients_of(phi: Array) -> Array:
     return np.asarray(np.einsum("cjk,j->ck", coefficients(), theta) @ M)
 
 
-def _turned_products(R: Array) -> Array:
+def _rotated_products(R: Array) -> Array:
     """Return (6, 6) map from products of omega to those of R^T omega."""
     out = np.empty((6, 6))
-    for row, (i, j) in enumerate(_PAIRS):
-        for column, (k, m) in enumerate(_PAIRS):
+    for row, (i, j) in enumerate(_PRODUCT_PAIRS):
+        for column, (k, m) in enumerate(_PRODUCT_PAIRS):
             out[row, column] = R[k, i] * R[m, j] + (k != m) * R[m, i] * R[k, j]
     return out
 
@@ -140,7 +142,7 @@ def fit_rigid(
     levels: Levels,
     start: State,
     free: NDArray[np.bool_],
-    saturated: Saturated,
+    linear: LinearFit,
     *,
     gain: float = 0.0,
 ) -> RigidFit:
@@ -152,19 +154,19 @@ def fit_rigid(
         levels: noise of the bands.
         start: initial state.
         free: (23,) estimated parameters.
-        saturated: linear model, whose residual gives the first weights.
+        linear: linear model, whose residual gives the first weights.
         gain: standard deviation of the sensor gains.
     """
-    record = _Record(Z, Q, levels, free, saturated.power)
+    record = _Record(Z, Q, levels, free, linear.power)
     solution = _solve(record, start)
     # The linear model is not compensated for noise, so the compared fit must not be either.
     plain = _solve(replace(record, Q=np.zeros_like(Q)), solution.state)
     least = least_power(record.Z, levels.sizes)
-    power = np.maximum(levels.power(_sums(record, plain.state)), least)
+    power = np.maximum(levels.power(_residual_sums(record, plain.state)), least)
     fit = RigidFit(
         solution.state,
         covariance=np.zeros((0, 0)),
-        misfit=2.0 * (float(levels.costs(power).sum()) - saturated.cost),
+        misfit=2.0 * (float(levels.costs(power).sum()) - linear.cost),
         degrees=6.0 * SIGNALS - float(free.sum()),
         misfit_of_gains=_misfit_of_gains(record, plain, gain),
     )
@@ -192,7 +194,7 @@ class _Solution:
     W: Array
     inverse: Array
     R: Array
-    lost: NDArray[np.bool_]
+    undetermined: NDArray[np.bool_]
 
 
 def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solution:
@@ -204,24 +206,24 @@ def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solut
             W[:] = np.linalg.inv(np.einsum("b,bcd->cd", sizes / sizes.sum(), R))
         B, Le = _columns(state)
         gram, right = _normal(B, Le, clean, W)
-        inverse, lost = _inverse(gram, record.free)
+        inverse, undetermined = _inverse(gram, record.free)
         step = inverse @ right
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
-        step *= min(1.0, float(np.min(_LIMITS / np.maximum(np.abs(step), 1e-300))))
-        state = _moved(state, step)
-        taken = _shares(B, record.Z, W, inverse)
-        R = _residual_covariances(record, state, _sums(record, state), taken)
+        step *= min(1.0, float(np.min(_MAX_STEP / np.maximum(np.abs(step), 1e-300))))
+        state = _apply_step(state, step)
+        used = _used_freedom(B, record.Z, W, inverse)
+        R = _residual_covariances(record, state, _residual_sums(record, state), used)
         if np.max(np.abs(step) / size) < _CONVERGED:
             break
-    return _Solution(state, B, W, inverse, R, lost)
+    return _Solution(state, B, W, inverse, R, undetermined)
 
 
 def _covariance(record: _Record, solution: _Solution, inflation: float, gain: float) -> Array:
     """Return the (23, 23) covariance by noise, gain errors and misfit."""
-    B, W, inverse, lost = solution.B, solution.W, solution.inverse, solution.lost
+    B, W, inverse, undetermined = solution.B, solution.W, solution.inverse, solution.undetermined
     middle = _normal(B, np.zeros((6, WIDTH)), record.Z, W @ solution.R @ W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
-    covariance *= np.outer(*2 * [_by_weights(record, solution)])
+    covariance *= np.outer(*2 * [_weight_estimation_factors(record, solution)])
     larger = covariance * inflation**2
     if gain:
         effects = gain * _gain_effects(B, record.Z - record.Q, W, inverse)
@@ -229,12 +231,12 @@ def _covariance(record: _Record, solution: _Solution, inflation: float, gain: fl
         ratio = np.diag(larger) / np.maximum(np.diag(covariance), 1e-300)
         scale = np.sqrt(np.maximum(1.0, ratio))
         larger = covariance * np.outer(scale, scale)
-    larger[lost], larger[:, lost] = 0.0, 0.0
-    larger[lost, lost] = np.inf
+    larger[undetermined], larger[:, undetermined] = 0.0, 0.0
+    larger[undetermined, undetermined] = np.inf
     return larger
 
 
-def _by_weights(record: _Record, solution: _Solution) -> Array:
+def _weight_estimation_factors(record: _Record, solution: _Solution) -> Array:
     """Return (23,) factors on deviations by estimated weights, Eq. (T81)."""
     levels, B = record.levels, solution.B
     half = np.einsum("cjk,ji->cik", B, solution.inverse)
@@ -266,10 +268,11 @@ def _columns(state: State) -> tuple[Array, Array]:
     for i, unit in enumerate(np.eye(3)):
         lever = _map(replace(state, r=state.r + unit)) - M
         ahead, behind = (
-            _map(replace(state, R=_turned(state.R, x * unit))) for x in (_SMALL, -_SMALL)
+            _map(replace(state, R=_rotate(state.R, x * unit)))
+            for x in (_ROTATION_STEP, -_ROTATION_STEP)
         )
         B[:, 17 + i] = -L @ lever
-        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * _SMALL)
+        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * _ROTATION_STEP)
     return B, L @ M
 
 
@@ -287,7 +290,7 @@ def _inverse(gram: Array, free: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bo
     used = free & (diagonal > 0.0)
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, diagonal, 1.0)), 0.0)
     values, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = values > _RANK * values[-1]
+    kept = values > _RANK_TOLERANCE * values[-1]
     basis = scale[:, None] * vectors[:, kept]
     null = np.sum(vectors[:, ~kept] ** 2, axis=1) > 1e-6
     return (basis / values[kept]) @ basis.T, free & (~used | null)
@@ -298,25 +301,25 @@ def _residual_powers(Z: Array, state: State) -> Array:
     return np.asarray(Le @ Z @ Le.T)
 
 
-def _sums(record: _Record, state: State) -> Array:
+def _residual_sums(record: _Record, state: State) -> Array:
     return np.asarray(np.diagonal(_residual_powers(record.Z, state), axis1=1, axis2=2))
 
 
 def _residual_covariances(
-    record: _Record, state: State, sums: Array, taken: Array | None = None
+    record: _Record, state: State, sums: Array, used: Array | None = None
 ) -> Array:
     """Return (bands, 6, 6) R_b of Eq. (T80)."""
     levels, sizes = record.levels, record.levels.sizes[:, None]
     P = _residual_powers(record.Q, state) / sizes[..., None]
-    own = np.diagonal(P, axis1=1, axis2=2) * (sizes if taken is None else sizes - 0.5 * taken)
+    own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
     least = np.maximum(
-        _LEAST_SHARE * levels.power(sums, taken), least_power(record.Z, levels.sizes)
+        _MIN_REST_SHARE * levels.power(sums, used), least_power(record.Z, levels.sizes)
     )
-    rest = np.maximum(levels.power(sums - own, taken), least)
+    rest = np.maximum(levels.power(sums - own, used), least)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
 
 
-def _shares(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
+def _used_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
     """Return (bands, 6) degrees of freedom that parameters use."""
     diagonal = np.diagonal(W, axis1=1, axis2=2)
     half = np.einsum("cjk,ji->cik", B, inverse)
@@ -346,14 +349,14 @@ def _misfit_of_gains(record: _Record, solution: _Solution, gain: float) -> float
     return 2.0 * float(levels.costs(1.0 + more).sum())
 
 
-def _moved(state: State, step: Array) -> State:
+def _apply_step(state: State, step: Array) -> State:
     return State(
         state.theta + step[LOAD],
         state.tau + float(step[16]),
         state.r + step[LEVER],
-        Rotation.from_matrix(_turned(state.R, step[TURN])).as_matrix(),
+        Rotation.from_matrix(_rotate(state.R, step[TURN])).as_matrix(),
     )
 
 
-def _turned(R: Array, rho: Array) -> Array:
+def _rotate(R: Array, rho: Array) -> Array:
     return np.asarray(R @ Rotation.from_rotvec(rho).as_matrix())

@@ -14,17 +14,17 @@ from drake_teleop.logs.pose_motion.splines import SIGNALS
 
 Complex = NDArray[np.complex128]
 
-TOP = 25.0
+MAX_FREQUENCY_HZ = 25.0
 """Highest frequency that is used [Hz]."""
-RAMP = 1.0
+RAMP_S = 1.0
 """Length of the taper's ramps at the ends of the record [s]."""
-EDGE = 0.2
+EDGE_S = 0.2
 """Length of its ramps beside excluded samples [s]."""
-_GRID = 100.0
-_EDGES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, TOP)
-_FEWEST_IN_GROUP = 8.0
+_GRID_RATE_HZ = 100.0
+_GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, MAX_FREQUENCY_HZ)
+_MIN_GROUP_SIZE = 8.0
 # Largest ratio of the ends of a band below this frequency [Hz].
-_NARROW, _RATIO = 3.0, 4.0 / 3.0
+_NARROW_BELOW_HZ, _MAX_BAND_RATIO = 3.0, 4.0 / 3.0
 FORCES = slice(SIGNALS, SIGNALS + 6)
 """Columns of the wrench and of the signals' derivatives in the moments."""
 RATES = slice(SIGNALS + 6, 2 * SIGNALS + 6)
@@ -51,7 +51,7 @@ class Grid:
     def of(cls, t: Array, wrench: Array, load: Array | None = None) -> Grid:
         """Return the grid of evenly spaced samples (N,), (N, 6)."""
         dt = (t[-1] - t[0]) / (len(t) - 1)
-        stride = max(1, int(1.0 / (_GRID * dt) + 1e-6))
+        stride = max(1, int(1.0 / (_GRID_RATE_HZ * dt) + 1e-6))
         rows = len(t) // stride
         return cls(t[0] + stride * dt * np.arange(rows), wrench[: rows * stride], stride, load)
 
@@ -108,14 +108,16 @@ def bands(grid: Grid, taper: Array, top: float) -> Bands:
     worth = (taper**2).sum() ** 2 / ((taper**4).sum() * grid.length)
     weight = np.full(len(frequency), worth)
     weight[0] *= 0.5
-    group = np.searchsorted(np.array(_EDGES[1:]), frequency, side="right")
-    for k in range(len(_EDGES)):
-        if 0.0 < weight[group == k].sum() < _FEWEST_IN_GROUP:
+    group = np.searchsorted(np.array(_GROUP_EDGES_HZ[1:]), frequency, side="right")
+    for k in range(len(_GROUP_EDGES_HZ)):
+        if 0.0 < weight[group == k].sum() < _MIN_GROUP_SIZE:
             group[group == k] = k + 1
     last = group == group[-1]
-    if weight[last].sum() < _FEWEST_IN_GROUP and not last.all():
+    if weight[last].sum() < _MIN_GROUP_SIZE and not last.all():
         group[last] = group[~last][-1]
-    narrow = np.log(np.clip(frequency, frequency[1], _NARROW) / frequency[1]) // np.log(_RATIO)
+    narrow = np.log(np.clip(frequency, frequency[1], _NARROW_BELOW_HZ) / frequency[1]) // np.log(
+        _MAX_BAND_RATIO
+    )
     first = np.concatenate([[True], (np.diff(group) > 0) | (np.diff(narrow) > 0)])
     group = np.unique(group[first], return_inverse=True)[1]
     return Bands(frequency, np.cumsum(first) - 1, weight, group)
@@ -123,14 +125,14 @@ def bands(grid: Grid, taper: Array, top: float) -> Bands:
 
 def end_taper(t: Array, start: float, stop: float) -> Array:
     """Return (M,) 1 between start and stop, with cosine ramps, and 0 outside."""
-    ramp = min(RAMP, 0.1 * (stop - start))
+    ramp = min(RAMP_S, 0.1 * (stop - start))
     x = np.clip(np.minimum(t - start, stop - t) / ramp, 0.0, 1.0)
     return 0.5 - 0.5 * np.cos(np.pi * x)
 
 
-def without(taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0) -> Array:
+def exclude(taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0) -> Array:
     """Return the taper, 0 within `margin` [s] of `lost` (M,), with cosine edges."""
-    edge = np.clip((distance(lost) * dt - margin) / EDGE, 0.0, 1.0)
+    edge = np.clip((distance(lost) * dt - margin) / EDGE_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 
@@ -169,17 +171,17 @@ def shifted(spectrum: Complex, frequency: Array, shift: float) -> Complex:
     return out
 
 
-def later(grid: Grid, taper: Array, shift: float) -> Array:
+def shift_taper(grid: Grid, taper: Array, shift: float) -> Array:
     """Return the (M,) taper moved by `shift` [s]."""
-    return _passed_through(grid, taper, np.exp(-2j * np.pi * grid.frequency * shift))
+    return _filter(grid, taper, np.exp(-2j * np.pi * grid.frequency * shift))
 
 
-def slope(grid: Grid, taper: Array) -> Array:
+def taper_derivative(grid: Grid, taper: Array) -> Array:
     """Return the (M,) derivative of the taper [1/s]."""
-    return _passed_through(grid, taper, 2j * np.pi * grid.frequency)
+    return _filter(grid, taper, 2j * np.pi * grid.frequency)
 
 
-def _passed_through(grid: Grid, x: Array, response: NDArray[np.complexfloating]) -> Array:
+def _filter(grid: Grid, x: Array, response: NDArray[np.complexfloating]) -> Array:
     return np.asarray(np.fft.irfft(np.fft.rfft(x, grid.length) * response, grid.length)[: len(x)])
 
 

@@ -15,19 +15,19 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.logs.pose_motion.poses import Poses
 
 DEGREE = 5
-FEWEST_PER_KNOT = 2.0
+MIN_POSES_PER_KNOT = 2.0
 """Least average number of poses between two knots."""
 SIGNALS = 16
 """Number of columns of `PoseSplines.signals`."""
-GRAVITY, ACCELERATED = slice(4, 7), [1, 2, 3, *range(7, 16)]
+GRAVITY_COLUMNS, MOTION_COLUMNS = slice(4, 7), [1, 2, 3, *range(7, 16)]
 """Columns of gravity, and columns that are zero at rest."""
 # Frequency times h where the residual is noise: just above the passed frequencies.
 _NOISE_BAND = (0.7, 1.5)
-_CHUNK = 2**17
+_CHUNK_ROWS = 2**17
 
 
 @dataclass(frozen=True, eq=False)
-class Aid:
+class ImuRows:
     """IMU data that refine the splines, corrected to the axes, clock and zero bias of the poses.
 
     Attributes:
@@ -58,7 +58,7 @@ class Aid:
         rate: float,
         pose_powers: tuple[float, float],
         own_powers: tuple[float, float],
-    ) -> Aid:
+    ) -> ImuRows:
         """Return the rows of s and omega (K, 3), with the orientation of `splines`."""
         q = splines.quaternion(t)
         n = np.sum(q * q, axis=1, keepdims=True)
@@ -97,43 +97,46 @@ class PoseSplines:
         aid: IMU data, or None.
     """
 
-    def __init__(self, poses: Poses, spacing: float, aid: Aid | None = None) -> None:
-        self.poses, self.spacing, self.rate, self.aid = poses, spacing, poses.rate, aid
+    def __init__(self, poses: Poses, spacing: float, imu_rows: ImuRows | None = None) -> None:
+        self.poses, self.spacing, self.rate, self.imu_rows = poses, spacing, poses.rate, imu_rows
         self._start = float(poses.t[0])
         t = poses.t - self._start
-        self._parts, knots = _parts(len(t)), _knots(t, spacing, aided=aid is not None)
+        self._row_blocks, knots = (
+            _row_blocks(len(t)),
+            _knots(t, spacing, with_imu=imu_rows is not None),
+        )
         try:
-            self._spline = self._fitted(t, knots)
+            self._spline = self._fit(t, knots)
         except np.linalg.LinAlgError:  # too few poses per knot between gaps
-            self._spline = self._fitted(t, _sparser(knots, t))
+            self._spline = self._fit(t, _thin_knots(knots, t))
 
-    def _fitted(self, t: Array, knots: Array) -> BSpline:
+    def _fit(self, t: Array, knots: Array) -> BSpline:
         """Solve banded normal equations.
 
         They are five times faster than `scipy.interpolate.make_lsq_spline` and sufficiently
         accurate.
         """
-        poses, aid = self.poses, self.aid
-        values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._parts)
-        times = (t[x] for x in self._parts)
+        poses, imu_rows = self.poses, self.imu_rows
+        values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._row_blocks)
+        times = (t[x] for x in self._row_blocks)
         gram, right = _normal(zip(times, values, strict=True), knots, DEGREE, 7)
-        if aid is None:
+        if imu_rows is None:
             return BSpline(knots, solveh_banded(gram, right), DEGREE)
         columns = []
-        later = aid.t - self._start
-        inside = (later >= knots[0]) & (later <= knots[-1])
+        shifted_t = imu_rows.t - self._start
+        inside = (shifted_t >= knots[0]) & (shifted_t <= knots[-1])
         for part, order, rows, pose, own in zip(
             (slice(0, 3), slice(3, 7)),
             (2, 1),
-            (aid.acceleration_W, aid.quaternion_rate),
-            aid.pose_powers,
-            aid.own_powers,
+            (imu_rows.acceleration_W, imu_rows.quaternion_rate),
+            imu_rows.pose_powers,
+            imu_rows.own_powers,
             strict=True,
         ):
             band, side = gram, right[:, part]
             if rows is not None:
-                weight = pose * self.rate / (own * aid.rate)
-                more, other = _normal_of_rates(later[inside], rows[inside], knots, order)
+                weight = pose * self.rate / (own * imu_rows.rate)
+                more, other = _normal_of_rates(shifted_t[inside], rows[inside], knots, order)
                 band, side = gram + weight * more, side + weight * other
             columns.append(solveh_banded(band, side))
         return BSpline(knots, np.hstack(columns), DEGREE)
@@ -172,16 +175,16 @@ class PoseSplines:
     def gravity(self, t: Array, gravity_W: Array) -> Array:
         """Return (N, 3) gravity in the axes of P [m/s^2]."""
         out = np.empty((len(t), 3))
-        for part in _parts(len(t)):
+        for part in _row_blocks(len(t)):
             q = self.quaternion(t[part])
-            down = np.broadcast_to(gravity_W, out[part].shape)
-            out[part] = _in_P(q, np.sum(q * q, axis=1, keepdims=True), down)
+            gravity_rows = np.broadcast_to(gravity_W, out[part].shape)
+            out[part] = _in_P(q, np.sum(q * q, axis=1, keepdims=True), gravity_rows)
         return out
 
     def _motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
         """Return (N, 3) a, -g, omega and alpha."""
         out = np.empty((4, len(t), 3))
-        for part in _parts(len(t)):
+        for part in _row_blocks(len(t)):
             out[:, part] = self._motion_at(t[part], gravity_W)
         return out[0], out[1], out[2], out[3]
 
@@ -189,30 +192,35 @@ class PoseSplines:
         x, first, second = (self._at(t, order) for order in range(3))
         q, qd, qdd = x[:, 3:], first[:, 3:], second[:, 3:]
         n = np.sum(q * q, axis=1, keepdims=True)
-        omega = 2.0 * _vector(q, qd) / n
-        alpha = 2.0 * _vector(q, qdd) / n - 2.0 * omega * np.sum(q * qd, axis=1, keepdims=True) / n
-        down = np.broadcast_to(-gravity_W, (len(t), 3))
-        return _in_P(q, n, second[:, :3]), _in_P(q, n, down), omega, alpha
+        omega = 2.0 * _relative_vector(q, qd) / n
+        alpha = (
+            2.0 * _relative_vector(q, qdd) / n
+            - 2.0 * omega * np.sum(q * qd, axis=1, keepdims=True) / n
+        )
+        gravity_rows = np.broadcast_to(-gravity_W, (len(t), 3))
+        return _in_P(q, n, second[:, :3]), _in_P(q, n, gravity_rows), omega, alpha
 
     def noise(self) -> tuple[float, float]:
         """Return standard deviations per axis of position [m] and rotation [rad].
 
         They come from residuals just above the passed frequencies, because noise can be coloured.
         """
-        if self.aid is not None:
-            place_power, turn_power = self.aid.pose_powers
-            return float(np.sqrt(place_power * self.rate)), float(np.sqrt(turn_power * self.rate))
+        if self.imu_rows is not None:
+            position_power, rotation_power = self.imu_rows.pose_powers
+            return float(np.sqrt(position_power * self.rate)), float(
+                np.sqrt(rotation_power * self.rate)
+            )
         sums, count = np.zeros(2), 0
-        for part in self._parts:
+        for part in self._row_blocks:
             fitted = self._spline(self.poses.t[part] - self._start)
             position = self.poses.position[part] - fitted[:, :3]
-            turn = 2.0 * _vector(fitted[:, 3:], self.poses.quaternion[part])
-            powers = self._powers(position), self._powers(turn)
+            turn = 2.0 * _relative_vector(fitted[:, 3:], self.poses.quaternion[part])
+            powers = self._noise_powers(position), self._noise_powers(turn)
             sums, count = sums + np.sum(powers, axis=(1, 2)), count + np.size(powers[0])
-        place_std, turn_std = np.sqrt(sums / count)
-        return float(place_std), float(turn_std)
+        position_std, rotation_std = np.sqrt(sums / count)
+        return float(position_std), float(rotation_std)
 
-    def _powers(self, residual: Array) -> Array:
+    def _noise_powers(self, residual: Array) -> Array:
         n = len(residual)
         frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
         low, high = (share / self.spacing for share in _NOISE_BAND)
@@ -220,23 +228,23 @@ class PoseSplines:
         return np.array([np.abs(np.fft.rfft(x)[inside]) ** 2 / n for x in residual.T])
 
 
-class Choice:
+class SplineCache:
     """Splines of the same poses with several knot distances, each fitted once."""
 
-    def __init__(self, poses: Poses, aid: Aid | None = None) -> None:
-        self.poses, self.aid = poses, aid
-        self._fitted: dict[float, PoseSplines] = {}
+    def __init__(self, poses: Poses, imu_rows: ImuRows | None = None) -> None:
+        self.poses, self.imu_rows = poses, imu_rows
+        self._fit: dict[float, PoseSplines] = {}
 
     @property
     def rate(self) -> float:
         """Rate of the fitted rows [Hz]."""
-        return self.poses.rate + (0.0 if self.aid is None else self.aid.rate)
+        return self.poses.rate + (0.0 if self.imu_rows is None else self.imu_rows.rate)
 
     def at(self, spacing: float) -> PoseSplines:
         """Return the splines with this knot distance [s]."""
-        if spacing not in self._fitted:
-            self._fitted[spacing] = PoseSplines(self.poses, spacing, self.aid)
-        return self._fitted[spacing]
+        if spacing not in self._fit:
+            self._fit[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
+        return self._fit[spacing]
 
 
 def passed(frequency: Array, spacing: float) -> Array:
@@ -246,10 +254,10 @@ def passed(frequency: Array, spacing: float) -> Array:
     return np.where(frequency * spacing < 1.0, share, 0.0)
 
 
-def _knots(t: Array, spacing: float, *, aided: bool = False) -> Array:
+def _knots(t: Array, spacing: float, *, with_imu: bool = False) -> Array:
     """Return uniform knots, without those in gaps of the samples."""
     inner = np.arange(t[0] + spacing, t[-1] - 0.5 * spacing, spacing)
-    if aided:
+    if with_imu:
         return np.concatenate([np.repeat(t[0], DEGREE + 1), inner, np.repeat(t[-1], DEGREE + 1)])
     before = np.searchsorted(t, inner)
     first = np.unique(before, return_index=True)[1]
@@ -258,18 +266,18 @@ def _knots(t: Array, spacing: float, *, aided: bool = False) -> Array:
     return np.concatenate([ends[: DEGREE + 1], inner, ends[DEGREE + 1 :]])
 
 
-def _sparser(knots: Array, t: Array) -> Array:
-    """Return knots with at least `FEWEST_PER_KNOT` samples between them."""
+def _thin_knots(knots: Array, t: Array) -> Array:
+    """Return knots with at least `MIN_POSES_PER_KNOT` samples between them."""
     inner, kept, last = knots[DEGREE + 1 : -DEGREE - 1], [], 0
     for knot, before in zip(inner, np.searchsorted(t, inner), strict=True):
-        if min(before - last, len(t) - before) >= FEWEST_PER_KNOT:
+        if min(before - last, len(t) - before) >= MIN_POSES_PER_KNOT:
             kept.append(knot)
             last = before
     return np.concatenate([knots[: DEGREE + 1], kept, knots[-DEGREE - 1 :]])
 
 
-def _parts(count: int) -> list[slice]:
-    return [slice(k, k + _CHUNK) for k in range(0, count, _CHUNK)]
+def _row_blocks(count: int) -> list[slice]:
+    return [slice(k, k + _CHUNK_ROWS) for k in range(0, count, _CHUNK_ROWS)]
 
 
 def _normal(
@@ -301,7 +309,7 @@ def _normal_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Arra
         n = len(span)
         step = diags_array([-degree / span, degree / span], offsets=[0, 1], shape=(n, n + 1))
         change = step @ change
-    degree, parts = DEGREE - order, _parts(len(t))
+    degree, parts = DEGREE - order, _row_blocks(len(t))
     inner = knots[order : len(knots) - order]
     band, right = _normal(((t[p], x[p]) for p in parts), inner, degree, x.shape[1])
     upper = diags_array(
@@ -314,7 +322,7 @@ def _normal_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Arra
     return out, change.T @ right
 
 
-def _vector(q: Array, p: Array) -> Array:
+def _relative_vector(q: Array, p: Array) -> Array:
     """Return (N, 3) vector part of q* p."""
     v, w = q[:, 1:], p[:, 1:]
     out: Array = q[:, :1] * w - p[:, :1] * v - _cross(v, w)

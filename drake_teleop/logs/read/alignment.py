@@ -12,10 +12,10 @@ from scipy.fft import next_fast_len
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log
 
-_FEWEST = 8
-_CHUNK = 2**18
-_SMOOTHER_SAMPLES = 9
-_SMOOTHER_DEGREE = 5
+_MIN_SAMPLES = 8
+_CHUNK_ROWS = 2**18
+_MIN_WINDOW_SAMPLES = 9
+_POLYNOMIAL_DEGREE = 5
 SMOOTHER_WINDOW = 1.8
 """Window length [s] of the smoother times its bandwidth [Hz]."""
 
@@ -41,13 +41,13 @@ def resample(
     if np.array_equal(t_new, t):
         return x
     out = np.empty((len(t_new), *x.shape[1:]))
-    for start in range(0, len(t_new), _CHUNK):  # limits the memory of temporaries
-        part = slice(start, start + _CHUNK)
-        out[part] = _interpolated(t_new[part], t, x)
+    for start in range(0, len(t_new), _CHUNK_ROWS):  # limits the memory of temporaries
+        part = slice(start, start + _CHUNK_ROWS)
+        out[part] = _interpolate(t_new[part], t, x)
     return out
 
 
-def _interpolated(
+def _interpolate(
     t_new: NDArray[np.float64], t: NDArray[np.float64], x: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     # A single search for all columns is faster than np.interp for each.
@@ -104,8 +104,8 @@ def smooth_derivatives(
     tau = dt * np.arange(1, half + 1)
     derivatives = []
     for order in range(3):
-        before = _polynomial([c[0] for c in inner], -tau[::-1], order)
-        after = _polynomial([c[-1] for c in inner], tau, order)
+        before = _differentiate_polynomials([c[0] for c in inner], -tau[::-1], order)
+        after = _differentiate_polynomials([c[-1] for c in inner], tau, order)
         middle = math.factorial(order) * inner[order]
         derivatives.append(np.concatenate([before, middle, after]).reshape(x.shape))
     return derivatives[0], derivatives[1], derivatives[2]
@@ -120,13 +120,13 @@ def noise_gain(dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
 def smoother(n: int, dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
     """Return (6, w) weights from the samples of a window to polynomial coefficients; w <= n."""
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW / bandwidth_hz
-    half = max(_SMOOTHER_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
-    powers = np.vander(np.arange(-half, half + 1) / half, _SMOOTHER_DEGREE + 1, increasing=True)
+    half = max(_MIN_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
+    powers = np.vander(np.arange(-half, half + 1) / half, _POLYNOMIAL_DEGREE + 1, increasing=True)
     # The interval -1 ... 1 makes the fit well-conditioned; then scale to seconds.
-    return np.linalg.pinv(powers) / (half * dt) ** np.arange(_SMOOTHER_DEGREE + 1)[:, None]
+    return np.linalg.pinv(powers) / (half * dt) ** np.arange(_POLYNOMIAL_DEGREE + 1)[:, None]
 
 
-def _polynomial(
+def _differentiate_polynomials(
     coefficients: list[NDArray[np.float64]], tau: NDArray[np.float64], order: int
 ) -> NDArray[np.float64]:
     terms = [
@@ -177,7 +177,7 @@ def undelayed(log: Log, delay_s: float) -> Log:
         return log
     at = log.t + delay_s
     known = (at >= log.t[0]) & (at <= log.t[-1])
-    if known.sum() < _FEWEST:
+    if known.sum() < _MIN_SAMPLES:
         raise DrakeTeleopError(
             f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples",
             where=log.source,

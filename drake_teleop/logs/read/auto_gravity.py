@@ -14,7 +14,7 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import STANDARD_GRAVITY, Description
 from drake_teleop.logs.read.log_instants import log_instants
 
-_LEAST_KNOWN_DEG = 2.0
+_MAX_DEVIATION_DEG = 2.0
 
 
 def describe_gravity(
@@ -26,21 +26,23 @@ def describe_gravity(
     """
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf
-    why = explain(log_instants(log), lambda late: log_instants(undelayed(log, late)), ("gravity",))
-    if why.theta[6] > 0.0:
-        change, covariance = part(why.state, "gravity")
-        true = description.gravity_W - change
-        true *= STANDARD_GRAVITY / np.linalg.norm(true)
-        across = np.eye(3) - np.outer(true, true) / STANDARD_GRAVITY**2
+    explanation = explain(
+        log_instants(log), lambda delay_s: log_instants(undelayed(log, delay_s)), ("gravity",)
+    )
+    if explanation.theta[6] > 0.0:
+        change, covariance = part(explanation.state, "gravity")
+        estimated = description.gravity_W - change
+        estimated *= STANDARD_GRAVITY / np.linalg.norm(estimated)
+        across = np.eye(3) - np.outer(estimated, estimated) / STANDARD_GRAVITY**2
         spread = np.linalg.eigvalsh(across @ covariance @ across)[-1]
         deviation = float(np.degrees(np.sqrt(spread) / STANDARD_GRAVITY))
-    if not deviation < _LEAST_KNOWN_DEG:
+    if not deviation < _MAX_DEVIATION_DEG:
         raise DrakeTeleopError(
             "the data do not determine the direction of gravity",
             where=f"{source}:gravity",
             remedy="record the load in more orientations, touching nothing; or give the vector",
         )
-    gravity = tuple((np.round(true, 4) + 0.0).tolist())
+    gravity = tuple((np.round(estimated, 4) + 0.0).tolist())
     note = (
         f"gravity found, standard deviation {deviation:.2g} deg; write it into the description as"
         f" gravity: {list(gravity)}"

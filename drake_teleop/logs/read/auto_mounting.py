@@ -14,7 +14,7 @@ from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.lever_arm import LeverArm, lever_arm_from_wrench
 from drake_teleop.logs.read.mounting import Mounting, find_mounting
 
-CLOCK = 0.05
+MAX_LAG_S = 0.05
 """Lag between the clocks of IMU and pose that causes a warning [s]."""
 
 
@@ -28,7 +28,7 @@ def describe_mounting(
     imu = description.imu
     assert imu is not None
 
-    def described(**changes: Any) -> Description:
+    def with_imu(**changes: Any) -> Description:
         return description.model_copy(update={"imu": imu.model_copy(update=changes)})
 
     frame: Any = imu.frame
@@ -38,62 +38,62 @@ def describe_mounting(
     mounting = None
     if description.pose is not None:
         alone = read(description.model_copy(update={"imu": None}))
-        at_Io = read(described(frame=start, position=(0.0, 0.0, 0.0)))
+        at_Io = read(with_imu(frame=start, position=(0.0, 0.0, 0.0)))
         mounting = find_mounting(at_Io, alone, position=description.pose.position is not None)
     if frame == "auto":
-        found = _believed(mounting, f"{source}:imu.frame")
+        found = _require_rotation(mounting, f"{source}:imu.frame")
         frame = tuple(map(tuple, found.R_SI.tolist()))
         notes += _rotation_notes(found)
     if position == "auto":
-        at_Io = read(described(frame=frame, position=(0.0, 0.0, 0.0)))
-        lever = _lever(mounting, at_Io, f"{source}:imu.position")
+        at_Io = read(with_imu(frame=frame, position=(0.0, 0.0, 0.0)))
+        lever = _choose_lever_arm(mounting, at_Io, f"{source}:imu.position")
         position = tuple(lever.p_SoIo_S.tolist())
         notes.append(
-            f"imu.position found: {_millimetres(lever)} mm, from the {lever.source}; write it into"
-            f" the description as imu.position: {_written(lever.p_SoIo_S)}"
+            f"imu.position found: {_format_mm(lever)} mm, from the {lever.source}; write it into"
+            f" the description as imu.position: {_round(lever.p_SoIo_S)}"
         )
-    return described(frame=frame, position=position), tuple(notes)
+    return with_imu(frame=frame, position=position), tuple(notes)
 
 
-def _believed(mounting: Mounting | None, where: str) -> Mounting:
+def _require_rotation(mounting: Mounting | None, where: str) -> Mounting:
     if mounting is None:
-        what = "the specific force hardly changes, or gaps leave too little of it"
+        problem = "the specific force hardly changes, or gaps leave too little of it"
         remedy = "turn the sensor about two axes"
     elif mounting.mirrored:
-        what = "the axes of the IMU are those of the pose mirrored"
+        problem = "the axes of the IMU are those of the pose mirrored"
         remedy = "exchange two of its columns, or change imu.sign"
     elif not mounting.fits:
-        what = f"no rotation brings IMU and pose together ({_left(mounting)})"
+        problem = f"no rotation brings IMU and pose together ({_unexplained_shares(mounting)})"
         remedy = "find wrong units, signs or clocks by `drake-teleop inspect` with `frame: sensor`"
     elif not mounting.determined:
         worst = float(mounting.deviations_deg.max())
-        what = f"one direction is known to {worst:.2g} deg only (standard deviation)"
+        problem = f"one direction is known to {worst:.2g} deg only (standard deviation)"
         remedy = "turn the sensor about two axes, by more than 30 deg"
     else:
         return mounting
     raise DrakeTeleopError(
-        f"the data do not determine the rotation of the IMU: {what}",
+        f"the data do not determine the rotation of the IMU: {problem}",
         where=where,
         remedy=f"{remedy}, or give a rotation matrix",
     )
 
 
-def _left(found: Mounting) -> str:
+def _unexplained_shares(found: Mounting) -> str:
     shares = {"specific force": found.unexplained, "angular velocity": found.unexplained_turning}
     return ", ".join(f"{v:.2g} of the {k}'s variance" for k, v in shares.items() if v is not None)
 
 
 def _rotation_notes(found: Mounting) -> list[str]:
     nearest = found.right_angled.astype(int).tolist()
-    away = f"{found.oblique_deg:.1f} deg from the right-angled mounting {nearest}"
-    sure = f"{float(found.deviations_deg.max()):.2g} deg"
+    oblique = f"{found.oblique_deg:.1f} deg from the right-angled mounting {nearest}"
+    std = f"{float(found.deviations_deg.max()):.2g} deg"
     notes = [
-        f"imu.frame found: {away}, standard deviation {sure}; write it into the description as"
-        f" imu.frame: {_written(found.R_SI)}"
+        f"imu.frame found: {oblique}, standard deviation {std}; write it into the description as"
+        f" imu.frame: {_round(found.R_SI)}"
     ]
     if not found.is_right_angled:
-        notes.append(f"warning: the IMU is mounted obliquely, {away}: check that it is meant so")
-    if abs(found.lag_s) > CLOCK:
+        notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check that it is meant so")
+    if abs(found.lag_s) > MAX_LAG_S:
         notes.append(
             f"warning: the clock of the IMU lags that of the pose by {found.lag_s:.3f} s, which"
             f" stays so unless you add {-found.lag_s:.3f} to imu.time.offset"
@@ -101,7 +101,7 @@ def _rotation_notes(found: Mounting) -> list[str]:
     return notes
 
 
-def _lever(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
+def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
     """Return the lever arm from the pose, or else from the wrench."""
     lever = None
     if mounting is not None and mounting.fits:
@@ -121,18 +121,18 @@ def _lever(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
         axes = ", ".join(a for a, known in zip("xyz", lever.determined, strict=True) if not known)
         raise DrakeTeleopError(
             f"the motion does not determine {axes} of the accelerometer's place"
-            f" ({_millimetres(lever)} mm, from the {lever.source})",
+            f" ({_format_mm(lever)} mm, from the {lever.source})",
             where=where,
             remedy="turn faster, about more axes, or give imu.position in metres",
         )
     return lever
 
 
-def _written(x: NDArray[np.float64]) -> list:
+def _round(x: NDArray[np.float64]) -> list:
     return list((np.round(x, 4) + 0.0).tolist())
 
 
-def _millimetres(lever: LeverArm) -> str:
+def _format_mm(lever: LeverArm) -> str:
     return ", ".join(
         f"{axis} {1e3 * value:.1f} +- {1e3 * deviation:.1f}" if deviation < 1 else f"{axis} unknown"
         for axis, value, deviation in zip("xyz", lever.p_SoIo_S, lever.deviations, strict=True)

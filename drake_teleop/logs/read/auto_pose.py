@@ -40,31 +40,35 @@ def describe_pose_frame(
     changes: dict[str, Any] = {}
     notes: list[str] = []
     if pose.position_in_sensor == "auto":
-        _known(frame.position_known, f"{source}:pose.position_in_sensor", "the pose's origin along")
+        _require_determined(
+            frame.position_known, f"{source}:pose.position_in_sensor", "the pose's origin along"
+        )
         changes["position_in_sensor"] = tuple(frame.p_SoPo_S.tolist())
-        sure = 1e3 * float(frame.position_deviations.max())
-        notes.append(_note("position_in_sensor", frame.p_SoPo_S, f"{sure:.2g} mm"))
+        deviation = 1e3 * float(frame.position_deviations.max())
+        notes.append(_result_note("position_in_sensor", frame.p_SoPo_S, f"{deviation:.2g} mm"))
     if pose.rotation_in_sensor == "auto":
-        _known(frame.rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about")
+        _require_determined(
+            frame.rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about"
+        )
         changes["rotation_in_sensor"] = tuple(map(tuple, frame.R_SP.tolist()))
-        sure = float(frame.turn_deviations_deg.max())
-        notes.append(_note("rotation_in_sensor", frame.R_SP, f"{sure:.2g} deg"))
+        deviation = float(frame.turn_deviations_deg.max())
+        notes.append(_result_note("rotation_in_sensor", frame.R_SP, f"{deviation:.2g} deg"))
     return description.model_copy(update={"pose": pose.model_copy(update=changes)}), tuple(notes)
 
 
-def _known(known: Any, where: str, what: str) -> None:
+def _require_determined(known: Any, where: str, quantity: str) -> None:
     if not known.all():
-        axes = ", ".join(a for a, sure in zip("xyz", known, strict=True) if not sure)
+        axes = ", ".join(a for a, deviation in zip("xyz", known, strict=True) if not deviation)
         raise DrakeTeleopError(
-            f"the data do not determine {what} {axes}",
+            f"the data do not determine {quantity} {axes}",
             where=where,
             remedy="turn the sensor faster, about more axes, touching nothing; or give it",
         )
 
 
-def _note(name: str, value: Any, sure: str) -> str:
+def _result_note(name: str, value: Any, deviation: str) -> str:
     written = (np.round(value, 4) + 0.0).tolist()
     return (
-        f"pose.{name} found, standard deviation {sure}; write it into the description as"
+        f"pose.{name} found, standard deviation {deviation}; write it into the description as"
         f" pose.{name}: {written}"
     )

@@ -30,13 +30,16 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 SUFFIXES = (".mcap", ".db3", ".bag")
-_LONGEST_ARRAY = 64
-_BLOCK, _RECEIVED = 10_000, "received at"
+_MAX_ARRAY_LENGTH = 64
+_BLOCK_MESSAGES, _RECEIVED = 10_000, "received at"
 # MCAP: opcode of a chunk; limits of the total uncompressed size: ratio to the file, bytes.
-_CHUNK, _MOST_RATIO, _MOST_UNPACKED = 6, 200, 100_000_000
-_MOST_MEMORY = 1_500_000_000  # bytes
-_TOO_LARGE, _CUT = "unpacks to more than can be read", "cut it, or write the topics one by one"
-_GROUPS = {
+_CHUNK_OPCODE, _MAX_UNPACK_RATIO, _MAX_UNPACKED_BYTES = 6, 200, 100_000_000
+_MAX_MEMORY_BYTES = 1_500_000_000  # bytes
+_TOO_LARGE, _CUT_REMEDY = (
+    "unpacks to more than can be read",
+    "cut it, or write the topics one by one",
+)
+_GROUP_NAMES = {
     "force": "force",
     "torque": "torque",
     "linear_acceleration": "linear_acceleration",
@@ -46,7 +49,7 @@ _GROUPS = {
     "position": "position",
     "translation": "position",
 }
-_TYPES = {
+_STREAM_TYPES = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
     "pose": (
@@ -85,7 +88,7 @@ def is_bag(path: Path) -> bool:
 
 def topics_of(path: Path) -> list[Topic]:
     """Return the topics of a bag by name; raise an error if it cannot be read."""
-    with _opened(path) as reader:
+    with _open_bag(path) as reader:
         seconds = reader.duration * 1e-9
         return [
             Topic(name, info.msgtype or "several", info.msgcount, info.msgcount / seconds)
@@ -100,7 +103,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
 
     Raises an error if bag, topic or child frame are missing, or the child frame is ambiguous.
     """
-    with _opened(path) as reader:
+    with _open_bag(path) as reader:
         connections = [entry for entry in reader.connections if entry.topic == topic]
         if not connections:
             known = [f"{name} ({info.msgtype})" for name, info in sorted(reader.topics.items())]
@@ -112,15 +115,15 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         pairs = (
             (received, part)
             for connection, received, raw in reader.messages(connections)
-            for part in _parts(reader.deserialize(raw, connection.msgtype))
+            for part in _split_transforms(reader.deserialize(raw, connection.msgtype))
         )
-        blocks = _blocks(pairs, child_frame, f"{path}:{topic}")
+        blocks = _read_blocks(pairs, child_frame, f"{path}:{topic}")
     if not blocks:
         raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
-    columns = _joined(blocks)
+    columns = _join_blocks(blocks)
     received = columns.pop(_RECEIVED)
-    absent = _take_absent(columns)
-    columns |= _short(columns)
+    absent = _remove_absent_groups(columns)
+    columns |= _short_names(columns)
     columns["received"] = received
     if "header.stamp" in columns and not columns["header.stamp"].any():
         del columns["header.stamp"]
@@ -142,14 +145,14 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
     draft: dict[str, Any] = {}
     others: list[str] = []
     file = os.path.relpath(path, folder)
-    for stream, types in _TYPES.items():
+    for stream, types in _STREAM_TYPES.items():
         kinds = {topic.name: topic.type.split("/")[-1] for topic in topics if topic.messages}
-        suited = [name for kind in types for name in kinds if kinds[name] == kind]
-        if suited:
-            draft[stream] = {"file": file, "topic": suited[0]}
-        if suited and kinds[suited[0]] == "TFMessage":
+        suitable = [name for kind in types for name in kinds if kinds[name] == kind]
+        if suitable:
+            draft[stream] = {"file": file, "topic": suitable[0]}
+        if suitable and kinds[suitable[0]] == "TFMessage":
             draft[stream]["child_frame"] = "FILL IN"
-        others += [f"{name} ({stream})" for name in suited[1:]]
+        others += [f"{name} ({stream})" for name in suitable[1:]]
     if "wrench" in draft or not draft:
         draft["wrench"] = {"file": file, "topic": "FILL IN"} | draft.get("wrench", {}) | {"sign": 1}
     head = [
@@ -170,7 +173,7 @@ def topic_missing(path: Path) -> DrakeTeleopError:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[AnyReader]:
+def _open_bag(path: Path) -> Iterator[AnyReader]:
     if not os.path.exists(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     if not is_bag(path):
@@ -191,14 +194,14 @@ def _opened(path: Path) -> Iterator[AnyReader]:
     try:
         for file in path.iterdir() if path.is_dir() else [path]:
             if file.suffix.lower() == ".mcap":
-                _check_unpacked(file)
+                _check_unpacked_size(file)
         standard = get_typestore(Stores.LATEST)
-        with _little_memory(), AnyReader([path], default_typestore=standard) as reader:
+        with _limit_memory(), AnyReader([path], default_typestore=standard) as reader:
             yield reader
     except DrakeTeleopError:
         raise
     except MemoryError:
-        raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT) from None
+        raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT_REMEDY) from None
     # Damaged files cause many kinds of exceptions in rosbags and its libraries.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
@@ -207,54 +210,54 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         ) from error
 
 
-def _check_unpacked(path: Path) -> None:
+def _check_unpacked_size(path: Path) -> None:
     """Reject an MCAP file whose chunks declare an implausible uncompressed size."""
-    total, most = 0, path.stat().st_size * _MOST_RATIO + _MOST_UNPACKED
+    total, limit = 0, path.stat().st_size * _MAX_UNPACK_RATIO + _MAX_UNPACKED_BYTES
     with path.open("rb") as file:
         file.seek(8)
         while len(head := file.read(33)) == 33:  # head of a record
             length = int.from_bytes(head[1:9], "little")
-            total += int.from_bytes(head[25:33], "little") if head[0] == _CHUNK else 0
-            file.seek(min(length - 24, most), 1)
-            if total > most:
-                raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT)
+            total += int.from_bytes(head[25:33], "little") if head[0] == _CHUNK_OPCODE else 0
+            file.seek(min(length - 24, limit), 1)
+            if total > limit:
+                raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT_REMEDY)
 
 
 @contextmanager
-def _little_memory() -> Iterator[None]:
-    """Raise MemoryError for more than `_MOST_MEMORY` additional bytes (Linux only)."""
+def _limit_memory() -> Iterator[None]:
+    """Raise MemoryError for more than `_MAX_MEMORY_BYTES` additional bytes (Linux only)."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
     except OSError:  # only Linux enforces this limit
         yield
         return
-    most = pages * resource.getpagesize() + _MOST_MEMORY
-    resource.setrlimit(resource.RLIMIT_AS, (most if soft < 0 else min(most, soft), hard))
+    limit = pages * resource.getpagesize() + _MAX_MEMORY_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (limit if soft < 0 else min(limit, soft), hard))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-def _parts(message: Any) -> list[Any]:
+def _split_transforms(message: Any) -> list[Any]:
     return getattr(message, "transforms", [message])
 
 
-def _blocks(
+def _read_blocks(
     pairs: Iterator[tuple[int, Any]], child_frame: str | None, where: str
 ) -> list[dict[str, NDArray]]:
     children: set[str] = set()
     blocks: list[dict[str, NDArray]] = []
 
-    def of_child() -> Iterator[tuple[int, Any]]:
+    def select_child() -> Iterator[tuple[int, Any]]:
         for received, part in pairs:
             children.add(getattr(part, "child_frame_id", ""))
             if child_frame in (None, getattr(part, "child_frame_id", "")):
                 yield received, part
 
-    found = of_child()
-    while block := list(itertools.islice(found, _BLOCK)):
+    found = select_child()
+    while block := list(itertools.islice(found, _BLOCK_MESSAGES)):
         received = {_RECEIVED: np.array([time for time, _ in block]) * 1e-9}
         blocks.append(_columns([part for _, part in block]) | received)
     if (child_frame is None and len(children) > 1) or (child_frame and child_frame not in children):
@@ -268,7 +271,7 @@ def _blocks(
     return blocks
 
 
-def _joined(blocks: list[dict[str, NDArray]]) -> dict[str, NDArray]:
+def _join_blocks(blocks: list[dict[str, NDArray]]) -> dict[str, NDArray]:
     return {
         name: np.concatenate([block[name] for block in blocks])
         for name, values in blocks[0].items()
@@ -278,7 +281,7 @@ def _joined(blocks: list[dict[str, NDArray]]) -> dict[str, NDArray]:
 
 def _columns(messages: list[Any]) -> dict[str, NDArray]:
     columns: dict[str, NDArray] = {}
-    for path, sample in _leaves(messages[0], ""):
+    for path, sample in _numeric_fields(messages[0], ""):
         get = attrgetter(path)
         values = [get(message) for message in messages]
         if hasattr(sample, "nanosec"):
@@ -293,19 +296,19 @@ def _columns(messages: list[Any]) -> dict[str, NDArray]:
     return columns
 
 
-def _leaves(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+def _numeric_fields(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
     for field in dataclasses.fields(message):
         value, path = getattr(message, field.name), prefix + field.name
         if hasattr(value, "nanosec") or isinstance(value, (bool, int, float, np.number)):
             yield path, value
         elif isinstance(value, np.ndarray):
-            if value.dtype.kind in "fiu" and 0 < len(value) <= _LONGEST_ARRAY:
+            if value.dtype.kind in "fiu" and 0 < len(value) <= _MAX_ARRAY_LENGTH:
                 yield path, value
         elif dataclasses.is_dataclass(value):
-            yield from _leaves(value, f"{path}.")
+            yield from _numeric_fields(value, f"{path}.")
 
 
-def _take_absent(columns: dict[str, NDArray]) -> tuple[str, ...]:
+def _remove_absent_groups(columns: dict[str, NDArray]) -> tuple[str, ...]:
     """Remove groups whose covariance begins with -1; return their names."""
     absent = tuple(
         name.removesuffix("_covariance")
@@ -317,11 +320,11 @@ def _take_absent(columns: dict[str, NDArray]) -> tuple[str, ...]:
     return absent
 
 
-def _short(columns: dict[str, NDArray]) -> dict[str, NDArray]:
+def _short_names(columns: dict[str, NDArray]) -> dict[str, NDArray]:
     """Return columns of the standard groups by unique short name."""
     found: dict[str, list[str]] = {}
     for path in columns:
         *_, group, axis = ["", *path.split(".")]
-        if group in _GROUPS and axis in ("x", "y", "z", "w"):
-            found.setdefault(f"{_GROUPS[group]}.{axis}", []).append(path)
+        if group in _GROUP_NAMES and axis in ("x", "y", "z", "w"):
+            found.setdefault(f"{_GROUP_NAMES[group]}.{axis}", []).append(path)
     return {short: columns[paths[0]] for short, paths in found.items() if len(paths) == 1}

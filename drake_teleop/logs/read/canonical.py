@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.writing import write_table
 from drake_teleop.logs.pose_motion.poses import Posed
-from drake_teleop.logs.read.clocks import SLOWEST
+from drake_teleop.logs.read.clocks import MIN_RATE_HZ
 from drake_teleop.logs.read.description import (
     Acceleration,
     AngularAcceleration,
@@ -39,9 +39,9 @@ ANGULAR_VELOCITY = ("omega_x", "omega_y", "omega_z")
 ANGULAR_ACCELERATION = ("alpha_x", "alpha_y", "alpha_z")
 ORIENTATION = ("q_w", "q_x", "q_y", "q_z")
 POSITION = ("p_x", "p_y", "p_z")
-_REST = 0.05  # rad/s
-_TURN = np.radians(10.0)
-_ARRAYS = (
+_MAX_REST_SPEED = 0.05  # rad/s
+_MIN_TURN = np.radians(10.0)
+_ARRAY_FIELDS = (
     "t",
     "wrench",
     "specific_force",
@@ -147,9 +147,9 @@ class Log:
         """Return the log with the selected rows."""
         if not isinstance(rows, slice) and rows.all():
             return self
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        taken: dict[str, Any] = {k: None if x is None else x[rows] for k, x in arrays.items()}
-        return replace(self, **taken)
+        arrays = {name: getattr(self, name) for name in _ARRAY_FIELDS}
+        selected: dict[str, Any] = {k: None if x is None else x[rows] for k, x in arrays.items()}
+        return replace(self, **selected)
 
     @property
     def motion(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -247,7 +247,7 @@ def _at_rest(table: Table, s: bool, omega: bool, q: bool) -> bool:
         return False
     if omega:
         speed = table.numbers(ANGULAR_VELOCITY, 3, where)
-        if np.median(np.linalg.norm(speed, axis=1)) > _REST:
+        if np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED:
             return False
     if "t" not in table.columns:
         return True
@@ -255,12 +255,12 @@ def _at_rest(table: Table, s: bool, omega: bool, q: bool) -> bool:
     if not np.isfinite(t).all():
         return False  # the reader raises an error that names the row
     steps = np.diff(t)
-    if not len(steps) or not np.median(steps) > 1 / SLOWEST:
+    if not len(steps) or not np.median(steps) > 1 / MIN_RATE_HZ:
         return False
     if q:
-        up = rotation_matrices(table.numbers(ORIENTATION, 4, where), "quaternion_wxyz")[:, 2]
+        vertical = rotation_matrices(table.numbers(ORIENTATION, 4, where), "quaternion_wxyz")[:, 2]
     else:
-        up = table.numbers(SPECIFIC_FORCE, 3, where)
-    up = up / (np.linalg.norm(up, axis=1, keepdims=True) + 1e-300)
-    turned = np.arccos(np.clip((up[1:] * up[:-1]).sum(axis=1), -1.0, 1.0))
-    return bool(np.quantile(turned, 0.8) > _TURN)
+        vertical = table.numbers(SPECIFIC_FORCE, 3, where)
+    vertical = vertical / (np.linalg.norm(vertical, axis=1, keepdims=True) + 1e-300)
+    turned = np.arccos(np.clip((vertical[1:] * vertical[:-1]).sum(axis=1), -1.0, 1.0))
+    return bool(np.quantile(turned, 0.8) > _MIN_TURN)

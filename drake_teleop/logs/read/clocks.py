@@ -25,11 +25,11 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.description import UNITS, Time
 from drake_teleop.logs.read.tables import Table
 
-GAP = 4.0
+MIN_GAP_STEPS = 4.0
 """Least length of a gap in median steps."""
-SLOWEST, FASTEST = 5.0, 1e5
+MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5
 """Range of plausible rates [Hz]; other rates indicate a wrong unit."""
-_SPARSE = 4.0
+_MAX_STEP_RATIO = 4.0
 _WINDOW = 50
 
 
@@ -49,7 +49,7 @@ class Clock:
     total: int
     notes: tuple[str, ...] = ()
 
-    def taken(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def select(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the rows of (total, ...) values that have a time."""
         return x if len(self.rows) == self.total else x[self.rows]
 
@@ -62,7 +62,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     if time.column is None:
         assert time.rate is not None
         rows = np.arange(table.rows)
-        return Clock(_common(rows / time.rate, time), rows, table.rows)
+        return Clock(_to_common_clock(rows / time.rate, time), rows, table.rows)
     stamps = table.raw(time.column, f"{where}.column")
     if stamps.shape[1] != 1 or not np.isfinite(stamps).any():
         table.numbers([time.column], 1, f"{where}.column")
@@ -80,7 +80,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     _check_forward(t[rows], rows, table, where)
     if (np.diff(t[rows]) == 0).any():
         before = len(rows)
-        rows = _distinct(rows, t, table, columns, where)
+        rows = _remove_repetitions(rows, t, table, columns, where)
         if len(rows) < before:
             notes.append(
                 f"{before - len(rows)} rows that repeat the one before, with its time stamp, are"
@@ -90,7 +90,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     shared = int((np.diff(t) == 0).sum())
     if shared:
         even = spread(t)
-        _check_spread(even, rows, table, where)
+        _check_increasing(even, rows, table, where)
         notes.append(
             f"{shared} rows share the time stamp of the one before: all are taken as evenly spaced"
             f" over {_WINDOW} stamps, which moves them by up to {np.abs(even - t).max():.2g} s"
@@ -98,10 +98,10 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
         t = even
     _check_rate(t, time, where)
     _check_even(t, rows, table, where)
-    return Clock(_common(t, time), rows, len(stamps), tuple(notes))
+    return Clock(_to_common_clock(t, time), rows, len(stamps), tuple(notes))
 
 
-def _common(t: NDArray[np.float64], time: Time) -> NDArray[np.float64]:
+def _to_common_clock(t: NDArray[np.float64], time: Time) -> NDArray[np.float64]:
     return t[0] + time.scale * (t - t[0]) + time.offset
 
 
@@ -115,7 +115,7 @@ def spread(t: NDArray[np.float64]) -> NDArray[np.float64]:
     per_stamp = len(t) / len(distinct)
     parts = np.split(t, np.flatnonzero(np.diff(t) > 3 * step) + 1)
     half = math.ceil(0.5 * _WINDOW * per_stamp)
-    return np.concatenate([_evened(part, half, step / per_stamp) for part in parts])
+    return np.concatenate([_smooth_stamps(part, half, step / per_stamp) for part in parts])
 
 
 def gaps(t: NDArray[np.float64], bandwidth_hz: float | None) -> NDArray[np.float64]:
@@ -130,10 +130,10 @@ def gaps(t: NDArray[np.float64], bandwidth_hz: float | None) -> NDArray[np.float
 
 def shortest_gap(step: float, bandwidth_hz: float | None) -> float:
     """Return the shortest gap [s] for a median `step` [s]."""
-    return max(GAP * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
+    return max(MIN_GAP_STEPS * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
 
 
-def _evened(t: NDArray[np.float64], half: int, dt: float) -> NDArray[np.float64]:
+def _smooth_stamps(t: NDArray[np.float64], half: int, dt: float) -> NDArray[np.float64]:
     """Return the moving average of the stamps over 2 half + 1 rows, with straight ends."""
     n = len(t)
     if t[0] == t[-1]:
@@ -156,7 +156,7 @@ def _evened(t: NDArray[np.float64], half: int, dt: float) -> NDArray[np.float64]
     return line + smooth
 
 
-def _distinct(
+def _remove_repetitions(
     rows: NDArray[np.intp],
     t: NDArray[np.float64],
     table: Table,
@@ -192,7 +192,9 @@ def _check_forward(
         )
 
 
-def _check_spread(t: NDArray[np.float64], rows: NDArray[np.intp], table: Table, where: str) -> None:
+def _check_increasing(
+    t: NDArray[np.float64], rows: NDArray[np.intp], table: Table, where: str
+) -> None:
     steps = np.diff(t)
     if (steps <= 0).any():
         row = rows[int(np.argmax(steps <= 0))] + table.first_row
@@ -207,13 +209,13 @@ def _check_rate(t: NDArray[np.float64], time: Time, where: str) -> None:
     if len(t) < 2:
         return
     step = float(np.median(np.diff(t)))
-    if 1 / FASTEST <= step <= 1 / SLOWEST:
+    if 1 / MAX_RATE_HZ <= step <= 1 / MIN_RATE_HZ:
         return
     counts = step / UNITS[time.unit]
     # Typical sensor rates are 20 Hz to 10 kHz.
     likely = [unit for unit in ("s", "ms", "us", "ns") if 1e-4 <= counts * UNITS[unit] <= 0.05]
     remedy = f"probably `unit: {likely[0]}`" if likely else "check the unit, or give time.rate"
-    if step > 1 / SLOWEST:
+    if step > 1 / MIN_RATE_HZ:
         remedy += "; if each row is a pose at rest, describe them as `static:`"
     raise DrakeTeleopError(
         f"the median step of the time stamps is {step:.3g} s, a rate of {1 / step:.3g} Hz",
@@ -224,7 +226,7 @@ def _check_rate(t: NDArray[np.float64], time: Time, where: str) -> None:
 
 def _check_even(t: NDArray[np.float64], rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
-    if len(t) < 3 or t[-1] - t[0] <= _SPARSE * len(t) * np.median(steps):
+    if len(t) < 3 or t[-1] - t[0] <= _MAX_STEP_RATIO * len(t) * np.median(steps):
         return
     longest = int(np.argmax(steps))
     row = rows[longest + 1] + table.first_row

@@ -16,8 +16,8 @@ from drake_teleop.logs.read.alignment import low_passed, measured, resample, wid
 from drake_teleop.logs.read.canonical import Log
 
 SEARCH_RANGE = 0.25
-_MOST_SAMPLES = 5000
-_FEWEST = 32
+_MAX_SAMPLES = 5000
+_MIN_SAMPLES = 32
 
 
 def estimate_delay(
@@ -34,18 +34,18 @@ def estimate_delay(
     reach = min(SEARCH_RANGE, 0.1 * float(log.t[-1] - log.t[0]))
     step = min(1 / (8 * cutoff), reach / 8)
     inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
-    inside = np.flatnonzero(inside & _known(log, cutoff, reach))
-    if len(inside) < _FEWEST:
+    inside = np.flatnonzero(inside & _away_from_gaps(log, cutoff, reach))
+    if len(inside) < _MIN_SAMPLES:
         return None
-    stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MOST_SAMPLES)
-    cost = _cost(smooth, inside[::stride], phi)
+    stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_SAMPLES)
+    cost = _shift_cost(smooth, inside[::stride], phi)
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
     costs = np.array([cost(shift) for shift in shifts])
     best = int(np.argmin(costs))
     independent = 2 * cutoff * float(log.t[-1] - log.t[0])
     if best in (0, len(shifts) - 1) or costs.max() - costs[best] < 0.1 + 50 / independent:
         return None
-    return _refined(cost, float(shifts[best]), step)
+    return _refine_shift(cost, float(shifts[best]), step)
 
 
 def delay_of(
@@ -67,12 +67,12 @@ def delay_of(
     return (0.0, "undetermined") if found is None else (found, "estimated")
 
 
-def _known(log: Log, cutoff: float, reach: float) -> NDArray[np.bool_]:
+def _away_from_gaps(log: Log, cutoff: float, reach: float) -> NDArray[np.bool_]:
     gap = ~measured(log, cutoff)
     return ~widened(gap, math.ceil(reach / log.dt)) if gap.any() else ~gap
 
 
-def _refined(cost: Callable[[float], float], best: float, step: float) -> float:
+def _refine_shift(cost: Callable[[float], float], best: float, step: float) -> float:
     while step > 1e-5:
         step /= 4
         candidates = best + step * np.arange(-4, 5)
@@ -80,7 +80,7 @@ def _refined(cost: Callable[[float], float], best: float, step: float) -> float:
     return best
 
 
-def _cost(
+def _shift_cost(
     log: Log, rows: NDArray[np.intp], phi: NDArray[np.float64] | None
 ) -> Callable[[float], float]:
     t, wrench = log.t[rows], log.wrench[rows]

@@ -37,16 +37,16 @@ from drake_teleop.logs.read.description_fields import (
     Gravity,
     ImuFrame,
     Number,
-    Place,
+    PositionOrAuto,
+    RotationOrAuto,
     Scale,
-    Turn,
     Vector,
     Weight,
 )
 
 STANDARD_GRAVITY = 9.80665
 NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
-_LARGEST_GRAVITY = 100.0
+_MAX_GRAVITY = 100.0
 
 UNITS = {
     "s": 1.0,
@@ -77,7 +77,7 @@ class _Strict(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _in_reach(cls, value: Any) -> Any:
+    def _limit_size(cls, value: Any) -> Any:
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, (int, float)) and 1e12 < abs(number) < np.inf:
                 raise ValueError(f"{number:g} is beyond 1e12")
@@ -101,7 +101,7 @@ class Time(_Strict):
     )
 
     @model_validator(mode="after")
-    def _one_of(self) -> Time:
+    def _check_alternatives(self) -> Time:
         if (self.column is None) == (self.rate is None):
             raise ValueError("give either column or rate")
         return self
@@ -160,17 +160,17 @@ class Position(_Quantity):
     unit: Literal["m", "mm"] = "m"
 
 
-def _named(group: str, axes: str = "xyz") -> list[str]:
+def _axis_columns(group: str, axes: str = "xyz") -> list[str]:
     return [f"{group}.{axis}" for axis in axes]
 
 
-_OF_TOPIC: dict[str, dict[str, Any]] = {
-    "force": {"columns": _named("force")},
-    "torque": {"columns": _named("torque")},
-    "specific_force": {"columns": _named("linear_acceleration")},
-    "angular_velocity": {"columns": _named("angular_velocity")},
-    "orientation": {"columns": _named("orientation", "wxyz"), "form": "quaternion_wxyz"},
-    "position": {"columns": _named("position")},
+_TOPIC_DEFAULTS: dict[str, dict[str, Any]] = {
+    "force": {"columns": _axis_columns("force")},
+    "torque": {"columns": _axis_columns("torque")},
+    "specific_force": {"columns": _axis_columns("linear_acceleration")},
+    "angular_velocity": {"columns": _axis_columns("angular_velocity")},
+    "orientation": {"columns": _axis_columns("orientation", "wxyz"), "form": "quaternion_wxyz"},
+    "position": {"columns": _axis_columns("position")},
 }
 
 
@@ -195,7 +195,7 @@ class _Recorded(_Stream):
 
     @model_validator(mode="before")
     @classmethod
-    def _of_topic(cls, data: Any) -> Any:
+    def _fill_topic_defaults(cls, data: Any) -> Any:
         if not isinstance(data, dict) or data.get("topic") is None:
             return data
         data = {"time": {}, **{name: {} for name in cls._defaults}, **data}
@@ -205,7 +205,7 @@ class _Recorded(_Stream):
         for name in cls._defaults:
             given = data[name]
             if isinstance(given, dict) and not {"columns", "form"} & set(given):
-                data[name] = {**_OF_TOPIC[name], **given}
+                data[name] = {**_TOPIC_DEFAULTS[name], **given}
         return data
 
     @property
@@ -238,13 +238,13 @@ class Imu(_Recorded):
     angular_acceleration: AngularAcceleration | None = None
     sign: Literal[1, -1] = Field(default=1, description="of the specific force; -1 for g - a")
     frame: ImuFrame = Field(default="sensor", description="auto: the rotation is found")
-    position: Place = Field(
+    position: PositionOrAuto = Field(
         default=(0.0, 0.0, 0.0),
         description="p_SoIo_S of the accelerometer, m; auto: it is found",
     )
 
     @model_validator(mode="after")
-    def _not_empty(self) -> Imu:
+    def _check_signals(self) -> Imu:
         if not (self.specific_force or self.angular_velocity):
             raise ValueError("give specific_force, angular_velocity, or both")
         if self.automatic and not self.specific_force:
@@ -267,17 +267,17 @@ class Pose(_Recorded):
     orientation: Orientation
     position: Position | None = None
     frame: Frame = "sensor"
-    position_in_sensor: Place = Field(
+    position_in_sensor: PositionOrAuto = Field(
         default=(0.0, 0.0, 0.0),
         description="p_SoPo_S of the posed frame's origin, m; auto: it is found",
     )
-    rotation_in_sensor: Turn = Field(
+    rotation_in_sensor: RotationOrAuto = Field(
         default=None,
         description="R_SP, from the posed frame to S, as frame has it; auto: it is found",
     )
 
     @model_validator(mode="after")
-    def _not_base(self) -> Pose:
+    def _check_frame(self) -> Pose:
         if self.frame == "base":
             raise ValueError("frame must be sensor, or the rotation from the posed frame to S")
         if self.frame != "sensor" and self.rotation_in_sensor is not None:
@@ -319,7 +319,7 @@ class Static(_Stream):
     gain_std: GainStd = 0.0
 
     @model_validator(mode="after")
-    def _one_of(self) -> Static:
+    def _check_alternatives(self) -> Static:
         if sum(x is not None for x in (self.gravity, self.specific_force, self.orientation)) != 1:
             raise ValueError("give one of gravity (in S), specific_force (in S), orientation")
         if self.weight == "removed":
@@ -344,9 +344,9 @@ class Description(_Strict):
     static: Static | None = None
 
     @model_validator(mode="after")
-    def _complete(self) -> Description:
-        if np.abs(self.gravity_W).max() > _LARGEST_GRAVITY:
-            raise ValueError(f"gravity is beyond {_LARGEST_GRAVITY:g} m/s^2")
+    def _check_streams(self) -> Description:
+        if np.abs(self.gravity_W).max() > _MAX_GRAVITY:
+            raise ValueError(f"gravity is beyond {_MAX_GRAVITY:g} m/s^2")
         if self.gravity == "auto" and (self.pose is None or self.imu is not None):
             raise ValueError("gravity: auto is found from a wrench with a pose and no imu")
         if self.static is not None:
@@ -390,9 +390,9 @@ class Description(_Strict):
     def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
         """Return poses of S with gravity, the pose frame and IMU data."""
         assert self.pose is not None
-        place, turn = self.pose.position_in_sensor, self.pose.R_SP
-        turn = np.eye(3) if turn is None else turn
-        return Posed(poses, self.gravity_W, np.array(place), turn, imu)
+        origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
+        rotation = np.eye(3) if rotation is None else rotation
+        return Posed(poses, self.gravity_W, np.array(origin), rotation, imu)
 
     def scale(self, unit: str) -> float:
         """Return the SI value of a unit; "g" is the described gravity."""
@@ -429,11 +429,11 @@ def load_description(path: str | Path) -> Description:
     try:
         description = Description.model_validate(data)
     except ValidationError as error:
-        raise _explained(error, path) from error
-    return _resolved(description, path.parent)
+        raise _validation_error(error, path) from error
+    return _resolve_paths(description, path.parent)
 
 
-def _resolved(description: Description, folder: Path) -> Description:
+def _resolve_paths(description: Description, folder: Path) -> Description:
     streams = {
         name: stream.model_copy(update={"file": folder / stream.file})
         for name in ("wrench", "imu", "pose", "static")
@@ -442,7 +442,7 @@ def _resolved(description: Description, folder: Path) -> Description:
     return description.model_copy(update=streams)
 
 
-def _explained(error: ValidationError, path: Path) -> DrakeTeleopError:
+def _validation_error(error: ValidationError, path: Path) -> DrakeTeleopError:
     # A misspelt field also causes "missing"; report the misspelling first.
     first = min(error.errors(), key=lambda entry: entry["type"] == "missing")
     *outer, last = first["loc"] or ("",)

@@ -9,7 +9,7 @@ from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 
 # Least log likelihood ratio (times 2) and total lag [s] of a significant drift.
-_LIKELIHOOD, _DRIFTED = 50.0, 0.01
+_MIN_LIKELIHOOD_RATIO, _MIN_DRIFT_S = 50.0, 0.01
 
 
 Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -35,14 +35,16 @@ def best_shift(
     U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
 
-    def beyond(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def without_arm(x: NDArray[np.float64]) -> NDArray[np.float64]:
         return x - U @ (U.T @ x)
 
-    expected, sensed = [beyond(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
+    expected, sensed = [without_arm(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
 
     def cost(shift: float) -> float:
-        moved = beyond(resample(t + shift, t_imu, sensed))
-        return sum(_unmapped(y, moved[:, 3 * k : 3 * k + 3]) for k, y in enumerate(expected))
+        moved = without_arm(resample(t + shift, t_imu, sensed))
+        return sum(
+            _unexplained_share(y, moved[:, 3 * k : 3 * k + 3]) for k, y in enumerate(expected)
+        )
 
     step = 0.01
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
@@ -90,13 +92,13 @@ def clock_drift(
         residual = np.concatenate([r.ravel() for r in left])
         found = found + np.linalg.lstsq(np.vstack(rows), residual, rcond=1e-6)[0]
     gain = independent * np.log(start / (cost + 1e-300))
-    moved_s = abs(found[1]) * float(t[-1] - t[0])
-    if gain < _LIKELIHOOD or moved_s < _DRIFTED:
+    total_drift_s = abs(found[1]) * float(t[-1] - t[0])
+    if gain < _MIN_LIKELIHOOD_RATIO or total_drift_s < _MIN_DRIFT_S:
         return lag, 0.0
     return float(found[0]), float(found[1])
 
 
-def _unmapped(y: NDArray[np.float64], x: NDArray[np.float64]) -> float:
+def _unexplained_share(y: NDArray[np.float64], x: NDArray[np.float64]) -> float:
     """Return the share of the variance of y (N, 3) that no affine map of x explains."""
     y, x = y - y.mean(axis=0), x - x.mean(axis=0)
     both, total = x.T @ y, float((y * y).sum()) + 1e-12 * len(y)

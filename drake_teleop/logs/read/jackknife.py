@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 _BLOCKS = 20
 # Directions with smaller singular values, relative to the largest, are undetermined.
 RANK = 1e-5
-_STEPS = 15  # evaluations of the solver: valid records need six
+_MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 
 
 def solve(
@@ -28,12 +28,12 @@ def solve(
     """
     linear = np.empty((*residual(x).shape, 0)) if linear is None else linear
     rows, channels, _ = linear.shape
-    found = _fitted(residual, x, linear)
-    found = _fitted(residual, found.x, linear)  # with updated weights
+    found = _fit(residual, x, linear)
+    found = _fit(residual, found.x, linear)  # with updated weights
     return found.x, jackknife(found.jac, found.fun, channels * (rows // _BLOCKS))
 
 
-def _fitted(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
+def _fit(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
     from scipy.optimize import approx_fprime, least_squares
 
     errors, others = residual(x), len(x) - linear.shape[2]
@@ -44,11 +44,11 @@ def _fitted(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
     def weighted(z: Array) -> Array:
         return (residual(z) / sigma).ravel()
 
-    def slopes(z: Array) -> Array:
+    def derivatives(z: Array) -> Array:
         found = approx_fprime(z[:others], lambda y: weighted(np.append(y, z[others:])))
         return np.hstack([found, known])
 
-    return least_squares(weighted, x, jac=slopes, x_scale="jac", max_nfev=_STEPS)
+    return least_squares(weighted, x, jac=derivatives, x_scale="jac", max_nfev=_MAX_EVALUATIONS)
 
 
 def jackknife(jacobian: Array, residual: Array, width: int) -> Array:

@@ -19,16 +19,16 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.jackknife import RANK, solve
 
-LEVER_KNOWN = 0.005
+MAX_LEVER_DEVIATION = 0.005
 """Largest standard deviation of a determined coordinate [m]."""
-BELIEVABLE = 0.05
+MAX_UNEXPLAINED = 0.05
 """Largest unexplained share of the variance of a valid fit."""
-CUTOFF = 8.0
+CUTOFF_HZ = 8.0
 """Cut-off of the low-pass on all signals [Hz]."""
-SAMPLES = 1500
+COMPARED_SAMPLES = 1500
 """Number of compared samples."""
 # Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
-_SIGNAL = 20.0
+_MIN_SIGNAL_RATIO = 20.0
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class LeverArm:
     @property
     def determined(self) -> NDArray[np.bool_]:
         """(3,) whether each coordinate is determined."""
-        return self.deviations < LEVER_KNOWN
+        return self.deviations < MAX_LEVER_DEVIATION
 
 
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
@@ -57,12 +57,12 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     Returns None if more than 5 % of the variance remains (contact), or gaps leave less than a
     tenth.
     """
-    cutoff = min(CUTOFF, 0.2 / log.dt)
+    cutoff = min(CUTOFF_HZ, 0.2 / log.dt)
     delay = estimate_delay(log, None) or 0.0
     smooth = low_passed(undelayed(log, delay), cutoff)
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
     t = common_times(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
-    if len(t) < SAMPLES // 10:
+    if len(t) < COMPARED_SAMPLES // 10:
         return None
     wrench = resample(t, smooth.t, smooth.wrench)
 
@@ -79,17 +79,17 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     offsets = (wrench - V @ phi).mean(axis=0)
     x, deviations = solve(residual, np.concatenate([np.zeros(4), offsets, phi]))
     left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual(x), wrench))
-    if (left > BELIEVABLE * whole).any():
+    if (left > MAX_UNEXPLAINED * whole).any():
         return None
-    shown = shown_axes(lever_matrix(*motion[1:]), smooth, cutoff)
-    return LeverArm(x[:3], np.where(shown, deviations[:3], np.inf), "wrench")
+    observable = observable_axes(lever_matrix(*motion[1:]), smooth, cutoff)
+    return LeverArm(x[:3], np.where(observable, deviations[:3], np.inf), "wrench")
 
 
 def common_times(
     start: float, stop: float, logs: Sequence[Log], cutoff: float
 ) -> NDArray[np.float64]:
     """Return evenly spaced times at which all logs have samples."""
-    t = np.linspace(start, stop, SAMPLES)
+    t = np.linspace(start, stop, COMPARED_SAMPLES)
     known = [np.interp(t, log.t, measured(log, cutoff).astype(float)) > 0.99 for log in logs]
     return t[np.all(known, axis=0)]
 
@@ -100,7 +100,7 @@ def lever_matrix(omega: NDArray[np.float64], alpha: NDArray[np.float64]) -> NDAr
     return cross_matrix(alpha) + W @ W
 
 
-def shown_axes(K: NDArray[np.float64], log: Log, cutoff: float) -> NDArray[np.bool_]:
+def observable_axes(K: NDArray[np.float64], log: Log, cutoff: float) -> NDArray[np.bool_]:
     """Return (3,) axes along which the motion exceeds its noise, which biases the arm to zero.
 
     The noise below the cut-off is at most a seventh of that in the next octave, because its power
@@ -112,4 +112,4 @@ def shown_axes(K: NDArray[np.float64], log: Log, cutoff: float) -> NDArray[np.bo
     K = K - K.mean(axis=0)
     information = np.einsum("nij,nik->jk", K, K) / len(K)
     alone = 1 / np.diag(np.linalg.pinv(information, rcond=1e-12, hermitian=True))
-    return alone > _SIGNAL * (noise.sum() - noise)
+    return alone > _MIN_SIGNAL_RATIO * (noise.sum() - noise)

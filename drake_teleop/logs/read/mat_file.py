@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-_HEADER, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _DEEPEST = 128, 14, 15, 2, 1 << 11, 20
-_NUMBERS = range(6, 16)  # numeric classes
+_HEADER, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _MAX_DEPTH = 128, 14, 15, 2, 1 << 11, 20
+_NUMERIC_CLASSES = range(6, 16)  # numeric classes
 _TYPES = {
     1: "i1",
     2: "u1",
@@ -49,18 +49,18 @@ def read_mat(path: Path) -> dict[str, NDArray]:
     if version == 1:
         data = path.read_bytes()
         order = "<" if data[126:128] == b"IM" else ">"
-        for kind, content in _elements(memoryview(data)[_HEADER:], order):
-            _take(kind, content, order, None, 0, found)
+        for kind, content in _iterate_elements(memoryview(data)[_HEADER:], order):
+            _add_variable(kind, content, order, None, 0, found)
     else:
         for name, value in loadmat(path).items():
             if isinstance(value, np.ndarray):
-                _put(name, value, found)
+                _add_array(name, value, found)
     if not found:
         raise ValueError("it has no arrays: what is in tables and timeseries, save as arrays")
     return found
 
 
-def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
+def _iterate_elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
     """Yield type and content of each element."""
     start = 0
     while start < len(data):
@@ -73,43 +73,43 @@ def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
         if len(content) < size or (small and size > 4):
             raise ValueError(_BROKEN)
         if kind == _COMPRESSED:
-            yield from _elements(memoryview(zlib.decompress(content)), order)
+            yield from _iterate_elements(memoryview(zlib.decompress(content)), order)
         else:
             yield kind, content
         start += 8 if small else 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
 
 
-def _take(
+def _add_variable(
     kind: int, content: memoryview, order: str, name: str | None, depth: int, found: dict
 ) -> None:
     """Add the arrays of a variable or named field to `found`."""
-    parts = list(_elements(content, order)) if kind == _MATRIX else []
+    parts = list(_iterate_elements(content, order)) if kind == _MATRIX else []
     if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _FLAGS_AND_SIZE:  # objects have no size
         return
-    if depth > _DEEPEST:
+    if depth > _MAX_DEPTH:
         raise ValueError(_BROKEN)
-    (flags, *_), size = (_numbers(part, order).tolist() for part in parts[:2])
+    (flags, *_), size = (_parse_numbers(part, order).tolist() for part in parts[:2])
     name = bytes(parts[2][1]).decode("latin-1") if name is None else name
-    if flags & 0xFF in _NUMBERS and not flags & _COMPLEX:
+    if flags & 0xFF in _NUMERIC_CLASSES and not flags & _COMPLEX:
         if len(parts) != 4:
             raise ValueError(_BROKEN)
-        _put(name, _numbers(parts[3], order).reshape(size, order="F"), found)
+        _add_array(name, _parse_numbers(parts[3], order).reshape(size, order="F"), found)
     elif flags & 0xFF == _STRUCTURE and math.prod(size) == 1 and len(parts) > 4:
-        (length, *_), names = _numbers(parts[3], order).tolist(), bytes(parts[4][1])
+        (length, *_), names = _parse_numbers(parts[3], order).tolist(), bytes(parts[4][1])
         fields = [names[i : i + length] for i in range(0, len(names), max(length, 1))]
         for field, part in zip(fields, parts[5:], strict=True):
             label = field.partition(b"\0")[0].decode("latin-1")
-            _take(*part, order, f"{name}.{label}", depth + 1, found)
+            _add_variable(*part, order, f"{name}.{label}", depth + 1, found)
 
 
-def _numbers(part: tuple[int, memoryview], order: str) -> NDArray:
+def _parse_numbers(part: tuple[int, memoryview], order: str) -> NDArray:
     kind, content = part
     if kind not in _TYPES:
         raise ValueError(_BROKEN)
     return np.frombuffer(content, f"{order}{_TYPES[kind]}").astype(_TYPES[kind])
 
 
-def _put(name: str, array: NDArray, found: dict[str, NDArray]) -> None:
+def _add_array(name: str, array: NDArray, found: dict[str, NDArray]) -> None:
     """Add an array: vectors as 1-D, matrix stacks with the stack axis first."""
     if array.size < 2 or not name:
         return

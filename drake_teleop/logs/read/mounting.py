@@ -16,23 +16,23 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.imu_clock import best_shift, clock_drift, signal_pairs
 from drake_teleop.logs.read.jackknife import solve
 from drake_teleop.logs.read.lever_arm import (
-    BELIEVABLE,
-    CUTOFF,
-    SAMPLES,
+    COMPARED_SAMPLES,
+    CUTOFF_HZ,
+    MAX_UNEXPLAINED,
     LeverArm,
     common_times,
     lever_matrix,
-    shown_axes,
+    observable_axes,
 )
 from drake_teleop.logs.read.rotations import right_angled_rotations, rotation_matrices
 
 RIGHT_ANGLED_DEG = 5.0
 """Largest angle from an exchange of axes of a right-angled mounting."""
-ROTATION_KNOWN_DEG = 1.0
+MAX_DEVIATION_DEG = 1.0
 """Largest standard deviation of a determined rotation."""
-BELIEVABLE_GRAVITY = 0.005
-"""As `BELIEVABLE`, without positions: unmodelled accelerations resemble a rotation."""
-_REACH = 1.0
+MAX_UNEXPLAINED_GRAVITY = 0.005
+"""As `MAX_UNEXPLAINED`, without positions: unmodelled accelerations resemble a rotation."""
+_MAX_LAG_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -88,17 +88,19 @@ class Mounting:
     @property
     def fits(self) -> bool:
         """Whether IMU and pose agree."""
-        turning = self.unexplained_turning is None or self.unexplained_turning < BELIEVABLE
+        omega_agrees = (
+            self.unexplained_turning is None or self.unexplained_turning < MAX_UNEXPLAINED
+        )
         if self.lever is not None:
-            return not self.mirrored and turning and self.unexplained < BELIEVABLE
+            return not self.mirrored and omega_agrees and self.unexplained < MAX_UNEXPLAINED
         # Without positions the pose determines the angular velocity, but not the acceleration.
-        known = self.unexplained_turning is not None or self.unexplained < BELIEVABLE_GRAVITY
-        return not self.mirrored and turning and known
+        known = self.unexplained_turning is not None or self.unexplained < MAX_UNEXPLAINED_GRAVITY
+        return not self.mirrored and omega_agrees and known
 
     @property
     def determined(self) -> bool:
         """Whether the rotation about every axis is determined."""
-        return self.fits and bool((self.deviations_deg < ROTATION_KNOWN_DEG).all())
+        return self.fits and bool((self.deviations_deg < MAX_DEVIATION_DEG).all())
 
 
 def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | None:
@@ -111,11 +113,11 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     little.
     """
     start, stop = max(imu.t[0], pose.t[0]), min(imu.t[-1], pose.t[-1])
-    reach = min(_REACH, 0.2 * float(stop - start))
-    cutoff = min(CUTOFF, 0.2 / imu.dt)
+    reach = min(_MAX_LAG_S, 0.2 * float(stop - start))
+    cutoff = min(CUTOFF_HZ, 0.2 / imu.dt)
     sensed, smooth = low_passed(imu, cutoff), low_passed(pose, cutoff)
     t = common_times(start + reach, stop - reach, (imu, pose), cutoff)
-    if len(t) < SAMPLES // 10:
+    if len(t) < COMPARED_SAMPLES // 10:
         return None
     # Without a gyroscope both readings contain the angular velocity of the pose.
     omega_imu, omega = (resample(t, log.t, log.angular_velocity) for log in (imu, pose))
@@ -138,20 +140,20 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     margin = min(reach, abs(middle) + 0.5 * abs(drift) * float(stop - start) + 0.1)
     t = common_times(start + margin, stop - margin, (imu, pose), cutoff)
     pairs = signal_pairs(t, sensed, smooth, gyroscope)
-    turned = resample(t, pose.t, smooth.angular_velocity)
-    K = lever_matrix(turned, resample(t, pose.t, smooth.angular_acceleration))
+    pose_omega = resample(t, pose.t, smooth.angular_velocity)
+    K = lever_matrix(pose_omega, resample(t, pose.t, smooth.angular_acceleration))
 
-    x, deviations, left = _refined(t, drift * (t - centre), imu.t, pairs, K, R, middle)
+    x, deviations, left = _refine(t, drift * (t - centre), imu.t, pairs, K, R, middle)
     lever = None
     if position:
         lever = LeverArm(
-            x[4:7], np.where(shown_axes(K, pose, cutoff), deviations[4:7], np.inf), "pose"
+            x[4:7], np.where(observable_axes(K, pose, cutoff), deviations[4:7], np.inf), "pose"
         )
     powers = left.reshape(len(t), -1, 3).var(axis=0).sum(axis=1)
     shares = [float(part / y.var(axis=0).sum()) for part, (y, _) in zip(powers, pairs, strict=True)]
     speeds = [float(np.linalg.norm(log.angular_velocity, axis=1).std()) for log in (imu, pose)]
     return Mounting(
-        R_SI=_turned(R, x[:3]),
+        R_SI=_rotate(R, x[:3]),
         lag_s=lag if drift else float(x[3]),
         lag_middle_s=float(x[3]),
         middle_s=centre,
@@ -165,9 +167,9 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     )
 
 
-def _refined(
+def _refine(
     t: NDArray[np.float64],
-    later: NDArray[np.float64],
+    drift_lag: NDArray[np.float64],
     t_imu: NDArray[np.float64],
     pairs: list[tuple[NDArray[np.float64], NDArray[np.float64]]],
     K: NDArray[np.float64],
@@ -176,15 +178,15 @@ def _refined(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Solve the least squares of `find_mounting` for k signals `pairs`.
 
-    `t` (N,) are times on the pose's clock, `later` (N,) lags by drift, `t_imu` (M,) times on the
-    IMU's clock [s]; K (N, 3, 3) of Eq. (T20). Returns (7 + 3 k,) rotation vector [rad], lag [s], p
-    [m] and biases, their standard deviations, and (N, 3 k) residuals.
+    `t` (N,) are times on the pose's clock, `drift_lag` (N,) lags by drift, `t_imu` (M,) times on
+    the IMU's clock [s]; K (N, 3, 3) of Eq. (T20). Returns (7 + 3 k,) rotation vector [rad], lag
+    [s], p [m] and biases, their standard deviations, and (N, 3 k) residuals.
     """
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
 
     def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        seen = resample(t + x[3] + later, t_imu, moving).reshape(-1, 3) @ _turned(R, x[:3]).T
-        left = seen.reshape(known.shape) - known
+        rotated = resample(t + x[3] + drift_lag, t_imu, moving).reshape(-1, 3) @ _rotate(R, x[:3]).T
+        left = rotated.reshape(known.shape) - known
         left[:, 0] -= K @ x[4:7]
         return left.reshape(len(t), -1) + x[7:]
 
@@ -208,7 +210,7 @@ def _kabsch(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.
     return R, bool(reflected < 0.25 * direct and reflected < 0.05)
 
 
-def _turned(R: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotate(R: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return R rotated by a rotation vector (3,) in S [rad]."""
     return rotation_matrices(vector[None], "rotation_vector")[0] @ R
 

@@ -38,7 +38,7 @@ class Orientations:
     def rotations(self, rows: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return (n, 3, 3) R_WS of n rows; raise an error for other matrices."""
         R = rotation_matrices(self._columns[rows], self._orientation.form)
-        self._check(rotation_error(R), rows)
+        self._check_errors(rotation_error(R), rows)
         return nearest_rotation(np.swapaxes(R, 1, 2) if self._orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -49,13 +49,13 @@ class Orientations:
         if self._orientation.form == "quaternion_xyzw":
             q = np.roll(q, 1, axis=1)
         squared = np.einsum("ij,ij->i", q, q)  # the matrix of q is this, times a rotation
-        self._check(np.abs(squared**2 - 1.0), rows)
+        self._check_errors(np.abs(squared**2 - 1.0), rows)
         q /= np.sqrt(squared)[:, None]
         if self._orientation.inverse:
             q[:, 1:] *= -1.0
         return q
 
-    def _check(self, errors: NDArray[np.float64], rows: NDArray[np.intp]) -> None:
+    def _check_errors(self, errors: NDArray[np.float64], rows: NDArray[np.intp]) -> None:
         worst = int(np.argmax(errors))
         if errors[worst] > ROTATION_TOLERANCE:
             row = rows[worst] + self._table.first_row

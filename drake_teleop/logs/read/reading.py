@@ -39,16 +39,23 @@ from drake_teleop.logs.read.description import (
     load_description,
 )
 from drake_teleop.logs.read.orientations import Orientations
-from drake_teleop.logs.read.removed_weight import restored, weight_of
+from drake_teleop.logs.read.removed_weight import restore_weight, weight_wrench
 from drake_teleop.logs.read.rotations import nearest_rotation, quaternions, rotation_matrices
-from drake_teleop.logs.read.streams import LARGEST, Stream, at_S, in_S, on_clock, turned_wrench
+from drake_teleop.logs.read.streams import (
+    MAX_VALUES,
+    Stream,
+    in_S,
+    move_to_So,
+    on_clock,
+    wrench_in_S,
+)
 from drake_teleop.logs.read.tables import FORMATS, Table, decimal_step, read_table
 
 MINIMUM_SAMPLES = 16
 MINIMUM_POSES = 3
-_LEAST_HZ = 1e-3
-_CHUNK = 2**16
-_BRIDGED = 4.0
+_MIN_BANDWIDTH_HZ = 1e-3
+_CHUNK_ROWS = 2**16
+_GAP_RATIO = 4.0
 
 
 def read_log(
@@ -71,7 +78,7 @@ def read_log(
         DrakeTeleopError: naming file, field and remedy.
     """
     expect((str, Path), path, "log", "give the file's name")
-    if bandwidth_hz is not None and not number("bandwidth_hz", bandwidth_hz) >= _LEAST_HZ:
+    if bandwidth_hz is not None and not number("bandwidth_hz", bandwidth_hz) >= _MIN_BANDWIDTH_HZ:
         raise DrakeTeleopError(
             f"{bandwidth_hz:g} Hz leave nothing", where="bandwidth_hz", remedy="give more, or None"
         )
@@ -131,11 +138,11 @@ class _Reader:
         parts = {"gravity": self._description.gravity == "auto", "weight": weight == "removed"}
         free = tuple(name for name, known in parts.items() if known)
         if self._description.gravity == "auto":
-            self._find(describe_gravity)
+            self._replace_auto(describe_gravity)
         if self._description.pose is not None and self._description.pose.automatic:
-            self._find(describe_pose_frame, differentiate=False)
+            self._replace_auto(describe_pose_frame, differentiate=False)
         if self._description.imu is not None and self._description.imu.automatic:
-            self._find(describe_mounting)
+            self._replace_auto(describe_mounting)
         wrench_t, wrench = self._wrench(self._description.wrench)
         pose = imu = None
         if self._description.pose is not None:
@@ -144,20 +151,20 @@ class _Reader:
             imu = self._imu(self._description.imu, pose)
         streams = [stream for stream in (imu, pose) if stream is not None]
         t = self._common_time(wrench_t, streams)
-        log = self._assembled(t, resample(t, wrench_t, wrench), imu, pose)
+        log = self._assemble(t, resample(t, wrench_t, wrench), imu, pose)
         log = replace(log, gain_std=self._description.wrench.gain_std, free=free)
         log = replace(log, described=self._description)
         if pose is not None and pose.raw is not None:
-            told = None if imu is None else imu.told
-            log = replace(log, posed=self._description.posed(pose.raw, told))
+            inertial = None if imu is None else imu.inertial
+            log = replace(log, posed=self._description.posed(pose.raw, inertial))
         log = log if keep_origin else log.earlier(float(wrench_t[0]))
         if not isinstance(weight, tuple):
             return log
         without = self._description.wrench.model_copy(update={"weight": None})
         other = self._description.model_copy(update={"wrench": without})
-        return restored(log, np.array(weight), self._another(other))
+        return restore_weight(log, np.array(weight), self._read_other(other))
 
-    def _find(
+    def _replace_auto(
         self,
         describe: Callable[..., tuple[Description, tuple[str, ...]]],
         *,
@@ -167,11 +174,11 @@ class _Reader:
         self._description, notes = describe(
             self._description,
             self._source,
-            partial(self._another, differentiate=differentiate),
+            partial(self._read_other, differentiate=differentiate),
         )
         self._notes += notes
 
-    def _another(self, description: Description, *, differentiate: bool = True) -> Log:
+    def _read_other(self, description: Description, *, differentiate: bool = True) -> Log:
         """Return the log of another description of the same files."""
         for name in ("wrench", "imu", "pose"):
             if (stream := getattr(self._description, name)) is not None:
@@ -187,7 +194,7 @@ class _Reader:
     def _wrench(self, stream: Wrench) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         table = self._table(stream)
         clock = self._clock("wrench", stream, table)
-        return clock.t, clock.taken(self._forces("wrench", stream, table, clock.total))
+        return clock.t, clock.select(self._forces("wrench", stream, table, clock.total))
 
     def _forces(
         self, name: str, stream: Wrench | Static, table: Table, rows: int
@@ -214,7 +221,7 @@ class _Reader:
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
         )
-        table.check_size(values, *LARGEST[field], where, remedy)
+        table.check_size(values, *MAX_VALUES[field], where, remedy)
         return values
 
     def _pose(self, stream: Pose, *, differentiate: bool) -> Stream:
@@ -229,7 +236,7 @@ class _Reader:
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
                 return Stream("pose", t, raw=raw)
         dt = spacing(t)
-        self._differentiated(dt)
+        self._extend_one_sided(dt)
         raw_R = rotation_matrices(quaternion, "quaternion_wxyz")
         R_WS = nearest_rotation(resample(t, clock.t, raw_R))
         acceleration = np.zeros(3)
@@ -252,12 +259,12 @@ class _Reader:
         position = None
         if stream.position is not None:
             position = self._vectors("pose", "position", stream.position, table, clock.total)
-            position = clock.taken(position)
+            position = clock.select(position)
         orientations = self._orientations("pose", stream.orientation, table, clock.total)
         quaternion = np.empty((len(clock.rows), 4))
         origin = np.array(stream.position_in_sensor)
-        for start in range(0, len(quaternion), _CHUNK):
-            part = slice(start, start + _CHUNK)
+        for start in range(0, len(quaternion), _CHUNK_ROWS):
+            part = slice(start, start + _CHUNK_ROWS)
             q = orientations.quaternions(clock.rows[part])
             if stream.R_SP is not None or (position is not None and origin.any()):
                 R_WS = rotation_matrices(q, "quaternion_wxyz")
@@ -281,20 +288,22 @@ class _Reader:
             if quantity is None:
                 return None
             values = self._vectors("imu", field, quantity, table, clock.total, sign)
-            return self._to_S("imu", stream.frame, resample(t, raw_t, clock.taken(values)), t, pose)
+            return self._to_S(
+                "imu", stream.frame, resample(t, raw_t, clock.select(values)), t, pose
+            )
 
         s = vectors("specific_force", stream.sign)
         omega, alpha = vectors("angular_velocity"), vectors("angular_acceleration")
         if omega is not None and alpha is None:
-            self._differentiated(dt)
+            self._extend_one_sided(dt)
             alpha = smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
-            s = at_S(s, np.array(stream.position), t, omega, alpha, pose)
+            s = move_to_So(s, np.array(stream.position), t, omega, alpha, pose)
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
-        kept = raw_t[at] - raw_t[at - 1] < _BRIDGED * dt  # outside of gaps
-        both = (None if x is None else x[kept] for x in (s, omega))
-        return Stream("imu", t, s, omega, alpha, told=Inertial(t[kept], *both))
+        outside_gaps = raw_t[at] - raw_t[at - 1] < _GAP_RATIO * dt  # outside of gaps
+        both = (None if x is None else x[outside_gaps] for x in (s, omega))
+        return Stream("imu", t, s, omega, alpha, inertial=Inertial(t[outside_gaps], *both))
 
     def _to_S(
         self,
@@ -338,9 +347,9 @@ class _Reader:
                     where=f"{self._source}:static.frame",
                     remedy="give static.orientation instead of gravity or specific_force",
                 )
-            wrench = turned_wrench(R_SW, wrench)
+            wrench = wrench_in_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
-            wrench = wrench + weight_of(np.array(stream.weight), gravity)
+            wrench = wrench + weight_wrench(np.array(stream.weight), gravity)
         n = len(wrench)
         if n < MINIMUM_POSES:
             raise DrakeTeleopError(
@@ -386,22 +395,22 @@ class _Reader:
             self._notes.append(
                 f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
             )
-        holes = gaps(t, self._bandwidth_hz)
-        if len(holes):
-            start, stop = holes[int(np.argmax(holes[:, 1] - holes[:, 0]))]
+        found_gaps = gaps(t, self._bandwidth_hz)
+        if len(found_gaps):
+            start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]
             self._notes.append(
-                f"{name}: {len(holes)} gaps, the longest of {stop - start:.3g} s at"
+                f"{name}: {len(found_gaps)} gaps, the longest of {stop - start:.3g} s at"
                 f" {start - t[0]:.3g} s; what lies in them and close by is not used"
             )
-            seen = self._half_window(float(np.median(np.diff(t))))
-            self._gaps.append(holes + np.array([-seen, seen]))
+            half_window = self._half_window(float(np.median(np.diff(t))))
+            self._gaps.append(found_gaps + np.array([-half_window, half_window]))
         return clock
 
     def _half_window(self, dt: float) -> float:
         window = SMOOTHER_WINDOW / self._bandwidth_hz if self._bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 
-    def _differentiated(self, dt: float) -> None:
+    def _extend_one_sided(self, dt: float) -> None:
         self._one_sided_s = max(self._one_sided_s, self._half_window(dt))
 
     def _orientations(
@@ -439,7 +448,7 @@ class _Reader:
             )
         return t
 
-    def _assembled(
+    def _assemble(
         self,
         t: NDArray[np.float64],
         wrench: NDArray[np.float64],
@@ -459,9 +468,9 @@ class _Reader:
             gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
             described = self._description.wrench
             if described is not None and described.frame == "base":
-                wrench = turned_wrench(np.swapaxes(R_WS, 1, 2), wrench)
+                wrench = wrench_in_S(np.swapaxes(R_WS, 1, 2), wrench)
         self._check_base_wrench(pose)
-        self._note_rest(imu)
+        self._note_missing_acceleration(imu)
         return Log(
             *(t, wrench, signal("specific_force"), signal("angular_velocity")),
             signal("angular_acceleration"),
@@ -498,7 +507,7 @@ class _Reader:
                 remedy="add a pose stream",
             )
 
-    def _note_rest(self, imu: Stream | None) -> None:
+    def _note_missing_acceleration(self, imu: Stream | None) -> None:
         posed = self._description.pose
         if (imu is None or imu.specific_force is None) and posed and posed.position is None:
             self._notes.append(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.read.alignment import low_pass, resample, spacing
 
-LARGEST = {
+MAX_VALUES = {
     "force": (1e6, "N"),
     "torque": (1e6, "N m"),
     "specific_force": (1e6, "m/s^2"),
@@ -26,7 +26,7 @@ LARGEST = {
 class Stream:
     """Signals (N, ...) on one clock `t` [s], or None.
 
-    `raw` are the recorded poses of S, `told` the IMU data in S.
+    `raw` are the recorded poses of S, `inertial` the IMU data in S.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Stream:
     angular_acceleration: NDArray[np.float64] | None = None
     R_WS: NDArray[np.float64] | None = None
     raw: Poses | None = None
-    told: Inertial | None = None
+    inertial: Inertial | None = None
 
     @property
     def dt(self) -> float:
@@ -58,13 +58,13 @@ def in_S(R_WS: NDArray[np.float64], vectors_W: NDArray[np.float64]) -> NDArray[n
     return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
 
 
-def turned_wrench(R_SW: NDArray[np.float64], wrench_W: NDArray[np.float64]) -> NDArray[np.float64]:
+def wrench_in_S(R_SW: NDArray[np.float64], wrench_W: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (N, 6) wrenches in S of wrenches in W."""
     both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
     return both.reshape(-1, 6)
 
 
-def at_S(
+def move_to_So(
     s: NDArray[np.float64],
     p_SoIo_S: NDArray[np.float64],
     t: NDArray[np.float64],

@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 _TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
 FORMATS = (*_TEXT, ".parquet", ".npz", ".mat")
-LARGEST = 1e25
+MAX_NUMBER = 1e25
 """Largest plausible number in any unit; nanoseconds since 1970 are 2e18."""
 _CANONICAL = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
 _Column = TypeVar("_Column")
-_PARTS = 16  # elements of an array with their own columns: up to a homogeneous matrix
-_MOST_DECIMALS = 12
-_LARGE = 2**24
+_MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
+_MAX_DECIMALS = 12
+_MAX_CELLS_IN_MEMORY = 2**24
 """Number of cells above which columns of a Parquet file are read on access."""
 
 
@@ -97,7 +97,7 @@ class Table:
         if name not in self.columns:
             return self._column(name, where)
         numbers = self._numbers(name)
-        self.check_size(numbers, LARGEST, "", f"{self.path}:{name}")
+        self.check_size(numbers, MAX_NUMBER, "", f"{self.path}:{name}")
         return numbers
 
     def single(self, name: str | int, where: str) -> NDArray[np.float64]:
@@ -141,12 +141,12 @@ class Table:
                     where=where,
                     remedy="name another column, or leave this out",
                 )
-            near = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
-            hint = "did you mean" if near else "its columns are"
+            similar = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
+            hint = "did you mean" if similar else "its columns are"
             raise DrakeTeleopError(
                 f"{self.path.name} has no column {name!r}",
                 where=where,
-                remedy=f"{hint} {_listed(near or list(self.columns))}",
+                remedy=f"{hint} {_join_names(similar or list(self.columns))}",
             )
         numbers = self.raw(name, where)
         bad = ~np.isfinite(numbers).all(axis=1)
@@ -162,10 +162,10 @@ class Table:
 
     def _numbers(self, name: str) -> NDArray[np.float64]:
         column = self.columns[name]
-        numbers = _as_numbers(column, lambda row, cell: self._bad(name, row, cell))
+        numbers = _as_numbers(column, lambda row, cell: self._cell_error(name, row, cell))
         return numbers.reshape(len(column), math.prod(numbers.shape[1:]))
 
-    def _bad(self, name: str, row: int, cell: object) -> DrakeTeleopError:
+    def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
         return DrakeTeleopError(
             f"{cell!r} in row {row + self.first_row} is not a number",
             where=f"{self.path}:{name}",
@@ -176,7 +176,7 @@ class Table:
 
 def decimal_step(values: NDArray[np.float64]) -> float:
     """Return the largest power of ten <= 1 that divides all values, or 0."""
-    for decimals in range(_MOST_DECIMALS if values.any() else 0):
+    for decimals in range(_MAX_DECIMALS if values.any() else 0):
         error = np.abs(values - np.round(values, decimals))
         if (error <= 4.0 * np.finfo(float).eps * np.abs(values)).all():
             return float(10.0**-decimals)
@@ -199,7 +199,9 @@ def read_table(path: Path, *, header: bool = True) -> Table:
     refuse_fork()
     with reading(path, f"check that it is a valid {path.suffix} file"):
         arrays = {".npz": _read_npz, ".mat": read_mat}.get(path.suffix.lower())
-        table = _read_frame(path, header) if arrays is None else _table_of(path, arrays(path))
+        table = (
+            _read_frame(path, header) if arrays is None else _table_from_arrays(path, arrays(path))
+        )
     if not table.columns or not all(len(c) for c in table.columns.values()):
         raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
     return table
@@ -211,18 +213,21 @@ def _read_frame(path: Path, header: bool) -> Table:
     if path.suffix.lower() == ".parquet":
         names = list(pl.read_parquet_schema(path))
         lazy = _ParquetColumns(
-            path, _with_canonical(dict(zip(_stripped(names), names, strict=True)))
+            path, _with_canonical(dict(zip(_strip_names(names), names, strict=True)))
         )
-        small = len(names) * pl.scan_parquet(path).select(pl.len()).collect().item() <= _LARGE
+        small = (
+            len(names) * pl.scan_parquet(path).select(pl.len()).collect().item()
+            <= _MAX_CELLS_IN_MEMORY
+        )
         return Table(path, dict(lazy) if small else lazy)
     frame, first_row = read_csv(path, header)
     names = [name if header else str(i) for i, name in enumerate(frame.columns)]
     found = [_frame_column(series) for series in frame.get_columns()]
-    columns = dict(zip(_stripped(names), found, strict=True))
+    columns = dict(zip(_strip_names(names), found, strict=True))
     return Table(path, _with_canonical(columns), first_row)
 
 
-def _stripped(names: list[str]) -> list[str]:
+def _strip_names(names: list[str]) -> list[str]:
     stripped = [name.strip() for name in names]
     if len(set(stripped)) < len(names):
         raise ValueError("two of its columns have names that differ in spaces alone")
@@ -263,13 +268,13 @@ def _frame_column(series: pl.Series) -> NDArray:
     return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
 
 
-def _table_of(path: Path, arrays: dict[str, NDArray]) -> Table:
+def _table_from_arrays(path: Path, arrays: dict[str, NDArray]) -> Table:
     arrays = {name: array for name, array in arrays.items() if len(array)}
     parts = {
         f"{name}[{k}]": array.reshape(len(array), -1)[:, k]
         for name, array in arrays.items()
         for k in range(math.prod(array.shape[1:]) if 1 < array.ndim <= 3 else 0)
-        if k < _PARTS
+        if k < _MAX_ELEMENT_COLUMNS
     }
     return Table(path, parts | arrays)
 
@@ -303,6 +308,6 @@ def _as_numbers(
     return numbers
 
 
-def _listed(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     shown = ", ".join(names[:12])
     return f"{shown}, ..." if len(names) > 12 else shown

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.logs.pose_motion.poses import Inertial
-from drake_teleop.logs.pose_motion.spectra import Complex, end_taper, without
-from drake_teleop.logs.pose_motion.splines import Aid, PoseSplines
+from drake_teleop.logs.pose_motion.spectra import Complex, end_taper, exclude
+from drake_teleop.logs.pose_motion.splines import ImuRows, PoseSplines
 
-_PRIOR = 0.1
-_STEPS, _FARTHEST, _ROUNDS, _ENOUGH = 4, 0.1, 10, 40
-_LARGEST = 0.2  # largest entry of D
+_PRIOR_GAIN_STD = 0.1
+_STEPS, _MAX_SHIFT_S, _POWER_ITERATIONS, _MIN_FREQUENCIES = 4, 0.1, 10, 40
+_MAX_GAIN_ERROR = 0.2  # largest entry of D
 # Share of 1 / h that splines pass, and largest unexplained share of the motion.
-_PASSED, _BELIEVABLE = 0.25, 0.05
+_PASSED_SHARE, _MAX_UNEXPLAINED = 0.25, 0.05
 # Rates of comparison and of added rows [Hz], and least length of a comparison [s].
-_COMPARED, _ADDED, _SHORTEST = 125.0, 500.0, 2.0
+_COMPARISON_RATE_HZ, _ROWS_RATE_HZ, _MIN_LENGTH_S = 125.0, 500.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,55 +37,55 @@ class _Sensor:
         return np.asarray(np.linalg.solve(np.eye(3) + self.D, (y - self.b).T).T)
 
 
-def aid_of(splines: PoseSplines, imu: Inertial, gravity_W: Array) -> Aid | None:
+def compare_imu(splines: PoseSplines, imu: Inertial, gravity_W: Array) -> ImuRows | None:
     """Return the corrected IMU data for splines of poses, or None if the two do not agree."""
     powers = tuple(std**2 / splines.rate for std in splines.noise())
-    few, sensors = imu.averaged(_COMPARED), []
-    for which, y in enumerate((few.specific_force, few.angular_velocity)):
+    averaged, sensors = imu.averaged(_COMPARISON_RATE_HZ), []
+    for which, y in enumerate((averaged.specific_force, averaged.angular_velocity)):
         sensor = None
         if y is not None:
-            by_pose = powers[which], 4 - 2 * which
-            sensor = _compared(splines, few.t, y, gravity_W, which, by_pose)
+            pose_noise = powers[which], 4 - 2 * which
+            sensor = _fit_sensor(splines, averaged.t, y, gravity_W, which, pose_noise)
             if sensor is None:
                 return None
         sensors.append(sensor)
-    known = [sensor for sensor in sensors if sensor is not None]
-    if not known:
+    fitted = [sensor for sensor in sensors if sensor is not None]
+    if not fitted:
         return None
-    rows = imu.averaged(_ADDED)
-    t = rows.t + known[-1].tau  # the gyroscope determines the clock best
+    rows = imu.averaged(_ROWS_RATE_HZ)
+    t = rows.t + fitted[-1].tau  # the gyroscope determines the clock best
     inside = (t > splines.poses.t[0]) & (t < splines.poses.t[-1])
     s, omega = (
         None if sensor is None or y is None else sensor.corrected(y[inside])
         for sensor, y in zip(sensors, (rows.specific_force, rows.angular_velocity), strict=True)
     )
-    own = [0.0 if sensor is None else sensor.power for sensor in sensors]
-    aid = None
+    imu_powers = [0.0 if sensor is None else sensor.power for sensor in sensors]
+    imu_rows = None
     for _ in range(2):  # repeat with the orientation of poses and IMU
-        aid = Aid.of(
-            PoseSplines(splines.poses, splines.spacing, aid),
+        imu_rows = ImuRows.of(
+            PoseSplines(splines.poses, splines.spacing, imu_rows),
             t[inside],
             gravity_W,
             s,
             omega,
             rate=rows.rate,
             pose_powers=(powers[0], powers[1]),
-            own_powers=(own[0], own[1]),
+            own_powers=(imu_powers[0], imu_powers[1]),
         )
-    return aid
+    return imu_rows
 
 
-def _compared(
+def _fit_sensor(
     splines: PoseSplines,
     t: Array,
     y: Array,
     gravity_W: Array,
     which: int,
-    by_pose: tuple[float, int],
+    pose_noise: tuple[float, int],
 ) -> _Sensor | None:
     """Fit y (K, 3) at t (K,) to the splines; return None if these do not explain it.
 
-    `which` is 0 for the specific force and 1 for the angular velocity. `by_pose` is the power of
+    `which` is 0 for the specific force and 1 for the angular velocity. `pose_noise` is the power of
     the poses' noise and its exponent of the angular frequency.
     """
     dt = float(np.median(np.diff(t)))
@@ -94,12 +94,12 @@ def _compared(
     lost, values = np.ones(len(even), bool), np.zeros((len(even), 3))
     lost[place], values[place] = False, y
     start, stop = max(t[0], splines.poses.t[0]), min(t[-1], splines.poses.t[-1])
-    taper = without(end_taper(even, start + _FARTHEST, stop - _FARTHEST), lost, dt)
-    if (taper > 0.5).sum() * dt < _SHORTEST:
+    taper = exclude(end_taper(even, start + _MAX_SHIFT_S, stop - _MAX_SHIFT_S), lost, dt)
+    if (taper > 0.5).sum() * dt < _MIN_LENGTH_S:
         return None
     frequency = np.fft.rfftfreq(len(even), dt)
-    used = frequency <= _PASSED / splines.spacing
-    noise: NDArray[np.floating] = by_pose[0] * (2.0 * np.pi * frequency[used]) ** by_pose[1]
+    used = frequency <= _PASSED_SHARE / splines.spacing
+    noise: NDArray[np.floating] = pose_noise[0] * (2.0 * np.pi * frequency[used]) ** pose_noise[1]
     energy = float(np.sum(taper**2)) / dt
 
     def spectrum(x: Array) -> Complex:
@@ -114,13 +114,16 @@ def _compared(
         if step == 0:
             power = max(power, float(np.median(np.abs(Y - X) ** 2)) / energy)
         weight = 1.0 / np.sqrt(energy * (noise + power))
-        D, b, later = _least_squares(Y - X, X, one, change, weight)
-        left: Array = np.abs(Y - X - X @ D.T - one * b - later * change) ** 2
-        power = _power(left.sum(axis=1) / (3.0 * energy), noise, least)
-        tau += later
-        if abs(tau) > _FARTHEST:
+        D, b, shift = _least_squares(Y - X, X, one, change, weight)
+        residual: Array = np.abs(Y - X - X @ D.T - one * b - shift * change) ** 2
+        power = _noise_power(residual.sum(axis=1) / (3.0 * energy), noise, least)
+        tau += shift
+        if abs(tau) > _MAX_SHIFT_S:
             return None
-    if np.abs(D).max() > _LARGEST or left[1:].sum() > _BELIEVABLE * (np.abs(X[1:]) ** 2).sum():
+    if (
+        np.abs(D).max() > _MAX_GAIN_ERROR
+        or residual[1:].sum() > _MAX_UNEXPLAINED * (np.abs(X[1:]) ** 2).sum()
+    ):
         return None
     return _Sensor(D, b, tau, power)
 
@@ -138,19 +141,21 @@ def _least_squares(
     A = (columns * weight[:, None, None]).reshape(3 * K, 13)
     right = (y * weight[:, None]).ravel()
     gram = (A.conj().T @ A).real
-    gram[range(9), range(9)] += 1.0 / _PRIOR**2
+    gram[range(9), range(9)] += 1.0 / _PRIOR_GAIN_STD**2
     found = np.linalg.solve(gram, (A.conj().T @ right).real)
     return found[:9].reshape(3, 3), found[9:12], float(found[12])
 
 
-def _power(left: NDArray[np.floating], by_pose: NDArray[np.floating], white: float) -> float:
+def _noise_power(
+    residual: NDArray[np.floating], pose_noise: NDArray[np.floating], white: float
+) -> float:
     """Return the IMU's noise power from the residual power and the poses' share, both (K,).
 
     Return `white` where the poses' noise dominates at most frequencies.
     """
-    power = max(float(np.median(left)), white)
-    for _ in range(_ROUNDS):
-        weight = 1.0 / (power + by_pose) ** 2
-        power = max(float(weight @ (left - by_pose) / weight.sum()), white)
-    seen = float(np.sum((white / (white + by_pose)) ** 2))
-    return power if seen > _ENOUGH else white
+    power = max(float(np.median(residual)), white)
+    for _ in range(_POWER_ITERATIONS):
+        weight = 1.0 / (power + pose_noise) ** 2
+        power = max(float(weight @ (residual - pose_noise) / weight.sum()), white)
+    effective = float(np.sum((white / (white + pose_noise)) ** 2))
+    return power if effective > _MIN_FREQUENCIES else white

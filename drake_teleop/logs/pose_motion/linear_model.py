@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from drake_teleop.common.arrays import Array
-from drake_teleop.logs.pose_motion.levels import Levels, wander
+from drake_teleop.logs.pose_motion.levels import Levels, random_walk_shape
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (
     FORCES,
@@ -17,38 +17,38 @@ from drake_teleop.logs.pose_motion.spectra import (
     Complex,
     Grid,
     bands,
-    later,
     moments,
+    shift_taper,
     shifted,
     signal_spectrum,
-    slope,
+    taper_derivative,
     wrench_spectrum,
 )
 from drake_teleop.logs.pose_motion.splines import (
-    FEWEST_PER_KNOT,
+    MIN_POSES_PER_KNOT,
     SIGNALS,
-    Choice,
     PoseSplines,
+    SplineCache,
 )
 
 SPACINGS = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
 """Knot distances that are tried before two beside the best [s]."""
-REACH = 0.25
+MAX_DELAY_CHANGE_S = 0.25
 """Largest change of the delay in the search, or a tenth of the record [s]."""
 ROUNDING = 1e-7
 """Least noise of a channel relative to the wrench."""
-_COARSE, _NEARLY, _FINEST = 0.016, 1e-3, 1e-5
+_COARSE_STEP_S, _FINE_STEP_S, _FINEST_STEP_S = 0.016, 1e-3, 1e-5
 _ITERATIONS = 4
-_SEARCH_RATE = 125.0
-_RANK, _FULL_RANK = 1e-12, 1e-8
+_SEARCH_RATE_HZ = 125.0
+_RANK_TOLERANCE, _FULL_RANK = 1e-12, 1e-8
 # Corners of a wandering offset [Hz], and least reduction of a channel's cost.
-_CORNERS = tuple(0.05 * 2.0**k for k in range(9))
-_WORTH = 3.0
-_FINER, _FINER_OF_LOAD, _DETERMINED = 0.84, 0.92, 25.0
+_CORNERS_HZ = tuple(0.05 * 2.0**k for k in range(9))
+_MIN_COST_REDUCTION = 3.0
+_SPACING_FACTOR, _SPACING_FACTOR_OF_LOAD, _MIN_COST_RISE = 0.84, 0.92, 25.0
 
 
 @dataclass(frozen=True, eq=False)
-class Saturated:
+class LinearFit:
     """Fit of the linear model.
 
     Attributes:
@@ -69,23 +69,23 @@ class Saturated:
         return float(self.costs.sum())
 
 
-def saturated(Z: Array, levels: Levels) -> Saturated:
+def fit_linear_model(Z: Array, levels: Levels) -> LinearFit:
     """Fit the model to moments (bands, 38, 38)."""
-    return _fitted(Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _powers(Z), levels)
+    return _fit_moments(Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _wrench_powers(Z), levels)
 
 
-def _powers(Z: Array) -> Array:
+def _wrench_powers(Z: Array) -> Array:
     return np.diagonal(Z[:, FORCES, FORCES], axis1=1, axis2=2)
 
 
-def _fitted(
+def _fit_moments(
     zz: Array, zf: Array, ff: Array, levels: Levels, load: Array | None = None
-) -> Saturated:
+) -> LinearFit:
     """Fit the model to moments zz (..., bands, 16, 16), zf (..., bands, 16, 6) and ff (bands, 6).
 
     Leading dimensions are separate fits. With `load` (6, 16) only the constants are free.
     """
-    floor = _least(ff, levels.sizes)
+    floor = _rounding_power(ff, levels.sizes)
     if load is not None:
         explained = zz @ load.T
         ff = ff - np.sum((2.0 * zf - explained) * load.T, axis=-2)
@@ -107,7 +107,7 @@ def _fitted(
         across = np.swapaxes(C, -1, -2)[..., None, :, :]
         explained = np.sum((2.0 * zf - zz @ across) * across, axis=-2)
         power = np.maximum(levels.power(ff - explained), floor)
-    return Saturated(
+    return LinearFit(
         coefficients=C * scale[..., None, :],
         covariance=0.5 * inverse * both[..., None, :, :],
         power=power,
@@ -124,29 +124,29 @@ def _inverses(gram: Array) -> Array:
     except np.linalg.LinAlgError:
         pass
     values, vectors = np.linalg.eigh(gram)
-    good = values > _RANK * values[..., -1:]
+    good = values > _RANK_TOLERANCE * values[..., -1:]
     scaled = vectors * np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)[..., None, :]
     return np.asarray(scaled @ np.swapaxes(vectors, -1, -2))
 
 
 def least_power(Z: Array, sizes: Array) -> Array:
     """Return (6,) power of rounding errors."""
-    return _least(_powers(Z), sizes)
+    return _rounding_power(_wrench_powers(Z), sizes)
 
 
-def _least(ff: Array, sizes: Array) -> Array:
+def _rounding_power(ff: Array, sizes: Array) -> Array:
     power = ff.sum(axis=0) / sizes.sum()
     both = power.reshape(2, 3).sum(axis=1).repeat(3)
     return np.maximum(ROUNDING**2 * both, 1e-60)
 
 
-def wandering(Z: Array, of: Bands) -> Levels:
+def fit_levels(Z: Array, of: Bands) -> Levels:
     """Return levels with the corner of lowest cost in each channel, Eq. (T74)."""
     levels = Levels.flat(of)
-    least, shape = saturated(Z, levels).costs - _WORTH, levels.shape.copy()
-    for corner in _CORNERS:
-        rising = np.repeat(wander(of, corner)[:, None], 6, axis=1)
-        costs = saturated(Z, replace(levels, shape=rising)).costs
+    least, shape = fit_linear_model(Z, levels).costs - _MIN_COST_REDUCTION, levels.shape.copy()
+    for corner in _CORNERS_HZ:
+        rising = np.repeat(random_walk_shape(of, corner)[:, None], 6, axis=1)
+        costs = fit_linear_model(Z, replace(levels, shape=rising)).costs
         better = costs < least
         least, shape = np.where(better, costs, least), np.where(better, rising, shape)
     return replace(levels, shape=shape)
@@ -173,7 +173,7 @@ class Spectra:
     zeta: Array
 
     @cached_property
-    def chopped(self) -> bool:
+    def taper_fixed(self) -> bool:
         """Whether the taper excludes interior samples, or the load is known.
 
         Then edges of the taper would bias the delay if they moved with the signals.
@@ -185,8 +185,8 @@ class Spectra:
     def at(self, delay: float) -> Spectra:
         """Return the spectra with signals at another delay; `zeta` is unchanged."""
         shift, signals = delay - self.delay, self.signals
-        if self.chopped:
-            before = later(self.grid, self.taper, shift)
+        if self.taper_fixed:
+            before = shift_taper(self.grid, self.taper, shift)
             signals = signal_spectrum(self.grid, before, self.zeta, len(signals))
         late = shifted(signals, self.of.frequency, shift)
         late[:, 0] = self.signals[:, 0]
@@ -195,32 +195,32 @@ class Spectra:
     def moments(self) -> Array:
         """Return (bands, 38, 38) moments, with derivatives of the signals alone."""
         rates = 2j * np.pi * self.of.frequency[:, None] * self.signals
-        edges = slope(self.grid, self.taper)
+        edges = taper_derivative(self.grid, self.taper)
         rates -= signal_spectrum(self.grid, edges, self.zeta, len(rates))
         rates[:, 0] = 0.0
         return moments(self.signals, self.wrench, self.of, rates)
 
-    def fit(self) -> Saturated:
+    def fit(self) -> LinearFit:
         """Fit all coefficients with flat levels; only the constants if the load is known."""
         Z, load = moments(self.signals, self.wrench, self.of), self.grid.load
-        parts = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _powers(Z)
-        fit = _fitted(*parts, Levels.flat(self.of), load)
+        parts = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _wrench_powers(Z)
+        fit = _fit_moments(*parts, Levels.flat(self.of), load)
         if load is None:
             return fit
         return replace(fit, coefficients=np.hstack([fit.coefficients, load[:, 1:]]))
 
     def costs(self, delays: Array) -> Array:
         """Return (D,) costs at delays (D,)."""
-        if self.chopped:
+        if self.taper_fixed:
             Z = np.array([moments(x.signals, x.wrench, x.of) for x in map(self.at, delays)])
             zz, zf = Z[..., :SIGNALS, :SIGNALS], Z[..., :SIGNALS, FORCES]
         else:
-            zz, zf = self._moved(np.asarray(delays))
+            zz, zf = self._delayed_moments(np.asarray(delays))
         power = np.abs(self.wrench) ** 2
-        fits = _fitted(zz, zf, self.of.sums(power), Levels.flat(self.of), self.grid.load)
+        fits = _fit_moments(zz, zf, self.of.sums(power), Levels.flat(self.of), self.grid.load)
         return fits.costs.sum(axis=-1)
 
-    def _moved(self, delays: Array) -> tuple[Array, Array]:
+    def _delayed_moments(self, delays: Array) -> tuple[Array, Array]:
         """Return (D, bands, 16, 16) and (D, bands, 16, 6) moments at delays (D,) for a whole taper.
 
         Phases cancel in products of signals, except with the constant.
@@ -266,9 +266,11 @@ def spectra_of(
     return Spectra(of, wrench, signals, delay, grid, taper, zeta)
 
 
-def best_delay(spectra: Spectra, reach: float, finest: float = _FINEST) -> tuple[float, float]:
+def best_delay(
+    spectra: Spectra, reach: float, finest: float = _FINEST_STEP_S
+) -> tuple[float, float]:
     """Return the delay of lowest cost within `reach`, to `finest` [s], and the cost."""
-    step = min(_COARSE, reach / 2)
+    step = min(_COARSE_STEP_S, reach / 2)
     at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
     costs = spectra.costs(at)
     while step > finest:
@@ -286,18 +288,18 @@ def best_delay(spectra: Spectra, reach: float, finest: float = _FINEST) -> tuple
 
 def delay_deviation(spectra: Spectra) -> float:
     """Return the standard deviation of the delay [s]; inf if undetermined."""
-    reach = min(REACH, 0.1 * float(spectra.grid.t[-1] - spectra.grid.t[0]))
-    beside = np.array([-_NEARLY, 0.0, _NEARLY])
+    reach = min(MAX_DELAY_CHANGE_S, 0.1 * float(spectra.grid.t[-1] - spectra.grid.t[0]))
+    beside = np.array([-_FINE_STEP_S, 0.0, _FINE_STEP_S])
     left, least, right = spectra.costs(spectra.delay + beside)
-    far = spectra.costs(spectra.delay + np.arange(-reach, reach, _COARSE))
+    far = spectra.costs(spectra.delay + np.arange(-reach, reach, _COARSE_STEP_S))
     bend = left - 2.0 * least + right
-    if bend <= 0.0 or far.max() - least < _DETERMINED or far.min() < least - 1.0:
+    if bend <= 0.0 or far.max() - least < _MIN_COST_RISE or far.min() < least - 1.0:
         return np.inf
-    return float(_NEARLY / np.sqrt(bend))
+    return float(_FINE_STEP_S / np.sqrt(bend))
 
 
-def first_guess(
-    few: Choice,
+def guess_spacing(
+    cache: SplineCache,
     grid: Grid,
     taper: Array,
     gravity_W: Array,
@@ -307,18 +309,20 @@ def first_guess(
     known: bool = False,
 ) -> tuple[float, float]:
     """Return knot distance and delay of lowest cost on a coarse grid."""
-    reach = min(REACH, 0.1 * float(grid.t[-1] - grid.t[0]))
-    spacings, found = _allowed(few)[::2], []
-    start = spectra_of(few.at(spacings[0]), grid, taper, gravity_W, delay, top)
+    reach = min(MAX_DELAY_CHANGE_S, 0.1 * float(grid.t[-1] - grid.t[0]))
+    spacings, found = _allowed_spacings(cache)[::2], []
+    start = spectra_of(cache.at(spacings[0]), grid, taper, gravity_W, delay, top)
     for h in spacings:
-        spectra = start.with_motion(few.at(h), gravity_W, delay)
-        late, cost = (delay, spectra.fit().cost) if known else best_delay(spectra, reach, _NEARLY)
+        spectra = start.with_motion(cache.at(h), gravity_W, delay)
+        late, cost = (
+            (delay, spectra.fit().cost) if known else best_delay(spectra, reach, _FINE_STEP_S)
+        )
         found.append((cost, h, late))
     return min(found)[1:]
 
 
-def best_spacing(
-    choices: Sequence[Choice],
+def choose_spacing(
+    choices: Sequence[SplineCache],
     grid: Grid,
     taper: Array,
     gravity_W: Array,
@@ -326,7 +330,7 @@ def best_spacing(
     top: float,
     *,
     known: bool = False,
-) -> tuple[Choice, float, float]:
+) -> tuple[SplineCache, float, float]:
     """Return the choice, knot distance [s] and delay [s] of lowest cost.
 
     Knots are slightly closer than at the minimum, because fits do not compensate for motion that
@@ -334,29 +338,29 @@ def best_spacing(
     """
     start = spectra_of(choices[0].at(SPACINGS[0]), grid, taper, gravity_W, delay, top)
     found = []
-    for few in choices:
-        spacings = _allowed(few)
+    for cache in choices:
+        spacings = _allowed_spacings(cache)
 
-        def cost(h: float, few: Choice = few) -> float:
-            return start.with_motion(few.at(h), gravity_W, delay).fit().cost
+        def cost(h: float, cache: SplineCache = cache) -> float:
+            return start.with_motion(cache.at(h), gravity_W, delay).fit().cost
 
         costs = [(cost(h), h) for h in spacings]
         middle = min(costs)[1]
         between = [float(np.sqrt(middle * h)) for h in _neighbours(middle, spacings)]
         found.append(min(costs + [(cost(h), h) for h in between]))
     least = min(range(len(found)), key=lambda k: found[k])
-    few = choices[least]
-    finer = _FINER if grid.load is None else _FINER_OF_LOAD
-    best = max(finer * found[least][1], FEWEST_PER_KNOT / few.rate)
+    cache = choices[least]
+    finer = _SPACING_FACTOR if grid.load is None else _SPACING_FACTOR_OF_LOAD
+    best = max(finer * found[least][1], MIN_POSES_PER_KNOT / cache.rate)
     if not known:
-        last = start.with_motion(few.at(best), gravity_W, delay)
-        delay, _ = best_delay(last, 3 * _COARSE)
-    return few, best, delay
+        last = start.with_motion(cache.at(best), gravity_W, delay)
+        delay, _ = best_delay(last, 3 * _COARSE_STEP_S)
+    return cache, best, delay
 
 
-def for_search(poses: Poses) -> Choice:
+def averaged_splines(poses: Poses) -> SplineCache:
     """Return splines of averaged poses, at the rate that the search needs."""
-    return Choice(poses.averaged(max(1, int(poses.rate / _SEARCH_RATE + 1e-6))))
+    return SplineCache(poses.averaged(max(1, int(poses.rate / _SEARCH_RATE_HZ + 1e-6))))
 
 
 def _neighbours(h: float, of: list[float]) -> list[float]:
@@ -364,5 +368,5 @@ def _neighbours(h: float, of: list[float]) -> list[float]:
     return of[max(0, k - 1) : k] + of[k + 1 : k + 2]
 
 
-def _allowed(few: Choice) -> list[float]:
-    return [h for h in SPACINGS if h * few.rate >= FEWEST_PER_KNOT] or [SPACINGS[0]]
+def _allowed_spacings(cache: SplineCache) -> list[float]:
+    return [h for h in SPACINGS if h * cache.rate >= MIN_POSES_PER_KNOT] or [SPACINGS[0]]
