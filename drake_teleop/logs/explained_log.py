@@ -18,7 +18,7 @@ from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, passed
 from drake_teleop.logs.read.alignment import undelayed
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.log_instants import log_instants
+from drake_teleop.logs.read.gravity import log_instants
 from drake_teleop.logs.read.rotations import rotation_matrices
 
 _MARGIN = 2.0  # knots, at either end

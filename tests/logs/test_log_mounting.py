@@ -22,7 +22,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
-from drake_teleop.logs.read import auto_mounting
+from drake_teleop.logs.read import auto_frames
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.lever_arm import LeverArm, lever_arm_from_wrench
 from drake_teleop.logs.read.mounting import Mounting, find_mounting
@@ -198,13 +198,13 @@ def test_the_wrench_is_believed_where_it_tells_more_than_the_pose(
         LeverArm(np.zeros(3), np.where(np.arange(3) < known, 1e-3, np.inf), source)
         for known, source in ((2, "pose"), (of_wrench, "wrench"))
     )
-    monkeypatch.setattr(auto_mounting, "lever_arm_from_wrench", lambda _: other)
+    monkeypatch.setattr(auto_frames, "lever_arm_from_wrench", lambda _: other)
     of_the_pose: Any = SimpleNamespace(fits=True, lever=of_pose)
     if taken == "wrench":
-        assert auto_mounting._choose_lever_arm(of_the_pose, None, "here") is other
+        assert auto_frames._choose_lever_arm(of_the_pose, None, "here") is other
         return
     with pytest.raises(DrakeTeleopError, match=r"determine z of .* from the pose\)"):
-        auto_mounting._choose_lever_arm(of_the_pose, None, "here")
+        auto_frames._choose_lever_arm(of_the_pose, None, "here")
 
 
 def test_a_load_that_touches_something_tells_nothing() -> None:

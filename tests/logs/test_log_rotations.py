@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.logs.read.jackknife import solve
-from drake_teleop.logs.read.orientations import Orientations
 from drake_teleop.logs.read.rotations import WIDTHS, rotation_matrices
+from drake_teleop.logs.read.streams import Orientations
 
 VECTORS = np.vstack([np.zeros((1, 3)), 3 * np.random.default_rng(2).uniform(-1, 1, (50, 3))])
 

@@ -14,9 +14,14 @@ from scipy.interpolate import BSpline
 
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 from drake_teleop.logs.pose_motion.imu_rows import compare_imu
-from drake_teleop.logs.pose_motion.noise import noise_moments
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
-from drake_teleop.logs.pose_motion.spectra import Grid, bands, end_taper, signal_spectrum
+from drake_teleop.logs.pose_motion.spectra import (
+    Grid,
+    bands,
+    end_taper,
+    noise_moments,
+    signal_spectrum,
+)
 from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, SplineCache, _normal_of_rates
 from drake_teleop.logs.processing import identify_log
 

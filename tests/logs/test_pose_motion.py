@@ -28,14 +28,12 @@ from posed_record import (
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
-from drake_teleop.logs.pose_motion.levels import Levels
 from drake_teleop.logs.pose_motion.linear_model import (
     best_delay,
     fit_levels,
     fit_linear_model,
     spectra_of,
 )
-from drake_teleop.logs.pose_motion.noise import noise_moments
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
 from drake_teleop.logs.pose_motion.rigid import (
@@ -48,7 +46,15 @@ from drake_teleop.logs.pose_motion.rigid import (
     fit_rigid,
     motion_map,
 )
-from drake_teleop.logs.pose_motion.spectra import Grid, bands, end_taper, moments, signal_spectrum
+from drake_teleop.logs.pose_motion.spectra import (
+    Grid,
+    Levels,
+    bands,
+    end_taper,
+    moments,
+    noise_moments,
+    signal_spectrum,
+)
 from drake_teleop.logs.pose_motion.spectra import without as taper_without
 from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, _knots, _thin_knots
 from drake_teleop.logs.read.rotations import rotation_matrices

@@ -30,7 +30,6 @@ from drake_teleop.logs.pose_motion.linear_model import (
     guess_spacing,
     spectra_of,
 )
-from drake_teleop.logs.pose_motion.noise import noise_moments
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
 from drake_teleop.logs.pose_motion.rejection import find_disturbances
@@ -43,7 +42,13 @@ from drake_teleop.logs.pose_motion.rigid import (
     State,
     fit_rigid,
 )
-from drake_teleop.logs.pose_motion.spectra import MAX_FREQUENCY_HZ, Grid, end_taper, exclude
+from drake_teleop.logs.pose_motion.spectra import (
+    MAX_FREQUENCY_HZ,
+    Grid,
+    end_taper,
+    exclude,
+    noise_moments,
+)
 from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
 
 SEARCHED_S = 120.0

@@ -9,15 +9,16 @@ from functools import cached_property
 import numpy as np
 
 from drake_teleop.common.arrays import Array
-from drake_teleop.logs.pose_motion.levels import Levels, random_walk_shape
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (
     FORCES,
     Bands,
     Complex,
     Grid,
+    Levels,
     bands,
     moments,
+    random_walk_shape,
     shift_taper,
     shifted,
     signal_spectrum,
@@ -250,12 +251,7 @@ class Spectra:
 
 
 def spectra_of(
-    splines: PoseSplines,
-    grid: Grid,
-    taper: Array,
-    gravity_W: Array,
-    delay: float,
-    top: float,
+    splines: PoseSplines, grid: Grid, taper: Array, gravity_W: Array, delay: float, top: float
 ) -> Spectra:
     """Return spectra of wrench and motion `delay` [s] later, up to `top` [Hz]."""
     of = bands(grid, taper, top)

@@ -15,9 +15,8 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.batch.covariance import ARM, gain_effects
 from drake_teleop.load.batch.moments import coefficients
-from drake_teleop.logs.pose_motion.levels import Levels
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, least_power
-from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH
+from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH, Levels
 from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, SIGNALS
 
 PARAMETERS = 23
@@ -97,13 +96,7 @@ def motion_map(R: Array, r: Array) -> Array:
 def _centripetal(r: Array) -> Array:
     """Return (3, 6) map from products of omega to omega x (omega x r)."""
     x, y, z = r
-    return np.array(
-        [
-            [0.0, -x, -x, y, z, 0.0],
-            [-y, 0.0, -y, x, 0.0, z],
-            [-z, -z, 0.0, 0.0, x, y],
-        ]
-    )
+    return np.array([[0.0, -x, -x, y, z, 0.0], [-y, 0.0, -y, x, 0.0, z], [-z, -z, 0.0, 0.0, x, y]])
 
 
 _PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))

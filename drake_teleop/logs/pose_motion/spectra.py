@@ -1,4 +1,8 @@
-"""Tapered spectra and second moments of wrench and signals in bands (docs/theory.md)."""
+"""Spectra, second moments and noise of wrench and signals in bands (docs/theory.md).
+
+The signals have about 100 Hz, the wrench its own rate over the same span, so that their frequencies
+agree.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
 from drake_teleop.common.arrays import Array
-from drake_teleop.logs.pose_motion.splines import SIGNALS
+from drake_teleop.common.vectors import cross_matrix
+from drake_teleop.logs.pose_motion.splines import SIGNALS, PoseSplines, passed
 
 Complex = NDArray[np.complex128]
 
@@ -200,3 +205,127 @@ def moments(zeta: Complex, wrench: Complex, of: Bands, rates: Complex | None = N
         part = part.transpose(0, 2, 1).reshape(-1, y.shape[1])
         out[k] = part.T @ part
     return out
+
+
+_MIN_REMAINING_SHARE = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Noise with one level for each group of bands and channel.
+
+    Attributes:
+        sizes: (bands,) half the number of independent numbers.
+        group: (bands,) number of the group.
+        shape: (bands, 6) relative power.
+    """
+
+    sizes: Array
+    group: NDArray[np.intp]
+    shape: Array
+
+    @classmethod
+    def flat(cls, of: Bands) -> Levels:
+        """Return white noise within each group."""
+        return cls(of.sizes, of.group, np.ones((of.count, 6)))
+
+    def power(self, sums: Array, used: Array | None = None) -> Array:
+        """Return (..., bands, 6) mean power of residual power `sums` (..., bands, 6).
+
+        `used` (bands, 6) are degrees of freedom used by parameters.
+        """
+        remaining = self._numbers
+        if used is not None:
+            remaining = np.maximum(
+                remaining - 0.5 * self.grouped(used), _MIN_REMAINING_SHARE * remaining
+            )
+        level = np.add.reduceat(sums / self.shape, self._starts, axis=-2) / remaining
+        return np.asarray(level[..., self.group, :] * self.shape)
+
+    def grouped(self, x: Array) -> Array:
+        """Return (groups, ...) sums of (bands, ...)."""
+        return np.asarray(np.add.reduceat(x, self._starts, axis=0))
+
+    @cached_property
+    def _starts(self) -> NDArray[np.intp]:
+        return np.flatnonzero(np.diff(self.group, prepend=-1))
+
+    @cached_property
+    def _numbers(self) -> Array:
+        return self.grouped(self.sizes)[:, None]
+
+    def costs(self, power: Array) -> Array:
+        """Return (..., 6) costs (T75) of powers (..., bands, 6)."""
+        return np.asarray(self.sizes @ np.log(power))
+
+
+def random_walk_shape(of: Bands, corner: float) -> Array:
+    """Return (bands,) means of 1 + (corner / f)^2, Eq. (T74)."""
+    f = np.maximum(of.frequency, of.frequency[1])
+    return np.asarray(1.0 + of.sums((corner / f) ** 2) / of.sizes)
+
+
+PRODUCTS = np.array([[10, 13, 14], [13, 11, 15], [14, 15, 12]])
+"""(3, 3) indices of the products of angular velocity among the signals."""
+_A, _G, _ALPHA = slice(1, 4), slice(4, 7), slice(7, 10)
+
+
+def noise_moments(
+    splines: PoseSplines,
+    grid: Grid,
+    taper: Array,
+    zeta: Array,
+    of: Bands,
+    noise: tuple[float, float],
+) -> Array:
+    """Return (bands, 38, 38) Q that noise of the poses adds to `spectra.moments`.
+
+    `zeta` (M, 16) are the signals, `noise` standard deviations of position [m] and rotation [rad].
+    """
+    w2 = (2.0 * np.pi * of.frequency) ** 2
+    per_number = np.sum(taper**2) / (grid.dt * splines.rate)
+    share = per_number * passed(of.frequency, splines.spacing)
+    position_power, rotation_power = (std**2 * share for std in noise)
+    if splines.imu_rows is not None:
+        left = splines.imu_rows.share(of.frequency)
+        position_power, rotation_power = position_power * left[0], rotation_power * left[1]
+    weight = taper**2 / np.sum(taper**2)
+    still, first, second, third = _rotation_covariances(zeta, weight)
+    eye = np.zeros((SIGNALS, SIGNALS))
+    eye[_A, _A] = np.eye(3)
+    parts = [
+        (position_power * w2**2, eye),
+        (rotation_power, still),
+        (rotation_power * w2, first + second),
+    ]
+    parts.append((rotation_power * w2**2, third))
+    Q = np.zeros((of.count, WIDTH, WIDTH))
+    for power, shape in parts:
+        Q[:, :SIGNALS, :SIGNALS] += of.sums(power)[:, None, None] * shape
+        Q[:, RATES, RATES] += of.sums(power * w2)[:, None, None] * shape
+    return Q
+
+
+def _rotation_covariances(zeta: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
+    """Return covariances (16, 16) for unit rotation noise; factors 1, w^2, w^2, w^4."""
+    still, cross, products, alpha = np.zeros((4, SIGNALS, SIGNALS))
+    mean = weight @ zeta
+    for left in (_A, _G):
+        for right in (_A, _G):
+            # Mean of (x x d)(y x d)^T for a rotation d of unit covariance.
+            both = (weight[:, None] * zeta[:, left]).T @ zeta[:, right]
+            still[left, right] = np.trace(both) * np.eye(3) - both.T
+    for where in (_A, _G):
+        cross[where, _ALPHA] = -cross_matrix(mean[where])
+        cross[_ALPHA, where] = cross[where, _ALPHA].T
+    jacobian = np.zeros(
+        (3, 3, SIGNALS)
+    )  # derivative of the signals by omega_j, coefficient of omega_i
+    for i in range(3):
+        for j in range(3):
+            jacobian[j, i, PRODUCTS[i, j]] += 1.0 + (i == j)
+    ww = mean[PRODUCTS]
+    for k in range(3):
+        products += jacobian[k].T @ ww @ jacobian[k]
+    alpha[_ALPHA, _ALPHA] = np.eye(3)
+    return still, cross, products, alpha

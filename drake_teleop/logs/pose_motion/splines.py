@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 from scipy.sparse import diags_array, eye_array
@@ -329,7 +328,7 @@ def _relative_vector(q: Array, p: Array) -> Array:
     return out
 
 
-def _in_P(q: Array, n: Array, x: NDArray[np.float64]) -> Array:
+def _in_P(q: Array, n: Array, x: Array) -> Array:
     """Return (N, 3) world vectors in the axes of P."""
     v = -q[:, 1:]
     once = _cross(v, x)

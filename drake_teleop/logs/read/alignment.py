@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log
 
@@ -20,12 +21,12 @@ SMOOTHER_WINDOW = 1.8
 """Window length [s] of the smoother times its bandwidth [Hz]."""
 
 
-def spacing(t: NDArray[np.float64]) -> float:
+def spacing(t: Array) -> float:
     """Return the mean step of (N,) times."""
     return float(t[-1] - t[0]) / (len(t) - 1)
 
 
-def uniform_times(t: NDArray[np.float64]) -> NDArray[np.float64]:
+def uniform_times(t: Array) -> Array:
     """Return equidistant times over the span of `t` (N,) at its median rate, or `t` itself."""
     even = np.linspace(t[0], t[-1], len(t))
     if np.abs(t - even).max() < 1e-3 * spacing(t):
@@ -34,9 +35,7 @@ def uniform_times(t: NDArray[np.float64]) -> NDArray[np.float64]:
     return t[0] + dt * np.arange(int((t[-1] - t[0]) / dt + 1e-6) + 1)
 
 
-def resample(
-    t_new: NDArray[np.float64], t: NDArray[np.float64], x: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def resample(t_new: Array, t: Array, x: Array) -> Array:
     """Interpolate (N, ...) samples linearly at `t_new`; hold the end values."""
     if np.array_equal(t_new, t):
         return x
@@ -47,9 +46,7 @@ def resample(
     return out
 
 
-def _interpolate(
-    t_new: NDArray[np.float64], t: NDArray[np.float64], x: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _interpolate(t_new: Array, t: Array, x: Array) -> Array:
     # A single search for all columns is faster than np.interp for each.
     before = np.searchsorted(t[1:-1], t_new, side="right")
     start, end = t[before], t[before + 1]
@@ -59,7 +56,7 @@ def _interpolate(
     return first + share * (x.take(before + 1, axis=0) - first)
 
 
-def low_pass(x: NDArray[np.float64], dt: float, cutoff_hz: float | None) -> NDArray[np.float64]:
+def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
     """Filter (N, ...) samples of spacing `dt` [s] without phase shift, Eq. (T10).
 
     The ends are continued by point reflection. A cut-off of None or above the Nyquist rate changes
@@ -86,8 +83,8 @@ def low_pass(x: NDArray[np.float64], dt: float, cutoff_hz: float | None) -> NDAr
 
 
 def smooth_derivatives(
-    x: NDArray[np.float64], dt: float, bandwidth_hz: float | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    x: Array, dt: float, bandwidth_hz: float | None
+) -> tuple[Array, Array, Array]:
     """Return x, dx/dt and d^2x/dt^2 of (N, ...) samples by sliding polynomials of degree 5.
 
     This is the filter of Savitzky and Golay (1964). The window is 1.8 / `bandwidth_hz` [s], at
@@ -111,13 +108,13 @@ def smooth_derivatives(
     return derivatives[0], derivatives[1], derivatives[2]
 
 
-def noise_gain(dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
+def noise_gain(dt: float, bandwidth_hz: float | None) -> Array:
     """Return (3,) white-noise gains of `smooth_derivatives`: [1], [1/s], [1/s^2]."""
     weights = smoother(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
 
-def smoother(n: int, dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
+def smoother(n: int, dt: float, bandwidth_hz: float | None) -> Array:
     """Return (6, w) weights from the samples of a window to polynomial coefficients; w <= n."""
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW / bandwidth_hz
     half = max(_MIN_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
@@ -126,9 +123,7 @@ def smoother(n: int, dt: float, bandwidth_hz: float | None) -> NDArray[np.float6
     return np.linalg.pinv(powers) / (half * dt) ** np.arange(_POLYNOMIAL_DEGREE + 1)[:, None]
 
 
-def _differentiate_polynomials(
-    coefficients: list[NDArray[np.float64]], tau: NDArray[np.float64], order: int
-) -> NDArray[np.float64]:
+def _differentiate_polynomials(coefficients: list[Array], tau: Array, order: int) -> Array:
     terms = [
         math.perm(power, order) * np.outer(tau ** (power - order), c)
         for power, c in enumerate(coefficients)
@@ -137,9 +132,7 @@ def _differentiate_polynomials(
     return np.sum(terms, axis=0)
 
 
-def angular_motion(
-    R_WS: NDArray[np.float64], dt: float, bandwidth_hz: float | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def angular_motion(R_WS: Array, dt: float, bandwidth_hz: float | None) -> tuple[Array, Array]:
     """Return omega_WS_S [rad/s] and alpha_WS_S [rad/s^2] (N, 3) of equidistant R_WS (N, 3, 3).
 
     They are the skew parts of R^T dR/dt and R^T d^2R/dt^2.
@@ -149,7 +142,7 @@ def angular_motion(
     return _skew_part(R_SW @ first), _skew_part(R_SW @ second)
 
 
-def _skew_part(A: NDArray[np.float64]) -> NDArray[np.float64]:
+def _skew_part(A: Array) -> Array:
     return 0.5 * np.stack(
         [A[:, 2, 1] - A[:, 1, 2], A[:, 0, 2] - A[:, 2, 0], A[:, 1, 0] - A[:, 0, 1]], axis=1
     )

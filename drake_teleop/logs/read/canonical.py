@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.writing import write_table
 from drake_teleop.logs.pose_motion.poses import Posed
@@ -81,20 +82,20 @@ class Log:
         DrakeTeleopError: for wrong shapes, values that are not finite, or decreasing `t`.
     """
 
-    t: NDArray[np.float64]
-    wrench: NDArray[np.float64]
-    specific_force: NDArray[np.float64]
-    angular_velocity: NDArray[np.float64]
-    angular_acceleration: NDArray[np.float64]
-    gravity: NDArray[np.float64] | None = None
+    t: Array
+    wrench: Array
+    specific_force: Array
+    angular_velocity: Array
+    angular_acceleration: Array
+    gravity: Array | None = None
     static: bool = False
     bridged: NDArray[np.bool_] | None = None
     notes: tuple[str, ...] = ()
     source: str = "log"
     posed: Posed | None = None
     gain_std: float = 0.0
-    R_WS: NDArray[np.float64] | None = None
-    gravity_W: NDArray[np.float64] | None = None
+    R_WS: Array | None = None
+    gravity_W: Array | None = None
     one_sided_s: float = 0.0
     described: Description | None = None
     free: tuple[str, ...] = ()
@@ -152,7 +153,7 @@ class Log:
         return replace(self, **selected)
 
     @property
-    def motion(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def motion(self) -> tuple[Array, Array, Array]:
         """Specific force, angular velocity and angular acceleration."""
         return self.specific_force, self.angular_velocity, self.angular_acceleration
 
@@ -196,13 +197,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
     table.numbers(WRENCH, 6, str(path))
     s, omega, alpha, q, p = (
         present(names)
-        for names in (
-            SPECIFIC_FORCE,
-            ANGULAR_VELOCITY,
-            ANGULAR_ACCELERATION,
-            ORIENTATION,
-            POSITION,
-        )
+        for names in (SPECIFIC_FORCE, ANGULAR_VELOCITY, ANGULAR_ACCELERATION, ORIENTATION, POSITION)
     )
     force, torque = Force(columns=WRENCH[:3]), Torque(columns=WRENCH[3:])
     orientation = Orientation(columns=ORIENTATION, form="quaternion_wxyz") if q else None

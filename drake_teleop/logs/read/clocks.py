@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.description import UNITS, Time
 from drake_teleop.logs.read.tables import Table
@@ -44,12 +45,12 @@ class Clock:
         notes: corrections.
     """
 
-    t: NDArray[np.float64]
+    t: Array
     rows: NDArray[np.intp]
     total: int
     notes: tuple[str, ...] = ()
 
-    def select(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def select(self, x: Array) -> Array:
         """Return the rows of (total, ...) values that have a time."""
         return x if len(self.rows) == self.total else x[self.rows]
 
@@ -101,11 +102,11 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     return Clock(_to_common_clock(t, time), rows, len(stamps), tuple(notes))
 
 
-def _to_common_clock(t: NDArray[np.float64], time: Time) -> NDArray[np.float64]:
+def _to_common_clock(t: Array, time: Time) -> Array:
     return t[0] + time.scale * (t - t[0]) + time.offset
 
 
-def spread(t: NDArray[np.float64]) -> NDArray[np.float64]:
+def spread(t: Array) -> Array:
     """Return times of rows with shared stamps: means over 50 distinct stamps.
 
     Windows end at steps of more than three median steps. `t` (N,) must not decrease.
@@ -118,7 +119,7 @@ def spread(t: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([_smooth_stamps(part, half, step / per_stamp) for part in parts])
 
 
-def gaps(t: NDArray[np.float64], bandwidth_hz: float | None) -> NDArray[np.float64]:
+def gaps(t: Array, bandwidth_hz: float | None) -> Array:
     """Return (G, 2) start and end of the gaps in increasing times `t` (N,) [s].
 
     A gap is longer than four median steps and half a period of the low-pass.
@@ -133,7 +134,7 @@ def shortest_gap(step: float, bandwidth_hz: float | None) -> float:
     return max(MIN_GAP_STEPS * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
 
 
-def _smooth_stamps(t: NDArray[np.float64], half: int, dt: float) -> NDArray[np.float64]:
+def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
     """Return the moving average of the stamps over 2 half + 1 rows, with straight ends."""
     n = len(t)
     if t[0] == t[-1]:
@@ -157,11 +158,7 @@ def _smooth_stamps(t: NDArray[np.float64], half: int, dt: float) -> NDArray[np.f
 
 
 def _remove_repetitions(
-    rows: NDArray[np.intp],
-    t: NDArray[np.float64],
-    table: Table,
-    columns: Sequence[str | int],
-    where: str,
+    rows: NDArray[np.intp], t: Array, table: Table, columns: Sequence[str | int], where: str
 ) -> NDArray[np.intp]:
     """Return `rows` without repetitions of the previous row."""
     values = [table.raw(column, where) for column in columns]
@@ -172,9 +169,7 @@ def _remove_repetitions(
     return rows[np.concatenate([[True], ~same])]
 
 
-def _check_forward(
-    t: NDArray[np.float64], rows: NDArray[np.intp], table: Table, where: str
-) -> None:
+def _check_forward(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
     if (steps < 0).any():
         first = int(np.argmax(steps < 0))
@@ -192,9 +187,7 @@ def _check_forward(
         )
 
 
-def _check_increasing(
-    t: NDArray[np.float64], rows: NDArray[np.intp], table: Table, where: str
-) -> None:
+def _check_increasing(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
     if (steps <= 0).any():
         row = rows[int(np.argmax(steps <= 0))] + table.first_row
@@ -205,7 +198,7 @@ def _check_increasing(
         )
 
 
-def _check_rate(t: NDArray[np.float64], time: Time, where: str) -> None:
+def _check_rate(t: Array, time: Time, where: str) -> None:
     if len(t) < 2:
         return
     step = float(np.median(np.diff(t)))
@@ -224,7 +217,7 @@ def _check_rate(t: NDArray[np.float64], time: Time, where: str) -> None:
     )
 
 
-def _check_even(t: NDArray[np.float64], rows: NDArray[np.intp], table: Table, where: str) -> None:
+def _check_even(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
     if len(t) < 3 or t[-1] - t[0] <= _MAX_STEP_RATIO * len(t) * np.median(steps):
         return

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import checked, number
+from drake_teleop.common.arrays import Array, checked, number
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
@@ -20,9 +20,7 @@ _MAX_SAMPLES = 5000
 _MIN_SAMPLES = 32
 
 
-def estimate_delay(
-    log: Log, cutoff_hz: float | None, phi: NDArray[np.float64] | None = None
-) -> float | None:
+def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) -> float | None:
     """Return the delay of the motion behind the wrench [s], or None if undetermined.
 
     It minimizes sum_c log var(w_c - o_c - (V(t + delay) phi)_c) over the channels c, within +-0.25
@@ -49,7 +47,7 @@ def estimate_delay(
 
 
 def delay_of(
-    log: Log, cutoff_hz: float | None, delay: str | float, phi: NDArray[np.float64] | None = None
+    log: Log, cutoff_hz: float | None, delay: str | float, phi: Array | None = None
 ) -> tuple[float, str]:
     """Return the delay to remove [s] and its source; estimate it if `delay` is "auto".
 
@@ -80,9 +78,7 @@ def _refine_shift(cost: Callable[[float], float], best: float, step: float) -> f
     return best
 
 
-def _shift_cost(
-    log: Log, rows: NDArray[np.intp], phi: NDArray[np.float64] | None
-) -> Callable[[float], float]:
+def _shift_cost(log: Log, rows: NDArray[np.intp], phi: Array | None) -> Callable[[float], float]:
     t, wrench = log.t[rows], log.wrench[rows]
     # Common scales of forces and torques prevent large weights of channels without a signal; the
     # floor excludes rounding of a constant wrench.
@@ -91,7 +87,7 @@ def _shift_cost(
     scale, floor = np.sqrt(variance), 1e-9 * variance
     motion = np.hstack(log.motion)  # one interpolation for all signals
 
-    def residual(shift: float) -> NDArray[np.float64]:
+    def residual(shift: float) -> Array:
         s, omega, alpha = np.split(resample(t + shift, log.t, motion), 3, axis=1)
         if phi is not None:
             return contact_wrench(wrench, np.zeros(6), s, omega, alpha, phi)

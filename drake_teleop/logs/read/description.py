@@ -17,16 +17,9 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
@@ -239,8 +232,7 @@ class Imu(_Recorded):
     sign: Literal[1, -1] = Field(default=1, description="of the specific force; -1 for g - a")
     frame: ImuFrame = Field(default="sensor", description="auto: the rotation is found")
     position: PositionOrAuto = Field(
-        default=(0.0, 0.0, 0.0),
-        description="p_SoIo_S of the accelerometer, m; auto: it is found",
+        default=(0.0, 0.0, 0.0), description="p_SoIo_S of the accelerometer, m; auto: it is found"
     )
 
     @model_validator(mode="after")
@@ -295,7 +287,7 @@ class Pose(_Recorded):
         return self.position_in_sensor == "auto" or self.rotation_in_sensor == "auto"
 
     @property
-    def R_SP(self) -> NDArray[np.float64] | None:
+    def R_SP(self) -> Array | None:
         """(3, 3) rotation from the posed frame to S; None for the axes of S."""
         for rotation in (self.rotation_in_sensor, self.frame):
             if isinstance(rotation, tuple):
@@ -333,11 +325,7 @@ class Static(_Stream):
 class Description(_Strict):
     """Description of a log: a wrench with imu, pose or both; or static poses."""
 
-    gravity: Gravity = (
-        0.0,
-        0.0,
-        -STANDARD_GRAVITY,
-    )
+    gravity: Gravity = (0.0, 0.0, -STANDARD_GRAVITY)
     wrench: Wrench | None = None
     imu: Imu | None = None
     pose: Pose | None = None
@@ -383,7 +371,7 @@ class Description(_Strict):
             raise ValueError(f"{' and '.join(both)} cannot be combined: give one of them alone")
 
     @property
-    def gravity_W(self) -> NDArray[np.float64]:
+    def gravity_W(self) -> Array:
         """(3,) gravity in W [m/s^2]; along -z for `auto`."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 
@@ -12,11 +12,11 @@ from drake_teleop.logs.read.canonical import Log
 _MIN_LIKELIHOOD_RATIO, _MIN_DRIFT_S = 50.0, 0.01
 
 
-Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
+Pairs = list[tuple[Array, Array]]
 """Signal of the pose and of the IMU, for each sensor, see `signal_pairs`."""
 
 
-def signal_pairs(t: NDArray[np.float64], imu: Log, pose: Log, gyroscope: bool) -> Pairs:
+def signal_pairs(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
     """Return (N, 3) signals of the pose at `t` with those of the IMU on its clock."""
     pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
     if gyroscope:
@@ -24,18 +24,12 @@ def signal_pairs(t: NDArray[np.float64], imu: Log, pose: Log, gyroscope: bool) -
     return pairs
 
 
-def best_shift(
-    t: NDArray[np.float64],
-    pairs: Pairs,
-    t_imu: NDArray[np.float64],
-    reach: float,
-    arm: NDArray[np.float64],
-) -> float:
+def best_shift(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -> float:
     """Return the shift [s] of the best affine maps, without effects linear in `arm` (N, k)."""
     U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
 
-    def without_arm(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def without_arm(x: Array) -> Array:
         return x - U @ (U.T @ x)
 
     expected, sensed = [without_arm(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
@@ -58,11 +52,7 @@ def best_shift(
 
 
 def clock_drift(
-    t: NDArray[np.float64],
-    pairs: Pairs,
-    t_imu: NDArray[np.float64],
-    lag: float,
-    independent: float,
+    t: Array, pairs: Pairs, t_imu: Array, lag: float, independent: float
 ) -> tuple[float, float]:
     """Return lag at mid-record [s] and drift [s/s], from a constant lag [s].
 
@@ -98,7 +88,7 @@ def clock_drift(
     return float(found[0]), float(found[1])
 
 
-def _unexplained_share(y: NDArray[np.float64], x: NDArray[np.float64]) -> float:
+def _unexplained_share(y: Array, x: Array) -> float:
     """Return the share of the variance of y (N, 3) that no affine map of x explains."""
     y, x = y - y.mean(axis=0), x - x.mean(axis=0)
     both, total = x.T @ y, float((y * y).sum()) + 1e-12 * len(y)

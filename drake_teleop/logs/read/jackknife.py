@@ -6,9 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from drake_teleop.common.arrays import Array
 
 _BLOCKS = 20
 # Directions with smaller singular values, relative to the largest, are undetermined.

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
@@ -41,8 +42,8 @@ class LeverArm:
         source: "pose" or "wrench".
     """
 
-    p_SoIo_S: NDArray[np.float64]
-    deviations: NDArray[np.float64]
+    p_SoIo_S: Array
+    deviations: Array
     source: str
 
     @property
@@ -66,7 +67,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
         return None
     wrench = resample(t, smooth.t, smooth.wrench)
 
-    def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residual(x: Array) -> Array:
         s, omega, alpha = (resample(t + x[3], smooth.t, signal) for signal in smooth.motion)
         s = s - lever_matrix(omega, alpha) @ x[:3]
         return contact_wrench(wrench, x[4:10], s, omega, alpha, x[10:])
@@ -85,22 +86,20 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     return LeverArm(x[:3], np.where(observable, deviations[:3], np.inf), "wrench")
 
 
-def common_times(
-    start: float, stop: float, logs: Sequence[Log], cutoff: float
-) -> NDArray[np.float64]:
+def common_times(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
     """Return evenly spaced times at which all logs have samples."""
     t = np.linspace(start, stop, COMPARED_SAMPLES)
     known = [np.interp(t, log.t, measured(log, cutoff).astype(float)) > 0.99 for log in logs]
     return t[np.all(known, axis=0)]
 
 
-def lever_matrix(omega: NDArray[np.float64], alpha: NDArray[np.float64]) -> NDArray[np.float64]:
+def lever_matrix(omega: Array, alpha: Array) -> Array:
     """Return (N, 3, 3) K of Eq. (T20)."""
     W = cross_matrix(omega)
     return cross_matrix(alpha) + W @ W
 
 
-def observable_axes(K: NDArray[np.float64], log: Log, cutoff: float) -> NDArray[np.bool_]:
+def observable_axes(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
     """Return (3,) axes along which the motion exceeds its noise, which biases the arm to zero.
 
     The noise below the cut-off is at most a seventh of that in the next octave, because its power

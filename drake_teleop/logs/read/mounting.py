@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.read.alignment import low_passed, resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.imu_clock import best_shift, clock_drift, signal_pairs
@@ -53,7 +53,7 @@ class Mounting:
         lever: lever arm; None without positions.
     """
 
-    R_SI: NDArray[np.float64]
+    R_SI: Array
     lag_s: float
     lag_middle_s: float
     middle_s: float
@@ -62,7 +62,7 @@ class Mounting:
     unexplained_turning: float | None
     mirrored: bool
     speed_ratio: float | None
-    deviations_deg: NDArray[np.float64]
+    deviations_deg: Array
     lever: LeverArm | None
 
     @property
@@ -71,7 +71,7 @@ class Mounting:
         return _angle_deg(self.R_SI)
 
     @property
-    def right_angled(self) -> NDArray[np.float64]:
+    def right_angled(self) -> Array:
         """(3, 3) nearest of the 24 rotations that map axes to axes."""
         return max(right_angled_rotations(), key=lambda R: float(np.trace(R.T @ self.R_SI)))
 
@@ -168,14 +168,14 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
 
 
 def _refine(
-    t: NDArray[np.float64],
-    drift_lag: NDArray[np.float64],
-    t_imu: NDArray[np.float64],
-    pairs: list[tuple[NDArray[np.float64], NDArray[np.float64]]],
-    K: NDArray[np.float64],
-    R: NDArray[np.float64],
+    t: Array,
+    drift_lag: Array,
+    t_imu: Array,
+    pairs: list[tuple[Array, Array]],
+    K: Array,
+    R: Array,
     lag: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array, Array]:
     """Solve the least squares of `find_mounting` for k signals `pairs`.
 
     `t` (N,) are times on the pose's clock, `drift_lag` (N,) lags by drift, `t_imu` (M,) times on
@@ -184,7 +184,7 @@ def _refine(
     """
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
 
-    def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residual(x: Array) -> Array:
         rotated = resample(t + x[3] + drift_lag, t_imu, moving).reshape(-1, 3) @ _rotate(R, x[:3]).T
         left = rotated.reshape(known.shape) - known
         left[:, 0] -= K @ x[4:7]
@@ -200,7 +200,7 @@ def _refine(
     return x, deviations, residual(x)
 
 
-def _kabsch(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+def _kabsch(x: Array, y: Array) -> tuple[Array, bool]:
     """Return R of least |y - R x - b|, and whether a reflection fits clearly better."""
     x, y = x - x.mean(axis=0), y - y.mean(axis=0)
     U, _, Vt = np.linalg.svd(y.T @ x)
@@ -210,10 +210,10 @@ def _kabsch(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.
     return R, bool(reflected < 0.25 * direct and reflected < 0.05)
 
 
-def _rotate(R: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotate(R: Array, vector: Array) -> Array:
     """Return R rotated by a rotation vector (3,) in S [rad]."""
     return rotation_matrices(vector[None], "rotation_vector")[0] @ R
 
 
-def _angle_deg(R: NDArray[np.float64]) -> float:
+def _angle_deg(R: Array) -> float:
     return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import number
+from drake_teleop.common.arrays import Array, number
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.read.alignment import (
@@ -22,9 +22,7 @@ from drake_teleop.logs.read.alignment import (
     spacing,
     uniform_times,
 )
-from drake_teleop.logs.read.auto_gravity import describe_gravity
-from drake_teleop.logs.read.auto_mounting import describe_mounting
-from drake_teleop.logs.read.auto_pose import describe_pose_frame
+from drake_teleop.logs.read.auto_frames import describe_mounting, describe_pose_frame
 from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, gaps, read_clock
@@ -38,11 +36,11 @@ from drake_teleop.logs.read.description import (
     Wrench,
     load_description,
 )
-from drake_teleop.logs.read.orientations import Orientations
-from drake_teleop.logs.read.removed_weight import restore_weight, weight_wrench
+from drake_teleop.logs.read.gravity import describe_gravity, restore_weight, weight_wrench
 from drake_teleop.logs.read.rotations import nearest_rotation, quaternions, rotation_matrices
 from drake_teleop.logs.read.streams import (
     MAX_VALUES,
+    Orientations,
     Stream,
     in_S,
     move_to_So,
@@ -101,10 +99,7 @@ def read_log(
 
 
 def read_description(
-    description: Description,
-    source: str,
-    *,
-    tables: dict[Path, Table] | None = None,
+    description: Description, source: str, *, tables: dict[Path, Table] | None = None
 ) -> Log:
     """Return the log of a description with absolute paths, as `read_log`."""
     return _Reader(description, source, 30.0, tables).log()
@@ -124,7 +119,7 @@ class _Reader:
         self._source = source
         self._bandwidth_hz = bandwidth_hz
         self._notes: list[str] = []
-        self._gaps: list[NDArray[np.float64]] = []
+        self._gaps: list[Array] = []
         self._one_sided_s = 0.0
         self._tables = dict(tables or {})
 
@@ -172,9 +167,7 @@ class _Reader:
     ) -> None:
         """Replace `auto` by the estimates of `describe`."""
         self._description, notes = describe(
-            self._description,
-            self._source,
-            partial(self._read_other, differentiate=differentiate),
+            self._description, self._source, partial(self._read_other, differentiate=differentiate)
         )
         self._notes += notes
 
@@ -191,14 +184,12 @@ class _Reader:
             self._tables[stream.source] = read_stream(stream)
         return self._tables[stream.source]
 
-    def _wrench(self, stream: Wrench) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _wrench(self, stream: Wrench) -> tuple[Array, Array]:
         table = self._table(stream)
         clock = self._clock("wrench", stream, table)
         return clock.t, clock.select(self._forces("wrench", stream, table, clock.total))
 
-    def _forces(
-        self, name: str, stream: Wrench | Static, table: Table, rows: int
-    ) -> NDArray[np.float64]:
+    def _forces(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
         both = [
             self._vectors(name, field, quantity, table, rows, stream.sign)
             for field, quantity in (("force", stream.force), ("torque", stream.torque))
@@ -210,7 +201,7 @@ class _Reader:
 
     def _vectors(
         self, name: str, field: str, quantity: Any, table: Table, rows: int, sign: float = 1.0
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """Return (rows, 3) values of a field in SI units, in the axes of the file."""
         where = f"{self._source}:{name}.{field}.columns"
         values = table.numbers(quantity.columns, 3, where, rows)
@@ -252,9 +243,7 @@ class _Reader:
             raw,
         )
 
-    def _poses_of_S(
-        self, stream: Pose, table: Table, clock: Clock
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    def _poses_of_S(self, stream: Pose, table: Table, clock: Clock) -> tuple[Array, Array | None]:
         """Return (N, 4) quaternions [w, x, y, z] of R_WS, and (N, 3) p_WoSo_W or None."""
         position = None
         if stream.position is not None:
@@ -283,7 +272,7 @@ class _Reader:
         t = uniform_times(raw_t)
         dt = spacing(t)
 
-        def vectors(field: str, sign: float = 1.0) -> NDArray[np.float64] | None:
+        def vectors(field: str, sign: float = 1.0) -> Array | None:
             quantity = getattr(stream, field)
             if quantity is None:
                 return None
@@ -306,13 +295,8 @@ class _Reader:
         return Stream("imu", t, s, omega, alpha, inertial=Inertial(t[outside_gaps], *both))
 
     def _to_S(
-        self,
-        name: str,
-        frame: str | tuple,
-        vectors: NDArray[np.float64],
-        t: NDArray[np.float64],
-        pose: Stream | None,
-    ) -> NDArray[np.float64]:
+        self, name: str, frame: str | tuple, vectors: Array, t: Array, pose: Stream | None
+    ) -> Array:
         if isinstance(frame, tuple):
             return vectors @ np.array(frame).T
         if frame == "sensor":
@@ -419,9 +403,7 @@ class _Reader:
         where = f"{self._source}:{name}.orientation"
         return Orientations(self._description, orientation, table, rows, where)
 
-    def _common_time(
-        self, wrench_t: NDArray[np.float64], streams: Sequence[Stream]
-    ) -> NDArray[np.float64]:
+    def _common_time(self, wrench_t: Array, streams: Sequence[Stream]) -> Array:
         """Return uniform times at the wrench's rate that all streams cover."""
         start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
         stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])
@@ -448,14 +430,8 @@ class _Reader:
             )
         return t
 
-    def _assemble(
-        self,
-        t: NDArray[np.float64],
-        wrench: NDArray[np.float64],
-        imu: Stream | None,
-        pose: Stream | None,
-    ) -> Log:
-        def signal(field: str) -> NDArray[np.float64]:
+    def _assemble(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
+        def signal(field: str) -> Array:
             for stream in (imu, pose):
                 values = None if stream is None else getattr(stream, field)
                 if stream is not None and values is not None:
@@ -483,7 +459,7 @@ class _Reader:
             one_sided_s=self._one_sided_s,
         )
 
-    def _bridged(self, t: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+    def _bridged(self, t: Array) -> NDArray[np.bool_] | None:
         """Return (N,) flags of samples that a gap affects, or None."""
         if not self._gaps:
             return None

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError, reading, refuse_fork
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.mat_file import read_mat
@@ -57,7 +58,7 @@ class Table:
 
     def numbers(
         self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """Return (N, width) finite numbers of the named columns, side by side.
 
         Raises an error if a column is absent, a cell is not finite, or `width` or `rows` differ.
@@ -85,13 +86,13 @@ class Table:
                     remedy="name columns that belong together",
                 )
 
-    def all_raw(self, names: Sequence[str | int], where: str) -> NDArray[np.float64]:
+    def all_raw(self, names: Sequence[str | int], where: str) -> Array:
         """Return `raw` of several columns with equal numbers of rows, side by side."""
         columns = [self.raw(name, where) for name in names]
         self._check_rows(names, columns, where, None)
         return np.hstack(columns)
 
-    def raw(self, name: str | int, where: str) -> NDArray[np.float64]:
+    def raw(self, name: str | int, where: str) -> Array:
         """Return (N, k) numbers of a column, including NaN and infinity, or raise an error."""
         name = str(name)
         if name not in self.columns:
@@ -100,7 +101,7 @@ class Table:
         self.check_size(numbers, MAX_NUMBER, "", f"{self.path}:{name}")
         return numbers
 
-    def single(self, name: str | int, where: str) -> NDArray[np.float64]:
+    def single(self, name: str | int, where: str) -> Array:
         """Return (N,) numbers of a column as `raw`; raise an error if it is wider."""
         numbers = self.raw(name, where)
         if numbers.shape[1] != 1:
@@ -113,7 +114,7 @@ class Table:
 
     def check_size(
         self,
-        values: NDArray[np.float64],
+        values: Array,
         largest: float,
         unit: str,
         where: str,
@@ -133,7 +134,7 @@ class Table:
                 remedy=remedy,
             )
 
-    def _column(self, name: str, where: str) -> NDArray[np.float64]:
+    def _column(self, name: str, where: str) -> Array:
         if name not in self.columns:
             if name.rpartition(".")[0] in self.absent:
                 raise DrakeTeleopError(
@@ -160,7 +161,7 @@ class Table:
             )
         return numbers
 
-    def _numbers(self, name: str) -> NDArray[np.float64]:
+    def _numbers(self, name: str) -> Array:
         column = self.columns[name]
         numbers = _as_numbers(column, lambda row, cell: self._cell_error(name, row, cell))
         return numbers.reshape(len(column), math.prod(numbers.shape[1:]))
@@ -174,7 +175,7 @@ class Table:
         )
 
 
-def decimal_step(values: NDArray[np.float64]) -> float:
+def decimal_step(values: Array) -> float:
     """Return the largest power of ten <= 1 that divides all values, or 0."""
     for decimals in range(_MAX_DECIMALS if values.any() else 0):
         error = np.abs(values - np.round(values, decimals))
@@ -287,9 +288,7 @@ def _read_npz(path: Path) -> dict[str, NDArray]:
     return {key: x for key, x in columns.items() if isinstance(x, np.ndarray) and x.ndim}
 
 
-def _as_numbers(
-    column: NDArray, bad: Callable[[int, object], DrakeTeleopError]
-) -> NDArray[np.float64]:
+def _as_numbers(column: NDArray, bad: Callable[[int, object], DrakeTeleopError]) -> Array:
     if column.dtype.kind in "fiu":
         return column.astype(float, copy=False)
     if column.dtype.kind in "mM":  # seconds, since 1970 or midnight
