@@ -38,9 +38,9 @@ from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
 from drake_teleop.logs.pose_motion.rigid import (
     State,
+    _apply_step,
     _columns,
     _gain_effects,
-    _moved,
     _Record,
     _solve,
     fit_rigid,
@@ -55,7 +55,7 @@ from drake_teleop.logs.pose_motion.spectra import (
     noise_moments,
     signal_spectrum,
 )
-from drake_teleop.logs.pose_motion.spectra import without as taper_without
+from drake_teleop.logs.pose_motion.spectra import exclude as exclude_from_taper
 from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, _knots, _thin_knots
 from drake_teleop.logs.read.rotations import rotation_matrices
 
@@ -175,7 +175,7 @@ def test_columns_are_derivatives_of_the_residual(rho, r, k):
     state = State(TRUTH, 1e-3, r, R)
     step = np.zeros(23)
     step[k] = 1e-5
-    ahead, behind = (_columns(_moved(state, x))[1] for x in (step, -step))
+    ahead, behind = (_columns(_apply_step(state, x))[1] for x in (step, -step))
     derivative = (ahead - behind) / 2e-5
     np.testing.assert_allclose(_columns(state)[0][:, k], -derivative, atol=1e-6)
 
@@ -217,7 +217,7 @@ def test_deviations_of_the_frame_are_those_of_what_was_estimated():
     for k in range(6):
         step = np.zeros(23)
         step[17 + k] = 1e-6
-        states = [_moved(found.free.state, x) for x in (step, -step)]
+        states = [_apply_step(found.free.state, x) for x in (step, -step)]
         ahead, behind = (-state.R.T @ state.r for state in states)
         place[:, k] = (ahead - behind) / 2e-6
     covariance = place @ found.free.covariance[17:, 17:] @ place.T
@@ -285,7 +285,7 @@ def test_two_fifths_of_the_record_are_lost():
 def test_signals_move_behind_a_chopped_taper_and_their_rates_are_theirs():
     t, wrench, poses = record(Kind(seed=1))
     grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
-    taper = taper_without(end_taper(grid.t, 0.3, SECONDS - 0.3), (grid.t % 2.0) < 0.8, grid.dt)
+    taper = exclude_from_taper(end_taper(grid.t, 0.3, SECONDS - 0.3), (grid.t % 2.0) < 0.8, grid.dt)
     spectra, there = (
         spectra_of(splines, grid, taper, GRAVITY_W, delay, 20.0) for delay in (LATE, LATE + 0.03)
     )
@@ -457,7 +457,7 @@ def test_delays_are_tried_together_as_one_by_one(chopped):
     t, wrench, poses = record(Kind(seed=10))
     grid = Grid.of(t, wrench)
     taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
-    taper = taper_without(taper, chopped & (np.abs(grid.t - 5.0) < 0.3), grid.dt)
+    taper = exclude_from_taper(taper, chopped & (np.abs(grid.t - 5.0) < 0.3), grid.dt)
     spectra = spectra_of(PoseSplines(poses.continued(), 0.07), grid, taper, GRAVITY_W, -0.02, 20.0)
     assert spectra.taper_fixed is chopped
     delays = np.array([-0.05, -0.02, LATE])
@@ -469,7 +469,7 @@ def test_a_taper_is_zero_where_lost_and_has_edges():
     taper = end_taper(np.arange(1000) / 100, 0.0, 10.0)
     lost = np.zeros(1000, bool)
     lost[500] = True
-    cut = taper_without(taper, lost, 0.01)
+    cut = exclude_from_taper(taper, lost, 0.01)
     assert cut[500] == 0.0 and cut[490] == pytest.approx(0.5, abs=0.01) and cut[475] == 1.0
     assert taper[0] == 0.0 and taper[500] == 1.0
 
