@@ -29,10 +29,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
 from drake_teleop.logs.pose_motion.linear_model import (
+    Window,
     best_delay,
     fit_levels,
     fit_linear_model,
-    spectra_of,
 )
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
@@ -231,7 +231,7 @@ def test_noise_in_the_signals_makes_no_load_lighter():
     t, wrench, poses = record(Kind(place=6e-4, turn=6e-4, seed=11))
     grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.035)
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 12.0)
+    spectra = Window(grid, taper, GRAVITY_W, 12.0).spectra(splines, LATE)
     zeta = splines.signals(grid.t + LATE, GRAVITY_W)
     Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
     free, start = np.arange(23) < 17, State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
@@ -287,7 +287,8 @@ def test_signals_move_behind_a_chopped_taper_and_their_rates_are_theirs():
     grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
     taper = exclude_from_taper(end_taper(grid.t, 0.3, SECONDS - 0.3), (grid.t % 2.0) < 0.8, grid.dt)
     spectra, there = (
-        spectra_of(splines, grid, taper, GRAVITY_W, delay, 20.0) for delay in (LATE, LATE + 0.03)
+        Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, delay)
+        for delay in (LATE, LATE + 0.03)
     )
     moved, slight = spectra.at(LATE + 0.03), spectra.at(LATE + 1e-5)
     size = np.abs(spectra.signals).max(axis=0)
@@ -304,7 +305,7 @@ def test_weights_of_a_poor_start_do_not_stay():
     t, wrench, poses = record(Kind(place=1e-3, turn=1e-3, seed=1))
     grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
+    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE)
     zeta = splines.signals(grid.t + LATE, GRAVITY_W)
     Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
     start = State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
@@ -323,7 +324,7 @@ def test_coloured_noise_does_not_choose_the_finest_knots():
 def seen_in(wrench_of_S: np.ndarray, poses: Poses, t: np.ndarray) -> ReadOff:
     grid, splines = Grid.of(t, wrench_of_S), PoseSplines(poses.continued(), 0.1)
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    return read_off(spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0).fit())
+    return read_off(Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE).fit())
 
 
 def test_units_axes_and_sign_are_read_off():
@@ -347,7 +348,7 @@ def test_gravity_that_stays_in_a_plane_is_no_use_for_axes_but_for_the_unit():
     noise = 0.01 * np.random.default_rng(7).normal(size=(len(t), 6))
     grid = Grid.of(t, non_contact_wrench(s, true.omega, true.alpha, PHI) + noise)
     splines, taper = PoseSplines(poses.continued(), 0.1), end_taper(t[::2], 0.3, SECONDS - 0.3)
-    seen = read_off(spectra_of(splines, grid, taper, DOWN, LATE, 20.0).fit())
+    seen = read_off(Window(grid, taper, DOWN, 20.0).spectra(splines, LATE).fit())
     assert not seen.usable
     assert seen.kappa == pytest.approx(1.0, abs=0.02)
 
@@ -375,7 +376,7 @@ def test_gains_enter_as_they_move_the_estimate():
     t, wrench, poses = record(Kind(seed=9))
     grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
+    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE)
     Z, levels, free = spectra.moments(), Levels.flat(spectra.of), np.ones(23, bool)
     none, start = np.zeros_like(Z), State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     power = spectra.fit().power
@@ -398,7 +399,7 @@ def test_channels_that_wander_are_told_and_weigh_less_where_they_do():
     wrench = wrench + walk * both * step * np.array([0, 0, 1, 1, 0, 0])
     grid, taper = Grid.of(t, wrench), end_taper(t[::2], 0.3, SECONDS - 0.3)
     splines = PoseSplines(poses.continued(), 0.1)
-    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
+    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE)
     levels = fit_levels(spectra.moments(), spectra.of)
     at = spectra.of.sums(spectra.of.frequency) / spectra.of.sizes
     corner = np.sqrt(levels.shape - 1.0)[5] * at[5]
@@ -448,7 +449,9 @@ def test_best_delay_is_found_from_afar():
     t, wrench, poses = record(Kind(seed=10))
     grid = Grid.of(t, wrench)
     taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
-    spectra = spectra_of(PoseSplines(poses.continued(), 0.07), grid, taper, GRAVITY_W, -0.05, 20.0)
+    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(
+        PoseSplines(poses.continued(), 0.07), -0.05
+    )
     assert best_delay(spectra, 0.1)[0] == pytest.approx(LATE, abs=2e-3)
 
 
@@ -458,7 +461,9 @@ def test_delays_are_tried_together_as_one_by_one(chopped):
     grid = Grid.of(t, wrench)
     taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
     taper = exclude_from_taper(taper, chopped & (np.abs(grid.t - 5.0) < 0.3), grid.dt)
-    spectra = spectra_of(PoseSplines(poses.continued(), 0.07), grid, taper, GRAVITY_W, -0.02, 20.0)
+    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(
+        PoseSplines(poses.continued(), 0.07), -0.02
+    )
     assert spectra.taper_fixed is chopped
     delays = np.array([-0.05, -0.02, LATE])
     alone = [spectra.at(delay).fit().cost for delay in delays]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
-from drake_teleop.logs.pose_motion.linear_model import Spectra, spectra_of
+from drake_teleop.logs.pose_motion.linear_model import Spectra, Window
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import Grid, signal_spectrum
 from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
@@ -15,17 +14,9 @@ _STEPS, _MIN_LIKELIHOOD_GAIN = 3, 25.0
 _MAX_CHANGE_S = 0.2
 
 
-def clock_rate(
-    cache: SplineCache,
-    grid: Grid,
-    taper: Array,
-    gravity_W: Array,
-    delay: float,
-    top: float,
-    spacing: float,
-) -> float:
+def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float) -> float:
     """Return the relative rate, such as 5e-5, or 0 if insignificant."""
-    first = spectra_of(cache.at(spacing), grid, taper, gravity_W, delay, top)
+    first, grid = window.spectra(cache.at(spacing), delay), window.grid
     now, best = first, 0.0
     least = start = now.fit().cost
     for _ in range(_STEPS):
@@ -36,7 +27,7 @@ def clock_rate(
         if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_CHANGE_S:
             break
         splines = PoseSplines(at_rate(cache.poses, trial, grid, delay), spacing)
-        now = first.with_motion(splines, gravity_W, delay)
+        now = first.with_motion(splines, window.gravity_W, delay)
         cost = now.fit().cost
         if not cost < least:
             break

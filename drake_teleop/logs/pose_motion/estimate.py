@@ -22,13 +22,13 @@ from drake_teleop.logs.pose_motion.imu_rows import compare_imu
 from drake_teleop.logs.pose_motion.linear_model import (
     MAX_DELAY_CHANGE_S,
     Spectra,
+    Window,
     averaged_splines,
     choose_spacing,
     delay_deviation,
     fit_levels,
     fit_linear_model,
     guess_spacing,
-    spectra_of,
 )
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
@@ -188,17 +188,15 @@ def estimate_from_poses(
         DrakeTeleopError: for wrong shapes, or if fewer than 100 instants remain.
     """
     with one_blas_thread():
-        grid, poses, gravity, top = _prepare(
-            t, wrench, poses, gravity_W, near if delay is None else delay, lost, _MIN_INSTANTS
+        found = _find_motion(
+            *(t, wrench, poses, gravity_W, near, delay, lost, imu), fewest=_MIN_INSTANTS
         )
-        guess = near if delay is None else delay
-        chosen = _search(grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu)
-        splines, late = chosen.splines, chosen.last.delay
-        base = _base_taper(grid, splines.poses, lost, late)
-        spectra = spectra_of(splines, grid, base, gravity, late, top)
-        rejected, note = find_disturbances(spectra, grid, base, splines.spacing)
-        taper = exclude(base, rejected, grid.dt)
-        spectra = spectra_of(splines, grid, taper, gravity, late, top)
+        splines, late, grid = found.splines, found.last.delay, found.window.grid
+        window = replace(found.window, taper=_base_taper(grid, splines.poses, lost, late))
+        spectra = window.spectra(splines, late)
+        rejected, note = find_disturbances(spectra, splines.spacing)
+        window = replace(window, taper=exclude(window.taper, rejected, grid.dt))
+        spectra = window.spectra(splines, late)
         Z = spectra.moments()
         Q = noise_moments(splines, grid, spectra.taper, spectra.zeta, spectra.of, splines.noise())
         levels = fit_levels(Z, spectra.of)
@@ -212,18 +210,16 @@ def estimate_from_poses(
         fit_free = np.ones(PARAMETERS, bool)
         fit_free[16] = delay is None
         fit_free[LEVER], fit_free[TURN] = p_SoPo_S is None, R_SP is None
-        fit = fitted(start, fit_free)
-        all_free = np.ones(PARAMETERS, bool)
-        all_free[16] = delay is None
-        free = (
-            fit if (fit_free == all_free).all() else fitted(_free_start(fit, start, seen), all_free)
-        )
+        fit = free = fitted(start, fit_free)
+        if p_SoPo_S is not None or R_SP is not None:
+            with_frame = fit_free | (np.arange(PARAMETERS) > 16)
+            free = fitted(_free_start(fit, start, seen), with_frame)
         return PoseEstimate(
             splines=splines,
             delay_s=spectra.delay + fit.state.tau,
             delay_deviation=float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free)))),
-            clock_rate=chosen.rate,
-            imu_agrees=chosen.agrees,
+            clock_rate=found.rate,
+            imu_agrees=found.agrees,
             fit=fit,
             frame=_estimate_frame(free, start),
             free=free,
@@ -251,97 +247,80 @@ def motion_of_load(
     or if fewer than 32 instants remain.
     """
     with one_blas_thread():
-        guess = 0.0 if delay is None else delay
-        prepared = _prepare(t, wrench, poses, gravity_W, guess, lost, _MIN_INSTANTS_OF_LOAD, load)
-        grid, poses, gravity, top = prepared
-        chosen = _search(grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu)
+        found = _find_motion(
+            *(t, wrench, poses, gravity_W, 0.0, delay, lost, imu),
+            fewest=_MIN_INSTANTS_OF_LOAD,
+            load=load,
+        )
         return PoseMotion(
-            splines=chosen.splines,
-            delay_s=chosen.last.delay,
-            delay_deviation=0.0 if delay is not None else delay_deviation(chosen.last),
-            clock_rate=chosen.rate,
-            imu_agrees=chosen.agrees,
+            splines=found.splines,
+            delay_s=found.last.delay,
+            delay_deviation=0.0 if delay is not None else delay_deviation(found.last),
+            clock_rate=found.rate,
+            imu_agrees=found.agrees,
         )
 
 
-def _prepare(
+@dataclass(frozen=True, eq=False)
+class _FoundMotion:
+    """Splines of all poses, and the spectra and window of the record that determined them."""
+
+    splines: PoseSplines
+    last: Spectra
+    window: Window
+    rate: float
+    agrees: bool
+
+
+def _find_motion(
     t: ArrayLike,
     wrench: ArrayLike,
     poses: Poses,
     gravity_W: ArrayLike,
-    delay: float,
+    near: float,
+    delay: float | None,
     lost: NDArray[np.bool_] | None,
+    imu: Inertial | None,
+    *,
     fewest: int,
     load: Array | None = None,
-) -> tuple[Grid, Poses, Array, float]:
+) -> _FoundMotion:
     t = checked("t", t, np.size(t))
     wrench = checked("wrench", wrench, len(t), 6)
     gravity = checked("gravity_W", gravity_W, 3)
     grid, poses = Grid.of(t, wrench, load), poses.continued()
-    if (_base_taper(grid, poses, lost, delay) > 0.5).sum() < fewest:
+    known, guess = delay is not None, near if delay is None else delay
+    taper = _base_taper(grid, poses, lost, guess)
+    if (taper > 0.5).sum() < fewest:
         raise DrakeTeleopError(
             "wrench and poses have too little in common",
             remedy="record longer, without interruptions",
         )
     top = min(MAX_FREQUENCY_HZ, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
-    return grid, poses, gravity, top
-
-
-@dataclass(frozen=True, eq=False)
-class _SearchResult:
-    splines: PoseSplines
-    last: Spectra
-    rate: float
-    agrees: bool
-
-
-def _search(
-    grid: Grid,
-    poses: Poses,
-    lost: NDArray[np.bool_] | None,
-    gravity: Array,
-    delay: float,
-    top: float,
-    *,
-    known: bool,
-    imu: Inertial | None = None,
-) -> _SearchResult:
-    part = _most_varied_part(grid)
-    part_grid = replace(grid, t=grid.t[part], wrench=_wrench_rows(grid, part))
-    near = _poses_near(poses, part_grid)
-    cache = averaged_splines(near)
-    taper = _base_taper(grid, poses, lost, delay)[part] * end_taper(
-        part_grid.t, part_grid.t[0], part_grid.t[-1]
-    )
-    spacing, late = guess_spacing(cache, part_grid, taper, gravity, delay, top, known=known)
-    first = spectra_of(PoseSplines(near, spacing), part_grid, taper, gravity, late, top)
-    clear_taper = exclude(taper, find_disturbances(first, part_grid, taper, spacing)[0], grid.dt)
-    rate = 0.0
-    if not known:
-        rate = clock_rate(cache, part_grid, clear_taper, gravity, late, top, spacing)
+    whole = Window(grid, taper, gravity, top)
+    rows = _most_varied_part(grid)
+    part = whole.part(rows)
+    near_poses = _poses_near(poses, part.grid)
+    cache = averaged_splines(near_poses)
+    spacing, late = guess_spacing(part, cache, guess, known=known)
+    first = part.spectra(PoseSplines(near_poses, spacing), late)
+    disturbed = find_disturbances(first, spacing)[0]
+    part = replace(part, taper=exclude(part.taper, disturbed, grid.dt))
+    rate = 0.0 if known else clock_rate(part, cache, late, spacing)
     if rate:
-        near, poses = (at_rate(x, rate, part_grid, late) for x in (near, poses))
-        cache = averaged_splines(near)
-    first_spacing, agrees = spacing, True
-    choices = [cache]
+        near_poses, poses = (at_rate(x, rate, part.grid, late) for x in (near_poses, poses))
+        cache = averaged_splines(near_poses)
+    choices, agrees, imu_spacing = [cache], True, spacing
     if imu is not None:
-        imu_rows = compare_imu(PoseSplines(near, first_spacing), imu, gravity)
+        imu_rows = compare_imu(PoseSplines(near_poses, imu_spacing), imu, gravity)
         agrees = imu_rows is not None
         choices += [] if imu_rows is None else [SplineCache(cache.poses, imu_rows)]
-    chosen, spacing, late = choose_spacing(
-        choices, part_grid, clear_taper, gravity, late, top, known=known
-    )
+    chosen, spacing, late = choose_spacing(part, choices, late, known=known)
     imu_rows = chosen.imu_rows
-    if imu_rows is not None and imu is not None and len(near.t) < len(poses.t):
-        imu_rows = compare_imu(
-            PoseSplines(poses, first_spacing), imu, gravity
-        )  # of the whole record
-    last = spectra_of(chosen.at(spacing), part_grid, clear_taper, gravity, late, top)
-    return _SearchResult(PoseSplines(poses, spacing, imu_rows), last, rate, agrees)
-
-
-def _wrench_rows(grid: Grid, part: slice) -> Array:
-    return grid.wrench[part.start * grid.stride : part.stop * grid.stride]
+    if imu_rows is not None and imu is not None and len(near_poses.t) < len(poses.t):
+        imu_rows = compare_imu(PoseSplines(poses, imu_spacing), imu, gravity)
+    last = part.spectra(chosen.at(spacing), late)
+    return _FoundMotion(PoseSplines(poses, spacing, imu_rows), last, whole, rate, agrees)
 
 
 def _poses_near(poses: Poses, grid: Grid) -> Poses:
@@ -412,20 +391,9 @@ def _estimate_frame(free: RigidFit, start: State) -> Frame:
     turned = Rotation.from_matrix(start.R.T @ free.state.R).as_rotvec()
     change = np.concatenate([moved, turned])[known]
     wald = float(change @ np.linalg.solve(covariance[np.ix_(known, known)], change))
-    shift_deviation, angle_deviation = (
-        _length_deviation(moved, covariance[:3, :3]),
-        _length_deviation(turned, covariance[3:, 3:]),
-    )
-    shift, angle = np.linalg.norm(moved), np.linalg.norm(turned)
-    limit, largest_deviation = np.radians([MIN_ROTATION_DEG, MAX_ROTATION_DEVIATION_DEG])
-    shifted = (
-        shift > max(MIN_SHIFT, _MIN_DEVIATIONS * shift_deviation)
-        and shift_deviation < MAX_SHIFT_DEVIATION
-    )
-    tilted = (
-        angle > max(limit, _MIN_DEVIATIONS * angle_deviation)
-        and angle_deviation < largest_deviation
-    )
+    limits = np.radians([MIN_ROTATION_DEG, MAX_ROTATION_DEVIATION_DEG])
+    shifted = _is_significant(moved, covariance[:3, :3], MIN_SHIFT, MAX_SHIFT_DEVIATION)
+    tilted = _is_significant(turned, covariance[3:, 3:], *limits)
     return Frame(
         p_SoPo_S=origin,
         R_SP=R_SP,
@@ -437,9 +405,12 @@ def _estimate_frame(free: RigidFit, start: State) -> Frame:
     )
 
 
-def _length_deviation(x: Array, covariance: Array) -> float:
-    """Return the standard deviation of the length of x; inf if a part is undetermined."""
+def _is_significant(x: Array, covariance: Array, least: float, largest_deviation: float) -> bool:
+    """Return whether the length of x is determined, and larger than `least` and its noise."""
     if not np.isfinite(np.diag(covariance)).all():
-        return np.inf
-    direction = x / (np.linalg.norm(x) + 1e-300)
-    return float(np.sqrt(direction @ covariance @ direction))
+        return False
+    length = np.linalg.norm(x)
+    direction = x / (length + 1e-300)
+    deviation = float(np.sqrt(direction @ covariance @ direction))
+    significant = length > max(least, _MIN_DEVIATIONS * deviation)
+    return bool(significant and deviation < largest_deviation)

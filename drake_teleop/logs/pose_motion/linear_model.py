@@ -17,6 +17,7 @@ from drake_teleop.logs.pose_motion.spectra import (
     Grid,
     Levels,
     bands,
+    end_taper,
     moments,
     random_walk_shape,
     shift_taper,
@@ -173,6 +174,11 @@ class Spectra:
     taper: Array
     zeta: Array
 
+    @property
+    def reach(self) -> float:
+        """Largest change of the delay in a search [s]."""
+        return min(MAX_DELAY_CHANGE_S, 0.1 * float(self.grid.t[-1] - self.grid.t[0]))
+
     @cached_property
     def taper_fixed(self) -> bool:
         """Whether the taper excludes interior samples, or the load is known.
@@ -250,16 +256,31 @@ class Spectra:
         return replace(self, signals=signals, delay=delay, zeta=zeta)
 
 
-def spectra_of(
-    splines: PoseSplines, grid: Grid, taper: Array, gravity_W: Array, delay: float, top: float
-) -> Spectra:
-    """Return spectra of wrench and motion `delay` [s] later, up to `top` [Hz]."""
-    of = bands(grid, taper, top)
-    count = len(of.frequency)
-    zeta = splines.signals(grid.t + delay, gravity_W)
-    wrench = wrench_spectrum(grid, taper, count)
-    signals = signal_spectrum(grid, taper, zeta, count)
-    return Spectra(of, wrench, signals, delay, grid, taper, zeta)
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Record for a fit: grid, taper (M,), gravity (3,) [m/s^2] and highest frequency [Hz]."""
+
+    grid: Grid
+    taper: Array
+    gravity_W: Array
+    top: float
+
+    def part(self, rows: slice) -> Window:
+        """Return a part of the grid, with ramps at its ends."""
+        grid = self.grid
+        wrench = grid.wrench[rows.start * grid.stride : rows.stop * grid.stride]
+        grid = replace(grid, t=grid.t[rows], wrench=wrench)
+        taper = self.taper[rows] * end_taper(grid.t, grid.t[0], grid.t[-1])
+        return replace(self, grid=grid, taper=taper)
+
+    def spectra(self, splines: PoseSplines, delay: float) -> Spectra:
+        """Return spectra of the wrench and of the motion `delay` [s] later."""
+        of = bands(self.grid, self.taper, self.top)
+        count = len(of.frequency)
+        zeta = splines.signals(self.grid.t + delay, self.gravity_W)
+        wrench = wrench_spectrum(self.grid, self.taper, count)
+        signals = signal_spectrum(self.grid, self.taper, zeta, count)
+        return Spectra(of, wrench, signals, delay, self.grid, self.taper, zeta)
 
 
 def best_delay(
@@ -284,7 +305,7 @@ def best_delay(
 
 def delay_deviation(spectra: Spectra) -> float:
     """Return the standard deviation of the delay [s]; inf if undetermined."""
-    reach = min(MAX_DELAY_CHANGE_S, 0.1 * float(spectra.grid.t[-1] - spectra.grid.t[0]))
+    reach = spectra.reach
     beside = np.array([-_FINE_STEP_S, 0.0, _FINE_STEP_S])
     left, least, right = spectra.costs(spectra.delay + beside)
     far = spectra.costs(spectra.delay + np.arange(-reach, reach, _COARSE_STEP_S))
@@ -295,50 +316,36 @@ def delay_deviation(spectra: Spectra) -> float:
 
 
 def guess_spacing(
-    cache: SplineCache,
-    grid: Grid,
-    taper: Array,
-    gravity_W: Array,
-    delay: float,
-    top: float,
-    *,
-    known: bool = False,
+    window: Window, cache: SplineCache, delay: float, *, known: bool
 ) -> tuple[float, float]:
     """Return knot distance and delay of lowest cost on a coarse grid."""
-    reach = min(MAX_DELAY_CHANGE_S, 0.1 * float(grid.t[-1] - grid.t[0]))
     spacings, found = _allowed_spacings(cache)[::2], []
-    start = spectra_of(cache.at(spacings[0]), grid, taper, gravity_W, delay, top)
+    start = window.spectra(cache.at(spacings[0]), delay)
     for h in spacings:
-        spectra = start.with_motion(cache.at(h), gravity_W, delay)
-        late, cost = (
-            (delay, spectra.fit().cost) if known else best_delay(spectra, reach, _FINE_STEP_S)
-        )
+        spectra = start.with_motion(cache.at(h), window.gravity_W, delay)
+        if known:
+            found.append((spectra.fit().cost, h, delay))
+            continue
+        late, cost = best_delay(spectra, spectra.reach, _FINE_STEP_S)
         found.append((cost, h, late))
     return min(found)[1:]
 
 
 def choose_spacing(
-    choices: Sequence[SplineCache],
-    grid: Grid,
-    taper: Array,
-    gravity_W: Array,
-    delay: float,
-    top: float,
-    *,
-    known: bool = False,
+    window: Window, choices: Sequence[SplineCache], delay: float, *, known: bool
 ) -> tuple[SplineCache, float, float]:
     """Return the choice, knot distance [s] and delay [s] of lowest cost.
 
     Knots are slightly closer than at the minimum, because fits do not compensate for motion that
     the splines miss.
     """
-    start = spectra_of(choices[0].at(SPACINGS[0]), grid, taper, gravity_W, delay, top)
+    start = window.spectra(choices[0].at(SPACINGS[0]), delay)
     found = []
     for cache in choices:
         spacings = _allowed_spacings(cache)
 
         def cost(h: float, cache: SplineCache = cache) -> float:
-            return start.with_motion(cache.at(h), gravity_W, delay).fit().cost
+            return start.with_motion(cache.at(h), window.gravity_W, delay).fit().cost
 
         costs = [(cost(h), h) for h in spacings]
         middle = min(costs)[1]
@@ -346,10 +353,10 @@ def choose_spacing(
         found.append(min(costs + [(cost(h), h) for h in between]))
     least = min(range(len(found)), key=lambda k: found[k])
     cache = choices[least]
-    finer = _SPACING_FACTOR if grid.load is None else _SPACING_FACTOR_OF_LOAD
+    finer = _SPACING_FACTOR if window.grid.load is None else _SPACING_FACTOR_OF_LOAD
     best = max(finer * found[least][1], MIN_POSES_PER_KNOT / cache.rate)
     if not known:
-        last = start.with_motion(cache.at(best), gravity_W, delay)
+        last = start.with_motion(cache.at(best), window.gravity_W, delay)
         delay, _ = best_delay(last, 3 * _COARSE_STEP_S)
     return cache, best, delay
 

@@ -22,17 +22,16 @@ _MIN_MARGIN_S = 0.1
 """Least margin of a rejected stretch [s]."""
 
 
-def find_disturbances(
-    spectra: Spectra, grid: Grid, taper: Array, spacing: float
-) -> tuple[NDArray[np.bool_], str]:
+def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
     """Return (M,) flags of disturbed instants, and a note for the user.
 
     For an identified load only the offsets are fitted.
     """
     # A Gaussian gain, one half at `_PASSED_SHARE` / h, does not ring.
     gain = 0.5 ** ((spectra.of.frequency * spacing / _PASSED_SHARE) ** 2)
+    grid = spectra.grid
     x, y = (_in_time(s * gain[:, None], grid) for s in (spectra.signals, spectra.wrench))
-    inside = taper > 0.5
+    inside = spectra.taper > 0.5
     size = np.sqrt(np.mean(x**2, axis=0))
     used = size > 1e-9 * size[0]
     if grid.load is None:
