@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,21 +16,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.writing import write_table
 from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.read.clocks import MIN_RATE_HZ
-from drake_teleop.logs.read.description import (
-    Acceleration,
-    AngularAcceleration,
-    AngularVelocity,
-    Description,
-    Force,
-    Imu,
-    Orientation,
-    Pose,
-    Position,
-    Static,
-    Time,
-    Torque,
-    Wrench,
-)
+from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.logs.read.tables import Table
 
@@ -40,18 +26,25 @@ ANGULAR_VELOCITY = ("omega_x", "omega_y", "omega_z")
 ANGULAR_ACCELERATION = ("alpha_x", "alpha_y", "alpha_z")
 ORIENTATION = ("q_w", "q_x", "q_y", "q_z")
 POSITION = ("p_x", "p_y", "p_z")
+_KINEMATICS = {
+    "specific_force": SPECIFIC_FORCE,
+    "angular_velocity": ANGULAR_VELOCITY,
+    "angular_acceleration": ANGULAR_ACCELERATION,
+    "orientation": ORIENTATION,
+    "position": POSITION,
+}
 _MAX_REST_SPEED = 0.05  # rad/s
 _MIN_TURN = np.radians(10.0)
-_ARRAY_FIELDS = (
-    "t",
-    "wrench",
-    "specific_force",
-    "angular_velocity",
-    "angular_acceleration",
-    "gravity",
-    "bridged",
-    "R_WS",
-)
+_ROW_SHAPES: dict[str, tuple[int, ...]] = {
+    "t": (),
+    "wrench": (6,),
+    "specific_force": (3,),
+    "angular_velocity": (3,),
+    "angular_acceleration": (3,),
+    "gravity": (3,),
+    "bridged": (),
+    "R_WS": (3, 3),
+}
 
 
 @dataclass(frozen=True)
@@ -102,19 +95,8 @@ class Log:
     resolution: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        n = len(self.t)
-        shapes = {
-            "t": (n,),
-            "wrench": (n, 6),
-            "specific_force": (n, 3),
-            "angular_velocity": (n, 3),
-            "angular_acceleration": (n, 3),
-            "gravity": (n, 3),
-            "bridged": (n,),
-            "R_WS": (n, 3, 3),
-        }
-        for name, shape in shapes.items():
-            value = getattr(self, name)
+        for name, row_shape in _ROW_SHAPES.items():
+            value, shape = getattr(self, name), (len(self.t), *row_shape)
             if value is None:
                 continue
             if np.shape(value) != shape:
@@ -148,7 +130,7 @@ class Log:
         """Return the log with the selected rows."""
         if not isinstance(rows, slice) and rows.all():
             return self
-        arrays = {name: getattr(self, name) for name in _ARRAY_FIELDS}
+        arrays = {name: getattr(self, name) for name in _ROW_SHAPES}
         selected: dict[str, Any] = {k: None if x is None else x[rows] for k, x in arrays.items()}
         return replace(self, **selected)
 
@@ -195,52 +177,38 @@ def describe_canonical(path: Path, table: Table) -> Description:
             remedy="describe it in a YAML file (docs/logs.md); `drake-teleop inspect` drafts one",
         )
     table.numbers(WRENCH, 6, str(path))
-    s, omega, alpha, q, p = (
-        present(names)
-        for names in (SPECIFIC_FORCE, ANGULAR_VELOCITY, ANGULAR_ACCELERATION, ORIENTATION, POSITION)
-    )
-    force, torque = Force(columns=WRENCH[:3]), Torque(columns=WRENCH[3:])
-    orientation = Orientation(columns=ORIENTATION, form="quaternion_wxyz") if q else None
-    specific_force = Acceleration(columns=SPECIFIC_FORCE) if s else None
-    if _at_rest(table, s, omega, q):
-        kinematics = {"orientation": orientation} if q else {"specific_force": specific_force}
-        return Description(static=Static(file=path, force=force, torque=torque, **kinematics))
-    if not q and not (s and omega):
-        missing = "s_x s_y s_z" if not s else "omega_x omega_y omega_z"
+    fields: dict[str, dict[str, Any]] = {
+        name: {"columns": names} for name, names in _KINEMATICS.items() if present(names)
+    }
+    if "orientation" in fields:
+        fields["orientation"]["form"] = "quaternion_wxyz"
+    wrench = {"file": path, "force": {"columns": WRENCH[:3]}, "torque": {"columns": WRENCH[3:]}}
+    if _at_rest(table, fields):
+        kinematics = "orientation" if "orientation" in fields else "specific_force"
+        return Description.model_validate({"static": wrench | {kinematics: fields[kinematics]}})
+    if "orientation" not in fields and not {"specific_force", "angular_velocity"} <= fields.keys():
+        missing = ANGULAR_VELOCITY if "specific_force" in fields else SPECIFIC_FORCE
         raise DrakeTeleopError(
-            f"a wrench without kinematics: no columns {missing}",
+            f"a wrench without kinematics: no columns {' '.join(missing)}",
             where=str(path),
             remedy="add them, or the pose q_w q_x q_y q_z (and p_x p_y p_z)",
         )
     table.raw("t", str(path))
-    time = Time(column="t")
-    imu = pose = None
-    if s or omega:
-        imu = Imu(
-            file=path,
-            time=time,
-            specific_force=specific_force,
-            angular_velocity=AngularVelocity(columns=ANGULAR_VELOCITY) if omega else None,
-            angular_acceleration=AngularAcceleration(columns=ANGULAR_ACCELERATION)
-            if alpha
-            else None,
-        )
-    if orientation is not None:
-        pose = Pose(
-            file=path,
-            time=time,
-            orientation=orientation,
-            position=Position(columns=POSITION) if p else None,
-        )
-    wrench = Wrench(file=path, time=time, force=force, torque=torque)
-    return Description(wrench=wrench, imu=imu, pose=pose)
+    stream = {"file": path, "time": {"column": "t"}}
+    streams: dict[str, Any] = {"wrench": wrench | stream}
+    pose = {name: fields.pop(name) for name in ("orientation", "position") if name in fields}
+    if {"specific_force", "angular_velocity"} & fields.keys():
+        streams["imu"] = stream | fields
+    if "orientation" in pose:
+        streams["pose"] = stream | pose
+    return Description.model_validate(streams)
 
 
-def _at_rest(table: Table, s: bool, omega: bool, q: bool) -> bool:
-    where = str(table.path)
-    if not (s or q):
+def _at_rest(table: Table, fields: Container[str]) -> bool:
+    where, q = str(table.path), "orientation" in fields
+    if not q and "specific_force" not in fields:
         return False
-    if omega:
+    if "angular_velocity" in fields:
         speed = table.numbers(ANGULAR_VELOCITY, 3, where)
         if np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED:
             return False

@@ -17,23 +17,28 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
 from drake_teleop.logs.read.description_fields import (
+    Acceleration,
+    AngularAcceleration,
+    AngularVelocity,
     Column,
+    Force,
     Frame,
     GainStd,
     Gravity,
     ImuFrame,
     Number,
+    Position,
     PositionOrAuto,
     RotationOrAuto,
-    Scale,
-    Vector,
+    Strict,
+    Torque,
     Weight,
 )
 
@@ -65,19 +70,7 @@ UNITS = {
 """SI value of each unit, except "g", the magnitude of the described gravity."""
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _limit_size(cls, value: Any) -> Any:
-        for number in value if isinstance(value, list) else [value]:
-            if isinstance(number, (int, float)) and 1e12 < abs(number) < np.inf:
-                raise ValueError(f"{number:g} is beyond 1e12")
-        return value
-
-
-class Time(_Strict):
+class Time(Strict):
     """Time of the rows of a stream: a column of stamps or a nominal rate."""
 
     column: Column | None = None
@@ -100,57 +93,13 @@ class Time(_Strict):
         return self
 
 
-class _Quantity(_Strict):
-    columns: tuple[Column, ...]
-    scale: Scale = (1.0, 1.0, 1.0)
-
-
-class Force(_Quantity):
-    """Columns of a force and their unit."""
-
-    unit: Literal["N", "lbf"] = "N"
-
-
-class Torque(_Quantity):
-    """Columns of a torque and their unit."""
-
-    unit: Literal["N m", "N mm", "lbf in"] = "N m"
-
-
-class Acceleration(_Quantity):
-    """Columns of a linear acceleration, their unit and bias."""
-
-    unit: Literal["m/s^2", "g", "mm/s^2"] = "m/s^2"
-    bias: Vector = (0.0, 0.0, 0.0)
-
-
-class AngularVelocity(_Quantity):
-    """Columns of an angular velocity, their unit and bias."""
-
-    unit: Literal["rad/s", "deg/s"] = "rad/s"
-    bias: Vector = (0.0, 0.0, 0.0)
-
-
-class AngularAcceleration(_Quantity):
-    """Columns of an angular acceleration, their unit and bias."""
-
-    unit: Literal["rad/s^2", "deg/s^2"] = "rad/s^2"
-    bias: Vector = (0.0, 0.0, 0.0)
-
-
-class Orientation(_Strict):
+class Orientation(Strict):
     """Orientation R_WS of S, or of the stream's frame if `frame` is a rotation."""
 
     columns: tuple[Column, ...]
     form: Literal["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector"]
     unit: Literal["rad", "deg"] = "rad"
     inverse: bool = Field(default=False, description="the columns hold R_SW, the world in S")
-
-
-class Position(_Quantity):
-    """Columns of a position and their unit."""
-
-    unit: Literal["m", "mm"] = "m"
 
 
 def _axis_columns(group: str, axes: str = "xyz") -> list[str]:
@@ -167,7 +116,7 @@ _TOPIC_DEFAULTS: dict[str, dict[str, Any]] = {
 }
 
 
-class _Stream(_Strict):
+class _Stream(Strict):
     file: Path
     header: bool = True
 
@@ -322,7 +271,7 @@ class Static(_Stream):
         return self
 
 
-class Description(_Strict):
+class Description(Strict):
     """Description of a log: a wrench with imu, pose or both; or static poses."""
 
     gravity: Gravity = (0.0, 0.0, -STANDARD_GRAVITY)

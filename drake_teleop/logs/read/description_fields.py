@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, WithJsonSchema
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, field_validator
 
 from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
 
@@ -113,3 +113,61 @@ ImuFrame = Annotated[
 ]
 RotationOrAuto = Annotated[Literal["auto"] | Rotation | None, BeforeValidator(_parse_rotation)]
 PositionOrAuto = Annotated[Vector | Literal["auto"], BeforeValidator(_parse_position)]
+
+
+class Strict(BaseModel):
+    """Frozen model without unknown fields, and with numbers of at most 1e12."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _limit_size(cls, value: Any) -> Any:
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, (int, float)) and 1e12 < abs(number) < np.inf:
+                raise ValueError(f"{number:g} is beyond 1e12")
+        return value
+
+
+class _Quantity(Strict):
+    columns: tuple[Column, ...]
+    scale: Scale = (1.0, 1.0, 1.0)
+
+
+class Force(_Quantity):
+    """Columns of a force and their unit."""
+
+    unit: Literal["N", "lbf"] = "N"
+
+
+class Torque(_Quantity):
+    """Columns of a torque and their unit."""
+
+    unit: Literal["N m", "N mm", "lbf in"] = "N m"
+
+
+class Acceleration(_Quantity):
+    """Columns of a linear acceleration, their unit and bias."""
+
+    unit: Literal["m/s^2", "g", "mm/s^2"] = "m/s^2"
+    bias: Vector = (0.0, 0.0, 0.0)
+
+
+class AngularVelocity(_Quantity):
+    """Columns of an angular velocity, their unit and bias."""
+
+    unit: Literal["rad/s", "deg/s"] = "rad/s"
+    bias: Vector = (0.0, 0.0, 0.0)
+
+
+class AngularAcceleration(_Quantity):
+    """Columns of an angular acceleration, their unit and bias."""
+
+    unit: Literal["rad/s^2", "deg/s^2"] = "rad/s^2"
+    bias: Vector = (0.0, 0.0, 0.0)
+
+
+class Position(_Quantity):
+    """Columns of a position and their unit."""
+
+    unit: Literal["m", "mm"] = "m"

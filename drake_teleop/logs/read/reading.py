@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,6 @@ from drake_teleop.logs.read.description import (
     NO_YAML,
     Description,
     Imu,
-    Orientation,
     Pose,
     Static,
     Wrench,
@@ -40,8 +39,10 @@ from drake_teleop.logs.read.gravity import describe_gravity, restore_weight, wei
 from drake_teleop.logs.read.rotations import nearest_rotation, quaternions, rotation_matrices
 from drake_teleop.logs.read.streams import (
     MAX_VALUES,
+    MINIMUM_SAMPLES,
     Orientations,
     Stream,
+    common_time,
     in_S,
     move_to_So,
     on_clock,
@@ -49,11 +50,11 @@ from drake_teleop.logs.read.streams import (
 )
 from drake_teleop.logs.read.tables import FORMATS, Table, decimal_step, read_table
 
-MINIMUM_SAMPLES = 16
 MINIMUM_POSES = 3
 _MIN_BANDWIDTH_HZ = 1e-3
 _CHUNK_ROWS = 2**16
 _GAP_RATIO = 4.0
+_Describe = Callable[..., tuple[Description, tuple[str, ...]]]
 
 
 def read_log(
@@ -130,25 +131,28 @@ class _Reader:
             return self._static(self._description.static)
         assert self._description.wrench is not None
         weight = self._description.wrench.weight
-        parts = {"gravity": self._description.gravity == "auto", "weight": weight == "removed"}
-        free = tuple(name for name, known in parts.items() if known)
+        causes = {"gravity": self._description.gravity == "auto", "weight": weight == "removed"}
+        free = tuple(name for name, is_free in causes.items() if is_free)
         if self._description.gravity == "auto":
             self._replace_auto(describe_gravity)
         if self._description.pose is not None and self._description.pose.automatic:
             self._replace_auto(describe_pose_frame, differentiate=False)
         if self._description.imu is not None and self._description.imu.automatic:
             self._replace_auto(describe_mounting)
-        wrench_t, wrench = self._wrench(self._description.wrench)
+        table = self._table(self._description.wrench)
+        clock = self._clock("wrench", self._description.wrench, table)
+        forces = self._forces("wrench", self._description.wrench, table, clock.total)
+        wrench_t, wrench = clock.t, clock.select(forces)
         pose = imu = None
         if self._description.pose is not None:
             pose = self._pose(self._description.pose, differentiate=differentiate)
         if self._description.imu is not None:
             imu = self._imu(self._description.imu, pose)
         streams = [stream for stream in (imu, pose) if stream is not None]
-        t = self._common_time(wrench_t, streams)
+        t = common_time(wrench_t, streams, self._source)
         log = self._assemble(t, resample(t, wrench_t, wrench), imu, pose)
-        log = replace(log, gain_std=self._description.wrench.gain_std, free=free)
-        log = replace(log, described=self._description)
+        gain_std = self._description.wrench.gain_std
+        log = replace(log, gain_std=gain_std, free=free, described=self._description)
         if pose is not None and pose.raw is not None:
             inertial = None if imu is None else imu.inertial
             log = replace(log, posed=self._description.posed(pose.raw, inertial))
@@ -159,12 +163,7 @@ class _Reader:
         other = self._description.model_copy(update={"wrench": without})
         return restore_weight(log, np.array(weight), self._read_other(other))
 
-    def _replace_auto(
-        self,
-        describe: Callable[..., tuple[Description, tuple[str, ...]]],
-        *,
-        differentiate: bool = True,
-    ) -> None:
+    def _replace_auto(self, describe: _Describe, *, differentiate: bool = True) -> None:
         """Replace `auto` by the estimates of `describe`."""
         self._description, notes = describe(
             self._description, self._source, partial(self._read_other, differentiate=differentiate)
@@ -183,11 +182,6 @@ class _Reader:
         if stream.source not in self._tables:
             self._tables[stream.source] = read_stream(stream)
         return self._tables[stream.source]
-
-    def _wrench(self, stream: Wrench) -> tuple[Array, Array]:
-        table = self._table(stream)
-        clock = self._clock("wrench", stream, table)
-        return clock.t, clock.select(self._forces("wrench", stream, table, clock.total))
 
     def _forces(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
         both = [
@@ -249,7 +243,10 @@ class _Reader:
         if stream.position is not None:
             position = self._vectors("pose", "position", stream.position, table, clock.total)
             position = clock.select(position)
-        orientations = self._orientations("pose", stream.orientation, table, clock.total)
+        where = f"{self._source}:pose.orientation"
+        orientations = Orientations(
+            self._description, stream.orientation, table, clock.total, where
+        )
         quaternion = np.empty((len(clock.rows), 4))
         origin = np.array(stream.position_in_sensor)
         for start in range(0, len(quaternion), _CHUNK_ROWS):
@@ -302,12 +299,15 @@ class _Reader:
         if frame == "sensor":
             return vectors
         if pose is None or pose.R_WS is None:
-            raise DrakeTeleopError(
-                "base axes cannot be turned to S without an orientation",
-                where=f"{self._source}:{name}.frame",
-                remedy="add a pose stream",
-            )
+            raise self._no_orientation(name)
         return in_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
+
+    def _no_orientation(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
+        return DrakeTeleopError(
+            "base axes cannot be turned to S without an orientation",
+            where=f"{self._source}:{name}.frame",
+            remedy=remedy,
+        )
 
     def _static(self, stream: Static) -> Log:
         table = self._table(stream)
@@ -320,17 +320,17 @@ class _Reader:
             gravity = -s
         else:
             assert stream.orientation is not None
-            orientations = self._orientations("static", stream.orientation, table, table.rows)
+            where = f"{self._source}:static.orientation"
+            orientations = Orientations(
+                self._description, stream.orientation, table, table.rows, where
+            )
             R_WS = orientations.rotations(np.arange(table.rows))
             R_SW = np.swapaxes(R_WS, 1, 2)
             gravity = R_SW @ self._description.gravity_W
         if stream.frame == "base":
             if R_SW is None:
-                raise DrakeTeleopError(
-                    "base axes cannot be turned to S without an orientation",
-                    where=f"{self._source}:static.frame",
-                    remedy="give static.orientation instead of gravity or specific_force",
-                )
+                remedy = "give static.orientation instead of gravity or specific_force"
+                raise self._no_orientation("static", remedy)
             wrench = wrench_in_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
             wrench = wrench + weight_wrench(np.array(stream.weight), gravity)
@@ -342,13 +342,14 @@ class _Reader:
                 remedy=f"record at least {MINIMUM_POSES}, better 12, with different orientations",
             )
         rest = np.zeros((n, 3))
-        motion = (-gravity, rest, rest)
-        notes = tuple(self._notes)
-        index = np.arange(float(n))
-        log = Log(index, wrench, *motion, gravity, True, notes=notes, source=self._source)
-        resolution = self._resolution(stream, table)
-        described = self._description
-        return replace(log, gain_std=stream.gain_std, described=described, resolution=resolution)
+        return Log(
+            *(np.arange(float(n)), wrench, -gravity, rest, rest, gravity, True),
+            notes=tuple(self._notes),
+            source=self._source,
+            gain_std=stream.gain_std,
+            described=self._description,
+            resolution=self._resolution(stream, table),
+        )
 
     def _resolution(self, stream: Static, table: Table) -> tuple[float, float]:
         """Return the steps of force and torque [N, N m]."""
@@ -397,39 +398,6 @@ class _Reader:
     def _extend_one_sided(self, dt: float) -> None:
         self._one_sided_s = max(self._one_sided_s, self._half_window(dt))
 
-    def _orientations(
-        self, name: str, orientation: Orientation, table: Table, rows: int
-    ) -> Orientations:
-        where = f"{self._source}:{name}.orientation"
-        return Orientations(self._description, orientation, table, rows, where)
-
-    def _common_time(self, wrench_t: Array, streams: Sequence[Stream]) -> Array:
-        """Return uniform times at the wrench's rate that all streams cover."""
-        start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
-        stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])
-        spans = "; ".join(
-            f"{name} {t[0]:.6g} to {t[-1]:.6g} s"
-            for name, t in [("wrench", wrench_t), *((s.name, s.t) for s in streams)]
-        )
-        if stop <= start:
-            raise DrakeTeleopError(
-                f"the streams do not overlap in time ({spans})",
-                where=self._source,
-                remedy="check time.unit of each stream, or shift its clock by time.offset",
-            )
-        uniform = uniform_times(wrench_t)
-        dt = spacing(uniform)
-        # Rounding of the clocks must not exclude the first and last sample.
-        inside = (uniform >= start - 1e-6 * dt) & (uniform <= stop + 1e-6 * dt)
-        t = uniform[inside]
-        if len(t) < MINIMUM_SAMPLES:
-            raise DrakeTeleopError(
-                f"the streams have only {len(t)} samples in common ({spans})",
-                where=self._source,
-                remedy=f"record at least {MINIMUM_SAMPLES}, or check time.offset",
-            )
-        return t
-
     def _assemble(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
         def signal(field: str) -> Array:
             for stream in (imu, pose):
@@ -438,15 +406,21 @@ class _Reader:
                     return on_clock(t, stream, values)
             return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
-        gravity, R_WS = None, None
+        gravity = R_WS = None
+        described, described_pose = self._description.wrench, self._description.pose
+        in_base = described is not None and described.frame == "base"
         if pose is not None and pose.R_WS is not None:
             R_WS = nearest_rotation(on_clock(t, pose, pose.R_WS))
             gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
-            described = self._description.wrench
-            if described is not None and described.frame == "base":
+            if in_base:
                 wrench = wrench_in_S(np.swapaxes(R_WS, 1, 2), wrench)
-        self._check_base_wrench(pose)
-        self._note_missing_acceleration(imu)
+        if in_base and pose is None:
+            raise self._no_orientation("wrench")
+        accelerometer = imu is not None and imu.specific_force is not None
+        if not accelerometer and described_pose and described_pose.position is None:
+            self._notes.append(
+                "neither accelerometer nor position: the acceleration of S is taken as zero"
+            )
         return Log(
             *(t, wrench, signal("specific_force"), signal("angular_velocity")),
             signal("angular_acceleration"),
@@ -473,19 +447,3 @@ class _Reader:
                 remedy="record without interruptions",
             )
         return flags
-
-    def _check_base_wrench(self, pose: Stream | None) -> None:
-        described = self._description.wrench
-        if described is not None and described.frame == "base" and pose is None:
-            raise DrakeTeleopError(
-                "base axes cannot be turned to S without an orientation",
-                where=f"{self._source}:wrench.frame",
-                remedy="add a pose stream",
-            )
-
-    def _note_missing_acceleration(self, imu: Stream | None) -> None:
-        posed = self._description.pose
-        if (imu is None or imu.specific_force is None) and posed and posed.position is None:
-            self._notes.append(
-                "neither accelerometer nor position: the acceleration of S is taken as zero"
-            )

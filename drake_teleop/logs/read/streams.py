@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
-from drake_teleop.logs.read.alignment import low_pass, resample, spacing
+from drake_teleop.logs.read.alignment import low_pass, resample, spacing, uniform_times
 from drake_teleop.logs.read.description import Description, Orientation
 from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
 from drake_teleop.logs.read.rotations import (
@@ -22,6 +23,7 @@ from drake_teleop.logs.read.rotations import (
 )
 from drake_teleop.logs.read.tables import Table
 
+MINIMUM_SAMPLES = 16
 MAX_VALUES = {
     "force": (1e6, "N"),
     "torque": (1e6, "N m"),
@@ -137,3 +139,31 @@ class Orientations:
                 where=self._where,
                 remedy=f"check the columns and their order; form is {self._orientation.form}",
             )
+
+
+def common_time(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
+    """Return uniform times at the wrench's rate that all streams cover."""
+    start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
+    stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])
+    spans = "; ".join(
+        f"{name} {t[0]:.6g} to {t[-1]:.6g} s"
+        for name, t in [("wrench", wrench_t), *((s.name, s.t) for s in streams)]
+    )
+    if stop <= start:
+        raise DrakeTeleopError(
+            f"the streams do not overlap in time ({spans})",
+            where=source,
+            remedy="check time.unit of each stream, or shift its clock by time.offset",
+        )
+    uniform = uniform_times(wrench_t)
+    dt = spacing(uniform)
+    # Rounding of the clocks must not exclude the first and last sample.
+    inside = (uniform >= start - 1e-6 * dt) & (uniform <= stop + 1e-6 * dt)
+    t = uniform[inside]
+    if len(t) < MINIMUM_SAMPLES:
+        raise DrakeTeleopError(
+            f"the streams have only {len(t)} samples in common ({spans})",
+            where=source,
+            remedy=f"record at least {MINIMUM_SAMPLES}, or check time.offset",
+        )
+    return t
