@@ -320,7 +320,7 @@ def test_the_draft_of_a_bag_without_wrenches_has_none(tmp_path: Path) -> None:
             ["run1", "does not say", "`drake-teleop inspect` drafts"],
         ),
         ("wrench", {"file": "none.mcap"}, ["none.mcap", "no such file"]),
-        ("wrench", {"file": "log.yaml"}, ["is no bag", "metadata.yaml"]),
+        ("wrench", {"file": "log.yaml"}, ["is not a bag", "metadata.yaml"]),
         ("wrench", {"file": "broken.mcap"}, ["broken.mcap", "cannot be read"]),
         ("wrench", {"file": "broken.bag"}, ["broken.bag", "cannot be read"]),
         ("wrench", {"file": "broken"}, ["cannot be read"]),
@@ -385,7 +385,7 @@ def test_a_bag_that_unpacks_to_too_much_is_one_line(
     assert path.stat().st_size < size / 100
     monkeypatch.setattr(bags, "_MAX_UNPACK_RATIO", 1 if limit == "_MAX_UNPACKED_BYTES" else 10**6)
     monkeypatch.setattr(bags, limit, 40_000_000)
-    with pytest.raises(DrakeTeleopError, match="unpacks to more than can be read; cut it"):
+    with pytest.raises(DrakeTeleopError, match="its uncompressed size is too large; cut it"):
         read_topic(path, "/x")
     assert resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY
 

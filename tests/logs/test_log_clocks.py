@@ -50,13 +50,13 @@ def test_five_hertz_are_enough() -> None:
 def test_rows_without_a_stamp_are_left_out() -> None:
     clock = clock_of([0.0, 0.1, NAN, NAN, 0.4, 0.5])
     assert clock.rows.tolist() == [0, 1, 4, 5] and clock.total == 6
-    assert clock.notes == ("2 rows without a time stamp are left out",)
+    assert clock.notes == ("2 rows without a time stamp are removed",)
 
 
 def test_rows_that_are_repeated_with_their_stamp_are_left_out() -> None:
     clock = clock_of([0.0, 0.1, 0.1, 0.1, 0.2, 0.3], [1, 2, 2, 2, NAN, 5])
     assert clock.rows.tolist() == [0, 1, 4, 5]
-    assert "2 rows that repeat the one before" in clock.notes[0]
+    assert "2 rows that repeat the previous row" in clock.notes[0]
     blank = clock_of([0.0, 0.1, 0.1, 0.2], [1, NAN, NAN, 2])
     assert blank.rows.tolist() == [0, 1, 3]
 
@@ -64,7 +64,7 @@ def test_rows_that_are_repeated_with_their_stamp_are_left_out() -> None:
 @pytest.mark.parametrize(
     ("stamps", "time", "words"),
     [
-        ([0, 0.1, 0.2, 0.15, 0.3], {}, "1 time stamps go back, the first is row 5 of log.csv, by"),
+        ([0, 0.1, 0.2, 0.15, 0.3], {}, "1 time stamps decrease, the first in row 5 of log.csv, by"),
         ([0.1] * 9, {}, "the time stamps of log.csv never increase; name another column"),
         ([NAN] * 9, {}, "no finite number in 9 rows"),
         (np.arange(9.0), {}, "a rate of 1 Hz; probably `unit: ms`"),
@@ -75,7 +75,7 @@ def test_rows_that_are_repeated_with_their_stamp_are_left_out() -> None:
         (np.arange(9.0) * 0.21, {"unit": "s"}, "a rate of 4.76 Hz; probably `unit: ms`"),
         (np.arange(9.0) * 20, {"unit": "s"}, "a rate of 0.05 Hz; probably `unit: ms`"),
         ([0, 0.01, 0.02, 0.03, 99, 99.01], {}, "longest 99 s to row 6 of log.csv; cut the log"),
-        ([*np.arange(200) * 0.01, *[2.0] * 400, 2.01], {}, "stand still around row 2"),
+        ([*np.arange(200) * 0.01, *[2.0] * 400, 2.01], {}, "do not increase around row 2"),
     ],
 )
 def test_stamps_that_nothing_can_be_made_of(stamps: object, time: dict, words: str) -> None:

@@ -62,7 +62,7 @@ BASE = yaml.safe_load(THREE_INSTRUMENTS)
         (("pose", "orientation", "form"), "euler", ["pose.orientation.form", "'matrix'"]),
         (("gravity",), "down", ["gravity"]),
         (("wrench",), None, ["no wrench"]),
-        (("pose",), None, ["nothing gives the angular velocity", "imu.angular_velocity"]),
+        (("pose",), None, ["the angular velocity is missing", "imu.angular_velocity"]),
         (("wrench", "file"), None, ["wrench.file"]),
     ],
 )
@@ -85,7 +85,7 @@ def test_errors_name_file_and_field(
         ("", ["holds no fields"]),
         ("static: {}", ["static.file: is missing", "add file"]),
         (yaml.safe_dump({"wrench": BASE["wrench"]}), ["without kinematics", "add imu or pose"]),
-        (AT_REST + THREE_INSTRUMENTS.replace("gravity: 9.82 ", "#"), ["stand alone"]),
+        (AT_REST + THREE_INSTRUMENTS.replace("gravity: 9.82 ", "#"), ["cannot be combined"]),
     ],
 )
 def test_files_that_are_no_descriptions(tmp_path: Path, text: str, words: list[str]) -> None:

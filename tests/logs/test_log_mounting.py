@@ -214,7 +214,7 @@ def test_a_load_that_touches_something_tells_nothing() -> None:
     tables[Path("w")] = replace(
         tables[Path("w")], columns=tables[Path("w")].columns | {"f": touched}
     )
-    with pytest.raises(DrakeTeleopError, match="nothing tells the place of the accelerometer"):
+    with pytest.raises(DrakeTeleopError, match="determine the position of the accelerometer"):
         read_description(described(pose=False, position="auto"), "log.yaml", tables=tables)
 
 

@@ -104,9 +104,9 @@ def test_orientation_alone_is_taken_for_slow_motion_and_says_so(tmp_path: Path) 
         (lambda f: f.head(15), "15 samples in log.csv are too few"),
         (
             lambda f: f.with_columns(t=pl.col("t").reverse()),
-            "1499 time stamps go back, the first is row 3",
+            "1499 time stamps decrease, the first in row 3",
         ),
-        (lambda f: pl.concat([f[:9], f[4:]]), "1 time stamps go back, the first is row 11"),
+        (lambda f: pl.concat([f[:9], f[4:]]), "1 time stamps decrease, the first in row 11"),
         (lambda f: f.with_columns(s_x=pl.lit("?")), "log.csv:s_x: '?' in row 2 is not a number"),
         (lambda f: f.with_columns(f_x=pl.lit(float("nan"))), "no finite number in 1500 rows"),
     ],
@@ -394,7 +394,7 @@ def test_a_canonical_table_of_poses_at_rest(
         values["t"] = np.arange(len(g_S)) / rate
     pl.DataFrame(values).write_csv(tmp_path / "log.csv")
     log = read_log(tmp_path / "log.csv")
-    assert log.static and log.notes == ("each row is taken for a pose at rest",)
+    assert log.static and log.notes == ("each row is interpreted as a pose at rest",)
     assert log.gravity is not None
     np.testing.assert_allclose(log.gravity, g_S, atol=1e-9)
     np.testing.assert_allclose(log.wrench[:, :3], -2 * g_S, atol=1e-9)

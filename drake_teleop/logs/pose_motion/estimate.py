@@ -75,7 +75,6 @@ class Frame:
         R_SP: (3, 3) rotation.
         position_deviations: (3,) standard deviations [m]; inf if undetermined.
         turn_deviations_deg: (3,) about the axes of S [deg].
-        wald: statistic of the change; chi-square (6) without one.
         shifted: whether the origin differs from the description.
         turned: whether the axes differ.
     """
@@ -84,7 +83,6 @@ class Frame:
     R_SP: Array
     position_deviations: Array
     turn_deviations_deg: Array
-    wald: float
     shifted: bool
     turned: bool
 
@@ -399,7 +397,6 @@ def _estimate_frame(free: RigidFit, start: State) -> Frame:
         R_SP=R_SP,
         position_deviations=deviations,
         turn_deviations_deg=np.degrees(np.sqrt(np.diag(covariance)[3:])),
-        wald=wald,
         shifted=bool(wald > _MIN_WALD and shifted),
         turned=bool(wald > _MIN_WALD and tilted),
     )

@@ -11,8 +11,8 @@ from drake_teleop.logs.pose_motion.spectra import Grid, distance
 from drake_teleop.logs.pose_motion.splines import MOTION_COLUMNS
 
 NOTHING_REJECTED = (
-    "the residual is large where the load moves and small where it rests, so that disturbances"
-    " cannot be told from errors of the motion: no sample was rejected"
+    "the residual is large where the load moves and small where it rests, so disturbances"
+    " cannot be distinguished from errors of the motion: no sample was rejected"
 )
 _HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS = 3.0, 4.5, 30
 _NORMAL_MAD = 1.4826

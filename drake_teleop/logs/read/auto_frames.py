@@ -60,14 +60,14 @@ def _require_rotation(mounting: Mounting | None, where: str) -> Mounting:
         problem = "the specific force hardly changes, or gaps leave too little of it"
         remedy = "turn the sensor about two axes"
     elif mounting.mirrored:
-        problem = "the axes of the IMU are those of the pose mirrored"
+        problem = "the axes of the IMU are a mirror image of those of the pose"
         remedy = "exchange two of its columns, or change imu.sign"
     elif not mounting.fits:
-        problem = f"no rotation brings IMU and pose together ({_unexplained_shares(mounting)})"
+        problem = f"no rotation makes IMU and pose agree ({_unexplained_shares(mounting)})"
         remedy = "find wrong units, signs or clocks by `drake-teleop inspect` with `frame: sensor`"
     elif not mounting.determined:
         worst = float(mounting.deviations_deg.max())
-        problem = f"one direction is known to {worst:.2g} deg only (standard deviation)"
+        problem = f"one direction has a standard deviation of {worst:.2g} deg"
         remedy = "turn the sensor about two axes, by more than 30 deg"
     else:
         return mounting
@@ -92,11 +92,11 @@ def _rotation_notes(found: Mounting) -> list[str]:
         f" imu.frame: {_round(found.R_SI)}"
     ]
     if not found.is_right_angled:
-        notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check that it is meant so")
+        notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check this")
     if abs(found.lag_s) > MAX_LAG_S:
         notes.append(
-            f"warning: the clock of the IMU lags that of the pose by {found.lag_s:.3f} s, which"
-            f" stays so unless you add {-found.lag_s:.3f} to imu.time.offset"
+            f"warning: the clock of the IMU lags that of the pose by {found.lag_s:.3f} s;"
+            f" add {-found.lag_s:.3f} to imu.time.offset to correct it"
         )
     return notes
 
@@ -112,15 +112,15 @@ def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> Leve
             lever = other
     if lever is None:
         raise DrakeTeleopError(
-            "nothing tells the place of the accelerometer: the pose has no fitting position, and"
-            " the wrench is not that of a load alone",
+            "the data do not determine the position of the accelerometer: no pose position fits,"
+            " and the wrench contains more than the load",
             where=where,
             remedy="give imu.position in metres, or pose.position",
         )
     if not lever.determined.all():
         axes = ", ".join(a for a, known in zip("xyz", lever.determined, strict=True) if not known)
         raise DrakeTeleopError(
-            f"the motion does not determine {axes} of the accelerometer's place"
+            f"the motion does not determine {axes} of the accelerometer's position"
             f" ({_format_mm(lever)} mm, from the {lever.source})",
             where=where,
             remedy="turn faster, about more axes, or give imu.position in metres",

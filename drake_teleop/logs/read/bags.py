@@ -36,7 +36,7 @@ _BLOCK_MESSAGES, _RECEIVED = 10_000, "received at"
 _CHUNK_OPCODE, _MAX_UNPACK_RATIO, _MAX_UNPACKED_BYTES = 6, 200, 100_000_000
 _MAX_MEMORY_BYTES = 1_500_000_000  # bytes
 _TOO_LARGE, _CUT_REMEDY = (
-    "unpacks to more than can be read",
+    "its uncompressed size is too large",
     "cut it, or write the topics one by one",
 )
 _GROUP_NAMES = {
@@ -166,7 +166,7 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
 def topic_missing(path: Path) -> DrakeTeleopError:
     """Return the error for a bag without a named topic."""
     return DrakeTeleopError(
-        "is a bag, which does not say what its topics are",
+        "is a bag, and no topic is specified",
         where=str(path),
         remedy="describe it, with `topic` in each stream; `drake-teleop inspect` drafts that",
     )
@@ -178,7 +178,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     if not is_bag(path):
         raise DrakeTeleopError(
-            "is no bag",
+            "is not a bag",
             where=str(path),
             remedy="give a folder with metadata.yaml, or a .mcap, .db3 or .bag file",
         )

@@ -172,7 +172,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
 
     if not {"t", *WRENCH} & set(table.columns):
         raise DrakeTeleopError(
-            "is no canonical log: it has none of the columns t, f_x ... tau_z",
+            "is not a canonical log: it has none of the columns t, f_x ... tau_z",
             where=str(path),
             remedy="describe it in a YAML file (docs/logs.md); `drake-teleop inspect` drafts one",
         )

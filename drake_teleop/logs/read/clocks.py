@@ -77,15 +77,15 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     rows = np.flatnonzero(np.isfinite(t))
     notes = []
     if len(rows) < len(t):
-        notes.append(f"{len(t) - len(rows)} rows without a time stamp are left out")
+        notes.append(f"{len(t) - len(rows)} rows without a time stamp are removed")
     _check_forward(t[rows], rows, table, where)
     if (np.diff(t[rows]) == 0).any():
         before = len(rows)
         rows = _remove_repetitions(rows, t, table, columns, where)
         if len(rows) < before:
             notes.append(
-                f"{before - len(rows)} rows that repeat the one before, with its time stamp, are"
-                " left out"
+                f"{before - len(rows)} rows that repeat the previous row and its time stamp"
+                " are removed"
             )
     t = t[rows]
     shared = int((np.diff(t) == 0).sum())
@@ -93,8 +93,8 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
         even = spread(t)
         _check_increasing(even, rows, table, where)
         notes.append(
-            f"{shared} rows share the time stamp of the one before: all are taken as evenly spaced"
-            f" over {_WINDOW} stamps, which moves them by up to {np.abs(even - t).max():.2g} s"
+            f"{shared} rows share the time stamp of the previous row: all rows are spaced evenly"
+            f" over {_WINDOW} stamps, which changes times by up to {np.abs(even - t).max():.2g} s"
         )
         t = even
     _check_rate(t, time, where)
@@ -174,7 +174,7 @@ def _check_forward(t: Array, rows: NDArray[np.intp], table: Table, where: str) -
     if (steps < 0).any():
         first = int(np.argmax(steps < 0))
         raise DrakeTeleopError(
-            f"{int((steps < 0).sum())} time stamps go back, the first is row"
+            f"{int((steps < 0).sum())} time stamps decrease, the first in row"
             f" {rows[first + 1] + table.first_row} of {table.path.name}, by {-steps[first]:.3g} s",
             where=where,
             remedy="cut the log there, sort the rows, or use another clock: time.column, time.rate",
@@ -192,7 +192,7 @@ def _check_increasing(t: Array, rows: NDArray[np.intp], table: Table, where: str
     if (steps <= 0).any():
         row = rows[int(np.argmax(steps <= 0))] + table.first_row
         raise DrakeTeleopError(
-            f"the time stamps stand still around row {row} of {table.path.name}",
+            f"the time stamps do not increase around row {row} of {table.path.name}",
             where=where,
             remedy="cut the log there, or give time.rate instead of the stamps",
         )

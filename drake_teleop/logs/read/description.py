@@ -265,8 +265,8 @@ class Static(_Stream):
             raise ValueError("give one of gravity (in S), specific_force (in S), orientation")
         if self.weight == "removed":
             raise ValueError(
-                "weight: removed leaves nothing of a load at rest: record it in motion, or give"
-                " [m, m c_x, m c_y, m c_z] of the payload in the robot's controller"
+                "weight: removed cannot be used with static poses: record the load in motion,"
+                " or give [m, m c_x, m c_y, m c_z] of the payload in the robot's controller"
             )
         return self
 
@@ -283,12 +283,12 @@ class Description(Strict):
     @model_validator(mode="after")
     def _check_streams(self) -> Description:
         if np.abs(self.gravity_W).max() > _MAX_GRAVITY:
-            raise ValueError(f"gravity is beyond {_MAX_GRAVITY:g} m/s^2")
+            raise ValueError(f"gravity exceeds {_MAX_GRAVITY:g} m/s^2")
         if self.gravity == "auto" and (self.pose is None or self.imu is not None):
             raise ValueError("gravity: auto is found from a wrench with a pose and no imu")
         if self.static is not None:
             if self.wrench or self.imu or self.pose:
-                raise ValueError("static poses stand alone: remove wrench, imu and pose")
+                raise ValueError("static poses cannot be combined with wrench, imu or pose")
             return self
         if self.wrench is None:
             raise ValueError(
@@ -299,9 +299,9 @@ class Description(Strict):
                 "a wrench without kinematics: add imu or pose, from whichever file has it"
             )
         if self.pose is None and (self.imu is None or self.imu.angular_velocity is None):
-            raise ValueError("nothing gives the angular velocity: add imu.angular_velocity or pose")
+            raise ValueError("the angular velocity is missing: add imu.angular_velocity or pose")
         if self.pose is None and (self.imu is None or self.imu.specific_force is None):
-            raise ValueError("nothing gives the specific force: add imu.specific_force or pose")
+            raise ValueError("the specific force is missing: add imu.specific_force or pose")
         if self.pose is None and self.imu is not None and self.imu.frame == "auto":
             raise ValueError("imu.frame: auto compares the IMU with a pose: add pose")
         if self.pose is not None and self.pose.automatic and self.wrench.frame == "base":

@@ -125,7 +125,7 @@ class Strict(BaseModel):
     def _limit_size(cls, value: Any) -> Any:
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, (int, float)) and 1e12 < abs(number) < np.inf:
-                raise ValueError(f"{number:g} is beyond 1e12")
+                raise ValueError(f"{number:g} exceeds 1e12")
         return value
 
 

@@ -30,7 +30,7 @@ _TYPES = {
     13: "u8",
 }
 _FLAGS_AND_SIZE = [6, 5]
-_BROKEN = "it is broken, or not all of it is there"
+_BROKEN = "it is damaged or incomplete"
 
 
 def read_mat(path: Path) -> dict[str, NDArray]:
@@ -44,7 +44,7 @@ def read_mat(path: Path) -> dict[str, NDArray]:
 
     version = matfile_version(path)[0]
     if version == 2:
-        raise ValueError("it is of version 7.3; save(..., '-v7') writes one that can be")
+        raise ValueError("version 7.3 is not supported; save it by save(..., '-v7')")
     found: dict[str, NDArray] = {}
     if version == 1:
         data = path.read_bytes()
@@ -56,7 +56,7 @@ def read_mat(path: Path) -> dict[str, NDArray]:
             if isinstance(value, np.ndarray):
                 _add_array(name, value, found)
     if not found:
-        raise ValueError("it has no arrays: what is in tables and timeseries, save as arrays")
+        raise ValueError("it has no arrays; save tables and timeseries as arrays")
     return found
 
 

@@ -79,7 +79,7 @@ def read_log(
     expect((str, Path), path, "log", "give the file's name")
     if bandwidth_hz is not None and not number("bandwidth_hz", bandwidth_hz) >= _MIN_BANDWIDTH_HZ:
         raise DrakeTeleopError(
-            f"{bandwidth_hz:g} Hz leave nothing", where="bandwidth_hz", remedy="give more, or None"
+            f"{bandwidth_hz:g} Hz is too low", where="bandwidth_hz", remedy="give more, or None"
         )
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):
@@ -127,7 +127,7 @@ class _Reader:
     def log(self, *, keep_origin: bool = False, differentiate: bool = True) -> Log:
         if self._description.static is not None:
             if keep_origin:
-                self._notes.append("each row is taken for a pose at rest")
+                self._notes.append("each row is interpreted as a pose at rest")
             return self._static(self._description.static)
         assert self._description.wrench is not None
         weight = self._description.wrench.weight
@@ -385,7 +385,7 @@ class _Reader:
             start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]
             self._notes.append(
                 f"{name}: {len(found_gaps)} gaps, the longest of {stop - start:.3g} s at"
-                f" {start - t[0]:.3g} s; what lies in them and close by is not used"
+                f" {start - t[0]:.3g} s; samples in and near them are not used"
             )
             half_window = self._half_window(float(np.median(np.diff(t))))
             self._gaps.append(found_gaps + np.array([-half_window, half_window]))

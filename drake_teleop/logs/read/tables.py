@@ -231,7 +231,7 @@ def _read_frame(path: Path, header: bool) -> Table:
 def _strip_names(names: list[str]) -> list[str]:
     stripped = [name.strip() for name in names]
     if len(set(stripped)) < len(names):
-        raise ValueError("two of its columns have names that differ in spaces alone")
+        raise ValueError("two column names differ only in spaces")
     return stripped
 
 
@@ -282,7 +282,7 @@ def _table_from_arrays(path: Path, arrays: dict[str, NDArray]) -> Table:
 
 def _read_npz(path: Path) -> dict[str, NDArray]:
     if not zipfile.is_zipfile(path):
-        raise ValueError("it is no archive of arrays, or not all of one; numpy.savez writes them")
+        raise ValueError("it is not a complete NPZ archive; numpy.savez writes one")
     with np.load(path, allow_pickle=False) as archive:
         columns = {key: archive[key] for key in archive.files}
     return {key: x for key, x in columns.items() if isinstance(x, np.ndarray) and x.ndim}
