@@ -143,7 +143,7 @@ def fit_rigid(
 
     Args:
         Z: (bands, 38, 38) `spectra.moments`.
-        Q: (bands, 38, 38) `noise.noise_moments`.
+        Q: (bands, 38, 38) `spectra.noise_moments`.
         levels: noise of the bands.
         start: initial state.
         free: (23,) estimated parameters.

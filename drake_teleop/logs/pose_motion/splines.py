@@ -93,17 +93,15 @@ class PoseSplines:
         poses: fitted poses with continuous signs.
         spacing: knot distance [s].
         rate: of the poses [Hz].
-        aid: IMU data, or None.
+        imu_rows: IMU data, or None.
     """
 
     def __init__(self, poses: Poses, spacing: float, imu_rows: ImuRows | None = None) -> None:
         self.poses, self.spacing, self.rate, self.imu_rows = poses, spacing, poses.rate, imu_rows
         self._start = float(poses.t[0])
         t = poses.t - self._start
-        self._row_blocks, knots = (
-            _row_blocks(len(t)),
-            _knots(t, spacing, with_imu=imu_rows is not None),
-        )
+        self._blocks = _row_blocks(len(t))
+        knots = _knots(t, spacing, with_imu=imu_rows is not None)
         try:
             self._spline = self._fit(t, knots)
         except np.linalg.LinAlgError:  # too few poses per knot between gaps
@@ -116,8 +114,8 @@ class PoseSplines:
         accurate.
         """
         poses, imu_rows = self.poses, self.imu_rows
-        values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._row_blocks)
-        times = (t[x] for x in self._row_blocks)
+        values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._blocks)
+        times = (t[x] for x in self._blocks)
         gram, right = _normal(zip(times, values, strict=True), knots, DEGREE, 7)
         if imu_rows is None:
             return BSpline(knots, solveh_banded(gram, right), DEGREE)
@@ -210,7 +208,7 @@ class PoseSplines:
                 np.sqrt(rotation_power * self.rate)
             )
         sums, count = np.zeros(2), 0
-        for part in self._row_blocks:
+        for part in self._blocks:
             fitted = self._spline(self.poses.t[part] - self._start)
             position = self.poses.position[part] - fitted[:, :3]
             turn = 2.0 * _relative_vector(fitted[:, 3:], self.poses.quaternion[part])
