@@ -74,7 +74,7 @@ def test_errors_name_file_and_field(
     for key in where[:-1]:
         place = place[key]
     place[where[-1]] = value
-    _expect(tmp_path, yaml.safe_dump(data), words)
+    _expect_error(tmp_path, yaml.safe_dump(data), words)
 
 
 @pytest.mark.parametrize(
@@ -88,11 +88,11 @@ def test_errors_name_file_and_field(
         (AT_REST + THREE_INSTRUMENTS.replace("gravity: 9.82 ", "#"), ["cannot be combined"]),
     ],
 )
-def test_files_that_are_no_descriptions(tmp_path: Path, text: str, words: list[str]) -> None:
-    _expect(tmp_path, text, words)
+def test_invalid_description_file_raises_error(tmp_path: Path, text: str, words: list[str]) -> None:
+    _expect_error(tmp_path, text, words)
 
 
-def test_what_is_left_to_the_data_needs_data(tmp_path: Path) -> None:
+def test_auto_without_the_required_streams_raises_error(tmp_path: Path) -> None:
     data = yaml.safe_load(THREE_INSTRUMENTS)
     omega = {"columns": ["wx", "wy", "wz"]}
     data["imu"] |= {"frame": "auto", "position": "auto", "angular_velocity": omega}
@@ -101,18 +101,18 @@ def test_what_is_left_to_the_data_needs_data(tmp_path: Path) -> None:
     imu = load_description(path).imu
     assert imu and imu.automatic and (imu.frame, imu.position) == ("auto", "auto")
     del data["pose"]
-    _expect(tmp_path, yaml.safe_dump(data), ["imu.frame: auto", "add pose"])
+    _expect_error(tmp_path, yaml.safe_dump(data), ["imu.frame: auto", "add pose"])
     data["imu"]["frame"] = "sensor"
     del data["imu"]["specific_force"]
-    _expect(tmp_path, yaml.safe_dump(data), ["imu", "found from specific_force"])
+    _expect_error(tmp_path, yaml.safe_dump(data), ["imu", "found from specific_force"])
 
 
-def test_missing_description(tmp_path: Path) -> None:
+def test_missing_description_raises_error(tmp_path: Path) -> None:
     with pytest.raises(DrakeTeleopError, match="no such file"):
         load_description(tmp_path / "log.yaml")
 
 
-def _expect(folder: Path, text: str, words: list[str]) -> None:
+def _expect_error(folder: Path, text: str, words: list[str]) -> None:
     path = folder / "log.yaml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(DrakeTeleopError) as error:
