@@ -321,7 +321,7 @@ def test_given_position_is_in_the_estimated_frame(tmp_path: Path) -> None:
         ({"rest": True}, ["the specific force hardly changes", "turn the sensor"]),
         ({"mirror": True}, ["mirrored", "exchange two of its columns"]),
         ({"sign": -1}, ["mirrored", "imu.sign"]),
-        ({"degrees": True}, ["no rotation brings", "angular velocity", "drake-teleop inspect"]),
+        ({"degrees": True}, ["no rotation makes", "angular velocity", "drake-teleop inspect"]),
     ],
 )
 def test_undetermined_rotation_raises_error(changes: dict[str, Any], words: list[str]) -> None:

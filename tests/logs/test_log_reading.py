@@ -265,7 +265,7 @@ def test_base_axes_are_rotated_to_S_by_the_orientation(tmp_path: Path) -> None:
             ["wrench.time.unit", "a rate of 0.7 Hz", "`unit: us`"],
         ),
         ({"pose__time": {"column": "sec"}}, ["do not overlap in time", "pose 0.03"]),
-        ({"pose__time": {"column": "q0"}}, ["pose.time", "go back", "time.rate"]),
+        ({"pose__time": {"column": "q0"}}, ["pose.time", "decrease", "time.rate"]),
         (
             {"pose__orientation": {"columns": ["q0", "q1", "q2"], "form": "quaternion_wxyz"}},
             ["pose.orientation.columns", "3 columns where 4"],

@@ -182,7 +182,7 @@ def test_matlab_variables_and_fields_are_columns(tmp_path: Path, form: str) -> N
     [
         (b"no mat", "cannot be read"),
         (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n", "'-v7'"),
-        (None, "save as arrays"),
+        (None, "save tables and timeseries"),
     ],
 )
 def test_error_of_a_mat_file_without_arrays_has_a_remedy(
@@ -203,7 +203,7 @@ def test_unnamed_array_of_a_matlab_table_is_ignored(tmp_path: Path) -> None:
     assert data[168:173] == b"\x01\0\x01\0t"
     data[168:176] = b"\x01" + bytes(7)
     path.write_bytes(data)
-    with pytest.raises(DrakeTeleopError, match="save as arrays"):
+    with pytest.raises(DrakeTeleopError, match="save tables and timeseries"):
         read_table(path)
 
 

@@ -60,7 +60,7 @@ def _require_rotation(mounting: Mounting | None, where: str) -> Mounting:
         problem = "the specific force hardly changes, or gaps leave too little of it"
         remedy = "turn the sensor about two axes"
     elif mounting.mirrored:
-        problem = "the axes of the IMU are a mirror image of those of the pose"
+        problem = "the axes of the IMU are mirrored relative to those of the pose"
         remedy = "exchange two of its columns, or change imu.sign"
     elif not mounting.fits:
         problem = f"no rotation makes IMU and pose agree ({_unexplained_shares(mounting)})"
