@@ -52,8 +52,8 @@ def one_array() -> bytes:
 WHOLE = archive(t=np.arange(100.0))
 AT = WHOLE.index(np.arange(100.0)[50:52].tobytes())
 DAMAGED = {
-    "the end is missing": (WHOLE[:-30], "not all of one"),
-    "the half is missing": (WHOLE[: len(WHOLE) // 2], "not all of one"),
+    "the end is missing": (WHOLE[:-30], "not a complete NPZ archive"),
+    "the half is missing": (WHOLE[: len(WHOLE) // 2], "not a complete NPZ archive"),
     "a wrong checksum": (WHOLE[:AT] + b"\x7f" + WHOLE[AT + 1 :], "Bad CRC"),
     "one array": (one_array(), "not a complete NPZ archive"),
     "text": (b"t\n0\n1\n", "not a complete NPZ archive"),
@@ -142,7 +142,7 @@ def test_what_no_sensor_measures(name, value, expected, tmp_path):
     [
         ("gravity: 1e300", ":gravity: 1e+300 exceeds 1e12"),
         ("gravity: [0, 0, -9810]", "gravity exceeds 100 m/s^2"),
-        ("wrench: {time: {rate: 100, offset: -1e13}}", ":wrench.time.offset: -1e+13 is beyond"),
+        ("wrench: {time: {rate: 100, offset: -1e13}}", ":wrench.time.offset: -1e+13 exceeds"),
         ("imu: {position: [0, 1e300, 0]}", ":imu.position: 1e+300 exceeds 1e12"),
         ("wrench: {time: {rate: 1e-300}}", ":wrench.time.rate: "),
         ("pose: {time: {column: t, scale: 1e-300}}", ":pose.time.scale: "),
